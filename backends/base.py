@@ -1,0 +1,320 @@
+"""The physics contract: N worlds of one robot, each on its own terrain, stepped together.
+
+Frames and units hold for every engine: world frame ``_w`` (x forward, y left, z up), body frame ``_b`` (that of the robot's base),
+SI units, quaternions wxyz. All tensors are torch tensors on the backend's device, first axis N (worlds). Floating point is float64 on
+an engine that computes in it and float32 elsewhere.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from enum import Enum
+from typing import ClassVar
+
+import torch
+
+from ..robots.base import JointParameters, Robot
+from ..terrains.base import Terrain
+
+
+class BackendError(RuntimeError):
+    """An engine cannot do what it was asked for; the message says what, why and what to change."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsOptions:
+    """How the world is simulated."""
+
+    timestep: float = 0.002
+    """Length of one physics step (a substep of the control period) [s]."""
+    substeps: int = 10
+    """Physics steps per control period."""
+    cone: str = "elliptic"
+    """Friction cone: ``elliptic`` or ``pyramidal``."""
+    impratio: float = 100.0
+    """Ratio of frictional to normal constraint impedance (elliptic cone)."""
+    iterations: int = 100
+    """Largest number of solver iterations."""
+    ls_iterations: int = 50
+    """Largest number of line-search iterations."""
+    tolerance: float = 1e-8
+    """Solver tolerance."""
+    foot_condim: int | None = None
+    """Contact dimension of the feet (3 sliding, 6 with torsion and rolling); None keeps the robot file's."""
+    self_collision: bool = True
+    """Whether the robot's own bodies collide with each other."""
+    torque_limits: bool = True
+    """Whether motor torque is clipped to the parameter set's ``torque_limit``."""
+    watch_tilt: float | None = None
+    """Tilt of the base's z axis against the world's [rad] whose first substep is recorded in ``PhysicsState.tilt_substep``."""
+    watch_penetration: float | None = None
+    """Depth of the robot in the terrain, floor and walls not counted [m], recorded in ``PhysicsState.penetration_substep``."""
+    contacts_per_world: int | None = None
+    """Contact capacity of a world in engines with fixed buffers; None lets the engine choose."""
+    deterministic: bool = False
+    """Ask for run-to-run identical results on a GPU."""
+
+    @property
+    def control_period(self) -> float:
+        """Length of a control period [s]."""
+        return self.timestep * self.substeps
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """What a backend is built from."""
+
+    robot: Robot
+    parameters: JointParameters
+    """Joint and motor constants, usually one of ``robot.parameters``."""
+    terrains: tuple[Terrain, ...]
+    """The palette of terrains. Worlds refer to it by index, and may change their terrain at a reset."""
+    terrain_index: tuple[int, ...]
+    """Terrain of every world at the start; its length is the number of worlds."""
+    physics: PhysicsOptions = PhysicsOptions()
+
+    @property
+    def num_worlds(self) -> int:
+        """Number of worlds."""
+        return len(self.terrain_index)
+
+
+@dataclass(kw_only=True)
+class PhysicsState:
+    """State of all worlds after a step. Forces and torques are those of the last substep; poses and velocities those after it.
+
+    N worlds, J joints, F feet, B collision bodies, in the robot's orders. A backend may hand out views of its own memory: they
+    change with the next call; ``clone()`` what must last.
+    """
+
+    time: torch.Tensor
+    """Simulated time since the world's last reset [s], (N,)."""
+    base_position_w: torch.Tensor
+    """Origin of the base body [m], (N, 3)."""
+    base_quaternion_w: torch.Tensor
+    """Orientation of the base, wxyz, (N, 4)."""
+    base_linear_velocity_w: torch.Tensor
+    """Velocity of the base origin [m/s], (N, 3)."""
+    base_angular_velocity_b: torch.Tensor
+    """Angular velocity in the body frame [rad/s], (N, 3)."""
+    joint_position: torch.Tensor
+    """[rad], (N, J)."""
+    joint_velocity: torch.Tensor
+    """[rad/s], (N, J)."""
+    joint_torque: torch.Tensor
+    """Motor torque applied in the last substep, after limits and strength [N·m], (N, J)."""
+    foot_position_w: torch.Tensor
+    """Centres of the foot spheres [m], (N, F, 3)."""
+    foot_velocity_w: torch.Tensor
+    """Velocities of the foot centres [m/s], (N, F, 3)."""
+    foot_contact_force_w: torch.Tensor
+    """Net force of the ground on each foot [N], (N, F, 3)."""
+    foot_normal_force: torch.Tensor
+    """Sum over a foot's ground contacts of the normal force, along each contact's own normal [N], (N, F)."""
+    foot_tangential_force: torch.Tensor
+    """Sum over a foot's ground contacts of the magnitude of the tangential force [N], (N, F)."""
+    body_contact_force_w: torch.Tensor
+    """Net force of the ground on each collision body without its foot geom [N], (N, B, 3)."""
+    ground_force_w: torch.Tensor
+    """Net force of all ground contacts on the robot [N], (N, 3)."""
+    ground_moment_w: torch.Tensor
+    """Net moment of all ground contacts about ``contact_center_w`` [N·m], (N, 3)."""
+    contact_center_w: torch.Tensor
+    """Mean position of the active ground contact points (force > 0) [m], (N, 3); zero without contact."""
+    contact_count: torch.Tensor
+    """Number of active ground contact points, (N,)."""
+    tilt_substep: torch.Tensor
+    """First substep (1-based) of the last step at which ``watch_tilt`` was exceeded, 0 if none, (N,) int64."""
+    penetration_substep: torch.Tensor
+    """First substep (1-based) of the last step at which ``watch_penetration`` was exceeded, 0 if none, (N,) int64."""
+    diverged: torch.Tensor
+    """The world's state became invalid since its last reset (NaN, infinity or the engine's own alarm), (N,) bool."""
+    overflowed: torch.Tensor
+    """Contacts or constraints were dropped for lack of capacity since the world's last reset, (N,) bool."""
+
+    def clone(self) -> PhysicsState:
+        """Copy every tensor."""
+        return replace(self, **{f.name: getattr(self, f.name).clone() for f in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomization:
+    """Per-world changes of the model; a field left None stays as it is. W worlds are those passed along with it."""
+
+    friction: torch.Tensor | None = None
+    """Sliding friction coefficient that acts in every contact of the world, (W,)."""
+    base_mass_offset: torch.Tensor | None = None
+    """Mass added to the base body's nominal mass [kg], (W,); inertia and centre of mass stay (a point load at the centre of mass)."""
+    link_mass_scale: torch.Tensor | None = None
+    """Factor on each collision body's nominal mass and inertia except the base's, (W, B); the base's entry is ignored."""
+    base_com_offset: torch.Tensor | None = None
+    """Shift of the base's centre of mass, body frame [m], (W, 3)."""
+    stiffness_scale: torch.Tensor | None = None
+    """Factor on kp, (W, J)."""
+    damping_scale: torch.Tensor | None = None
+    """Factor on kd, (W, J)."""
+    motor_strength: torch.Tensor | None = None
+    """Factor on the motor torque after its limit, (W, J)."""
+    motor_offset: torch.Tensor | None = None
+    """Added to the position error inside the motor law [rad], (W, J)."""
+
+
+class Support(Enum):
+    """How well an engine does a thing."""
+
+    EXACT = "exact"
+    APPROXIMATE = "approximate"
+    NONE = "not supported"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capability:
+    """One thing that an engine may do, and how."""
+
+    support: Support
+    note: str = ""
+
+
+# Everything a backend declares, in the order in which the documentation lists it.
+CAPABILITY_NAMES: tuple[str, ...] = (
+    "plane",
+    "boxes",
+    "height_field",
+    "per_world_terrain",
+    "friction",
+    "base_mass",
+    "link_mass",
+    "base_com",
+    "gains",
+    "motor_strength",
+    "motor_offset",
+    "latency",
+    "push",
+    "external_force",
+    "torque_limits",
+    "joint_friction",
+    "elliptic_cone",
+    "foot_condim_6",
+    "self_collision",
+    "contact_forces",
+    "penetration",
+    "deterministic",
+    "gpu",
+)
+
+
+class PhysicsBackend(ABC):
+    """N worlds of one robot. See the module docstring for frames and units."""
+
+    name: ClassVar[str]
+    """Registry name, for example ``mujoco``."""
+
+    scene: Scene
+    device: torch.device
+    dtype: torch.dtype
+
+    @classmethod
+    @abstractmethod
+    def capabilities(cls) -> Mapping[str, Capability]:
+        """One entry for each of ``CAPABILITY_NAMES``."""
+
+    @abstractmethod
+    def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
+        """Build the worlds; every world starts at the origin in the default pose and must be reset before its first step.
+
+        Raises:
+            BackendError: the engine cannot do what the scene asks for.
+        """
+
+    @property
+    def num_worlds(self) -> int:
+        """Number of worlds N."""
+        return self.scene.num_worlds
+
+    @property
+    @abstractmethod
+    def state(self) -> PhysicsState:
+        """State after the last call."""
+
+    @property
+    @abstractmethod
+    def sample(self) -> PhysicsState:
+        """State snapshot asked for with ``step(sample_at=…)``; rows of worlds that asked for none are stale."""
+
+    @abstractmethod
+    def reset(
+        self,
+        worlds: torch.Tensor | None = None,
+        *,
+        base_position: torch.Tensor,
+        base_quaternion: torch.Tensor,
+        joint_position: torch.Tensor | None = None,
+        base_linear_velocity: torch.Tensor | None = None,
+        base_angular_velocity: torch.Tensor | None = None,
+        joint_velocity: torch.Tensor | None = None,
+        held_target: torch.Tensor | None = None,
+        terrain_index: torch.Tensor | None = None,
+    ) -> None:
+        """Put worlds into a state; ``state`` is fresh afterwards (positions, velocities; forces are zero).
+
+        Randomization persists. External forces and the watches are cleared.
+
+        Args:
+            worlds: mask (N,) bool of the worlds to reset, None for all. All other arguments have N rows; only the masked rows count.
+            base_position: [m], (N, 3), world frame.
+            base_quaternion: wxyz, (N, 4).
+            joint_position: [rad], (N, J); None for the robot's default pose.
+            base_linear_velocity: world frame [m/s], (N, 3); None for rest.
+            base_angular_velocity: body frame [rad/s], (N, 3); None for rest.
+            joint_velocity: [rad/s], (N, J); None for rest.
+            held_target: joint targets that act until the first step's own take effect, (N, J); None leaves the motors limp.
+            terrain_index: new terrain of each world, (N,) int64, into ``scene.terrains``; None keeps it.
+        """
+
+    @abstractmethod
+    def step(
+        self,
+        joint_targets: torch.Tensor | None,
+        *,
+        delay: torch.Tensor | None = None,
+        sample_at: torch.Tensor | None = None,
+        worlds: torch.Tensor | None = None,
+        substeps: int | None = None,
+    ) -> None:
+        """Advance one control period.
+
+        Args:
+            joint_targets: [rad], (N, J); None: targets do not change (limp motors stay limp).
+            delay: number of substeps for which the previous target still acts, (N,) int64 in 0..substeps; None for 0.
+            sample_at: substep (1-based) after which ``sample`` is filled for the world, 0 for none, (N,) int64.
+            worlds: mask (N,) bool of the worlds to step, None for all. The others do not change.
+            substeps: number of physics steps, None for ``scene.physics.substeps``.
+        """
+
+    @abstractmethod
+    def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
+        """Change the model of some worlds. ``worlds`` is a mask (N,) bool, None for all; the fields have as many rows as it selects."""
+
+    @abstractmethod
+    def push(
+        self,
+        worlds: torch.Tensor | None = None,
+        *,
+        linear_velocity_w: torch.Tensor | None = None,
+        angular_velocity_b: torch.Tensor | None = None,
+    ) -> None:
+        """Set base velocities, (N, 3) each, of the masked worlds. NaN entries keep the present value."""
+
+    @abstractmethod
+    def apply_force(self, force_w: torch.Tensor) -> None:
+        """External force on the base's centre of mass [N], (N, 3), that acts until changed or the world is reset."""
+
+    def close(self) -> None:
+        """Free what the engine holds. A closed backend must not be used again."""
+
+
+def unsupported(backend: str, needed: Sequence[str], capabilities: Mapping[str, Capability]) -> list[str]:
+    """Those names of ``needed`` that the engine does not support at all."""
+    return [n for n in needed if capabilities[n].support is Support.NONE]

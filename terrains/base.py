@@ -1,0 +1,78 @@
+"""Terrain as data: boxes, an optional height field, the floor plane, and where episodes start and end.
+
+Frame: x forward, y left, z up, metres. A terrain sits in one world of its own; nothing here knows an engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """A solid box."""
+
+    center: tuple[float, float, float]
+    """Centre [m]."""
+    half_size: tuple[float, float, float]
+    """Half extents along the box's own axes [m]."""
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Orientation, wxyz."""
+    wall: bool = False
+    """True for the boundary walls: they stop the robot but are no ground to walk on (``height`` ignores them)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeightField:
+    """A rectangular grid of heights, axis-aligned, linear between nodes as MuJoCo triangulates it."""
+
+    center: tuple[float, float]
+    """Middle of the grid [m]."""
+    half_size: tuple[float, float]
+    """Half extents in x and y [m]; the outermost nodes lie on the edge."""
+    heights: FloatArray
+    """Node heights [m], shape (rows, columns): rows run along +y, columns along +x; all >= 0."""
+    base: float = 0.1
+    """Thickness of the solid below height 0 [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pose:
+    """A base pose: the ground point below the base and the heading."""
+
+    position: tuple[float, float, float]
+    """Ground point [m]; the robot's base starts ``Robot.stand_height`` above it."""
+    yaw: float = 0.0
+    """Heading about +z [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Terrain:
+    """The ground of one world."""
+
+    name: str
+    """Registry name, for example ``stairs_fd``."""
+    family: str
+    """Terrains of one family and layout share an engine's model layout, for example ``stairs``."""
+    level: int = 0
+    """Difficulty 1..10; 0 where the terrain has no levels."""
+    boxes: tuple[Box, ...] = ()
+    height_field: HeightField | None = None
+    spawns: Mapping[str, Pose] = field(default_factory=dict)
+    """Start poses by stage, for example ``level_search`` and ``level_eval``."""
+    target: tuple[float, float, float] | None = None
+    """Goal position of the base [m], where the terrain has one."""
+    backward: bool = False
+    """True where the robot is to cross the terrain walking backwards."""
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Height of the ground at (x, y) [m], any shape: the highest of floor, boxes and height field; walls do not count."""
+        from .height import ground_height
+
+        return ground_height(self, np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
