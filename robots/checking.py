@@ -1,0 +1,166 @@
+"""Compares a robot's description with its MuJoCo model. MuJoCo is imported only when a robot is checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from .base import Robot
+from .loading import RobotError, did_you_mean
+
+if TYPE_CHECKING:
+    import mujoco
+
+_SITE_TOLERANCE = 1e-4
+"""Largest distance between a foot's site and its geom's centre [m]."""
+
+
+def check_robot(robot: Robot) -> None:
+    """Compile the robot's MuJoCo model and check that it has everything that the description names.
+
+    Joints, one motor each, the free base, feet (a geom and a site at its centre), collision bodies, the imu site; that the default
+    pose is within the joint ranges; that at ``stand_height`` no foot is in the ground; that the model brings no ground.
+
+    Raises:
+        RobotError: the first disagreement found.
+    """
+    import mujoco
+
+    try:
+        model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    except ValueError as error:
+        raise RobotError(
+            f"'{robot.mjcf}' is not a model that MuJoCo can compile: {' '.join(str(error).split())}"
+        ) from error
+    check = _Check(robot, model)
+    check.base()
+    check.joints()
+    check.motors()
+    check.feet()
+    check.bodies_and_sites()
+    check.standing_pose()
+
+
+class _Check:
+    """The single checks, each of which raises ``RobotError``."""
+
+    def __init__(self, robot: Robot, model: mujoco.MjModel) -> None:
+        import mujoco
+
+        self.mujoco = mujoco
+        self.robot = robot
+        self.model = model
+
+    def error(self, problem: str) -> RobotError:
+        return RobotError(f"robot '{self.robot.name}': {problem}")
+
+    def require(self, names: Iterable[str], key: str, kind: str) -> list[int]:
+        """Ids of named model objects (``joint``, ``body``, ``geom``, ``site``); those of ``key`` must all exist."""
+        object_type = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+        known = self.names(object_type)
+        for name in names:
+            if name not in known:
+                raise self.error(
+                    f"{key} names '{name}' but {self.robot.mjcf.name} has no {kind} of that name{did_you_mean(name, known)}"
+                )
+        return [self.mujoco.mj_name2id(self.model, object_type, name) for name in names]
+
+    def names(self, object_type: mujoco.mjtObj) -> list[str]:
+        count = {
+            self.mujoco.mjtObj.mjOBJ_JOINT: self.model.njnt,
+            self.mujoco.mjtObj.mjOBJ_BODY: self.model.nbody,
+            self.mujoco.mjtObj.mjOBJ_GEOM: self.model.ngeom,
+            self.mujoco.mjtObj.mjOBJ_SITE: self.model.nsite,
+        }[object_type]
+        found = (self.mujoco.mj_id2name(self.model, object_type, i) for i in range(count))
+        return [name for name in found if name is not None]
+
+    def base(self) -> None:
+        model, robot = self.model, self.robot
+        (base,) = self.require([robot.base_body], "base_body", "body")
+        free = [j for j in range(model.njnt) if model.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_FREE]
+        if [model.jnt_bodyid[j] for j in free] != [base]:
+            raise self.error(f"{robot.mjcf.name} must have one free joint, on the base_body '{robot.base_body}'")
+        if any(model.geom_bodyid == 0):
+            raise self.error(
+                f"{robot.mjcf.name} has geoms in its worldbody; it must hold the robot alone, without ground"
+            )
+
+    def joints(self) -> None:
+        model, robot = self.model, self.robot
+        ids = self.require(robot.joint_names, "joint_names", "joint")
+        for name, joint in zip(robot.joint_names, ids, strict=True):
+            if model.jnt_type[joint] != self.mujoco.mjtJoint.mjJNT_HINGE:
+                raise self.error(f"joint_names names '{name}', which is not a hinge in {robot.mjcf.name}")
+        others = [
+            self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j}"
+            for j in range(model.njnt)
+            if model.jnt_type[j] != self.mujoco.mjtJoint.mjJNT_FREE and j not in ids
+        ]
+        if others:
+            raise self.error(
+                f"{robot.mjcf.name} has the joint '{others[0]}', which joint_names lacks; add it or weld it"
+            )
+        for name, joint, angle in zip(robot.joint_names, ids, robot.default_joint_position, strict=True):
+            low, high = model.jnt_range[joint]
+            if model.jnt_limited[joint] and not low <= angle <= high:
+                raise self.error(
+                    f"default_joint_position of '{name}' is {angle:g} rad, outside its range {low:g} to {high:g} rad"
+                )
+
+    def motors(self) -> None:
+        model, robot = self.model, self.robot
+        ids = self.require(robot.joint_names, "joint_names", "joint")
+        driven = [
+            int(model.actuator_trnid[a, 0])
+            for a in range(model.nu)
+            if model.actuator_trntype[a] == self.mujoco.mjtTrn.mjTRN_JOINT
+        ]
+        for name, joint in zip(robot.joint_names, ids, strict=True):
+            if driven.count(joint) != 1:
+                raise self.error(f"{robot.mjcf.name} has {driven.count(joint)} actuators on '{name}'; it must have one")
+        if model.nu != len(ids):
+            raise self.error(
+                f"{robot.mjcf.name} has {model.nu} actuators for {len(ids)} joints; there must be one per joint and no other"
+            )
+
+    def feet(self) -> None:
+        model, robot = self.model, self.robot
+        geoms = self.require(robot.foot_names, "foot_names", "geom")
+        sites = self.require(robot.foot_names, "foot_names", "site")
+        for name, geom, site in zip(robot.foot_names, geoms, sites, strict=True):
+            apart = math.dist(model.geom_pos[geom], model.site_pos[site])
+            if model.geom_bodyid[geom] != model.site_bodyid[site] or apart > _SITE_TOLERANCE:
+                raise self.error(f"the site '{name}' must be at the centre of the foot geom '{name}', on the same body")
+            if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+                raise self.error(f"the foot geom '{name}' collides with nothing; give it contype or conaffinity 1")
+
+    def bodies_and_sites(self) -> None:
+        (base,) = self.require([self.robot.base_body], "base_body", "body")
+        self.require(self.robot.collision_bodies, "collision_bodies", "body")
+        (imu,) = self.require([self.robot.imu_site], "imu_site", "site")
+        if self.model.site_bodyid[imu] != base:
+            raise self.error(f"imu_site '{self.robot.imu_site}' must be on the base_body '{self.robot.base_body}'")
+
+    def standing_pose(self) -> None:
+        model, robot = self.model, self.robot
+        data = self.mujoco.MjData(model)
+        for joint, angle in zip(
+            self.require(robot.joint_names, "joint_names", "joint"), robot.default_joint_position, strict=True
+        ):
+            data.qpos[model.jnt_qposadr[joint]] = angle
+        free = next(j for j in range(model.njnt) if model.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_FREE)
+        address = model.jnt_qposadr[free]
+        data.qpos[address : address + 7] = (0.0, 0.0, robot.stand_height, 1.0, 0.0, 0.0, 0.0)
+        self.mujoco.mj_kinematics(model, data)
+        for name, geom in zip(robot.foot_names, self.require(robot.foot_names, "foot_names", "geom"), strict=True):
+            # The bounding sphere is exact for the usual ball feet and cautious for others.
+            bottom = data.geom_xpos[geom][2] - (
+                model.geom_size[geom][0] if model.geom_type[geom] == self.mujoco.mjtGeom.mjGEOM_SPHERE else 0.0
+            )
+            if bottom < 0:
+                raise self.error(
+                    f"at stand_height {robot.stand_height:g} m the foot '{name}' is {-bottom:.3f} m below the ground; "
+                    f"it must be at least {robot.stand_height - bottom:.3f} m"
+                )
