@@ -72,7 +72,7 @@ class Terrain:
     """True where the robot is to cross the terrain walking backwards."""
 
     def height(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """Height of the ground at (x, y) [m], any shape: the highest of floor, boxes and height field; walls do not count."""
+        """Height of the ground at (x, y) [m], any shape: the highest of floor, boxes and height field; no walls."""
         from .height import ground_height
 
         return ground_height(self, np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))

@@ -1,0 +1,109 @@
+"""Height of the ground above a point of the plane: exact for the floor, boxes of any orientation and height fields."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import Box, FloatArray, HeightField, Terrain
+
+# A point on the very edge of a solid counts as above it, whichever way the edge's coordinate was rounded [m].
+EDGE_TOLERANCE = 1e-9
+
+
+def ground_height(terrain: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Height of the highest solid on the vertical line through (x, y); the floor plane z = 0 is everywhere.
+
+    Args:
+        terrain: the ground; its walls do not count.
+        x: forward coordinate, world frame [m], any shape.
+        y: leftward coordinate, world frame [m], a shape that broadcasts with ``x``.
+
+    Returns:
+        Height [m], the broadcast shape of ``x`` and ``y``; NaN where a coordinate is NaN.
+    """
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    height: FloatArray = np.where(np.isnan(x) | np.isnan(y), np.nan, 0.0)
+    for box in terrain.boxes:
+        if not box.wall:
+            height = np.maximum(height, box_top(box, x, y))
+    if terrain.height_field is not None:
+        height = np.maximum(height, height_field_top(terrain.height_field, x, y))
+    return height
+
+
+def box_top(box: Box, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Height at which the vertical line through (x, y) leaves a box.
+
+    Args:
+        box: the solid.
+        x: world frame [m], any shape.
+        y: world frame [m], same shape as ``x``.
+
+    Returns:
+        Height [m], same shape; -inf where the line misses the box.
+    """
+    rotation = rotation_matrix(box.quaternion)
+    offset_x, offset_y = x - box.center[0], y - box.center[1]
+    lowest = np.full(x.shape, -np.inf)
+    highest = np.full(x.shape, np.inf)
+    inside: NDArray[np.bool_] = np.ones(x.shape, dtype=bool)
+    for axis, half in enumerate(box.half_size):
+        # Coordinate along the box's axis: start at the height of the centre, climb by `rise` per metre of height.
+        start = rotation[0, axis] * offset_x + rotation[1, axis] * offset_y
+        rise = rotation[2, axis]
+        reach = half + EDGE_TOLERANCE
+        if abs(rise) < 1e-12:
+            inside &= np.abs(start) <= reach
+            continue
+        middle, span = -start / rise, half / abs(rise)
+        # The tolerance decides only which lines hit, not the height at which they leave.
+        lowest = np.maximum(lowest, middle - span - EDGE_TOLERANCE)
+        highest = np.minimum(highest, middle + span)
+    hit = inside & (lowest <= highest)
+    return np.where(hit, box.center[2] + highest, -np.inf)
+
+
+def height_field_top(field: HeightField, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Height of a height field's surface, split into triangles as MuJoCo's collision and ray functions split it.
+
+    Each cell has the diagonal from its node of lowest x and y to that of highest x and y; each triangle is flat.
+
+    Args:
+        field: the grid.
+        x: world frame [m], any shape.
+        y: world frame [m], same shape as ``x``.
+
+    Returns:
+        Height [m], same shape; -inf outside of the grid.
+    """
+    rows, columns = field.heights.shape
+    # Grid coordinates: columns count along +x, rows along +y, from the corner of lowest x and y.
+    along_x = (x - field.center[0] + field.half_size[0]) * ((columns - 1) / (2.0 * field.half_size[0]))
+    along_y = (y - field.center[1] + field.half_size[1]) * ((rows - 1) / (2.0 * field.half_size[1]))
+    inside = (np.abs(x - field.center[0]) <= field.half_size[0] + EDGE_TOLERANCE) & (
+        np.abs(y - field.center[1]) <= field.half_size[1] + EDGE_TOLERANCE
+    )
+    along_x = np.where(inside, along_x, 0.0)
+    along_y = np.where(inside, along_y, 0.0)
+    column = np.clip(np.floor(along_x), 0, columns - 2).astype(np.int64)
+    row = np.clip(np.floor(along_y), 0, rows - 2).astype(np.int64)
+    u, v = along_x - column, along_y - row
+    near, far = field.heights[row, column], field.heights[row + 1, column + 1]
+    # The triangle's third corner lies on the +x side of the diagonal where u >= v, else on the +y side.
+    right, left = field.heights[row, column + 1], field.heights[row + 1, column]
+    below_diagonal = near + u * (right - near) + v * (far - right)
+    above_diagonal = near + v * (left - near) + u * (far - left)
+    return np.where(inside, np.where(u >= v, below_diagonal, above_diagonal), -np.inf)
+
+
+def rotation_matrix(quaternion: tuple[float, float, float, float]) -> FloatArray:
+    """Rotation matrix (3, 3) of a quaternion wxyz, which need not have unit length; columns are the rotated axes."""
+    w, x, y, z = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,97 @@
+"""Finds terrains by name: the gauge's own, and any installed under the entry-point group ``gaitgauge.terrains``.
+
+The value of such an entry point is a callable that takes the level (0 where none was asked for) and returns a
+``Terrain``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from difflib import get_close_matches
+from functools import partial
+from importlib.metadata import EntryPoint, entry_points
+
+from .base import Terrain
+from .gauge_terrains import LEVELS, flat, obstacle, slope, stairs, wave
+
+GROUP = "gaitgauge.terrains"
+
+# The order in which the published benchmark lists its terrains; tables and averages follow it.
+_LEVELLED: dict[str, Callable[[int], Terrain]] = {
+    "slope_fd": slope,
+    "slope_bd": partial(slope, backward=True),
+    "stairs_fd": stairs,
+    "stairs_bd": partial(stairs, backward=True),
+    "wave": wave,
+    "obstacle": obstacle,
+}
+
+
+class TerrainError(ValueError):
+    """A terrain or level that does not exist; the message says what is allowed."""
+
+
+def gauge_terrain_names() -> list[str]:
+    """The seven terrains of the published benchmark, in its order; ``flat``, the first, is the one without levels."""
+    return ["flat", *_LEVELLED]
+
+
+def terrain_names() -> list[str]:
+    """Names of all terrains that can be asked for: the gauge's own first, then installed plug-ins."""
+    own = gauge_terrain_names()
+    return own + sorted(set(_plugins()) - set(own))
+
+
+def make_terrain(name: str, level: int | None = None) -> Terrain:
+    """Build a terrain.
+
+    Args:
+        name: one of ``terrain_names()``.
+        level: 1..10; None or 0 for ``flat``. A plug-in is handed the level as it is, 0 for None.
+
+    Raises:
+        TerrainError: unknown name, a level that the terrain does not have, or a plug-in that cannot be loaded or gives
+            no terrain.
+    """
+    if level is not None and (isinstance(level, bool) or not isinstance(level, int)):
+        raise TerrainError(f"the level of terrain '{name}' must be a whole number, not {level!r}")
+    if name == "flat":
+        if level not in (None, 0):
+            raise TerrainError(f"terrain 'flat' has no levels, but level {level} was asked for; leave the level out")
+        return flat()
+    if name in _LEVELLED:
+        if level is None:
+            raise TerrainError(f"terrain '{name}' needs a level from {LEVELS[0]} to {LEVELS[-1]}")
+        if level not in LEVELS:
+            raise TerrainError(f"terrain '{name}' has levels {LEVELS[0]} to {LEVELS[-1]}, not {level}")
+        return _LEVELLED[name](level)
+    plugin = _plugins().get(name)
+    if plugin is None:
+        close = get_close_matches(name, terrain_names(), n=3)
+        hint = (
+            f"did you mean {' or '.join(repr(c) for c in close)}?"
+            if close
+            else f"choose one of: {', '.join(terrain_names())}"
+        )
+        raise TerrainError(f"unknown terrain '{name}'; {hint}")
+    return _from_plugin(plugin, 0 if level is None else level)
+
+
+def _plugins() -> dict[str, EntryPoint]:
+    return {plugin.name: plugin for plugin in entry_points(group=GROUP)}
+
+
+def _from_plugin(plugin: EntryPoint, level: int) -> Terrain:
+    try:
+        build = plugin.load()
+    except (ImportError, AttributeError) as error:
+        raise TerrainError(
+            f"terrain '{plugin.name}' comes from '{plugin.value}', which cannot be loaded: {error}"
+        ) from error
+    terrain = build(level)
+    if not isinstance(terrain, Terrain):
+        kind = type(terrain).__name__
+        raise TerrainError(
+            f"terrain '{plugin.name}' comes from '{plugin.value}', which must return a Terrain, not {kind}"
+        )
+    return terrain
