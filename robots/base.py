@@ -11,8 +11,8 @@ from pathlib import Path
 class JointParameters:
     """One named set of joint and motor constants. Every tuple has one entry per joint, in the robot's joint order.
 
-    The motor law is ``torque = stiffness * (target - q) - damping * qd``, clipped to ``torque_limit`` where the physics options
-    ask for torque limits, then multiplied by the motor strength.
+    The motor law is ``torque = stiffness * (target - q) - damping * qd``, clipped to ``torque_limit`` where the physics
+    options ask for torque limits, then multiplied by the motor strength.
     """
 
     stiffness: tuple[float, ...]

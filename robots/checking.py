@@ -19,8 +19,9 @@ _SITE_TOLERANCE = 1e-4
 def check_robot(robot: Robot) -> None:
     """Compile the robot's MuJoCo model and check that it has everything that the description names.
 
-    Joints, one motor each, the free base, feet (a geom and a site at its centre), collision bodies, the imu site; that the default
-    pose is within the joint ranges; that at ``stand_height`` no foot is in the ground; that the model brings no ground.
+    That is: the free base, the joints with one motor each, the feet (a geom and a site at its centre), the collision
+    bodies and the imu site; that the default pose is within the joint ranges; that no foot is in the ground at
+    ``stand_height``; that the model brings no ground of its own.
 
     Raises:
         RobotError: the first disagreement found.
@@ -61,9 +62,8 @@ class _Check:
         known = self.names(object_type)
         for name in names:
             if name not in known:
-                raise self.error(
-                    f"{key} names '{name}' but {self.robot.mjcf.name} has no {kind} of that name{did_you_mean(name, known)}"
-                )
+                hint = did_you_mean(name, known)
+                raise self.error(f"{key} names '{name}' but {self.robot.mjcf.name} has no {kind} of that name{hint}")
         return [self.mujoco.mj_name2id(self.model, object_type, name) for name in names]
 
     def names(self, object_type: mujoco.mjtObj) -> list[str]:
@@ -83,9 +83,7 @@ class _Check:
         if [model.jnt_bodyid[j] for j in free] != [base]:
             raise self.error(f"{robot.mjcf.name} must have one free joint, on the base_body '{robot.base_body}'")
         if any(model.geom_bodyid == 0):
-            raise self.error(
-                f"{robot.mjcf.name} has geoms in its worldbody; it must hold the robot alone, without ground"
-            )
+            raise self.error(f"{robot.mjcf.name} has geoms in its worldbody; it must hold the robot alone")
 
     def joints(self) -> None:
         model, robot = self.model, self.robot
@@ -99,9 +97,7 @@ class _Check:
             if model.jnt_type[j] != self.mujoco.mjtJoint.mjJNT_FREE and j not in ids
         ]
         if others:
-            raise self.error(
-                f"{robot.mjcf.name} has the joint '{others[0]}', which joint_names lacks; add it or weld it"
-            )
+            raise self.error(f"{robot.mjcf.name} has the joint '{others[0]}', which joint_names lacks; add it there")
         for name, joint, angle in zip(robot.joint_names, ids, robot.default_joint_position, strict=True):
             low, high = model.jnt_range[joint]
             if model.jnt_limited[joint] and not low <= angle <= high:
@@ -122,7 +118,7 @@ class _Check:
                 raise self.error(f"{robot.mjcf.name} has {driven.count(joint)} actuators on '{name}'; it must have one")
         if model.nu != len(ids):
             raise self.error(
-                f"{robot.mjcf.name} has {model.nu} actuators for {len(ids)} joints; there must be one per joint and no other"
+                f"{robot.mjcf.name} has {model.nu} actuators for {len(ids)} joints; it must have one for each"
             )
 
     def feet(self) -> None:
@@ -146,21 +142,16 @@ class _Check:
     def standing_pose(self) -> None:
         model, robot = self.model, self.robot
         data = self.mujoco.MjData(model)
-        for joint, angle in zip(
-            self.require(robot.joint_names, "joint_names", "joint"), robot.default_joint_position, strict=True
-        ):
-            data.qpos[model.jnt_qposadr[joint]] = angle
-        free = next(j for j in range(model.njnt) if model.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_FREE)
-        address = model.jnt_qposadr[free]
-        data.qpos[address : address + 7] = (0.0, 0.0, robot.stand_height, 1.0, 0.0, 0.0, 0.0)
+        joints = self.require(robot.joint_names, "joint_names", "joint")
+        data.qpos[model.jnt_qposadr[joints]] = robot.default_joint_position
         self.mujoco.mj_kinematics(model, data)
+        (base,) = self.require([robot.base_body], "base_body", "body")
         for name, geom in zip(robot.foot_names, self.require(robot.foot_names, "foot_names", "geom"), strict=True):
-            # The bounding sphere is exact for the usual ball feet and cautious for others.
-            bottom = data.geom_xpos[geom][2] - (
-                model.geom_size[geom][0] if model.geom_type[geom] == self.mujoco.mjtGeom.mjGEOM_SPHERE else 0.0
-            )
-            if bottom < 0:
+            # Of feet that are no balls only the centre is checked: their lowest point depends on the shape.
+            is_ball = model.geom_type[geom] == self.mujoco.mjtGeom.mjGEOM_SPHERE
+            reach = data.xpos[base][2] - data.geom_xpos[geom][2] + (model.geom_size[geom][0] if is_ball else 0.0)
+            if reach > robot.stand_height:
                 raise self.error(
-                    f"at stand_height {robot.stand_height:g} m the foot '{name}' is {-bottom:.3f} m below the ground; "
-                    f"it must be at least {robot.stand_height - bottom:.3f} m"
+                    f"at stand_height {robot.stand_height:g} m the foot '{name}' is {reach - robot.stand_height:.3f} m "
+                    f"below the ground; raise it to {reach:.3f} m or more"
                 )

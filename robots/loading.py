@@ -1,8 +1,9 @@
 """Reads a robot from a ``robot.toml``.
 
-The file's keys are the fields of ``Robot`` and, in ``[parameters.NAME]`` tables, those of ``JointParameters``; all must be there.
-``mjcf`` is relative to the file. A value per joint is one number for all joints, a list in the order of ``joint_names``, or a table
-whose keys are joint names or endings of them: ``calf`` fits ``FL_calf`` and ``FL_calf_joint``, the longest fitting key wins.
+The file's keys are the fields of ``Robot`` and, in ``[parameters.NAME]`` tables, those of ``JointParameters``; all must
+be there. ``mjcf`` is relative to the file. A value per joint is one number for all joints, a list in the order of
+``joint_names``, or a table whose keys are joint names or their endings (``calf`` fits ``FL_calf`` and
+``FL_calf_joint``); the longest fitting key wins.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class RobotError(ValueError):
 
 
 def did_you_mean(word: str, known: Collection[str]) -> str:
-    """``; did you mean 'a' or 'b'?`` for the words of ``known`` close to ``word``, an empty string if there are none."""
+    """``; did you mean 'a' or 'b'?`` for words of ``known`` close to ``word``, else an empty string."""
     close = get_close_matches(word, list(known), n=3)
     return "; did you mean " + " or ".join(f"'{c}'" for c in close) + "?" if close else ""
 
@@ -182,5 +183,5 @@ class _Reader:
 
 
 def _fits(ending: str, joint: str) -> bool:
-    """Whether a table key stands for the joint: its name, or whole words at the end of it, with or without ``_joint``."""
+    """Whether a table key stands for the joint: its name or whole words at its end, with or without ``_joint``."""
     return any(name == ending or name.endswith("_" + ending) for name in (joint, joint.removesuffix(_JOINT_ENDING)))

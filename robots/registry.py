@@ -1,6 +1,7 @@
-"""Finds robots: the project's own, those installed under the entry-point group ``gaitgauge.robots``, and any ``robot.toml``.
+"""Finds robots: the project's own, plug-ins of the entry-point group ``gaitgauge.robots``, and any ``robot.toml``.
 
-An entry point's value is a callable that returns a ``Robot``, or the path of a ``robot.toml``; its name is the robot's name.
+An entry point refers to a callable that returns a ``Robot``, or to a path of a ``robot.toml``; it bears the robot's
+name.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ def load_robot(name_or_path: str | Path) -> Robot:
     """Load a robot.
 
     Args:
-        name_or_path: a name out of ``robot_names()``, the path of a ``robot.toml``, or a folder that holds one. What contains a
-            path separator or ends in ``.toml`` is a path, anything else a name.
+        name_or_path: a name out of ``robot_names()``, the path of a ``robot.toml``, or a folder that holds one. A text
+            is a path if it contains a path separator or ends in ``.toml``, else a name.
 
     Raises:
         RobotError: there is no such robot, its description is wrong, or a plug-in's entry point does not give a robot.
@@ -43,7 +44,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
         known = robot_names()
         hint = did_you_mean(text, known)
         raise RobotError(
-            f"unknown robot '{text}'{hint or ';'} choose one of {', '.join(known)}, or give the path of a {ROBOT_FILE}"
+            f"unknown robot '{text}'{hint} (installed: {', '.join(known)}; or give the path of a {ROBOT_FILE})"
         )
     return _from_plugin(plugin)
 

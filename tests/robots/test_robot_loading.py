@@ -1,0 +1,294 @@
+"""Finding and reading robots, and the errors of those who describe their own."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+from gaitgauge.robots import JointParameters, Robot, RobotError, check_robot, load_robot, robot_names
+from gaitgauge.robots import registry as registry_module
+
+LEGS = ("FL", "FR", "RL", "RR")
+
+HOPPER_MJCF = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="trunk">
+      <freejoint/>
+      <geom type="box" size="0.1 0.1 0.05" mass="3"/>
+      <site name="imu"/>
+      <body name="upper" pos="0 0 -0.05">
+        <joint name="hip" axis="0 1 0" range="-1 1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.5"/>
+        <body name="lower" pos="0 0 -0.2">
+          <joint name="left_knee_joint" axis="0 1 0" range="-2 0"/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.015" mass="0.3"/>
+          <geom name="foot" type="sphere" size="0.02" pos="0 0 -0.2"/>
+          <site name="foot" pos="0 0 -0.2"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="hip"/>
+    <position joint="left_knee_joint"/>
+  </actuator>
+</mujoco>
+"""
+
+HOPPER = """
+name = "hopper"
+title = "One leg"
+mjcf = "model/hopper.xml"
+joint_names = ["hip", "left_knee_joint"]
+default_joint_position = [0.3, -0.6]
+base_body = "trunk"
+foot_names = ["foot"]
+collision_bodies = ["trunk", "upper", "lower"]
+imu_site = "imu"
+stand_height = 0.5
+command_limits = [0.5, 0, 1]
+default_parameters = "soft"
+
+[parameters.soft]
+stiffness = 30
+damping = { hip = 1.0, knee = 2.0 }
+torque_limit = [40, 50]
+armature = 0.01
+joint_damping = 0
+friction_loss = 0.1
+"""
+
+
+@pytest.fixture
+def write_hopper(tmp_path):
+    """Writes a user's robot, with pieces of text replaced, and returns the path of its robot.toml."""
+
+    def write(*changes: tuple[str, str], mjcf: tuple[str, str] = ("", "")) -> Path:
+        description = HOPPER
+        for old, new in changes:
+            assert old in description
+            description = description.replace(old, new)
+        assert mjcf[0] in HOPPER_MJCF
+        (tmp_path / "model").mkdir(exist_ok=True)
+        (tmp_path / "model" / "hopper.xml").write_text(HOPPER_MJCF.replace(*mjcf) if mjcf[0] else HOPPER_MJCF)
+        path = tmp_path / "robot.toml"
+        path.write_text(description)
+        return path
+
+    return write
+
+
+def test_go2_description():
+    go2 = load_robot("go2")
+    assert go2.joint_names == tuple(f"{leg}_{part}_joint" for leg in LEGS for part in ("hip", "thigh", "calf"))
+    assert go2.default_joint_position == (0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5)
+    assert go2.foot_names == LEGS
+    assert len(go2.collision_bodies) == 13
+    assert go2.stand_height == 0.445
+    assert go2.command_limits == (2.0, 1.0, 2.0)
+    assert go2.default_parameters == "gauge"
+
+
+def test_go2_parameter_sets():
+    sets = load_robot("go2").parameters
+    assert sets["gauge"] == JointParameters(
+        stiffness=(20.0,) * 12,
+        damping=(0.5,) * 12,
+        torque_limit=(23.7, 23.7, 45.43) * 4,
+        armature=(0.01,) * 12,
+        joint_damping=(0.1,) * 12,
+        friction_loss=(0.2,) * 12,
+    )
+    assert sets["training"] == replace(sets["gauge"], torque_limit=(23.7, 23.7, 35.55) * 4)
+    without = (0.0,) * 12
+    assert sets["training-published"] == replace(
+        sets["training"], armature=without, joint_damping=without, friction_loss=without
+    )
+
+
+def test_own_robots_are_named_as_their_folders():
+    assert robot_names()[0] == "go2"
+    for name in robot_names():
+        assert load_robot(name).name == name
+
+
+def test_users_robot(write_hopper):
+    path = write_hopper()
+    robot = load_robot(path)
+    assert robot == load_robot(str(path)) == load_robot(path.parent)
+    assert robot.mjcf == path.parent.resolve() / "model" / "hopper.xml"
+    assert robot.default_joint_position == (0.3, -0.6)
+    assert robot.parameters["soft"] == JointParameters(
+        stiffness=(30.0, 30.0),
+        damping=(1.0, 2.0),
+        torque_limit=(40.0, 50.0),
+        armature=(0.01, 0.01),
+        joint_damping=(0.0, 0.0),
+        friction_loss=(0.1, 0.1),
+    )
+    check_robot(robot)
+
+
+def test_longest_key_wins(write_hopper):
+    path = write_hopper(("{ hip = 1.0, knee = 2.0 }", "{ hip = 1.0, knee = 2.0, left_knee = 3.0 }"))
+    assert load_robot(path).parameters["soft"].damping == (1.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('title = "One leg"\n', "", "missing key title"),
+        ('title = "One leg"\n', 'titel = "One leg"\n', "titel is an unknown key; did you mean 'title'?"),
+        ("armature = 0.01\n", "", "missing key parameters.soft.armature"),
+        ("armature = 0.01", "amature = 0.01", "parameters.soft.amature is an unknown key; did you mean 'armature'?"),
+        ("armature = 0.01", "armature = true", "parameters.soft.armature holds True"),
+        ("armature = 0.01", "armature = nan", "parameters.soft.armature holds nan"),
+        ("armature = 0.01", 'armature = "0.01"', "parameters.soft.armature holds '0.01'"),
+        ("armature = 0.01", "armature = -0.01", "parameters.soft.armature is -0.01 for hip but must not be negative"),
+        ("[40, 50]", "[40, 50, 60]", "parameters.soft.torque_limit has 3 values but there are 2 joints"),
+        ("knee = 2.0", "ankle = 2.0", "'ankle', which is neither a joint nor the ending of one"),
+        ("knee = 2.0", "left_kne = 2.0", "did you mean 'left_knee'?"),
+        (", knee = 2.0", "", "no value for the joint 'left_knee_joint'"),
+        ("[0.3, -0.6]", "[0.3]", "default_joint_position has 1 values but there are 2 joints"),
+        ('"hip", "left_knee_joint"', '"hip", "hip"', "joint_names names 'hip' twice"),
+        ('["foot"]', "[]", "foot_names must be a list of one or more names"),
+        ('"trunk"\nfoot', "3\nfoot", "base_body is 3 but must be a text"),
+        ("stand_height = 0.5", "stand_height = 0", "stand_height is 0 but must be above 0"),
+        ("[0.5, 0, 1]", "[0.5, 1]", "command_limits must be three numbers"),
+        ("[0.5, 0, 1]", "[0.5, -1, 1]", "command_limits is [0.5, -1, 1] but its entries must not be negative"),
+        ('= "soft"', '= "hard"', "default_parameters is 'hard' but the parameter sets are: soft"),
+        ("model/hopper.xml", "hopper.xml", "which does not exist; the path is relative to the robot file"),
+        ("stand_height = 0.5", "stand_height = ", "is not valid TOML"),
+    ],
+)
+def test_malformed_description(write_hopper, old, new, message):
+    path = write_hopper((old, new))
+    with pytest.raises(RobotError) as caught:
+        load_robot(path)
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_unreadable_files(tmp_path):
+    with pytest.raises(RobotError, match=r"robot file '.*robot.toml' does not exist"):
+        load_robot(tmp_path)
+    binary = tmp_path / "robot.toml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(RobotError, match="is not a UTF-8 text file"):
+        load_robot(binary)
+
+
+def test_unknown_name_offers_close_ones():
+    with pytest.raises(RobotError, match=r"unknown robot 'g02'; did you mean 'go2'\?"):
+        load_robot("g02")
+    with pytest.raises(RobotError, match=r"unknown robot 'elephant' \(installed: go2"):
+        load_robot("elephant")
+
+
+@pytest.mark.parametrize(
+    ("changes", "mjcf", "message"),
+    [
+        ([("left_knee_joint", "right_knee_joint")], ("", ""), "no joint of that name; did you mean 'left_knee_joint'?"),
+        ([('"lower"]', '"lowest"]')], ("", ""), "collision_bodies names 'lowest' but hopper.xml has no body"),
+        ([('"trunk"\nfoot', '"upper"\nfoot')], ("", ""), "one free joint, on the base_body 'upper'"),
+        ([('"imu"', '"foot"')], ("", ""), "imu_site 'foot' must be on the base_body 'trunk'"),
+        ([("[0.3, -0.6]", "[0.3, 0.6]")], ("", ""), "'left_knee_joint' is 0.6 rad, outside its range -2 to 0 rad"),
+        ([("stand_height = 0.5", "stand_height = 0.4")], ("", ""), "the foot 'foot' is 0.052 m below the ground"),
+        ([], ('<site name="foot" pos="0 0 -0.2"/>', ""), "foot_names names 'foot' but hopper.xml has no site"),
+        ([], ('<site name="foot" pos="0 0 -0.2"/>', '<site name="foot"/>'), "must be at the centre of the foot geom"),
+        ([], ('size="0.02" pos', 'size="0.02" contype="0" conaffinity="0" pos'), "collides with nothing"),
+        ([], ('<position joint="hip"/>', ""), "has 0 actuators on 'hip'; it must have one"),
+        ([], ('<position joint="hip"/>', '<position joint="hip"/>' * 2), "has 2 actuators on 'hip'; it must have one"),
+        ([], ("<worldbody>", '<worldbody><geom type="plane" size="1 1 1"/>'), "must hold the robot alone"),
+        (
+            [],
+            ('<joint name="hip"', '<joint name="roll"/><joint name="hip"'),
+            "the joint 'roll', which joint_names lacks",
+        ),
+        ([], ('<joint name="hip"', '<joint name="hip" type="slide"'), "'hip', which is not a hinge"),
+        ([], ('type="box"', 'type="bix"'), "is not a model that MuJoCo can compile"),
+    ],
+)
+def test_description_that_the_model_contradicts(write_hopper, changes, mjcf, message):
+    robot = load_robot(write_hopper(*changes, mjcf=mjcf))
+    with pytest.raises(RobotError) as caught:
+        check_robot(robot)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+GO2 = load_robot("go2")
+PLUGIN_PATH = ""
+
+
+def plugin_robot() -> Robot:
+    return replace(GO2, name="plugged")
+
+
+def plugin_nonsense() -> int:
+    return 3
+
+
+@pytest.fixture
+def install_plugin(monkeypatch):
+    """Pretends that a package with one entry point is installed."""
+
+    def install(name: str, value: str) -> None:
+        monkeypatch.setitem(sys.modules, "robot_plugin", sys.modules[__name__])
+        found = [EntryPoint(name=name, value=value, group="gaitgauge.robots")]
+        monkeypatch.setattr(registry_module, "entry_points", lambda group: [e for e in found if e.group == group])
+
+    return install
+
+
+def test_plugin_callable(install_plugin):
+    install_plugin("plugged", "robot_plugin:plugin_robot")
+    assert robot_names() == ["go2", "plugged"]
+    assert load_robot("plugged") == plugin_robot()
+
+
+def test_plugin_path(install_plugin, write_hopper, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "PLUGIN_PATH", str(write_hopper()))
+    install_plugin("hopper", "robot_plugin:PLUGIN_PATH")
+    assert load_robot("hopper").title == "One leg"
+
+
+def test_plugin_does_not_replace_an_own_robot(install_plugin):
+    install_plugin("go2", "robot_plugin:plugin_robot")
+    assert robot_names() == ["go2"]
+    assert load_robot("go2") == GO2
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("plugged", "no_such_module_anywhere:robot", "cannot be loaded: No module named 'no_such_module_anywhere'"),
+        ("plugged", "robot_plugin:no_such_attribute", "cannot be loaded"),
+        ("plugged", "robot_plugin:plugin_nonsense", "gave int; it must be a path or a callable"),
+        (
+            "other",
+            "robot_plugin:plugin_robot",
+            "a robot named 'plugged'; entry point and robot must bear the same name",
+        ),
+    ],
+)
+def test_broken_plugin(install_plugin, name, value, message):
+    install_plugin(name, value)
+    with pytest.raises(RobotError) as caught:
+        load_robot(name)
+    assert message in str(caught.value)
+
+
+def test_listing_and_loading_import_no_engine():
+    code = (
+        "import sys; from gaitgauge.robots import load_robot, robot_names\n"
+        "[load_robot(n) for n in robot_names()]\n"
+        "print(sorted({'mujoco', 'torch', 'warp', 'numpy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
