@@ -37,7 +37,8 @@ class HeightField:
     half_size: tuple[float, float]
     """Half extents in x and y [m]; the outermost nodes lie on the edge."""
     heights: FloatArray
-    """Node heights [m], shape (rows, columns): rows run along +y, columns along +x; all >= 0."""
+    """Node heights [m], shape (rows, columns): rows run along +y, columns along +x; the lowest must be 0,
+    because MuJoCo shifts every field so that it is."""
     base: float = 0.1
     """Thickness of the solid below height 0 [m]."""
 

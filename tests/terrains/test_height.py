@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 from gaitgauge.terrains import Box, HeightField, Terrain, make_terrain
+from gaitgauge.terrains.training_tiles import TILE_KINDS, make_tile
 
 
 def compiled(terrain):
@@ -57,6 +58,12 @@ def test_boxes_agree_with_rays(name, level):
 def test_wave_agrees_with_rays(level):
     points = np.random.default_rng(1).uniform([-0.5, -5.5], [10.5, 5.5], (300, 2))
     check_against_rays(make_terrain("wave", level), points, 1e-6)
+
+
+@pytest.mark.parametrize("kind", TILE_KINDS)
+def test_training_tiles_agree_with_rays(kind):
+    points = np.random.default_rng(5).uniform(-4.5, 4.5, (200, 2))
+    check_against_rays(make_tile(kind, 9, 1), points)
 
 
 def test_boxes_of_any_orientation_agree_with_rays():
