@@ -1,0 +1,241 @@
+"""The test bench: builds small scenes that fit an engine's capabilities and talks to the engine in numpy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ...robots.base import JointParameters, Robot
+from ...terrains.base import Terrain
+from ..base import Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, Scene, Support
+
+FLAT = Terrain(name="conformance_flat", family="flat")
+WORLDS = 4
+"""Number of worlds in nearly every scene, so that an engine that compiles for sizes compiles once."""
+
+
+class Mismatch(AssertionError):
+    """An engine does something else than the contract says; the message gives both values."""
+
+
+def expect(condition: bool, message: str) -> None:
+    """Raise ``Mismatch`` with the message unless the condition holds."""
+    if not condition:
+        raise Mismatch(message)
+
+
+def expect_close(what: str, actual: ArrayLike, expected: ArrayLike, tolerance: ArrayLike) -> float:
+    """Compare arrays of one shape, the first axis being worlds.
+
+    Args:
+        what: name of the quantity with its unit, for the message.
+        actual: the engine's values.
+        expected: the reference's values; broadcast against ``actual``.
+        tolerance: largest allowed magnitude of the difference, broadcast too.
+
+    Returns:
+        The largest difference.
+
+    Raises:
+        Mismatch: a value is not finite or too far off.
+    """
+    found = np.asarray(actual, dtype=np.float64)
+    wanted = np.broadcast_to(np.asarray(expected, dtype=np.float64), found.shape)
+    allowed = np.broadcast_to(np.asarray(tolerance, dtype=np.float64), found.shape)
+    error = np.abs(found - wanted)
+    bad = ~(error <= allowed)
+    if bad.any():
+        # NaN first, then the worst excess over the tolerance
+        excess = np.where(np.isnan(error), np.inf, error - allowed)
+        worst = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        at = "" if not worst else f" at {tuple(int(i) for i in worst)}"
+        raise Mismatch(
+            f"{what}: {found[worst]:.6g} instead of {wanted[worst]:.6g}{at}; "
+            f"off by {error[worst]:.3g}, allowed {allowed[worst]:.3g}"
+        )
+    return float(error.max()) if error.size else 0.0
+
+
+class Worlds:
+    """An engine's worlds with numpy arrays in and out. Arrays are (N, …), in the contract's units and frames."""
+
+    def __init__(self, backend: PhysicsBackend) -> None:
+        self.backend = backend
+        self.robot = backend.scene.robot
+        self.count = backend.num_worlds
+        self.default_pose = np.tile(np.asarray(self.robot.default_joint_position), (self.count, 1))
+
+    @property
+    def single_precision(self) -> bool:
+        """Whether the engine computes in float32."""
+        return self.backend.dtype == torch.float32
+
+    def precision(self, double: float, single: float) -> float:
+        """A tolerance that depends on the engine's floating-point type only."""
+        return single if self.single_precision else double
+
+    def read(self) -> SimpleNamespace:
+        """Copies of all fields of the present state; floating point as float64."""
+        return _snapshot(self.backend.state)
+
+    def read_sample(self) -> SimpleNamespace:
+        """Copies of all fields of the sample."""
+        return _snapshot(self.backend.sample)
+
+    def reset(self, worlds: ArrayLike | None = None, **arguments: Any) -> None:
+        """``PhysicsBackend.reset``; the base is upright at (0, 0, 1) where no pose is given."""
+        arguments.setdefault("base_position", np.tile([0.0, 0.0, 1.0], (self.count, 1)))
+        arguments.setdefault("base_quaternion", np.tile([1.0, 0.0, 0.0, 0.0], (self.count, 1)))
+        terrain_index = arguments.pop("terrain_index", None)
+        tensors = {name: self._tensor(value) for name, value in arguments.items() if value is not None}
+        self.backend.reset(self._mask(worlds), terrain_index=self._whole(terrain_index), **tensors)
+
+    def step(
+        self,
+        targets: ArrayLike | None = None,
+        *,
+        delay: ArrayLike | None = None,
+        sample_at: ArrayLike | None = None,
+        worlds: ArrayLike | None = None,
+        substeps: int | None = None,
+    ) -> None:
+        """``PhysicsBackend.step``."""
+        self.backend.step(
+            None if targets is None else self._tensor(targets),
+            delay=self._whole(delay),
+            sample_at=self._whole(sample_at),
+            worlds=self._mask(worlds),
+            substeps=substeps,
+        )
+
+    def run(self, seconds: float) -> None:
+        """Step whole control periods with unchanged targets."""
+        for _ in range(round(seconds / self.backend.scene.physics.control_period)):
+            self.step()
+
+    def randomize(self, worlds: ArrayLike | None = None, **values: ArrayLike) -> None:
+        """``PhysicsBackend.randomize``; every value has a row for each world of the mask."""
+        randomization = Randomization(**{name: self._tensor(value) for name, value in values.items()})
+        self.backend.randomize(randomization, self._mask(worlds))
+
+    def push(self, worlds: ArrayLike | None = None, **velocities: ArrayLike) -> None:
+        """``PhysicsBackend.push``."""
+        self.backend.push(self._mask(worlds), **{name: self._tensor(value) for name, value in velocities.items()})
+
+    def apply_force(self, force_w: ArrayLike) -> None:
+        """``PhysicsBackend.apply_force``."""
+        self.backend.apply_force(self._tensor(force_w))
+
+    def _tensor(self, value: ArrayLike) -> torch.Tensor:
+        return torch.tensor(np.asarray(value), dtype=self.backend.dtype, device=self.backend.device)
+
+    def _whole(self, value: ArrayLike | None) -> torch.Tensor | None:
+        return None if value is None else torch.tensor(np.asarray(value), dtype=torch.int64, device=self.backend.device)
+
+    def _mask(self, value: ArrayLike | None) -> torch.Tensor | None:
+        return None if value is None else torch.tensor(np.asarray(value), dtype=torch.bool, device=self.backend.device)
+
+
+def _snapshot(state: PhysicsState) -> SimpleNamespace:
+    def copy(tensor: torch.Tensor) -> NDArray:
+        values = tensor.detach().cpu().numpy()
+        return np.array(values, dtype=np.float64 if values.dtype.kind == "f" else values.dtype)
+
+    return SimpleNamespace(**{f.name: copy(getattr(state, f.name)) for f in fields(PhysicsState)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """What a check needs to know about the engine under test."""
+
+    make: Callable[[Scene, str], PhysicsBackend]
+    """Builds the engine's worlds of a scene on a device."""
+    capabilities: Mapping[str, Capability]
+    """What the engine declares."""
+    robot: Robot
+    """The robot in every scene; four-legged, its feet spheres."""
+    device: str = "cpu"
+    """The device under test."""
+
+    @property
+    def gpu(self) -> bool:
+        """Whether the device under test is a GPU."""
+        return not self.device.startswith("cpu")
+
+    def supports(self, *names: str) -> bool:
+        """Whether the engine supports all of the named capabilities, exactly or approximately."""
+        return all(self.capabilities[name].support is not Support.NONE for name in names)
+
+    def bound(self, capability: str, *, exact: float, approximate: float) -> float:
+        """A tolerance by how well the engine says it does a thing."""
+        return exact if self.capabilities[capability].support is Support.EXACT else approximate
+
+    def physics(self, **changes: Any) -> PhysicsOptions:
+        """The default physics options, less what the engine does not support, plus the changes."""
+        options: dict[str, Any] = {
+            "cone": "elliptic" if self.supports("elliptic_cone") else "pyramidal",
+            "foot_condim": None if self.supports("foot_condim_6") else 3,
+            "self_collision": self.supports("self_collision"),
+            "torque_limits": False,
+        }
+        return PhysicsOptions(**(options | changes))
+
+    def soft(self, **changes: float) -> JointParameters:
+        """The robot's default joint parameters without dry friction, one value for all joints where a change is given."""
+        base = self.robot.parameters[self.robot.default_parameters]
+        values = {f.name: getattr(base, f.name) for f in fields(JointParameters)}
+        values["friction_loss"] = (0.0,) * self.robot.num_joints
+        values.update({name: (value,) * self.robot.num_joints for name, value in changes.items()})
+        return JointParameters(**values)
+
+    def stiff(self) -> JointParameters:
+        """Joints that hold the standing pose nearly rigidly: the robot becomes a table with four feet."""
+        return self.soft(stiffness=800.0, damping=16.0, armature=0.1, joint_damping=0.0, torque_limit=1000.0)
+
+    @contextmanager
+    def worlds(
+        self,
+        parameters: JointParameters | None = None,
+        *,
+        terrains: Sequence[Terrain] = (FLAT,),
+        terrain_index: Sequence[int] | None = None,
+        **physics: Any,
+    ) -> Iterator[Worlds]:
+        """Build a scene in the engine, closed at the end.
+
+        Args:
+            parameters: joint constants, ``soft()`` where None.
+            terrains: the palette.
+            terrain_index: terrain of each world; None for ``WORLDS`` worlds on the first one.
+            physics: changes to ``physics()``.
+        """
+        scene = self.scene(parameters, terrains=terrains, terrain_index=terrain_index, **physics)
+        backend = self.make(scene, self.device)
+        try:
+            yield Worlds(backend)
+        finally:
+            backend.close()
+
+    def scene(
+        self,
+        parameters: JointParameters | None = None,
+        *,
+        terrains: Sequence[Terrain] = (FLAT,),
+        terrain_index: Sequence[int] | None = None,
+        **physics: Any,
+    ) -> Scene:
+        """The scene that ``worlds`` builds."""
+        return Scene(
+            robot=self.robot,
+            parameters=parameters or self.soft(),
+            terrains=tuple(terrains),
+            terrain_index=(0,) * WORLDS if terrain_index is None else tuple(terrain_index),
+            physics=self.physics(**physics),
+        )

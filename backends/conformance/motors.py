@@ -1,0 +1,201 @@
+"""Checks of the motor law, its limits and randomized factors, and of control latency."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .bench import Bench, Worlds, expect, expect_close
+from .kinematics import follow_reference, posed
+from .suite import check
+
+
+def law(bench: Bench, target: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Motor torque of the default parameters before limits [N·m]."""
+    parameters = bench.soft()
+    return np.asarray(parameters.stiffness) * (target - position) - np.asarray(parameters.damping) * velocity
+
+
+def one_step_torques(worlds: Worlds, bench: Bench, *, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """(reported torque, torque by the plain law) of one substep from random joint states with targets up to ``reach`` [rad] away."""
+    random = np.random.default_rng(5)
+    asked = posed(bench, worlds.count, seed=5)
+    target = asked["joint_position"] + random.uniform(-reach, reach, asked["joint_position"].shape)
+    worlds.reset(**asked)
+    worlds.step(target, substeps=1)
+    return worlds.read().joint_torque, law(bench, target, asked["joint_position"], asked["joint_velocity"])
+
+
+@check("motors/law")
+def motor_law(bench: Bench) -> str:
+    """joint_torque = kp (target − q) − kd q̇ at the start of the substep; without limits there is no clipping."""
+    with bench.worlds() as worlds:
+        torque, expected = one_step_torques(worlds, bench, reach=4.0)
+        error = expect_close("joint_torque [N·m]", torque, expected, 1e-3 + 1e-4 * np.abs(expected))
+    return f"up to {np.abs(expected).max():.0f} N·m, largest error {error:.1e} N·m"
+
+
+@check("motors/limits", "torque_limits")
+def motor_limits(bench: Bench) -> str:
+    """With torque limits the torque is clipped to each joint's own limit."""
+    with bench.worlds(torque_limits=True) as worlds:
+        torque, expected = one_step_torques(worlds, bench, reach=4.0)
+        limit = np.asarray(bench.soft().torque_limit)
+        clipped = np.clip(expected, -limit, limit)
+        expect((clipped != expected).any(), "the check's own targets do not reach the limits")
+        expect_close("joint_torque with limits [N·m]", torque, clipped, 1e-3 + 1e-4 * limit)
+    return f"{int((clipped != expected).sum())} of {clipped.size} torques clipped"
+
+
+@check("motors/strength", "motor_strength", "torque_limits")
+def motor_strength(bench: Bench) -> str:
+    """Motor strength multiplies the torque after its limit, so a strong motor exceeds it."""
+    strength = np.random.default_rng(6).uniform(0.5, 1.5, (4, bench.robot.num_joints))
+    with bench.worlds(torque_limits=True) as worlds:
+        worlds.randomize(motor_strength=strength)
+        torque, expected = one_step_torques(worlds, bench, reach=4.0)
+        limit = np.asarray(bench.soft().torque_limit)
+        wanted = np.clip(expected, -limit, limit) * strength
+        expect_close("joint_torque with limits and strength [N·m]", torque, wanted, 1e-3 + 1e-4 * limit)
+    return ""
+
+
+@check("motors/gains", "gains")
+def motor_gains(bench: Bench) -> str:
+    """kp and kd are scaled for each world and joint on their own."""
+    random = np.random.default_rng(7)
+    stiffness, damping = random.uniform(0.5, 1.5, (2, 4, bench.robot.num_joints))
+    with bench.worlds() as worlds:
+        worlds.randomize(stiffness_scale=stiffness)
+        worlds.randomize(damping_scale=damping)
+        asked = posed(bench, worlds.count, seed=8)
+        target = asked["joint_position"] + random.uniform(-0.5, 0.5, stiffness.shape)
+        worlds.reset(**asked)
+        worlds.step(target, substeps=1)
+        parameters = bench.soft()
+        wanted = stiffness * np.asarray(parameters.stiffness) * (target - asked["joint_position"])
+        wanted -= damping * np.asarray(parameters.damping) * asked["joint_velocity"]
+        expect_close("joint_torque with scaled gains [N·m]", worlds.read().joint_torque, wanted, 2e-3)
+    return ""
+
+
+@check("motors/offset", "motor_offset")
+def motor_offset(bench: Bench) -> str:
+    """The motor offset is added to the position error; a limp motor ignores it."""
+    offset = np.random.default_rng(9).uniform(-0.2, 0.2, (4, bench.robot.num_joints))
+    with bench.worlds() as worlds:
+        worlds.randomize(motor_offset=offset)
+        torque, expected = one_step_torques(worlds, bench, reach=0.5)
+        wanted = expected + np.asarray(bench.soft().stiffness) * offset
+        expect_close("joint_torque with offset [N·m]", torque, wanted, 2e-3)
+        worlds.reset()
+        worlds.step()
+        expect_close("joint_torque of limp motors with offset [N·m]", worlds.read().joint_torque, 0.0, 1e-6)
+    return ""
+
+
+@check("motors/limp_and_held")
+def limp_and_held(bench: Bench) -> str:
+    """Motors are limp from a reset to the first target, unless the reset gives a held target; step(None) keeps the target."""
+    with bench.worlds() as worlds:
+        asked = posed(bench, worlds.count, seed=10)
+        worlds.reset(**asked)
+        for _ in range(2):
+            worlds.step()
+            expect_close("joint_torque of limp motors [N·m]", worlds.read().joint_torque, 0.0, 1e-5)
+        target = worlds.default_pose + 0.1
+        worlds.reset(**asked, held_target=target)
+        worlds.step(substeps=1)
+        expected = law(bench, target, asked["joint_position"], asked["joint_velocity"])
+        expect_close("joint_torque with a held target [N·m]", worlds.read().joint_torque, expected, 2e-3)
+        before = worlds.read()
+        worlds.step(worlds.default_pose, substeps=1)
+        expected = law(bench, worlds.default_pose, before.joint_position, before.joint_velocity)
+        expect_close("joint_torque of a new target [N·m]", worlds.read().joint_torque, expected, 2e-3)
+        before = worlds.read()
+        worlds.step(substeps=1)
+        expected = law(bench, worlds.default_pose, before.joint_position, before.joint_velocity)
+        expect_close("joint_torque after step(None) [N·m]", worlds.read().joint_torque, expected, 2e-3)
+        worlds.reset(**asked)
+        worlds.step()
+        expect_close("joint_torque after a reset without held target [N·m]", worlds.read().joint_torque, 0.0, 1e-5)
+    return ""
+
+
+@check("motors/step_response")
+def step_response(bench: Bench) -> str:
+    """Joints in the air follow a step of their targets as in a plain reference loop with the explicit motor law."""
+    with bench.worlds() as worlds:
+        asked = posed(bench, worlds.count, seed=11)
+        asked = {name: asked[name] for name in ("base_position", "base_quaternion")}
+        target = worlds.default_pose.copy()
+        for row in range(worlds.count):
+            target[row, row % 3 :: 3] += 0.3 if row < 3 else -0.2  # hips, thighs, calves, hips
+        worlds.reset(**asked)
+        worlds.step(target)
+        for _ in range(9):
+            worlds.step()
+        error = follow_reference(
+            bench, worlds, asked, worlds.read(), seconds=0.2, angle=0.01, position=0.003, target=target
+        )
+    return f"0.2 s after a step of 0.3 rad: {error}"
+
+
+@check("motors/joint_friction", "joint_friction")
+def joint_friction(bench: Bench) -> str:
+    """Dry friction, viscous damping and rotor inertia of the joints act as in the reference."""
+    parameters = bench.soft(friction_loss=0.2, joint_damping=0.1, armature=0.02)
+    with bench.worlds(parameters) as worlds:
+        asked = posed(bench, worlds.count, seed=12)
+        asked["joint_velocity"] = 3.0 * np.sign(asked["joint_velocity"])
+        worlds.reset(**asked)
+        worlds.run(0.04)
+        bound = bench.bound("joint_friction", exact=0.01, approximate=0.05)
+        error = follow_reference(bench, worlds, asked, worlds.read(), seconds=0.04, angle=bound, position=0.005)
+    with bench.worlds(bench.soft(joint_damping=0.1, armature=0.02)) as worlds:
+        worlds.reset(**asked)
+        worlds.run(0.04)
+        try:
+            follow_reference(bench, worlds, asked, worlds.read(), seconds=0.04, angle=bound, position=0.005)
+        except AssertionError as wrong:
+            raise AssertionError(f"without dry friction: {wrong}") from wrong
+    return f"0.04 s from 3 rad/s: {error}"
+
+
+@check("motors/latency", "latency")
+def latency(bench: Bench) -> str:
+    """A delay of k lets the previous target act for exactly k substeps, for each world on its own."""
+    delay = np.array([0, 3, 9, 10])
+    with bench.worlds() as worlds, bench.worlds() as single:
+        first, second = worlds.default_pose + 0.2, worlds.default_pose - 0.3
+        for each in (worlds, single):
+            each.reset(held_target=each.default_pose)
+        previous = worlds.default_pose
+        for target in (first, second):
+            worlds.step(target, delay=delay)
+            for substep in range(10):
+                now = np.where((delay <= substep)[:, None], target, previous)
+                single.step(now, substeps=1)
+            previous = target
+            tolerance = worlds.precision(1e-9, 2e-4)
+            state, expected = worlds.read(), single.read()
+            error = expect_close(
+                "joint_position with latency [rad]", state.joint_position, expected.joint_position, tolerance
+            )
+            expect_close("joint_torque with latency [N·m]", state.joint_torque, expected.joint_torque, 200 * tolerance)
+        spread = np.abs(state.joint_position[1:] - state.joint_position[:-1]).max(axis=1).min()
+        expect(bool(spread > 10 * tolerance), f"delays 0, 3, 9 and 10 make no difference ({spread:.1e} rad)")
+        # a target that came too late to act in its own period acts from the next one on
+        worlds.step()
+        single.step(np.where((delay == 10)[:, None], second, previous))
+        expect_close(
+            "joint_position in the next period [rad]",
+            worlds.read().joint_position,
+            single.read().joint_position,
+            tolerance,
+        )
+        worlds.reset()
+        worlds.step(first, delay=[0, 10, 10, 10])
+        torque = worlds.read().joint_torque
+        expect_close("joint_torque of a limp robot whose first target is late [N·m]", torque[1:], 0.0, 1e-5)
+        expect(bool(np.abs(torque[0]).max() > 0.1), "the first target of a limp robot without delay has no effect")
+    return f"equal to switching targets between single substeps to {error:.1e} rad"

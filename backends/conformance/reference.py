@@ -1,0 +1,204 @@
+"""What should happen: plain MuJoCo (C) on the robot's own file, one world, one loop, the motor law written out.
+
+It shares no code with the engines of this package, on purpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...robots.base import JointParameters, Robot
+
+GRAVITY = 9.81
+"""Acceleration of free fall [m/s²]; the contract's worlds have no other."""
+
+Array = NDArray[np.float64]
+
+
+class Reference:
+    """One robot in empty space under gravity."""
+
+    def __init__(self, robot: Robot, parameters: JointParameters, *, timestep: float = 0.002) -> None:
+        spec = mujoco.MjSpec.from_file(str(robot.mjcf))
+        spec.option.timestep = timestep
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        self.model = spec.compile()
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self.data = mujoco.MjData(self.model)
+        self.robot, self.parameters = robot, parameters
+        joints = [self.model.joint(name) for name in robot.joint_names]
+        self.at_position = np.array([j.qposadr[0] for j in joints])
+        self.at_velocity = np.array([j.dofadr[0] for j in joints])
+        self.joint_range = np.array([j.range for j in joints])
+        self.model.dof_armature[self.at_velocity] = parameters.armature
+        self.model.dof_damping[self.at_velocity] = parameters.joint_damping
+        self.model.dof_frictionloss[self.at_velocity] = parameters.friction_loss
+        self.base = self.model.body(robot.base_body).id
+        self.bodies = np.array([self.model.body(name).id for name in robot.collision_bodies])
+        self.feet = np.array([self.model.geom(name).id for name in robot.foot_names])
+        self.foot_radius = float(self.model.geom_size[self.feet[0], 0])
+        self.torque = np.zeros(robot.num_joints)
+        self.force_w = np.zeros(3)
+        mujoco.mj_setConst(self.model, self.data)
+
+    @property
+    def mass(self) -> float:
+        """Mass of the robot [kg]."""
+        return float(self.model.body_mass.sum())
+
+    def change(
+        self, *, base_mass: float = 0.0, base_com: ArrayLike = (0.0, 0.0, 0.0), link_scale: ArrayLike = 1.0
+    ) -> None:
+        """Change the model as ``Randomization`` describes it; ``link_scale`` is (B,), its entry for the base is ignored."""
+        scale = np.broadcast_to(np.asarray(link_scale, dtype=np.float64), self.bodies.shape)
+        for body, factor in zip(self.bodies, scale, strict=True):
+            if body != self.base:
+                self.model.body_mass[body] *= factor
+                self.model.body_inertia[body] *= factor
+        self.model.body_mass[self.base] += base_mass
+        self.model.body_ipos[self.base] += np.asarray(base_com)
+        mujoco.mj_setConst(self.model, self.data)
+
+    def place(
+        self,
+        base_position: ArrayLike = (0.0, 0.0, 1.0),
+        base_quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        joint_position: ArrayLike | None = None,
+        *,
+        base_linear_velocity: ArrayLike = (0.0, 0.0, 0.0),
+        base_angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+        joint_velocity: ArrayLike | float = 0.0,
+    ) -> None:
+        """Put the robot into a state: linear velocity in the world frame, angular velocity in the body frame."""
+        mujoco.mj_resetData(self.model, self.data)
+        qpos, qvel = self.data.qpos, self.data.qvel
+        qpos[0:3], qpos[3:7] = base_position, base_quaternion
+        qpos[self.at_position] = self.robot.default_joint_position if joint_position is None else joint_position
+        # MuJoCo's free joint: linear velocity of the body's origin in the world frame, angular velocity in the body frame
+        qvel[0:3], qvel[3:6] = base_linear_velocity, base_angular_velocity
+        qvel[self.at_velocity] = joint_velocity
+        mujoco.mj_forward(self.model, self.data)
+
+    def step(self, target: ArrayLike | None = None, *, substeps: int = 1) -> None:
+        """Integrate with the motor law evaluated at the start of each substep; None leaves the motors limp."""
+        kp, kd = np.asarray(self.parameters.stiffness), np.asarray(self.parameters.damping)
+        for _ in range(substeps):
+            if target is not None:
+                q, qd = self.data.qpos[self.at_position], self.data.qvel[self.at_velocity]
+                self.torque = kp * (np.asarray(target) - q) - kd * qd
+            else:
+                self.torque = np.zeros(self.robot.num_joints)
+            self.data.qfrc_applied[self.at_velocity] = self.torque
+            self.data.xfrc_applied[self.base, :3] = self.force_w
+            mujoco.mj_step(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
+
+    @property
+    def base_position(self) -> Array:
+        """[m], (3,)."""
+        return self.data.qpos[0:3].copy()
+
+    @property
+    def base_quaternion(self) -> Array:
+        """wxyz, (4,)."""
+        return self.data.qpos[3:7].copy()
+
+    @property
+    def joint_position(self) -> Array:
+        """[rad], (J,)."""
+        return self.data.qpos[self.at_position]
+
+    @property
+    def joint_velocity(self) -> Array:
+        """[rad/s], (J,)."""
+        return self.data.qvel[self.at_velocity]
+
+    @property
+    def foot_position(self) -> Array:
+        """Centres of the foot spheres, world frame [m], (F, 3)."""
+        return self.data.geom_xpos[self.feet].copy()
+
+    @property
+    def foot_velocity(self) -> Array:
+        """Velocities of the foot centres, world frame [m/s], (F, 3)."""
+        velocity = []
+        for foot in self.feet:
+            jacobian = np.zeros((3, self.model.nv))
+            point, body = self.data.geom_xpos[foot], int(self.model.geom_bodyid[foot])
+            mujoco.mj_jac(self.model, self.data, jacobian, None, point, body)
+            velocity.append(jacobian @ self.data.qvel)
+        return np.array(velocity)
+
+    @property
+    def center_of_mass(self) -> Array:
+        """Of the whole robot, world frame [m], (3,)."""
+        return self.data.subtree_com[self.base].copy()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stance:
+    """The base pose in which all feet of the default joint position touch level ground at height 0."""
+
+    height: float
+    """Height of the base origin [m]."""
+    quaternion: Array
+    """Orientation, wxyz."""
+
+
+def level_stance(reference: Reference, *, clearance: float = 0.0005) -> Stance:
+    """Fit the plane through the foot centres and turn the base so that it is level.
+
+    Args:
+        reference: the robot.
+        clearance: distance of the lowest foot from the ground [m].
+    """
+    reference.place((0.0, 0.0, 0.0))
+    feet = reference.foot_position
+    slope_x, slope_y, _ = np.linalg.lstsq(np.c_[feet[:, :2], np.ones(len(feet))], feet[:, 2], rcond=None)[0]
+    normal = np.array([-slope_x, -slope_y, 1.0])
+    normal /= np.linalg.norm(normal)
+    # the shortest turn that brings the feet's normal upright
+    axis = np.cross(normal, [0.0, 0.0, 1.0])
+    angle = float(np.arctan2(np.linalg.norm(axis), normal[2]))
+    quaternion = axis_angle(axis, angle)
+    lowest = min(float(rotated(quaternion, foot)[2]) for foot in feet)
+    return Stance(height=reference.foot_radius - lowest + clearance, quaternion=quaternion)
+
+
+def axis_angle(axis: ArrayLike, angle: float) -> Array:
+    """Quaternion wxyz of a turn by ``angle`` [rad] about ``axis`` (any length; zero for no turn)."""
+    direction = np.asarray(axis, dtype=np.float64)
+    length = np.linalg.norm(direction)
+    quaternion = np.array([1.0, 0.0, 0.0, 0.0])
+    if length > 1e-12:
+        mujoco.mju_axisAngle2Quat(quaternion, direction / length, angle)
+    return quaternion
+
+
+def composed(*quaternions: ArrayLike) -> Array:
+    """Product of quaternions wxyz; the leftmost turn is the outermost."""
+    product = np.array([1.0, 0.0, 0.0, 0.0])
+    for quaternion in quaternions:
+        factor = product.copy()
+        mujoco.mju_mulQuat(product, factor, np.asarray(quaternion, dtype=np.float64))
+    return product
+
+
+def rotated(quaternion: ArrayLike, vector: ArrayLike) -> Array:
+    """A vector turned from the body frame into the world frame."""
+    result = np.zeros(3)
+    mujoco.mju_rotVecQuat(result, np.asarray(vector, dtype=np.float64), np.asarray(quaternion, dtype=np.float64))
+    return result
+
+
+def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
+    """Angle of the turn between pairs of quaternions (N, 4) [rad], (N,)."""
+    a, b = np.asarray(first), np.asarray(second)
+    a, b = a / np.linalg.norm(a, axis=-1, keepdims=True), b / np.linalg.norm(b, axis=-1, keepdims=True)
+    # 4 atan2(|a-b|, |a+b|) keeps its precision at small angles, where arccos loses it
+    angle = 4.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+    return np.minimum(angle, 4.0 * np.arctan2(np.linalg.norm(a + b, axis=-1), np.linalg.norm(a - b, axis=-1)))

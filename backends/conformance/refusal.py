@@ -1,0 +1,95 @@
+"""Checks that an engine refuses what it says it cannot do, one for each capability: nothing is silently ignored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ...terrains.base import Box, HeightField, Terrain
+from ..base import BackendError
+from .bench import FLAT, Bench, Worlds, expect
+from .suite import check
+
+_BOX = Terrain(name="conformance_box", family="box", boxes=(Box(center=(0.0, 0.0, 0.1), half_size=(1.0, 1.0, 0.1)),))
+_FIELD = Terrain(
+    name="conformance_field",
+    family="field",
+    height_field=HeightField(center=(0.0, 0.0), half_size=(1.0, 1.0), heights=np.zeros((5, 5))),
+)
+
+
+def _build(bench: Bench, **scene: object) -> None:
+    with bench.worlds(**scene):  # type: ignore[arg-type]
+        pass
+
+
+def _ask(bench: Bench, request: Callable[[Worlds], None]) -> None:
+    with bench.worlds() as worlds:
+        worlds.reset()
+        request(worlds)
+
+
+def _randomize(
+    field: str, value: float, shape: Callable[[Bench], tuple[int, ...]] = lambda bench: ()
+) -> Callable[[Bench], None]:
+    return lambda bench: _ask(bench, lambda w: w.randomize(**{field: np.full((w.count, *shape(bench)), value)}))
+
+
+def _joints(bench: Bench) -> tuple[int, ...]:
+    return (bench.robot.num_joints,)
+
+
+def _cuda(bench: Bench) -> None:
+    bench.make(bench.scene(), "cuda").close()
+
+
+REQUESTS: dict[str, Callable[[Bench], None]] = {
+    "plane": lambda bench: _build(bench, terrains=(FLAT,)),
+    "boxes": lambda bench: _build(bench, terrains=(_BOX,)),
+    "height_field": lambda bench: _build(bench, terrains=(_FIELD,)),
+    "per_world_terrain": lambda bench: _build(bench, terrains=(FLAT, _BOX), terrain_index=(0, 1, 0, 1)),
+    "friction": _randomize("friction", 0.7),
+    "base_mass": _randomize("base_mass_offset", 1.0),
+    "link_mass": _randomize("link_mass_scale", 1.1, lambda bench: (len(bench.robot.collision_bodies),)),
+    "base_com": _randomize("base_com_offset", 0.01, lambda bench: (3,)),
+    "gains": _randomize("stiffness_scale", 1.1, _joints),
+    "motor_strength": _randomize("motor_strength", 0.9, _joints),
+    "motor_offset": _randomize("motor_offset", 0.01, _joints),
+    "latency": lambda bench: _ask(bench, lambda w: w.step(w.default_pose, delay=[1] * w.count)),
+    "push": lambda bench: _ask(bench, lambda w: w.push(linear_velocity_w=np.ones((w.count, 3)))),
+    "external_force": lambda bench: _ask(bench, lambda w: w.apply_force(np.ones((w.count, 3)))),
+    "torque_limits": lambda bench: _build(bench, torque_limits=True),
+    "joint_friction": lambda bench: _build(bench, parameters=bench.soft(friction_loss=0.2)),
+    "elliptic_cone": lambda bench: _build(bench, cone="elliptic"),
+    "foot_condim_6": lambda bench: _build(bench, foot_condim=6),
+    "self_collision": lambda bench: _build(bench, self_collision=True),
+    "penetration": lambda bench: _build(bench, watch_penetration=0.02),
+    "deterministic": lambda bench: _build(bench, deterministic=True),
+    "gpu": _cuda,
+}
+"""What to ask an engine for, by the capability that it takes. Contact forces have no request: they are NaN where not supported."""
+
+
+def accepts_or_refuses(capability: str) -> Callable[[Bench], str]:
+    """The check for one capability: supported things are accepted, others raise ``BackendError``."""
+
+    def run(bench: Bench) -> str:
+        declared = bench.capabilities[capability].support.value
+        possible = bench.supports(capability) and (capability != "gpu" or torch.cuda.is_available())
+        try:
+            REQUESTS[capability](bench)
+        except BackendError as refusal:
+            expect(not possible, f"declared as '{declared}', but refused: {refusal}")
+            expect(len(str(refusal)) > 20, f"the refusal says too little: '{refusal}'")
+            return f"refused: {refusal}"
+        expect(possible, f"declared as '{declared}', but accepted without BackendError")
+        return declared
+
+    run.__doc__ = f"The engine takes a request for '{capability}' if it declares it, and raises BackendError if not."
+    return run
+
+
+for _name in REQUESTS:
+    check(f"refusal/{_name}")(accepts_or_refuses(_name))

@@ -1,0 +1,226 @@
+"""Checks of what a step and a reset touch: samples, masks, independence, repeatability."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import fields
+from types import SimpleNamespace
+
+import numpy as np
+
+from ..base import PhysicsState, Support
+from .bench import Bench, Worlds, expect, expect_close
+from .reference import Reference, level_stance
+from .suite import check
+
+MOTION_FIELDS = (
+    "base_position_w",
+    "base_quaternion_w",
+    "base_linear_velocity_w",
+    "base_angular_velocity_b",
+    "joint_position",
+    "joint_velocity",
+    "foot_position_w",
+    "foot_velocity_w",
+)
+
+
+def stand(bench: Bench, worlds: Worlds, *, clearance: float = 0.02, held: bool = True) -> None:
+    """Reset all worlds just above level ground, each with another heading and sideways speed."""
+    stance = level_stance(Reference(bench.robot, bench.soft()), clearance=clearance)
+    speed = np.zeros((worlds.count, 3))
+    speed[:, 0] = np.linspace(0.0, 0.6, worlds.count)
+    worlds.reset(
+        base_position=np.tile([0.0, 0.0, stance.height], (worlds.count, 1)),
+        base_quaternion=np.tile(stance.quaternion, (worlds.count, 1)),
+        base_linear_velocity=speed,
+        held_target=worlds.default_pose if held else None,
+    )
+
+
+def wave(worlds: Worlds, period: int) -> np.ndarray:
+    """Joint targets that differ in every world and control period, (N, J) [rad]."""
+    phase = np.arange(worlds.count)[:, None] + np.arange(worlds.robot.num_joints)[None, :]
+    return worlds.default_pose + 0.15 * np.sin(0.9 * period + phase)
+
+
+def expect_same(what: str, first: SimpleNamespace, second: SimpleNamespace, rows: Iterable[int]) -> None:
+    """The rows of two states are the same to the last bit."""
+    chosen = list(rows)
+    for field in fields(PhysicsState):
+        a, b = getattr(first, field.name)[chosen], getattr(second, field.name)[chosen]
+        equal = np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+        expect(equal, f"{what}: state.{field.name} differs by {_difference(a, b):.3g}; it must not change at all")
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.abs(a.astype(np.float64) - b.astype(np.float64)).max())
+
+
+@check("stepping/substeps")
+def single_substeps(bench: Bench) -> str:
+    """A control period equals its substeps taken one by one, contacts included."""
+    with bench.worlds() as worlds, bench.worlds() as single:
+        for each in (worlds, single):
+            stand(bench, each)
+        for period in range(6):
+            target = wave(worlds, period)
+            worlds.step(target)
+            for _ in range(10):
+                single.step(target, substeps=1)
+        tolerance = worlds.precision(1e-7, 5e-3)
+        state, expected = worlds.read(), single.read()
+        for name in MOTION_FIELDS:
+            factor = 20.0 if "velocity" in name else 1.0
+            expect_close(f"{name} after 60 substeps", getattr(state, name), getattr(expected, name), factor * tolerance)
+        error = expect_close("base_position_w [m]", state.base_position_w, expected.base_position_w, tolerance)
+    return f"base positions equal to {error:.1e} m"
+
+
+@check("stepping/sample_at")
+def sample_at(bench: Bench) -> str:
+    """The sample is the state after the substep that each world asked for, forces included."""
+    at = np.array([1, 4, 10, 7])
+    with bench.worlds() as worlds, bench.worlds() as single:
+        for each in (worlds, single):
+            stand(bench, each)
+            each.step(wave(each, 0))
+        target = wave(worlds, 1)
+        worlds.step(target, sample_at=at)
+        history = []
+        for _ in range(10):
+            single.step(target, substeps=1)
+            history.append(single.read())
+        sample, tolerance = worlds.read_sample(), worlds.precision(1e-7, 2e-3)
+        for row, substep in enumerate(at):
+            expected = history[substep - 1]
+            for name in (*MOTION_FIELDS, "time", "joint_torque"):
+                factor = 50.0 if "velocity" in name or "torque" in name else 1.0
+                found, wanted = getattr(sample, name)[row], getattr(expected, name)[row]
+                expect_close(f"sample.{name} of world {row} at substep {substep}", found, wanted, factor * tolerance)
+            if bench.supports("contact_forces"):
+                found, wanted = sample.ground_force_w[row], expected.ground_force_w[row]
+                allowed = worlds.precision(1e-3, 5.0) + 0.05 * np.abs(wanted).max()
+                expect_close(f"sample.ground_force_w of world {row} at substep {substep} [N]", found, wanted, allowed)
+        expect_close("state.time after a sampled step [s]", worlds.read().time, 0.04, 1e-6)
+        worlds.step(sample_at=[0, 2, 0, 0])
+        expect_close("sample.time of the only world that asked [s]", worlds.read_sample().time[1], 0.044, 1e-6)
+    return ""
+
+
+@check("stepping/mask")
+def step_mask(bench: Bench) -> str:
+    """Worlds outside of a step's mask do not change at all, their targets included."""
+    stepped = np.array([True, False, True, False])
+    with bench.worlds() as worlds, bench.worlds() as other:
+        for each in (worlds, other):
+            stand(bench, each)
+            each.step(wave(each, 0))
+        before = worlds.read()
+        worlds.step(wave(worlds, 5), worlds=stepped)
+        after = worlds.read()
+        expect_same("worlds outside of the mask", before, after, np.flatnonzero(~stepped))
+        expect_close("time of the masked worlds [s]", after.time, [0.04, 0.02, 0.04, 0.02], 1e-6)
+        moved = np.abs(after.joint_position - before.joint_position).max(axis=1)
+        expect(bool((moved[stepped] > 1e-4).all()), "worlds inside of the mask did not move")
+        # the worlds left out go on as if nothing had been: the targets of the masked step were not theirs
+        worlds.step(worlds=~stepped)
+        other.step()
+        tolerance = worlds.precision(1e-9, 1e-4)
+        rows = np.flatnonzero(~stepped)
+        found, wanted = worlds.read().joint_position[rows], other.read().joint_position[rows]
+        expect_close("joint_position of worlds that sat out a step [rad]", found, wanted, tolerance)
+        before = worlds.read()
+        worlds.step(wave(worlds, 2), worlds=[False] * worlds.count)
+        expect_same("an empty mask", before, worlds.read(), range(worlds.count))
+    return ""
+
+
+@check("reset/mask")
+def reset_mask(bench: Bench) -> str:
+    """Worlds outside of a reset's mask do not change at all and go on as if nothing had been."""
+    chosen = np.array([False, True, False, True])
+    with bench.worlds() as worlds, bench.worlds() as other:
+        for each in (worlds, other):
+            stand(bench, each)
+            each.step(wave(each, 0))
+        before = worlds.read()
+        worlds.reset(chosen, base_position=np.full((worlds.count, 3), 2.0))
+        after = worlds.read()
+        rows = np.flatnonzero(~chosen)
+        expect_same("worlds outside of the reset's mask", before, after, rows)
+        expect_close("base_position_w of reset worlds [m]", after.base_position_w[chosen], 2.0, 1e-5)
+        for each in (worlds, other):
+            each.step()
+        tolerance = worlds.precision(1e-9, 1e-4)
+        found, wanted = worlds.read(), other.read()
+        for name in ("joint_position", "base_position_w"):
+            expect_close(f"{name} beside a reset", getattr(found, name)[rows], getattr(wanted, name)[rows], tolerance)
+        expect_close("joint_torque of worlds reset to limp [N·m]", found.joint_torque[chosen], 0.0, 1e-5)
+    return ""
+
+
+@check("reset/repeat")
+def reset_repeat(bench: Bench) -> str:
+    """After a reset nothing of the past is left: the same start gives the same motion."""
+    with bench.worlds() as worlds:
+        ends = []
+        for _ in range(2):
+            stand(bench, worlds, held=False)
+            for period in range(4):
+                worlds.step(wave(worlds, period), delay=[0, 2, 5, 10])
+            ends.append(worlds.read())
+        tolerance = worlds.precision(1e-9, 2e-3)
+        for name in MOTION_FIELDS:
+            factor = 20.0 if "velocity" in name else 1.0
+            expect_close(
+                f"{name} on the second run", getattr(ends[1], name), getattr(ends[0], name), factor * tolerance
+            )
+        error = expect_close("base_position_w", ends[1].base_position_w, ends[0].base_position_w, tolerance)
+    return f"second run within {error:.1e} m"
+
+
+@check("stepping/determinism")
+def determinism(bench: Bench) -> str:
+    """Two engines built alike do the same to the last bit; on a GPU only where the engine has a deterministic mode."""
+    declared = bench.capabilities["deterministic"].support
+    if bench.gpu and declared is not Support.EXACT:
+        return f"not promised on a GPU: deterministic is '{declared.value}'"
+    ends = []
+    for _ in range(2):
+        with bench.worlds(deterministic=declared is Support.EXACT) as worlds:
+            stand(bench, worlds)
+            for period in range(6):
+                worlds.step(wave(worlds, period), delay=[0, 2, 5, 10])
+            ends.append(worlds.read())
+    expect_same("two runs", *ends, range(len(ends[0].time)))
+    return "60 substeps with contacts, to the last bit"
+
+
+@check("stepping/independence")
+def independence(bench: Bench) -> str:
+    """A world among others moves as it does alone."""
+    with bench.worlds() as worlds:
+        stand(bench, worlds)
+        for period in range(4):
+            worlds.step(wave(worlds, period))
+        together, count = worlds.read(), worlds.count
+        targets = [wave(worlds, period) for period in range(4)]
+    with bench.worlds(terrain_index=(0,)) as alone:
+        row = 2
+        stance = level_stance(Reference(bench.robot, bench.soft()), clearance=0.02)
+        alone.reset(
+            base_position=[[0.0, 0.0, stance.height]],
+            base_quaternion=[stance.quaternion],
+            base_linear_velocity=[[np.linspace(0.0, 0.6, count)[row], 0.0, 0.0]],
+            held_target=alone.default_pose,
+        )
+        for target in targets:
+            alone.step(target[row : row + 1])
+        state, tolerance = alone.read(), alone.precision(1e-7, 2e-3)
+        for name in MOTION_FIELDS:
+            factor = 20.0 if "velocity" in name else 1.0
+            found, wanted = getattr(state, name)[0], getattr(together, name)[row]
+            expect_close(f"{name} of a world alone", found, wanted, factor * tolerance)
+        error = float(np.abs(state.base_position_w[0] - together.base_position_w[row]).max())
+    return f"equal to {error:.1e} m"

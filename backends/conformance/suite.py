@@ -1,0 +1,162 @@
+"""Collects the checks, runs them against an engine and says what came of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from time import perf_counter
+
+import mujoco
+
+from ...robots import Robot, load_robot
+from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsBackend, Scene, Support, unsupported
+from ..registry import backend_class, make_backend
+from .bench import Bench
+
+# Whatever an engine under test may raise is a failed check, not the end of the run.
+ENGINE_ERRORS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    mujoco.FatalError,
+)
+
+
+class Outcome(Enum):
+    """What came of a check."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    NOT_SUPPORTED = "not supported"
+    """The engine declares that it cannot do this; that it refuses to is checked under ``refusal/…``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One check. Its ``run`` raises ``Mismatch`` where the engine breaks the contract and returns what it measured, for the table."""
+
+    name: str
+    """Room and subject, for example ``motors/latency``."""
+    needs: tuple[str, ...]
+    """Capabilities without which the check makes no sense."""
+    run: Callable[[Bench], str]
+    about: str
+    """One sentence."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckResult:
+    """What came of one check."""
+
+    name: str
+    outcome: Outcome
+    detail: str
+    """What was measured, what is wrong, or what the engine says it cannot do."""
+    seconds: float
+    """Wall-clock time [s]."""
+
+
+_CHECKS: dict[str, Check] = {}
+
+
+def check(name: str, *needs: str) -> Callable[[Callable[[Bench], str]], Callable[[Bench], str]]:
+    """Register a function as a check; the first line of its docstring says what it is about."""
+
+    def register(function: Callable[[Bench], str]) -> Callable[[Bench], str]:
+        unknown = set(needs) - set(CAPABILITY_NAMES)
+        if name in _CHECKS or unknown:
+            raise ValueError(f"check '{name}' is registered twice or needs unknown capabilities {sorted(unknown)}")
+        about = (function.__doc__ or "").strip().partition("\n")[0]
+        _CHECKS[name] = Check(name=name, needs=needs, run=function, about=about)
+        return function
+
+    return register
+
+
+def all_checks() -> tuple[Check, ...]:
+    """All checks in the order in which they run: what everything else rests on comes first."""
+    from . import kinematics, motors, stepping, health, refusal  # noqa: F401, I001
+
+    return tuple(_CHECKS.values())
+
+
+def run_check(check: Check, bench: Bench) -> CheckResult:
+    """Run one check; an error in the engine is a failed check."""
+    start = perf_counter()
+    missing = unsupported("", check.needs, bench.capabilities)
+    if missing:
+        outcome, detail = (
+            Outcome.NOT_SUPPORTED,
+            ", ".join(_described(name, bench.capabilities[name]) for name in missing),
+        )
+    else:
+        try:
+            outcome, detail = Outcome.PASSED, check.run(bench)
+        except ENGINE_ERRORS as error:
+            kind = "" if isinstance(error, AssertionError) else f"{type(error).__name__}: "
+            outcome, detail = Outcome.FAILED, f"{kind}{error}"
+    return CheckResult(name=check.name, outcome=outcome, detail=detail, seconds=perf_counter() - start)
+
+
+def run_conformance(
+    backend: str | type[PhysicsBackend],
+    device: str = "cpu",
+    *,
+    robot: Robot | None = None,
+    only: Sequence[str] = (),
+    report: Callable[[CheckResult], None] | None = None,
+) -> list[CheckResult]:
+    """Run the conformance checks against an engine.
+
+    Args:
+        backend: registry name (``mujoco``, ``newton:kamino``, a plug-in's name), or a class.
+        device: where its worlds live, ``cpu`` or ``cuda``.
+        robot: the robot in the scenes, four-legged with spherical feet; None for the Go2.
+        only: beginnings of the names of the checks to run (``motors``, ``contact/rest``); empty for all.
+        report: called with each result as soon as it is there.
+
+    Returns:
+        One result for each check.
+
+    Raises:
+        BackendError: the engine is unknown or not installed, does not declare its capabilities, or no check has such a name.
+    """
+    name = backend if isinstance(backend, str) else backend.name
+    found = backend_class(name) if isinstance(backend, str) else backend
+    variant = name.partition(":")[2] if isinstance(backend, str) else ""
+    with_solver = getattr(found, "with_solver", None)
+    if variant and with_solver is not None:
+        found = with_solver(variant)
+    capabilities = found.capabilities()
+    undeclared = [n for n in CAPABILITY_NAMES if n not in capabilities]
+    if undeclared:
+        raise BackendError(
+            f"backend '{name}' does not declare {', '.join(undeclared)}; capabilities() needs one entry for each"
+        )
+
+    def make(scene: Scene, on: str) -> PhysicsBackend:
+        return make_backend(name, scene, device=on) if isinstance(backend, str) else found(scene, device=on)
+
+    bench = Bench(make=make, capabilities=capabilities, robot=robot or load_robot("go2"), device=device)
+    chosen = [c for c in all_checks() if not only or any(c.name.startswith(o) for o in only)]
+    if not chosen:
+        known = ", ".join(sorted({c.name.partition("/")[0] for c in all_checks()}))
+        raise BackendError(f"no conformance check begins with {', '.join(map(repr, only))}; choose from {known}")
+    results = []
+    for each in chosen:
+        result = run_check(each, bench)
+        if report is not None:
+            report(result)
+        results.append(result)
+    return results
+
+
+def _described(name: str, capability: Capability) -> str:
+    note = f" ({capability.note})" if capability.note else ""
+    return f"{name}: {Support.NONE.value}{note}"
