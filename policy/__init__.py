@@ -1,0 +1,16 @@
+"""What turns observations into actions: the policy contract, the observation builder, networks and policy files.
+
+Only the contract is imported here, so that reading one does not wait for torch.
+"""
+
+from .contract import ContractError, History, ObservationTerm, PolicyContract, check_robot, difference, go2_contract
+
+__all__ = [
+    "ContractError",
+    "History",
+    "ObservationTerm",
+    "PolicyContract",
+    "check_robot",
+    "difference",
+    "go2_contract",
+]

@@ -16,7 +16,13 @@ class PolicyError(ValueError):
 class PolicySession(ABC):
     """A policy at work on a fixed number of episodes. One session belongs to one thread.
 
-    Rows never influence each other: the action of an episode depends on that row's observations alone, and on the batch size only.
+    Rows never influence each other: the action of an episode depends on that row's observations alone, and on the batch
+    size only.
+    """
+
+    batched: bool = True
+    """Whether all episodes go through the network at once; False for a foreign file that can only be run one episode at
+    a time.
     """
 
     @abstractmethod
@@ -25,7 +31,8 @@ class PolicySession(ABC):
 
     @abstractmethod
     def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Raw network output (N, J) float32, in the contract's joint order, for observations (N, ``contract.observation_width``) float32.
+        """Raw network output (N, J) float32, in the contract's joint order, for observations (N,
+        ``contract.observation_width``) float32.
 
         The output is not checked: a policy may return NaN, and the caller decides what that means.
 

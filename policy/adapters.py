@@ -1,0 +1,350 @@
+"""Contracts for policies that come without one: what their files, sidecars and widths tell.
+
+Every adapter notes in the contract's provenance where it took the facts from and what it had to assume.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from ..robots.base import Robot
+from .base import PolicyError
+from .contract import ContractError, History, ObservationTerm, PolicyContract, go2_contract
+from .native import StoredNetwork, first_line
+
+# Observation terms as Isaac Lab and mjlab name them.
+FOREIGN_TERMS: Mapping[str, str] = {
+    "base_lin_vel": "base_linear_velocity_b",
+    "base_ang_vel": "base_angular_velocity_b",
+    "projected_gravity": "projected_gravity_b",
+    "velocity_commands": "command",
+    "command": "command",
+    "joint_pos_rel": "joint_position",
+    "joint_pos": "joint_position",
+    "joint_vel_rel": "joint_velocity",
+    "joint_vel": "joint_velocity",
+    "last_action": "last_action",
+    "actions": "last_action",
+}
+
+# Order in which the maker's SDK numbers the motors; ``joint_ids_map`` of a deploy.yaml refers to it.
+SDK_LEGS: Mapping[str, Sequence[str]] = {"go2": ("FR", "FL", "RR", "RL")}
+SDK_JOINTS = ("hip", "thigh", "calf")
+
+LONGEST_HISTORY = 20
+
+
+def sidecar_contract(path: Path) -> PolicyContract | None:
+    """The contract in ``<stem>.contract.json`` or ``contract.json`` beside a policy file, None if there is neither.
+
+    Raises:
+        PolicyError: the sidecar is malformed.
+    """
+    for sidecar in (path.with_name(f"{path.stem}.contract.json"), path.with_name("contract.json")):
+        if sidecar.is_file():
+            try:
+                return PolicyContract.from_json(sidecar.read_text(encoding="utf-8"))
+            except (ContractError, UnicodeDecodeError) as error:
+                raise PolicyError(f"'{sidecar}' is not a policy contract: {error}") from error
+    return None
+
+
+def contract_for_width(width: int, robot: Robot, *, order: str, provenance: Mapping[str, Any]) -> PolicyContract | None:
+    """The standard contract with as many frames as an input of this width holds, None if it is not a whole number of
+    frames.
+    """
+    frame = go2_contract(robot).frame_width
+    frames, rest = divmod(width, frame)
+    if rest or not 1 <= frames <= LONGEST_HISTORY:
+        return None
+    history = History(length=frames, order=order if frames > 1 else "frame-major")
+    assumed = {
+        **provenance,
+        "assumed": f"observation of {frame} entries, {frames} frame(s) {history.order}, gains of the robot",
+    }
+    return go2_contract(robot, history=history, provenance=assumed)
+
+
+def find_deploy_file(path: Path) -> Path | None:
+    """The ``deploy.yaml`` that belongs to an ONNX file: beside it, or in ``params/`` next to the folder of exports."""
+    candidates = (
+        path.with_name(f"{path.stem}.deploy.yaml"),
+        path.with_name("deploy.yaml"),
+        path.parent / "params" / "deploy.yaml",
+        path.parent.parent / "params" / "deploy.yaml",
+    )
+    return next((c for c in candidates if c.is_file()), None)
+
+
+def deploy_contract(path: Path, robot: Robot) -> PolicyContract:
+    """Read a ``deploy.yaml`` as Unitree's and Isaac Lab's exporters write it.
+
+    In it ``stiffness`` and ``damping`` are in the order of the robot's SDK, everything else is in the policy's; entry i
+    of ``joint_ids_map`` is the SDK's number of the policy's joint i. Histories are term-major unless
+    ``use_gym_history`` is set, and start with copies of the first observation. Clipping comes before scaling unless
+    ``scale_first`` is set; a clip of the action limits the joint target.
+
+    Raises:
+        PolicyError: the file is malformed, or asks for something that a contract cannot express.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise PolicyError(f"'{path}' is not valid YAML: {first_line(error)}") from error
+    try:
+        return _deploy_contract(data, path, robot)
+    except ContractError as error:
+        raise PolicyError(f"'{path}' does not give a valid policy contract: {error}") from error
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        if isinstance(error, PolicyError):
+            raise
+        raise PolicyError(f"'{path}' lacks or garbles an entry of a deploy.yaml: {error!r}") from error
+
+
+def _deploy_contract(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
+    names = _deploy_joints(data, path, robot)
+    sdk = [int(i) for i in data["joint_ids_map"]]
+    default = [float(v) for v in data["default_joint_pos"]]
+    action = data["actions"]["JointPositionAction"]
+    offset = action.get("offset") or default
+    if max((abs(o - d) for o, d in zip(offset, default, strict=True)), default=0.0) > 1e-6:
+        raise PolicyError(
+            f"'{path}' has an action offset other than default_joint_pos, which a policy contract cannot express"
+        )
+    clip = action.get("clip")
+    ranges = ((data.get("commands") or {}).get("base_velocity") or {}).get("ranges") or {}
+    limits = [
+        max(abs(float(v)) for v in ranges[axis]) if ranges.get(axis) else robot.command_limits[i]
+        for i, axis in enumerate(("lin_vel_x", "lin_vel_y", "ang_vel_z"))
+    ]
+    settings = dict(data["observations"])
+    frame_major = bool(settings.pop("use_gym_history", False))
+    scale_first = bool(settings.pop("scale_first", False))
+    terms, lengths = [], set()
+    for name, term in settings.items():
+        if name not in FOREIGN_TERMS:
+            raise PolicyError(f"'{path}' asks for the observation '{name}'; supported are: {', '.join(FOREIGN_TERMS)}")
+        scale = tuple(float(s) for s in _listed(term.get("scale"), 1.0))
+        terms.append(
+            ObservationTerm(name=FOREIGN_TERMS[name], scale=scale, clip=_clip(term, scale, path, name, scale_first))
+        )
+        lengths.add(int(term.get("history_length") or 1))
+    if len(lengths) > 1:
+        raise PolicyError(
+            f"'{path}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
+        )
+    length = lengths.pop() if lengths else 1
+    order = "frame-major" if frame_major or length == 1 else "term-major"
+    return PolicyContract(
+        robot=robot.name,
+        joint_names=names,
+        default_joint_position=tuple(default),
+        action_scale=tuple(float(v) for v in _listed(action.get("scale"), 1.0, len(names))),
+        target_range=tuple((float(low), float(high)) for low, high in clip) if clip else None,
+        stiffness=tuple(float(data["stiffness"][i]) for i in sdk),
+        damping=tuple(float(data["damping"][i]) for i in sdk),
+        control_period=float(data["step_dt"]),
+        observation=tuple(terms),
+        history=History(length=length, order=order, start="repeat"),
+        command_limits=(limits[0], limits[1], limits[2]),
+        provenance={"adapter": "deploy.yaml", "file": path.name},
+    )
+
+
+def _deploy_joints(data: Any, path: Path, robot: Robot) -> tuple[str, ...]:
+    if not isinstance(data, Mapping):
+        raise PolicyError(f"'{path}' holds no table of settings")
+    legs = SDK_LEGS.get(robot.name)
+    if legs is None:
+        raise PolicyError(
+            f"'{path}' numbers joints as the robot's SDK does, which is not known for robot '{robot.name}'"
+        )
+    numbered = [matching_joint(f"{leg}_{joint}", robot) for leg in legs for joint in SDK_JOINTS]
+    order = list(data["joint_ids_map"])
+    if sorted(order) != list(range(len(numbered))):
+        raise PolicyError(
+            f"'{path}' has joint_ids_map {order}; every number from 0 to {len(numbered) - 1} is needed once"
+        )
+    return tuple(numbered[i] for i in order)
+
+
+def matching_joint(name: str, robot: Robot) -> str:
+    """The robot's joint of this name, with or without the ending ``_joint``; the name itself if the robot has none
+    such.
+    """
+    bare = name.removesuffix("_joint")
+    return next((j for j in robot.joint_names if j.removesuffix("_joint") == bare), name)
+
+
+def _listed(value: Any, missing: float, count: int = 1) -> list[float]:
+    if value is None:
+        return [missing] * count
+    return list(value) if isinstance(value, (list, tuple)) else [value] * count
+
+
+def _clip(
+    term: Mapping[str, Any], scale: tuple[float, ...], path: Path, name: str, scale_first: bool
+) -> tuple[float, ...] | None:
+    """The clip of an observation as magnitudes after scaling."""
+    clip = term.get("clip")
+    if clip is None:
+        return None
+    low, high = float(clip[0]), float(clip[1])
+    if low != -high:
+        raise PolicyError(
+            f"'{path}' clips the observation '{name}' to [{low}, {high}]; only symmetric limits are supported"
+        )
+    return (high,) if scale_first else tuple(high * abs(s) for s in scale)
+
+
+def mjlab_contract(metadata: Mapping[str, str], robot: Robot, *, source: str) -> PolicyContract | None:
+    """Read the metadata that mjlab's exporter writes into an ONNX file; None if they are not there.
+
+    Histories are term-major and start with copies of the first observation. The command limits are the robot's and the
+    control period is 0.02 s, mjlab's, because the metadata name neither.
+
+    Raises:
+        PolicyError: the metadata are incomplete or malformed.
+    """
+    if "observation_names" not in metadata or "joint_names" not in metadata:
+        return None
+    try:
+        return _mjlab_contract(metadata, robot, source)
+    except ContractError as error:
+        raise PolicyError(f"the metadata of '{source}' do not give a valid policy contract: {error}") from error
+    except (KeyError, IndexError, ValueError) as error:
+        if isinstance(error, PolicyError):
+            raise
+        raise PolicyError(f"the metadata of '{source}' lack or garble an entry: {error!r}") from error
+
+
+def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> PolicyContract:
+    def words(key: str, default: str = "") -> list[str]:
+        return [w.strip() for w in metadata.get(key, default).split(",") if w.strip()]
+
+    names = tuple(matching_joint(n, robot) for n in words("joint_names"))
+    observations = words("observation_names")
+    unknown = [n for n in observations if n not in FOREIGN_TERMS]
+    if unknown:
+        raise PolicyError(
+            f"'{source}' asks for the observation '{unknown[0]}'; supported are: {', '.join(FOREIGN_TERMS)}"
+        )
+    count = len(observations)
+    scales = [float(s) for s in words("observation_terms_scale")] or [1.0] * count
+    clips = words("observation_terms_clip") or ["-inf;inf"] * count
+    lengths = {max(1, int(float(n))) for n in words("observation_terms_history_length")} or {1}
+    if len(lengths) > 1:
+        raise PolicyError(
+            f"'{source}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
+        )
+    terms = []
+    for name, scale, clip in zip(observations, scales, clips, strict=True):
+        low, high = (float(v) for v in clip.split(";"))
+        if low != -high:
+            raise PolicyError(
+                f"'{source}' clips the observation '{name}' to [{low}, {high}]; only symmetric limits are supported"
+            )
+        limit = None if high == float("inf") else high * abs(scale)
+        terms.append(ObservationTerm(name=FOREIGN_TERMS[name], scale=(scale,), clip=limit))
+    action_scale = [float(v) for v in words("action_scale")]
+    length = lengths.pop()
+    return PolicyContract(
+        robot=robot.name,
+        joint_names=names,
+        default_joint_position=tuple(float(v) for v in words("default_joint_pos")),
+        action_scale=tuple(action_scale * len(names) if len(action_scale) == 1 else action_scale),
+        stiffness=tuple(float(v) for v in words("joint_stiffness")),
+        damping=tuple(float(v) for v in words("joint_damping")),
+        control_period=0.02,
+        observation=tuple(terms),
+        history=History(length=length, order="frame-major" if length == 1 else "term-major", start="repeat"),
+        command_limits=robot.command_limits,
+        provenance={"adapter": "mjlab metadata", "assumed": "control period 0.02 s, command limits of the robot"},
+    )
+
+
+def checkpoint_network(
+    entries: Mapping[str, Any], robot: Robot, *, path: Path
+) -> tuple[PolicyContract, StoredNetwork] | None:
+    """Network and contract of a bare rsl_rl checkpoint, None if it is not one.
+
+    Understood are a plain perceptron as the actor, with or without input normalisation, and a student of concurrent
+    teacher-student training (``student_encoder``). The activation is the one in ``params/agent.yaml`` beside it, else
+    ELU.
+
+    Raises:
+        PolicyError: it is one, but of another kind or of a width that the standard contract does not have.
+    """
+    weights = entries.get("actor_state_dict") or entries.get("model_state_dict")
+    if not isinstance(weights, Mapping) or not all(isinstance(v, torch.Tensor) for v in weights.values()):
+        return None
+    actor = {
+        "network." + k.split(".", 1)[1]: v
+        for k, v in weights.items()
+        if re.match(r"(actor|mlp)\.\d+\.(weight|bias)$", k)
+    }
+    encoder = {
+        "encoder." + k.split(".", 1)[1]: v
+        for k, v in weights.items()
+        if re.match(r"student_encoder\.\d+\.(weight|bias)$", k)
+    }
+    strange = [k for k in weights if k.startswith(("memory", "rnn", "cnn", "student.", "estimator"))]
+    if not actor or strange:
+        raise PolicyError(
+            f"'{path}' is an rsl_rl checkpoint without a plain perceptron as its actor "
+            f"(it has '{(strange or list(weights) or ['nothing'])[0]}')"
+        )
+    activation = _activation(path)
+    contract = go2_contract(
+        robot, provenance={"adapter": "rsl_rl checkpoint", "assumed": f"standard observation, {activation}"}
+    )
+    frame = contract.frame_width
+    arguments: dict[str, Any] = {"frame_width": frame, "num_actions": contract.num_joints, "activation": activation}
+    actor_widths = _widths(actor)
+    if encoder:
+        encoder_widths = _widths(encoder)
+        arguments.update(
+            history_length=encoder_widths[0] // frame,
+            latent_width=encoder_widths[-1],
+            encoder_hidden=encoder_widths[1:-1],
+            actor_hidden=actor_widths[1:-1],
+        )
+        state = {**encoder, **{"actor." + k.split(".", 1)[1]: v for k, v in actor.items()}}
+        return contract, StoredNetwork(architecture="cts", arguments=arguments, state_dict=state)
+    if actor_widths[0] != frame or actor_widths[-1] != contract.num_joints:
+        raise PolicyError(
+            f"'{path}' has an actor of {actor_widths[0]} inputs and {actor_widths[-1]} outputs; "
+            f"without a contract only {frame} and {contract.num_joints} are understood"
+        )
+    arguments.update(hidden=actor_widths[1:-1])
+    normalizer = next((p for p in ("obs_normalizer.", "actor_obs_normalizer.") if p + "_mean" in weights), None)
+    if normalizer:
+        arguments.update(normalize=True)
+        # rsl_rl divides by the standard deviation plus this constant.
+        actor["mean"], actor["deviation"] = weights[normalizer + "_mean"], weights[normalizer + "_std"] + 0.01
+    return contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=actor)
+
+
+def _widths(layers: Mapping[str, torch.Tensor]) -> list[int]:
+    """Widths of a perceptron from its weights, input first."""
+    weights = sorted(
+        ((int(k.split(".")[1]), v) for k, v in layers.items() if k.endswith("weight")), key=lambda pair: pair[0]
+    )
+    return [weights[0][1].shape[1], *(w.shape[0] for _, w in weights)]
+
+
+def _activation(path: Path) -> str:
+    """Activation that the training configuration beside a checkpoint names, ELU if there is none."""
+    settings = path.parent / "params" / "agent.yaml"
+    if not settings.is_file():
+        return "elu"
+    found = re.search(
+        r"^\s*activation:\s*['\"]?(\w+)", settings.read_text(encoding="utf-8", errors="replace"), re.MULTILINE
+    )
+    return found.group(1).lower() if found else "elu"

@@ -1,0 +1,148 @@
+"""Loads a policy from any file that the project understands, and finds the policies that have names."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from pathlib import Path
+
+from ..robots import Robot, load_robot
+from .adapters import checkpoint_network
+from .base import Policy, PolicyError
+from .contract import check_robot
+from .native import FORMAT, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
+
+LOG_ROOT = Path("logs/rsl_rl")
+PRETRAINED = Path(__file__).parent / "pretrained" / "go2.gauge.pt"
+POLICY_NAMES = ("latest", "best", "pretrained")
+DEFAULT_ROBOT = "go2"
+
+
+def load_policy(path_or_name: str | Path, robot: Robot | None = None, *, log_root: Path = LOG_ROOT) -> Policy:
+    """Load a policy and try it on zeros.
+
+    A file's content decides what it is, not its ending: the project's own format, TorchScript, ONNX, or a bare rsl_rl
+    checkpoint. Nothing that a file holds is executed except TorchScript's and ONNX's own operators.
+
+    Args:
+        path_or_name: a file; or ``latest`` (last checkpoint of the last training run), ``best`` (the last run's best
+            checkpoint), ``pretrained`` (the one that ships with the project).
+        robot: the robot it has to fit, and whose data stand in where a foreign file does not say; None: any robot is
+            accepted, and the Go2 stands in.
+        log_root: where ``latest`` and ``best`` look: ``<log_root>/<experiment>/<run>/``.
+
+    Raises:
+        PolicyError: no such file or name, a damaged or foreign file, or a network that does not fit its contract.
+        ContractError: the policy is for another robot or other joints.
+    """
+    path = find_policy(path_or_name, log_root=log_root)
+    data = _read(path)
+    stand_in = robot or load_robot(DEFAULT_ROBOT)
+    policy = _load(data, path, str(path_or_name), stand_in)
+    if robot is not None:
+        check_robot(policy.contract, robot)
+    return policy
+
+
+def find_policy(path_or_name: str | Path, *, log_root: Path = LOG_ROOT) -> Path:
+    """The file behind a path or one of ``POLICY_NAMES``. A file that exists wins over a name.
+
+    Raises:
+        PolicyError: there is none.
+    """
+    path = Path(path_or_name)
+    name = str(path_or_name)
+    if name in POLICY_NAMES and not path.is_file():
+        return _named(name, log_root)
+    if path.is_dir():
+        raise PolicyError(f"'{name}' is a folder; name a policy file in it, or one of: {', '.join(POLICY_NAMES)}")
+    if not path.exists():
+        raise PolicyError(
+            f"there is no policy file '{name}'; give the path of a file, or one of: {', '.join(POLICY_NAMES)}"
+        )
+    if not path.is_file():
+        raise PolicyError(f"'{name}' is not a regular file")
+    return path
+
+
+def _named(name: str, log_root: Path) -> Path:
+    if name == "pretrained":
+        if not PRETRAINED.is_file():
+            raise PolicyError(
+                f"no pretrained policy ships with this installation (looked for '{PRETRAINED}'); give a path"
+            )
+        return PRETRAINED
+    # Runs are named by their time, so the name's order is that of time.
+    runs = sorted((r for r in log_root.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True)
+    for run in runs:
+        if name == "best" and (run / "best.pt").is_file():
+            return run / "best.pt"
+        checkpoints = [(int(m.group(1)), f) for f in run.iterdir() if (m := re.fullmatch(r"model_(\d+)\.pt", f.name))]
+        if name == "latest" and checkpoints:
+            return max(checkpoints)[1]
+    wanted = "best.pt" if name == "best" else "model_<iteration>.pt"
+    raise PolicyError(
+        f"there is no policy '{name}': no run in '{log_root}/<experiment>/<run>/' has a {wanted}; give a path"
+    )
+
+
+def _read(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise PolicyError(f"'{path}' cannot be read: {error.strerror}") from error
+    if not data:
+        raise PolicyError(f"'{path}' is empty")
+    return data
+
+
+def _load(data: bytes, path: Path, source: str, robot: Robot) -> Policy:
+    """Load a file's content; ``path`` is where its sidecars are, ``source`` what the user called it."""
+    kind = file_kind(data, source)
+    if kind in ("torchscript", "onnx"):
+        return _foreign(ForeignFile(kind=kind, data=data), path, source, robot)
+    entries = load_entries(data, source=source)
+    if entries.get("format") == FORMAT:
+        stored = read_policy(entries, source=source)
+        if isinstance(stored.network, StoredNetwork):
+            return NativePolicy(stored.contract, stored.network, path=source)
+        return _foreign(stored.network, path, source, robot)
+    found = checkpoint_network(entries, robot, path=path)
+    if found is None:
+        raise PolicyError(f"'{source}' is a torch.save file, but neither a gaitgauge policy nor an rsl_rl checkpoint")
+    return NativePolicy(*found, path=source)
+
+
+def _foreign(file: ForeignFile, path: Path, source: str, robot: Robot) -> Policy:
+    raise PolicyError(f"'{source}' is a {file.kind} file, which cannot be loaded yet")
+
+
+def file_kind(data: bytes, source: str) -> str:
+    """What a file's content is: ``torchscript``, ``onnx`` or ``torch`` (a ``torch.save`` archive).
+
+    Raises:
+        PolicyError: anything else; a plain pickle is refused without being opened.
+    """
+    if data[:4] == b"PK\x03\x04":
+        try:
+            names = zipfile.ZipFile(io.BytesIO(data)).namelist()
+        except (zipfile.BadZipFile, ValueError, OSError) as error:
+            raise PolicyError(f"'{source}' is a damaged or truncated archive") from error
+        inner = {n.partition("/")[2] for n in names}
+        if "constants.pkl" in inner and any(n.startswith("code/") for n in inner):
+            return "torchscript"
+        if "data.pkl" in inner:
+            return "torch"
+        raise PolicyError(f"'{source}' is a zip archive, but neither TorchScript nor a torch.save file")
+    if data[:1] == b"\x80":
+        raise PolicyError(
+            f"'{source}' is a plain pickle, which could run code when opened, and is refused; "
+            "save it with torch.save of today's torch"
+        )
+    # An ONNX file starts with its format version as a one-byte number (protocol buffer field 1).
+    if data[:1] == b"\x08" and len(data) > 16:
+        return "onnx"
+    raise PolicyError(
+        f"'{source}' is not a policy: neither a gaitgauge file, TorchScript, ONNX nor an rsl_rl checkpoint"
+    )

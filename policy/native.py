@@ -1,0 +1,288 @@
+"""The project's own policy file, and policies whose network is built from it.
+
+The file is what ``torch.save`` writes of a dictionary of plain data and tensors; it is only ever read with
+``torch.load(weights_only=True)``, which cannot run code.
+
+==============  =====================================================================================================
+``format``      ``gaitgauge-policy``
+``version``     of the layout, a whole number
+``contract``    the policy contract as JSON text
+``network``     ``kind``, ``architecture`` and ``arguments`` (JSON text) for a network of ``networks.py``;
+                ``kind`` (``torchscript`` or ``onnx``) and ``bytes`` (uint8 tensor) for a foreign file carried inside
+``state_dict``  tensors of the network; absent for a foreign file
+==============  =====================================================================================================
+
+Other keys are left alone: a training checkpoint keeps its optimiser there.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import os
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from .base import Policy, PolicyError, PolicySession
+from .contract import ContractError, PolicyContract
+from .networks import ARCHITECTURES
+
+FORMAT = "gaitgauge-policy"
+VERSION = 1
+FOREIGN_KINDS = ("torchscript", "onnx")
+
+# What torch raises for damaged or foreign data, from the archive down to the tensors.
+LOAD_ERRORS = (
+    RuntimeError,
+    pickle.UnpicklingError,
+    EOFError,
+    OSError,
+    ValueError,
+    KeyError,
+    IndexError,
+    TypeError,
+    AttributeError,
+    AssertionError,
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredNetwork:
+    """A network of ``networks.py`` as data."""
+
+    architecture: str
+    """A key of ``ARCHITECTURES``."""
+    arguments: Mapping[str, Any]
+    """Keyword arguments of the architecture, plain JSON data."""
+    state_dict: Mapping[str, torch.Tensor]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ForeignFile:
+    """A policy file of another format, carried unchanged."""
+
+    kind: str
+    """``torchscript`` or ``onnx``."""
+    data: bytes
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PolicyFile:
+    """What a file of the project's own format holds."""
+
+    contract: PolicyContract
+    network: StoredNetwork | ForeignFile
+
+
+def first_line(error: BaseException) -> str:
+    """The first line that says anything of an error's message, for messages of one sentence."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0].rstrip(".") if lines else type(error).__name__
+
+
+def save_policy(
+    path: str | Path,
+    contract: PolicyContract,
+    network: StoredNetwork | ForeignFile,
+    *,
+    extra: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a policy file. The file appears whole or not at all.
+
+    Args:
+        path: conventionally ``model_<iteration>.pt`` for a checkpoint and ``<name>.gauge.pt`` for an import.
+        contract: what the policy expects of the loop that runs it.
+        network: the network.
+        extra: more entries of the file, tensors and plain data only, for example an optimiser's state.
+
+    Raises:
+        PolicyError: ``extra`` uses a name of the format, or the network does not fit the contract.
+    """
+    entries: dict[str, Any] = {"format": FORMAT, "version": VERSION, "contract": contract.to_json()}
+    if isinstance(network, StoredNetwork):
+        build_network(network, contract, source=str(path))
+        arguments = json.dumps(dict(network.arguments))
+        entries["network"] = {"kind": "native", "architecture": network.architecture, "arguments": arguments}
+        entries["state_dict"] = {name: value.detach().to("cpu") for name, value in network.state_dict.items()}
+    else:
+        entries["network"] = {
+            "kind": network.kind,
+            "bytes": torch.frombuffer(bytearray(network.data), dtype=torch.uint8),
+        }
+    taken = entries.keys() & (extra or {}).keys()
+    if taken:
+        raise PolicyError(
+            f"extra entries of a policy file cannot be named {', '.join(sorted(taken))}: the format uses these names"
+        )
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    torch.save({**entries, **(extra or {})}, partial)
+    os.replace(partial, target)
+
+
+def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
+    """Take the parts out of a loaded file's dictionary.
+
+    Args:
+        entries: the dictionary; its ``format`` has been checked.
+        source: name for messages.
+
+    Raises:
+        PolicyError: the file is of another version, incomplete or malformed.
+    """
+    if entries.get("version") != VERSION:
+        raise PolicyError(
+            f"'{source}' has version {entries.get('version')!r} of the policy format; this gaitgauge reads {VERSION}"
+        )
+    text, spec = entries.get("contract"), entries.get("network")
+    if not isinstance(text, str) or not isinstance(spec, Mapping):
+        raise PolicyError(f"'{source}' lacks its contract or network and cannot be used")
+    try:
+        contract = PolicyContract.from_json(text)
+    except ContractError as error:
+        raise PolicyError(f"'{source}' has a malformed contract: {error}") from error
+    kind = spec.get("kind")
+    if kind in FOREIGN_KINDS:
+        data = spec.get("bytes")
+        if not isinstance(data, torch.Tensor) or data.dtype != torch.uint8:
+            raise PolicyError(f"'{source}' says that it carries a {kind} file, but has none")
+        return PolicyFile(contract=contract, network=ForeignFile(kind=kind, data=data.numpy().tobytes()))
+    if kind != "native":
+        raise PolicyError(f"'{source}' has a network of unknown kind {kind!r}")
+    state_dict = entries.get("state_dict")
+    if not isinstance(state_dict, Mapping) or not all(isinstance(v, torch.Tensor) for v in state_dict.values()):
+        raise PolicyError(f"'{source}' has no state_dict of tensors")
+    try:
+        arguments = json.loads(spec.get("arguments", ""))
+    except (json.JSONDecodeError, TypeError) as error:
+        raise PolicyError(f"'{source}' has malformed network arguments: {first_line(error)}") from error
+    architecture = str(spec.get("architecture"))
+    stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=state_dict)
+    return PolicyFile(contract=contract, network=stored)
+
+
+def load_entries(data: bytes, *, source: str) -> Mapping[str, Any]:
+    """Read a ``torch.save`` archive of plain data and tensors, without the ability to run code.
+
+    Raises:
+        PolicyError: damaged, or with anything else inside.
+    """
+    try:
+        entries = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except LOAD_ERRORS as error:
+        raise PolicyError(
+            f"'{source}' is damaged or holds more than tensors and plain data, and was not loaded: {first_line(error)}"
+        ) from error
+    if not isinstance(entries, Mapping):
+        raise PolicyError(f"'{source}' holds a {type(entries).__name__}, not a policy")
+    return entries
+
+
+def build_network(stored: StoredNetwork, contract: PolicyContract, *, source: str) -> nn.Module:
+    """Build a network with its weights and try it on zeros.
+
+    Raises:
+        PolicyError: unknown architecture, wrong arguments, weights that do not fit, or widths other than the
+            contract's.
+    """
+    make = ARCHITECTURES.get(stored.architecture)
+    if make is None:
+        raise PolicyError(
+            f"'{source}' names the unknown network '{stored.architecture}'; known are: {', '.join(ARCHITECTURES)}"
+        )
+    try:
+        network = make(**stored.arguments)
+        network.load_state_dict(dict(stored.state_dict))
+    except LOAD_ERRORS as error:
+        message = " ".join(str(error).split())
+        raise PolicyError(
+            f"'{source}': the weights or arguments do not fit the network '{stored.architecture}': {message}"
+        ) from error
+    network = network.float().eval().requires_grad_(False)
+    if network.frame_width != contract.observation_width:
+        raise PolicyError(
+            f"'{source}': the network takes {network.frame_width} values, "
+            f"but its contract's observation has {contract.observation_width}"
+        )
+    session = NativeSession(network, 1, contract.num_joints, torch.device("cpu"), source)
+    session.act(torch.zeros(1, contract.observation_width))
+    return network
+
+
+class NativePolicy(Policy):
+    """A policy whose network is one of ``networks.py``."""
+
+    def __init__(self, contract: PolicyContract, stored: StoredNetwork, *, path: str) -> None:
+        """Build the network.
+
+        Raises:
+            PolicyError: the network does not fit the contract.
+        """
+        self.contract = contract
+        self.path = path
+        self.stored = stored
+        self.network = build_network(stored, contract, source=path)
+
+    def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
+        """Start work on ``num_episodes`` episodes, with a copy of the network."""
+        network = copy.deepcopy(self.network).to(device)
+        return NativeSession(network, num_episodes, self.contract.num_joints, torch.device(device), self.path)
+
+
+class NativeSession(PolicySession):
+    """Runs a network of ``networks.py`` and keeps its history and state."""
+
+    def __init__(
+        self, network: nn.Module, num_episodes: int, num_joints: int, device: torch.device, source: str
+    ) -> None:
+        """Take over a network on ``device``; ``source`` is its name for messages."""
+        self._network: Any = network
+        self._shape = (num_episodes, num_joints)
+        self._source = source
+        self._history = torch.zeros(num_episodes, network.history_length, network.frame_width, device=device)  # type: ignore[arg-type]
+        self._initial: torch.Tensor | None = None
+        if hasattr(network, "initial_state"):
+            self._initial = self._network.initial_state(num_episodes).to(device)
+            self._state = self._initial.clone()
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """See ``PolicySession``: the history becomes zero, the state initial."""
+        if episodes is None:
+            self._history = torch.zeros_like(self._history)
+            if self._initial is not None:
+                self._state = self._initial.clone()
+            return
+        self._history = self._history.masked_fill(episodes[:, None, None], 0.0)
+        if self._initial is not None:
+            self._state = torch.where(episodes[:, None], self._initial, self._state)
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """See ``PolicySession``."""
+        expected = (self._shape[0], self._history.shape[2])
+        if tuple(observation.shape) != expected:
+            raise PolicyError(
+                f"'{self._source}' takes observations of shape {expected}, not {tuple(observation.shape)}"
+            )
+        self._history = torch.cat((self._history[:, 1:], observation[:, None]), dim=1)
+        with torch.no_grad():
+            try:
+                if self._initial is None:
+                    action = self._network(self._history)
+                else:
+                    action, self._state = self._network(self._history, self._state)
+            except RuntimeError as error:
+                raise PolicyError(f"'{self._source}' failed: {first_line(error)}") from error
+        if tuple(action.shape) != self._shape:
+            raise PolicyError(
+                f"'{self._source}' gives an output of shape {tuple(action.shape)}; "
+                f"{self._shape}, one entry per joint, is needed"
+            )
+        return action

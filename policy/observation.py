@@ -1,0 +1,175 @@
+"""From physics to the network's input and back: the one observation builder that both training and the gauge use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+from ..backends.base import PhysicsState
+from ..robots.base import Robot
+from ..robots.rotation import projected_gravity, rotate_inverse
+from .contract import TERM_WIDTH, ContractError, ObservationTerm, PolicyContract, check_robot
+
+NOISE_TERMS = (
+    "base_linear_velocity_b",
+    "base_angular_velocity_b",
+    "projected_gravity_b",
+    "joint_position",
+    "joint_velocity",
+)
+
+
+class ObservationBuilder:
+    """Builds the observations of N episodes as a policy's contract asks for them, and turns its actions into joint
+    targets.
+
+    Everything stays on one device, has static shapes and never waits for it, so that the steps can be captured in a
+    CUDA graph. Rows do not influence each other.
+    """
+
+    def __init__(
+        self, contract: PolicyContract, robot: Robot, num_episodes: int, device: torch.device | str = "cpu"
+    ) -> None:
+        """Prepare buffers and index maps.
+
+        Args:
+            contract: what the policy expects.
+            robot: the robot whose joint order the physics uses.
+            num_episodes: number of rows N.
+            device: where the physics' tensors live.
+
+        Raises:
+            ContractError: the policy is not for this robot.
+        """
+        index = check_robot(contract, robot)
+        self.contract = contract
+        self.num_episodes = num_episodes
+        self.device = torch.device(device)
+        self._widths = [TERM_WIDTH[t.name] or contract.num_joints for t in contract.observation]
+        identity = tuple(range(contract.num_joints))
+        # An identity map is left out: indexing costs a kernel per term and step.
+        self._robot_joint = None if index == identity else self._tensor(index, torch.int64)
+        inverse = tuple(index.index(j) for j in identity)
+        self._policy_joint = None if index == identity else self._tensor(inverse, torch.int64)
+        self._default = self._tensor(contract.default_joint_position)
+        self._action_scale = self._tensor(contract.action_scale)
+        self._target_range = None if contract.target_range is None else self._tensor(contract.target_range).T
+        self._scale = torch.cat(
+            [self._tensor(t.scale).expand(w) for t, w in zip(contract.observation, self._widths, strict=True)]
+        )
+        limits = [self._tensor(_clip(t)).expand(w) for t, w in zip(contract.observation, self._widths, strict=True)]
+        self._limit = None if all(t.clip is None for t in contract.observation) else torch.cat(limits)
+        self._frames = torch.zeros(num_episodes, contract.history.length, contract.frame_width, device=self.device)
+        self._fresh = torch.ones(num_episodes, dtype=torch.bool, device=self.device)
+
+    def _tensor(self, values: object, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.tensor(values, dtype=dtype, device=self.device)
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """Forget the past frames of the masked episodes, (N,) bool, None for all."""
+        if episodes is None:
+            self._frames.zero_()
+            self._fresh.fill_(True)
+        else:
+            self._frames.masked_fill_(episodes[:, None, None], 0.0)
+            self._fresh.logical_or_(episodes)
+
+    def build(
+        self,
+        state: PhysicsState,
+        command: torch.Tensor,
+        last_action: torch.Tensor,
+        noise: Mapping[str, torch.Tensor] | None = None,
+    ) -> torch.Tensor:
+        """Observations of all episodes. With a history, each call adds one frame to it: call once per control step.
+
+        Commands are not clipped here: which limits hold depends on the terrain, and the caller knows them.
+
+        Args:
+            state: the true state; it is not changed.
+            command: forward, lateral [m/s] and yaw [rad/s] speed, (N, 3).
+            last_action: raw network output of the step before, zeros after a reset, (N, J) in the policy's joint order.
+            noise: added to the measured quantities before scaling, in their own units, by name of the observation term;
+                joints in the robot's order. A history keeps its frames' noise.
+
+        Returns:
+            (N, ``contract.observation_width``) float32, a fresh tensor.
+
+        Raises:
+            ContractError: noise for something that is not measured.
+        """
+        noise = noise or {}
+        if not noise.keys() <= set(NOISE_TERMS):
+            unknown = ", ".join(sorted(noise.keys() - set(NOISE_TERMS)))
+            raise ContractError(f"no noise can be added to '{unknown}'; choose from: {', '.join(NOISE_TERMS)}")
+        blocks = []
+        for term in self.contract.observation:
+            value = self._value(term.name, state, command, last_action, noise.get(term.name))
+            blocks.append(value.to(torch.float32))
+        frame = torch.cat(blocks, dim=-1) * self._scale
+        if self._limit is not None:
+            frame = torch.clamp(frame, -self._limit, self._limit)
+        if self.contract.history.length == 1:
+            return frame
+        return self._with_history(frame)
+
+    def _value(
+        self,
+        name: str,
+        state: PhysicsState,
+        command: torch.Tensor,
+        last_action: torch.Tensor,
+        noise: torch.Tensor | None,
+    ) -> torch.Tensor:
+        """One term in physical units, joints in the policy's order."""
+        if name == "command":
+            return command
+        if name == "last_action":
+            return last_action
+        if name == "base_linear_velocity_b":
+            value = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)
+        elif name == "base_angular_velocity_b":
+            value = state.base_angular_velocity_b
+        elif name == "projected_gravity_b":
+            value = projected_gravity(state.base_quaternion_w)
+        elif name == "joint_position":
+            value = state.joint_position
+        else:
+            value = state.joint_velocity
+        if noise is not None:
+            value = value + noise
+        if name in ("joint_position", "joint_velocity") and self._robot_joint is not None:
+            value = value[:, self._robot_joint]
+        return value - self._default if name == "joint_position" else value
+
+    def _with_history(self, frame: torch.Tensor) -> torch.Tensor:
+        frames = torch.cat((self._frames[:, 1:], frame[:, None]), dim=1)
+        if self.contract.history.start == "repeat":
+            frames = torch.where(self._fresh[:, None, None], frame[:, None].expand_as(frames), frames)
+        self._frames.copy_(frames)
+        self._fresh.fill_(False)
+        order = self.contract.history.order
+        if order == "term-major":
+            return torch.cat([block.flatten(1) for block in frames.split(self._widths, dim=2)], dim=1)
+        if order == "frame-major-newest-first":
+            frames = frames.flip(1)
+        return frames.reshape(self.num_episodes, -1)
+
+    def targets(self, action: torch.Tensor) -> torch.Tensor:
+        """Joint targets [rad] of raw actions, both (N, J): actions in the policy's joint order, targets in the robot's.
+
+        NaN stays NaN.
+        """
+        if self.contract.action_clip is not None:
+            action = torch.clamp(action, -self.contract.action_clip, self.contract.action_clip)
+        target = self._default + self._action_scale * action
+        if self._target_range is not None:
+            target = torch.clamp(target, self._target_range[0], self._target_range[1])
+        return target if self._policy_joint is None else target[:, self._policy_joint]
+
+
+def _clip(term: ObservationTerm) -> tuple[float, ...]:
+    if term.clip is None:
+        return (float("inf"),)
+    return term.clip if isinstance(term.clip, tuple) else (term.clip,)

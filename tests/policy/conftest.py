@@ -1,0 +1,45 @@
+from pathlib import Path
+
+import pytest
+import torch
+from gaitgauge.policy.contract import PolicyContract, go2_contract
+from gaitgauge.policy.native import StoredNetwork, save_policy
+from gaitgauge.policy.networks import CtsNetwork
+from gaitgauge.robots import Robot, load_robot
+
+SMALL_CTS = {"latent_width": 8, "encoder_hidden": [32, 16], "actor_hidden": [32, 16]}
+
+
+@pytest.fixture(scope="session")
+def go2() -> Robot:
+    return load_robot("go2")
+
+
+@pytest.fixture(scope="session")
+def contract(go2: Robot) -> PolicyContract:
+    return go2_contract(go2)
+
+
+@pytest.fixture(scope="session")
+def cts_network() -> CtsNetwork:
+    """A small random CTS network."""
+    torch.manual_seed(0)
+    return CtsNetwork(**SMALL_CTS).eval().requires_grad_(False)
+
+
+@pytest.fixture(scope="session")
+def cts_stored(cts_network: CtsNetwork) -> StoredNetwork:
+    return StoredNetwork(architecture="cts", arguments=SMALL_CTS, state_dict=cts_network.state_dict())
+
+
+@pytest.fixture
+def cts_file(tmp_path: Path, contract: PolicyContract, cts_stored: StoredNetwork) -> Path:
+    path = tmp_path / "cts.gauge.pt"
+    save_policy(path, contract, cts_stored)
+    return path
+
+
+@pytest.fixture(scope="session")
+def observations() -> torch.Tensor:
+    """Random observations of 6 episodes over 12 steps, (12, 6, 45)."""
+    return torch.randn(12, 6, 45, generator=torch.Generator().manual_seed(1))

@@ -1,0 +1,133 @@
+import json
+from dataclasses import replace
+
+import pytest
+from gaitgauge.policy.contract import (
+    ContractError,
+    History,
+    ObservationTerm,
+    PolicyContract,
+    check_robot,
+    difference,
+    go2_contract,
+)
+from gaitgauge.robots import load_robot
+
+GO2_HASH = "a39d917c21f5da0f009218783dcf44cabfcd6e01b12999d81604a0d806afa182"
+
+
+@pytest.fixture(scope="module")
+def contract() -> PolicyContract:
+    return go2_contract(load_robot("go2"))
+
+
+def changed(contract: PolicyContract, **changes: object) -> dict:
+    return {**json.loads(contract.to_json()), **changes}
+
+
+def test_standard_contract_follows_the_published_interface(contract):
+    assert contract.observation_width == contract.frame_width == 45
+    assert contract.action_scale == (0.25,) * 12
+    assert set(contract.stiffness) == {20.0}
+    assert set(contract.damping) == {0.5}
+    assert contract.control_period == 0.02
+    assert contract.command_limits == (2.0, 1.0, 2.0)
+    assert contract.default_joint_position == (0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5)
+    assert go2_contract(load_robot("go2"), history=History(length=5)).observation_width == 225
+
+
+def test_hash_is_stable(contract):
+    # Results and checkpoints bear this digest: it may only change together with the schema version.
+    assert contract.hash == GO2_HASH
+
+
+def test_json_round_trip_keeps_contract_and_hash(contract):
+    again = PolicyContract.from_json(contract.to_json())
+    assert again == contract
+    assert again.hash == contract.hash
+
+
+def test_hash_ignores_provenance_and_number_types(contract):
+    assert replace(contract, provenance={"run": "x"}).hash == contract.hash
+    assert replace(contract, stiffness=(20,) * 12).hash == contract.hash
+    assert replace(contract, stiffness=(21,) * 12).hash != contract.hash
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"stiffness": [20.0] * 11}, "stiffness"),
+        ({"stiffness": [float("nan")] * 12}, "stiffness"),
+        ({"damping": "0.5"}, "damping"),
+        ({"action_scale": [True] * 12}, "action_scale"),
+        ({"control_period": 0}, "control_period"),
+        ({"command_limits": [1, 1]}, "command_limits"),
+        ({"joint_names": ["a"] * 12}, "joint_names"),
+        ({"joint_names": "FL_hip_joint"}, "joint_names"),
+        ({"robot": 3}, "robot"),
+        ({"schema_version": 2}, "schema_version"),
+        ({"observation": []}, "observation"),
+        ({"observation": [{"name": "smell", "scale": [1.0]}]}, "smell"),
+        ({"observation": [{"name": "command", "scale": [1.0, 2.0]}]}, "observation.command.scale"),
+        ({"observation": [{"name": "command"}]}, "scale"),
+        ({"observation": [{"name": "command", "scale": [1.0], "weight": 1}]}, "weight"),
+        ({"observation": [{"name": "command", "scale": [1.0], "clip": -1}]}, "observation.command.clip"),
+        ({"observation": [{"name": "command", "scale": [1.0]}] * 2}, "twice"),
+        ({"history": {"length": 0}}, "history.length"),
+        ({"history": {"order": "upwards"}}, "history.order"),
+        ({"history": {"start": "ones"}}, "history.start"),
+        ({"history": 5}, "history"),
+        ({"target_range": [[-1.0, 1.0]]}, "target_range"),
+        ({"gains": 1}, "gains"),
+        ({"provenance": "me"}, "provenance"),
+    ],
+)
+def test_malformed_contracts_are_refused_by_name(contract, changes, named):
+    with pytest.raises(ContractError, match=named) as caught:
+        PolicyContract.from_dict(changed(contract, **changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_field_and_bad_json(contract):
+    data = changed(contract)
+    del data["damping"]
+    with pytest.raises(ContractError, match="'damping' is missing"):
+        PolicyContract.from_dict(data)
+    with pytest.raises(ContractError, match="JSON"):
+        PolicyContract.from_json("{")
+    with pytest.raises(ContractError, match="table"):
+        PolicyContract.from_json("[]")
+
+
+def test_check_robot_gives_the_joint_map(contract):
+    robot = load_robot("go2")
+    assert check_robot(contract, robot) == tuple(range(12))
+    order = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
+    permuted = replace(contract, joint_names=tuple(robot.joint_names[i] for i in order))
+    assert check_robot(permuted, robot) == order
+
+
+def test_check_robot_refuses_other_joints_and_robots(contract):
+    robot = load_robot("go2")
+    renamed = replace(contract, joint_names=("tail", *contract.joint_names[1:]))
+    with pytest.raises(ContractError, match=r"tail.*FL_hip_joint"):
+        check_robot(renamed, robot)
+    with pytest.raises(ContractError, match="'a1'"):
+        check_robot(replace(contract, robot="a1"), robot)
+
+
+def test_difference_names_the_fields(contract):
+    assert difference(contract, replace(contract, provenance={"run": "x"})) == ""
+    other = replace(
+        contract,
+        control_period=0.01,
+        history=History(length=5),
+        observation=(*contract.observation[:-1], ObservationTerm(name="last_action", scale=(2.0,))),
+    )
+    lines = difference(contract, other).splitlines()
+    assert sorted(line.partition(":")[0] for line in lines) == [
+        "control_period",
+        "history.length",
+        "observation.last_action.scale",
+    ]
+    assert "control_period: 0.02 -> 0.01" in lines

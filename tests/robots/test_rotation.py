@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+import torch
+from gaitgauge.robots import rotation
+from scipy.spatial.transform import Rotation
+
+
+@pytest.fixture
+def sample() -> tuple[Rotation, torch.Tensor, torch.Tensor]:
+    generator = np.random.default_rng(0)
+    turns = Rotation.random(50, rng=generator)
+    quaternions = torch.from_numpy(turns.as_quat(scalar_first=True))
+    return turns, quaternions, torch.from_numpy(generator.normal(size=(50, 3)))
+
+
+def test_rotate_and_back(sample):
+    turns, quaternions, vectors = sample
+    np.testing.assert_allclose(rotation.rotate(quaternions, vectors), turns.apply(vectors), atol=1e-12)
+    np.testing.assert_allclose(rotation.rotate_inverse(quaternions, vectors), turns.inv().apply(vectors), atol=1e-12)
+
+
+def test_rotate_broadcasts_over_points_of_a_body(sample):
+    turns, quaternions, vectors = sample
+    points = vectors[:4]
+    rotated = rotation.rotate(quaternions[:, None], points)
+    assert rotated.shape == (50, 4, 3)
+    np.testing.assert_allclose(rotated[7], turns[7].apply(points), atol=1e-12)
+
+
+def test_products_and_conjugates(sample):
+    turns, quaternions, _ = sample
+    product = rotation.multiply(quaternions[:25], quaternions[25:])
+    assert _same(product, turns[:25] * turns[25:])
+    assert _same(rotation.conjugate(quaternions), turns.inv())
+
+
+def test_euler_angles_and_yaw():
+    angles = torch.tensor([[0.3, -0.7, 2.9], [-1.0, 0.2, -3.0], [0.0, 0.0, 0.5]], dtype=torch.float64)
+    made = rotation.from_euler(*angles.unbind(1))
+    assert _same(made, Rotation.from_euler("xyz", angles.numpy()))
+    np.testing.assert_allclose(rotation.yaw_of(made), angles[:, 2], atol=1e-12)
+    assert _same(rotation.from_yaw(angles[:, 2]), Rotation.from_euler("z", angles[:, 2:].numpy()))
+
+
+def test_gravity_and_tilt(sample):
+    turns, quaternions, _ = sample
+    np.testing.assert_allclose(rotation.projected_gravity(quaternions), turns.inv().apply([0, 0, -1.0]), atol=1e-12)
+    np.testing.assert_allclose(rotation.tilt(quaternions), np.arccos(turns.apply([0, 0, 1.0])[:, 2]), atol=1e-7)
+
+
+def test_tilt_is_precise_near_upright_in_single_precision():
+    angle = torch.tensor([1e-3, 1e-4, torch.pi - 1e-3])
+    made = rotation.from_euler(angle, torch.zeros(3), torch.zeros(3))
+    np.testing.assert_allclose(rotation.tilt(made), angle, rtol=1e-3, atol=1e-6)
+
+
+def _same(quaternions: torch.Tensor, turns: Rotation) -> bool:
+    expected = turns.as_quat(scalar_first=True)
+    signs = np.sign(np.sum(expected * quaternions.numpy(), axis=-1, keepdims=True))
+    return np.allclose(quaternions.numpy() * signs, expected, atol=1e-12)
