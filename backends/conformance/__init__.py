@@ -4,14 +4,14 @@
 The expected values come from plain MuJoCo (C) loops and closed formulas in ``reference``, never from another engine of this package.
 """
 
-from .bench import Bench, Mismatch
+from .bench import Bench, ConformanceError
 from .suite import Check, CheckResult, Outcome, all_checks, run_check, run_conformance
 
 __all__ = [
     "Bench",
     "Check",
     "CheckResult",
-    "Mismatch",
+    "ConformanceError",
     "Outcome",
     "all_checks",
     "run_check",

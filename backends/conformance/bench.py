@@ -21,14 +21,14 @@ WORLDS = 4
 """Number of worlds in nearly every scene, so that an engine that compiles for sizes compiles once."""
 
 
-class Mismatch(AssertionError):
+class ConformanceError(AssertionError):
     """An engine does something else than the contract says; the message gives both values."""
 
 
 def expect(condition: bool, message: str) -> None:
-    """Raise ``Mismatch`` with the message unless the condition holds."""
+    """Raise ``ConformanceError`` with the message unless the condition holds."""
     if not condition:
-        raise Mismatch(message)
+        raise ConformanceError(message)
 
 
 def expect_close(what: str, actual: ArrayLike, expected: ArrayLike, tolerance: ArrayLike) -> float:
@@ -44,7 +44,7 @@ def expect_close(what: str, actual: ArrayLike, expected: ArrayLike, tolerance: A
         The largest difference.
 
     Raises:
-        Mismatch: a value is not finite or too far off.
+        ConformanceError: a value is not finite or too far off.
     """
     found = np.asarray(actual, dtype=np.float64)
     wanted = np.broadcast_to(np.asarray(expected, dtype=np.float64), found.shape)
@@ -56,7 +56,7 @@ def expect_close(what: str, actual: ArrayLike, expected: ArrayLike, tolerance: A
         excess = np.where(np.isnan(error), np.inf, error - allowed)
         worst = np.unravel_index(int(np.argmax(excess)), excess.shape)
         at = "" if not worst else f" at {tuple(int(i) for i in worst)}"
-        raise Mismatch(
+        raise ConformanceError(
             f"{what}: {found[worst]:.6g} instead of {wanted[worst]:.6g}{at}; "
             f"off by {error[worst]:.3g}, allowed {allowed[worst]:.3g}"
         )

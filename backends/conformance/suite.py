@@ -39,7 +39,7 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One check. Its ``run`` raises ``Mismatch`` where the engine breaks the contract and returns what it measured, for the table."""
+    """One check. Its ``run`` raises ``ConformanceError`` where the engine breaks the contract and returns what it measured, for the table."""
 
     name: str
     """Room and subject, for example ``motors/latency``."""
@@ -81,7 +81,7 @@ def check(name: str, *needs: str) -> Callable[[Callable[[Bench], str]], Callable
 
 def all_checks() -> tuple[Check, ...]:
     """All checks in the order in which they run: what everything else rests on comes first."""
-    from . import kinematics, motors, stepping, health, refusal  # noqa: F401, I001
+    from . import kinematics, motors, stepping, health, contact, ground, friction, model, disturbance, refusal  # noqa: F401, I001
 
     return tuple(_CHECKS.values())
 

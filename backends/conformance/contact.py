@@ -1,0 +1,157 @@
+"""Checks of what is reported about contacts at rest: forces add up to the weight, moments to the centre of mass."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from .bench import Bench, Worlds, expect, expect_close
+from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, level_stance
+from .suite import check
+
+
+def stand_still(bench: Bench, worlds: Worlds, *, seconds: float = 0.5, **start: Any) -> SimpleNamespace:
+    """Put stiff robots on their feet, each with another heading, let them come to rest and read the state.
+
+    Args:
+        bench: the bench.
+        worlds: worlds with ``Bench.stiff()`` joints.
+        seconds: time to come to rest [s].
+        start: ``ground``, height of the ground below each robot [m], (N,); ``xy``, its place [m], (N, 2); ``turn``, turns of the
+            whole robot about its feet's plane, quaternions (N, 4), instead of the headings; the rest goes to ``Worlds.reset``.
+    """
+    stance = level_stance(Reference(bench.robot, worlds.backend.scene.parameters))
+    ground = np.broadcast_to(start.pop("ground", 0.0), (worlds.count,))
+    xy = np.broadcast_to(start.pop("xy", (0.0, 0.0)), (worlds.count, 2))
+    headings = np.array([axis_angle((0.0, 0.0, 1.0), a) for a in np.linspace(0.0, 2.5, worlds.count)])
+    turns = start.pop("turn", headings)
+    worlds.reset(
+        base_position=np.c_[xy, ground + stance.height],
+        base_quaternion=np.array([composed(turn, stance.quaternion) for turn in turns]),
+        held_target=worlds.default_pose,
+        **start,
+    )
+    worlds.run(seconds)
+    return worlds.read()
+
+
+def pressure_point(state: SimpleNamespace) -> np.ndarray:
+    """Where the ground force acts at the height of the contact centre, (N, 2) [m], from force and moment."""
+    force, moment, center = state.ground_force_w, state.ground_moment_w, state.contact_center_w
+    shift = np.stack([-moment[:, 1], moment[:, 0]], axis=1) / force[:, 2:3]
+    return center[:, :2] + shift
+
+
+def centers_of_mass(
+    bench: Bench, worlds: Worlds, state: SimpleNamespace, changes: list[dict[str, Any]] | None = None
+) -> np.ndarray:
+    """The reference's centre of mass in each world's present pose, (N, 3) [m]; ``changes`` as in ``Reference.change``."""
+    found = []
+    for row in range(worlds.count):
+        reference = Reference(bench.robot, worlds.backend.scene.parameters)
+        if changes is not None:
+            reference.change(**changes[row])
+        reference.place(state.base_position_w[row], state.base_quaternion_w[row], state.joint_position[row])
+        found.append(reference.center_of_mass)
+    return np.array(found)
+
+
+@check("contact/rest", "contact_forces", "plane")
+def rest(bench: Bench) -> str:
+    """A standing robot presses on the ground with its weight and nothing else, and stands at the height of its legs."""
+    with bench.worlds(bench.stiff()) as worlds:
+        state = stand_still(bench, worlds)
+        reference = Reference(bench.robot, bench.stiff())
+        weight = reference.mass * GRAVITY
+        expected = np.tile([0.0, 0.0, weight], (worlds.count, 1))
+        bound = bench.bound("contact_forces", exact=0.01, approximate=0.05) * weight
+        error = expect_close("ground_force_w of a standing robot [N]", state.ground_force_w, expected, bound)
+        expect_close("base velocity at rest [m/s]", state.base_linear_velocity_w, 0.0, 0.01)
+        expect_close("joint velocity at rest [rad/s]", state.joint_velocity, 0.0, 0.05)
+        feet = state.foot_position_w[..., 2]
+        expect_close("height of the foot centres [m]", feet, reference.foot_radius, 0.004)
+        expect(not state.overflowed.any() and not state.diverged.any(), "a standing robot overflows or diverges")
+    return f"weight {weight:.2f} N to {error:.1e} N, feet sink {1e3 * (reference.foot_radius - feet.min()):.2f} mm"
+
+
+@check("contact/feet", "contact_forces", "plane")
+def feet(bench: Bench) -> str:
+    """Foot forces, normal and tangential forces, body forces and the number of contacts fit the net ground force."""
+    with bench.worlds(bench.stiff()) as worlds:
+        state = stand_still(bench, worlds)
+        force, weight = state.foot_contact_force_w, Reference(bench.robot, bench.stiff()).mass * GRAVITY
+        bound = 0.01 * weight
+        expect_close(
+            "sum of foot_contact_force_w against ground_force_w [N]", force.sum(1), state.ground_force_w, bound
+        )
+        expect_close("foot_normal_force against the vertical [N]", state.foot_normal_force, force[..., 2], bound)
+        horizontal = np.linalg.norm(force[..., :2], axis=-1)
+        expect_close("foot_tangential_force against the horizontal [N]", state.foot_tangential_force, horizontal, bound)
+        expect(
+            bool((force[..., 2] > 0.05 * weight).all()),
+            f"a foot of a standing robot carries {force[..., 2].min():.3g} N",
+        )
+        expect_close("body_contact_force_w of a robot on its feet [N]", state.body_contact_force_w, 0.0, 1e-3)
+        expect_close("contact_count on four spheres", state.contact_count, len(bench.robot.foot_names), 0)
+    return f"{force[..., 2].min():.1f} to {force[..., 2].max():.1f} N a foot"
+
+
+@check("contact/moment", "contact_forces", "plane")
+def moment(bench: Bench) -> str:
+    """The ground moment is about the mean contact point, and puts the pressure below the centre of mass of a robot at rest."""
+    with bench.worlds(bench.stiff()) as worlds:
+        state = stand_still(bench, worlds, xy=[[0.0, 0.0], [0.8, 0.0], [0.0, -0.7], [1.0, 1.0]])
+        radius = Reference(bench.robot, bench.stiff()).foot_radius
+        points = state.foot_position_w - [0.0, 0.0, radius]
+        expect_close("contact_center_w [m]", state.contact_center_w, points.mean(1), 0.005)
+        arms = points - state.contact_center_w[:, None, :]
+        expected = np.cross(arms, state.foot_contact_force_w).sum(1)
+        # rolling and torsional friction of six-dimensional contacts add moments of their own
+        expect_close("ground_moment_w against the feet's forces [N·m]", state.ground_moment_w, expected, 1.0)
+        found, below = pressure_point(state), centers_of_mass(bench, worlds, state)[:, :2]
+        error = expect_close("pressure point against the centre of mass [m]", found, below, 0.004)
+    return f"pressure point below the centre of mass to {1e3 * error:.2f} mm"
+
+
+@check("contact/bodies", "contact_forces", "plane")
+def bodies(bench: Bench) -> str:
+    """A robot on its back: body and foot forces add up to the ground force, which is the weight; the base carries some of it."""
+    with bench.worlds(bench.stiff()) as worlds:
+        turned = np.array(
+            [composed(axis_angle((0, 0, 1), a), [0.0, 1.0, 0.0, 0.0]) for a in np.linspace(0, 2, worlds.count)]
+        )
+        reference = Reference(bench.robot, bench.stiff())
+        position = np.tile([0.0, 0.0, back_height(reference)], (worlds.count, 1))
+        worlds.reset(base_position=position, base_quaternion=turned, held_target=worlds.default_pose)
+        worlds.run(0.8)
+        state = worlds.read()
+        weight = reference.mass * GRAVITY
+        total = state.body_contact_force_w.sum(1) + state.foot_contact_force_w.sum(1)
+        expect_close(
+            "sum of body and foot forces against ground_force_w [N]", total, state.ground_force_w, 0.01 * weight
+        )
+        expected = np.tile([0.0, 0.0, weight], (worlds.count, 1))
+        expect_close("ground_force_w of a robot on its back [N]", state.ground_force_w, expected, 0.03 * weight)
+        expect_close("foot_contact_force_w of feet in the air [N]", state.foot_contact_force_w, 0.0, 1e-3)
+        base = bench.robot.collision_bodies.index(bench.robot.base_body)
+        share = state.body_contact_force_w[:, base, 2] / weight
+        expect(
+            bool((share > 0.1).all()), f"the base of a robot on its back carries only {share.min():.0%} of the weight"
+        )
+        expect_close("turn of a robot on its back [rad]", angle_between(state.base_quaternion_w, turned), 0.0, 0.4)
+    return f"the base carries {share.min():.0%} to {share.max():.0%}"
+
+
+def back_height(reference: Reference, *, clearance: float = 0.001) -> float:
+    """Height of the base origin at which a robot on its back, in its default pose, just does not touch the ground [m]."""
+    reference.place((0.0, 0.0, 0.0))
+    model, data = reference.model, reference.data
+    top = 0.0
+    for geom in range(model.ngeom):
+        if model.geom_contype[geom] or model.geom_conaffinity[geom]:
+            center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            up = data.geom_xmat[geom].reshape(3, 3)[2]
+            top = max(top, float(data.geom_xpos[geom, 2] + up @ center + np.abs(up) @ half))
+    return top + clearance

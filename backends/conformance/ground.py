@@ -1,0 +1,152 @@
+"""Checks of the ground: boxes, turned boxes, height fields, walls, and worlds that differ."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...terrains.base import Box, HeightField, Terrain
+from .bench import Bench, expect, expect_close
+from .contact import stand_still
+from .reference import GRAVITY, Reference, axis_angle, level_stance
+from .suite import check
+
+PITCH = 0.2
+"""Slope of the inclined box [rad]."""
+
+
+def _box(name: str, *boxes: Box) -> Terrain:
+    return Terrain(name=f"conformance_{name}", family="boxes", boxes=boxes)
+
+
+def incline(angle: float, *, name: str = "incline") -> Terrain:
+    """A box whose top goes through (0, 0, 0.8) and rises towards -x by ``angle`` [rad]: a turn about +y."""
+    half = (2.0, 1.5, 0.1)
+    center = (-half[2] * float(np.sin(angle)), 0.0, 0.8 - half[2] * float(np.cos(angle)))
+    w, x, y, z = axis_angle((0.0, 1.0, 0.0), angle)
+    return _box(name, Box(center=center, half_size=half, quaternion=(float(w), float(x), float(y), float(z))))
+
+
+FLOOR = _box("floor")
+PLATFORM = _box("platform", Box(center=(0.0, 0.0, 0.25), half_size=(1.0, 1.0, 0.05)))
+# Turned by a right angle it is long in y; taken unturned it would leave nothing to stand on at y = 1.2.
+PLANK = _box(
+    "plank",
+    Box(center=(0.0, 0.0, 0.1), half_size=(2.0, 0.45, 0.1), quaternion=(0.70710678, 0.0, 0.0, 0.70710678)),
+    Box(center=(3.0, 0.0, 0.4), half_size=(0.2, 0.2, 0.4)),
+)
+PALETTE = (FLOOR, PLATFORM, PLANK, incline(PITCH))
+PLACES = np.array([[0.0, 0.0], [0.5, -0.4], [0.0, 1.2], [0.0, 0.0]])
+"""Where the robots stand on the terrains of ``PALETTE``."""
+
+
+def _standing_height(bench: Bench) -> float:
+    return level_stance(Reference(bench.robot, bench.stiff())).height
+
+
+@check("ground/boxes", "boxes", "per_world_terrain")
+def boxes(bench: Bench) -> str:
+    """Every world has its own boxes where the terrain says, turned ones included; robots stand on them at their height."""
+    with bench.worlds(bench.stiff(), terrains=PALETTE, terrain_index=(0, 1, 2, 3)) as worlds:
+        heights = np.array([float(t.height(x, y)) for t, (x, y) in zip(PALETTE, PLACES, strict=True)])
+        turns = np.array([axis_angle((0.0, 1.0, 0.0), PITCH if row == 3 else 0.0) for row in range(worlds.count)])
+        # a robot that leans with the slope starts a little higher, as its feet's plane goes through the slope's surface
+        lift = np.array([0.0, 0.0, 0.0, _standing_height(bench) * (np.cos(PITCH) - 1.0)])
+        xy = PLACES + np.array([[0.0, 0.0]] * 3 + [[_standing_height(bench) * np.sin(PITCH), 0.0]])
+        if bench.supports("friction"):
+            worlds.randomize(friction=np.ones(worlds.count))
+        state = stand_still(bench, worlds, seconds=0.4, xy=xy, ground=heights + lift, turn=turns)
+        reference = Reference(bench.robot, bench.stiff())
+        for row, terrain in enumerate(PALETTE):
+            x, y, z = state.foot_position_w[row].T
+            rise = reference.foot_radius / np.cos(PITCH if row == 3 else 0.0)
+            expect_close(f"foot height on terrain {terrain.name} [m]", z, terrain.height(x, y) + rise, 0.004)
+            drift = float(np.linalg.norm(state.base_position_w[row, :2] - xy[row]))
+            expect(drift < 0.02, f"a standing robot on terrain {terrain.name} drifts by {drift:.3f} m")
+        if bench.supports("contact_forces"):
+            weight = reference.mass * GRAVITY
+            expected = np.tile([0.0, 0.0, weight], (worlds.count, 1))
+            expect_close("ground_force_w on boxes [N]", state.ground_force_w, expected, 0.03 * weight)
+            normal = state.foot_normal_force[3].sum()
+            expect_close("sum of foot_normal_force on the incline [N]", normal, weight * np.cos(PITCH), 0.03 * weight)
+    return f"heights {', '.join(f'{h:.2f}' for h in heights)} m"
+
+
+@check("ground/switch", "boxes", "per_world_terrain")
+def switch(bench: Bench) -> str:
+    """A reset moves a world to another terrain of the palette; the others keep theirs."""
+    with bench.worlds(bench.stiff(), terrains=PALETTE, terrain_index=(0, 1, 0, 1)) as worlds:
+        stand_still(bench, worlds, seconds=0.1, ground=np.array([0.0, 0.3, 0.0, 0.3]))
+        chosen = np.array([True, True, False, False])
+        index, ground = np.array([1, 0, 3, 3]), np.array([0.3, 0.0, 0.0, 0.3])
+        state = stand_still(bench, worlds, seconds=0.3, worlds=chosen, ground=ground, terrain_index=index)
+        stance = _standing_height(bench)
+        expect_close("base height above the new ground [m]", state.base_position_w[:, 2], ground + stance, 0.006)
+        keep = np.array([1, 0, 0, 1])
+        state = stand_still(bench, worlds, seconds=0.2, ground=ground)
+        expect_close("base height after another reset [m]", state.base_position_w[:, 2], 0.3 * keep + stance, 0.006)
+    return ""
+
+
+def terraces() -> Terrain:
+    """A height field of four level terraces, one in each quadrant, all of another height, none at 0."""
+    x, y = np.meshgrid(np.linspace(-3.0, 3.0, 61), np.linspace(-2.0, 2.0, 41))
+    ahead = np.where(y > 0.0, 0.20, 0.05)
+    behind = np.where(y > 0.0, 0.15, 0.10)
+    field = HeightField(center=(0.5, 0.25), half_size=(3.0, 2.0), heights=np.where(x > 0.0, ahead, behind))
+    return Terrain(name="conformance_terraces", family="field", height_field=field)
+
+
+def ramp_field() -> Terrain:
+    """A height field that rises along +x and, half as much, along +y."""
+    x, y = np.meshgrid(np.linspace(-3.0, 3.0, 61), np.linspace(-2.0, 2.0, 41))
+    heights = 0.5 + 0.12 * x + 0.06 * y
+    field = HeightField(center=(0.5, 0.25), half_size=(3.0, 2.0), heights=heights)
+    return Terrain(name="conformance_ramp", family="field", height_field=field)
+
+
+@check("ground/height_field", "height_field", "per_world_terrain")
+def height_field(bench: Bench) -> str:
+    """Height fields lie as the terrain says: rows along +y, columns along +x, heights in metres."""
+    places = np.array([[2.0, 1.25], [2.0, -0.75], [-1.0, 1.25], [0.5, 0.25]])
+    terrains, index = (terraces(), ramp_field()), (0, 0, 0, 1)
+    with bench.worlds(bench.stiff(), terrains=terrains, terrain_index=index) as worlds:
+        if bench.supports("friction"):
+            worlds.randomize(friction=np.ones(worlds.count))
+        heights = np.array([float(terrains[i].height(x, y)) for i, (x, y) in zip(index, places, strict=True)])
+        slope = np.array([0.0, 0.0, 0.0, np.arctan(np.hypot(0.12, 0.06))])
+        # the turn that lays the robot along the ramp: about the horizontal line across its direction of ascent
+        turns = np.array([axis_angle((0.06, -0.12, 0.0), float(a)) for a in slope])
+        stance = _standing_height(bench)
+        across = np.array([-0.12, -0.06, 1.0]) / np.linalg.norm([0.12, 0.06, 1.0])
+        xy = places + np.array([[0.0, 0.0]] * 3 + [stance * across[:2]])
+        lift = stance * (np.cos(slope) - 1.0)
+        state = stand_still(bench, worlds, seconds=0.4, xy=xy, ground=heights + lift, turn=turns)
+        reference = Reference(bench.robot, bench.stiff())
+        for row in range(worlds.count):
+            x, y, z = state.foot_position_w[row].T
+            rise = reference.foot_radius / np.cos(slope[row])
+            ground = terrains[index[row]].height(x, y)
+            expect_close(f"foot height in world {row} on a height field [m]", z, ground + rise, 0.005)
+        if bench.supports("contact_forces"):
+            weight = reference.mass * GRAVITY
+            expected = np.tile([0.0, 0.0, weight], (worlds.count, 1))
+            expect_close("ground_force_w on height fields [N]", state.ground_force_w, expected, 0.05 * weight)
+    return f"heights {', '.join(f'{h:.2f}' for h in heights)} m"
+
+
+@check("ground/walls", "boxes")
+def walls(bench: Bench) -> str:
+    """A wall stops a sliding robot."""
+    wall = Box(center=(1.25, 0.0, 1.0), half_size=(0.25, 2.0, 1.0), wall=True)
+    terrain = Terrain(name="conformance_wall", family="wall", boxes=(wall,))
+    with bench.worlds(bench.stiff(), terrains=(terrain,)) as worlds:
+        if bench.supports("friction"):
+            worlds.randomize(friction=np.full(worlds.count, 0.1))
+        velocity = np.tile([1.5, 0.0, 0.0], (worlds.count, 1))
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (worlds.count, 1))
+        state = stand_still(bench, worlds, seconds=0.6, turn=turns, xy=[0.3, 0.0], base_linear_velocity=velocity)
+        x = state.base_position_w[:, 0]
+        expect(bool((x < 1.0).all()), f"the base is {x.max() - 1.0:.3f} m inside of the wall or beyond it")
+        expect(bool((x > 0.3).all()), f"the base was to slide to the wall, but is at x = {x.min():.3f} m")
+        expect(not state.diverged.any(), "a robot that runs into a wall diverges")
+    return f"stopped {1.0 - x.max():.2f} m before the wall's face"
