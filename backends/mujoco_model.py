@@ -16,8 +16,8 @@ CONTACT_SLOTS = 12
 """Ground contacts reported one by one, the strongest first; a robot that lies flat has about this many."""
 FOOT_SLOTS = 3
 """Contacts reported one by one for each foot."""
-PARKED = (0.0, 0.0, -100.0)
-"""Where unused boxes wait."""
+PARKED = {"size": [0.01, 0.01, 0.01], "pos": [0.0, 0.0, -1.0], "contype": 0, "conaffinity": 0}
+"""Unused boxes of a layout: they meet nothing."""
 
 
 def robot_spec(scene: Scene) -> mujoco.MjSpec:
@@ -44,7 +44,10 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
         joint.damping = np.array([constants.joint_damping[j], 0.0, 0.0])
         joint.frictionloss = constants.friction_loss[j]
     _set_motors(spec, scene)
-    for geom in spec.geoms:
+    for geom in list(spec.geoms):
+        if not (geom.contype or geom.conaffinity):
+            spec.delete(geom)  # visual only: costs time in every step
+            continue
         if geom.name in robot.foot_names and physics.foot_condim is not None:
             geom.condim = physics.foot_condim
         if not physics.self_collision and (geom.contype or geom.conaffinity):
@@ -73,30 +76,30 @@ def _set_motors(spec: mujoco.MjSpec, scene: Scene) -> None:
             motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
 
-def add_terrain(spec: mujoco.MjSpec, terrain: Terrain, *, box_slots: int, field_shape: tuple[int, int] | None) -> None:
+def add_terrain(
+    spec: mujoco.MjSpec, terrain: Terrain, *, walls: int, blocks: int, field_shape: tuple[int, int] | None
+) -> None:
     """Add the ground of one world.
 
     Args:
         spec: the robot's model.
         terrain: what to add.
-        box_slots: number of box geoms in the layout, at least as many as the terrain has; the rest is parked out of reach.
-        field_shape: (rows, columns) of the layout's height field, None for none. A terrain without one gets a parked one.
+        walls: number of walls in the layout, at least as many as the terrain has; the rest meets nothing.
+        blocks: the same for the other boxes.
+        field_shape: (rows, columns) of the layout's height field, None for none. A terrain without one gets one that
+            meets nothing.
     """
     environment = spec.worldbody.add_body(name="environment")
     ground = environment.add_body(name="ground")
     ground.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
     body = environment.add_body(name="terrain")
-    walls = [b for b in terrain.boxes if b.wall]
-    blocks = [b for b in terrain.boxes if not b.wall]
-    for i, box in enumerate(walls):
-        ground.add_geom(name=f"wall_{i}", type=mujoco.mjtGeom.mjGEOM_BOX, size=box.half_size, pos=box.center, quat=box.quaternion)
-    for i in range(box_slots - len(walls)):
-        if i < len(blocks):
-            box = blocks[i]
-            place = {"size": box.half_size, "pos": box.center, "quat": box.quaternion}
-        else:
-            place = {"size": [0.01, 0.01, 0.01], "pos": PARKED, "contype": 0, "conaffinity": 0}
-        body.add_geom(name=f"box_{i}", type=mujoco.mjtGeom.mjGEOM_BOX, **place)
+    for parent, label, slots, wall in ((ground, "wall", walls, True), (body, "box", blocks, False)):
+        boxes = [b for b in terrain.boxes if b.wall == wall]
+        for i in range(slots):
+            place = PARKED
+            if i < len(boxes):
+                place = {"size": boxes[i].half_size, "pos": boxes[i].center, "quat": boxes[i].quaternion}
+            parent.add_geom(name=f"{label}_{i}", type=mujoco.mjtGeom.mjGEOM_BOX, **place)
     if field_shape is not None:
         field = terrain.height_field
         heights = np.zeros(field_shape) if field is None else field.heights
@@ -105,7 +108,7 @@ def add_terrain(spec: mujoco.MjSpec, terrain: Terrain, *, box_slots: int, field_
         half = (1.0, 1.0) if field is None else field.half_size
         hfield.size = np.array([half[0], half[1], top, 0.1 if field is None else field.base])
         hfield.userdata = (heights / top).astype(np.float32).ravel()
-        place = {"pos": [*field.center, 0.0]} if field is not None else {"pos": PARKED, "contype": 0, "conaffinity": 0}
+        place = {"pos": [*field.center, 0.0]} if field is not None else {"contype": 0, "conaffinity": 0}
         body.add_geom(name="field", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field", **place)
 
 
@@ -150,14 +153,12 @@ def build_models(scene: Scene) -> list[mujoco.MjModel]:
             f"the height fields of one scene must have the same number of nodes, but have {sorted(fields)}; use one scene for each"
         )
     shape = next(iter(fields), None)
-    slots = max(len(t.boxes) for t in scene.terrains)
-    walls = {sum(b.wall for b in t.boxes) for t in scene.terrains}
-    if len(walls) > 1:
-        raise BackendError(f"the terrains of one scene must have the same number of walls, but have {sorted(walls)}")
+    walls = max(sum(b.wall for b in t.boxes) for t in scene.terrains)
+    blocks = max(sum(not b.wall for b in t.boxes) for t in scene.terrains)
     models = []
     for terrain in scene.terrains:
         spec = robot_spec(scene)
-        add_terrain(spec, terrain, box_slots=slots, field_shape=shape)
+        add_terrain(spec, terrain, walls=walls, blocks=blocks, field_shape=shape)
         add_report_sensors(spec, scene)
         try:
             models.append(spec.compile())

@@ -1,0 +1,151 @@
+"""Random numbers of the episodes: observation noise and action latency, independent of batch order, device and threads."""
+
+from __future__ import annotations
+
+import random
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+
+from .episodes import Episode
+from .suite import Noise
+
+
+class NoiseStream(ABC):
+    """Draws for K episodes at work: half widths times uniform numbers in [-1, 1), and delays."""
+
+    @abstractmethod
+    def assign(self, slot: int, episode: Episode) -> None:
+        """Start an episode's stream in a slot."""
+
+    def reserve(self, steps: int) -> None:
+        """Be ready for episodes of ``steps`` control steps."""
+
+    @abstractmethod
+    def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Noise by observation term and delay [substeps] of every slot.
+
+        Args:
+            step: number of control steps that each episode has behind it, (K,) int64.
+
+        Returns:
+            ``{term: (K, width)}`` in physical units, and (K,) int64.
+        """
+
+
+class ReferenceStream(NoiseStream):
+    """Python's generator seeded with the episode's seed, drawn in the published order (gauge protocol §4).
+
+    A control step draws uniform numbers for joint positions, joint velocities, base and imu linear velocity and base and
+    imu angular velocity (all in that order), then one whole number for the delay, whatever the episode does. Episodes of
+    one seed therefore share one table.
+    """
+
+    def __init__(self, noise: Noise, joints: int, slots: int, device: torch.device) -> None:
+        self._noise, self._joints, self._device = noise, joints, device
+        self._seeds: list[int] = []
+        self._generators: list[random.Random] = []
+        self._length = 0
+        self._widths = 2 * joints + 12
+        self._uniform = torch.zeros(0, 0, self._widths, device=device)
+        self._delays = torch.zeros(0, 0, dtype=torch.int64, device=device)
+        self._row = torch.zeros(slots, dtype=torch.int64, device=device)
+        half = [noise.joint_position] * joints + [noise.joint_velocity] * joints + [0.05] * 3
+        half += [noise.base_angular_velocity] * 3 + [0.05] * 3 + [noise.base_angular_velocity] * 3
+        self._half = half
+
+    def assign(self, slot: int, episode: Episode) -> None:
+        """See ``NoiseStream.assign``."""
+        if episode.seed not in self._seeds:
+            self._seeds.append(episode.seed)
+            self._generators = [random.Random(s) for s in self._seeds]
+            length, self._length = self._length, 0
+            self._uniform = self._uniform.new_zeros(len(self._seeds), 0, self._widths)
+            self._delays = self._delays.new_zeros(len(self._seeds), 0)
+            self._extend(max(length, 2000))
+        self._row[slot] = self._seeds.index(episode.seed)
+
+    def _extend(self, length: int) -> None:
+        """Draw further control steps of every seed, until there are ``length``."""
+        uniform, delays = [], []
+        for generator in self._generators:
+            rows, late = [], []
+            for _ in range(length - self._length):
+                rows.append([generator.uniform(-h, h) for h in self._half])
+                late.append(generator.randint(0, self._noise.latency))
+            uniform.append(rows)
+            delays.append(late)
+        self._uniform = torch.cat((self._uniform, torch.tensor(uniform, device=self._device)), dim=1)
+        self._delays = torch.cat((self._delays, torch.tensor(delays, device=self._device)), dim=1)
+        self._length = length
+
+    def reserve(self, steps: int) -> None:
+        """See ``NoiseStream.reserve``."""
+        while self._length < steps:
+            self._extend(self._length + 2000)
+
+    def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """See ``NoiseStream.draw``. Call ``reserve`` before an episode can get beyond the table."""
+        values = self._uniform[self._row, step]
+        j = self._joints
+        terms = {
+            "joint_position": values[:, :j],
+            "joint_velocity": values[:, j : 2 * j],
+            "base_angular_velocity_b": values[:, -3:],
+        }
+        return terms, self._delays[self._row, step]
+
+
+class CounterStream(NoiseStream):
+    """A hash of (episode, control step, index): every episode has a stream of its own, with no state to carry."""
+
+    def __init__(self, noise: Noise, joints: int, slots: int, device: torch.device) -> None:
+        self._noise, self._joints = noise, joints
+        self._key = torch.zeros(slots, dtype=torch.int64, device=device)
+        half = [noise.joint_position] * joints + [noise.joint_velocity] * joints + [noise.base_angular_velocity] * 3
+        self._half = torch.tensor(half, device=device)
+        self._index = torch.arange(2 * joints + 4, dtype=torch.int64, device=device)
+
+    def assign(self, slot: int, episode: Episode) -> None:
+        """See ``NoiseStream.assign``."""
+        low, high = zlib.crc32(episode.key.encode()), zlib.crc32(episode.key[::-1].encode())
+        self._key[slot] = (high << 31) ^ low
+
+    def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """See ``NoiseStream.draw``."""
+        unit = uniform_hash(self._key[:, None], step[:, None], self._index)
+        delay = (unit[:, -1] * (self._noise.latency + 1)).to(torch.int64)
+        values = (2.0 * unit[:, :-1] - 1.0) * self._half
+        j = self._joints
+        terms = {
+            "joint_position": values[:, :j],
+            "joint_velocity": values[:, j : 2 * j],
+            "base_angular_velocity_b": values[:, -3:],
+        }
+        return terms, delay
+
+
+def uniform_hash(key: torch.Tensor, step: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """Uniform numbers in [0, 1) from integers, the same on every device (the SplitMix64 finalizer over a Weyl sequence).
+
+    Arguments are int64 and broadcast against each other; returns float32 with 24 random bits.
+    """
+    state = key + step * 0x5851F42D4C957F2D + index * -0x61C8864680B583EB
+    state = (state ^ _shift(state, 30)) * -0x40A7B892E31B1A47
+    state = (state ^ _shift(state, 27)) * -0x6B2FB644ECCEEE15
+    state = state ^ _shift(state, 31)
+    return _shift(state, 40).to(torch.float32) / float(1 << 24)
+
+
+def _shift(value: torch.Tensor, bits: int) -> torch.Tensor:
+    """Logical right shift of int64."""
+    return (value >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def make_stream(noise: Noise, joints: int, slots: int, device: torch.device) -> ReferenceStream | CounterStream:
+    """The stream that a suite asks for."""
+    return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, slots, device)
+
+

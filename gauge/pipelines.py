@@ -1,0 +1,262 @@
+"""Which episodes a pipeline asks for, and what follows from their outcomes (gauge protocol: Base, Multi, Level, Stress; §7).
+
+Every pipeline is a list of environments. An environment is played at a given level, or at the level that a binary search finds;
+then its quality episodes run, unless only the level was asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from .episodes import Episode, Record
+from .goals import TARGET
+from .suite import Suite, SuiteError
+
+PIPELINES = ("base", "multi", "level", "stress")
+
+
+class Store(Protocol):
+    """Where finished episodes are kept."""
+
+    def get(self, episode: Episode) -> Record | None:
+        """The record of an episode that has already run."""
+
+    def put(self, record: Record) -> None:
+        """Keep a record."""
+
+
+class LevelTest:
+    """One level, played with the search seeds, in rounds that stop as soon as the outcome is certain.
+
+    The first round has as many episodes as may fail plus one, each later one as many as must still succeed: the outcome is that
+    of playing all seeds, and the set of episodes depends on nothing but their results.
+    """
+
+    def __init__(self, seeds: Sequence[int], pass_rate: float, *, all_at_once: bool) -> None:
+        self._waiting = list(seeds)
+        self._needed = math.ceil(pass_rate * len(seeds) - 1e-9)
+        self._may_fail = len(seeds) - self._needed
+        self._running = 0
+        self._all = all_at_once
+        self.successes = 0
+        self.failures = 0
+
+    @property
+    def passed(self) -> bool | None:
+        """Whether the level is passed; None while open."""
+        if self.successes >= self._needed:
+            return True
+        return False if self.failures > self._may_fail else None
+
+    def next_round(self) -> list[int]:
+        """Seeds to play now; empty while a round is running or once decided."""
+        if self._running or self.passed is not None:
+            return []
+        first = self.successes == self.failures == 0
+        size = len(self._waiting) if self._all else self._may_fail + 1 if first else self._needed - self.successes
+        seeds, self._waiting = self._waiting[:size], self._waiting[size:]
+        self._running = len(seeds)
+        return seeds
+
+    def record(self, success: bool) -> None:
+        """An episode of the round has ended."""
+        self._running -= 1
+        self.successes += success
+        self.failures += not success
+
+    @property
+    def idle(self) -> bool:
+        """No episode of it is running."""
+        return self._running == 0
+
+
+@dataclass(kw_only=True)
+class Environment:
+    """One terrain at one friction and payload, and how far its gauging is."""
+
+    terrain: str
+    friction: float
+    payload: float
+    level: int | None
+    """Level reached or given; None while searched for. 0 on flat ground, and where not even level 1 is passed."""
+    searched: bool
+    """Whether the level is found by search."""
+    tests: dict[int, LevelTest] = field(default_factory=dict)
+    records: list[Record] = field(default_factory=list)
+    """Quality episodes, in the order of the seeds once complete."""
+    low: int = 0
+    high: int = 0
+
+    @property
+    def key(self) -> str:
+        """Unique name."""
+        return f"{self.terrain}-f{self.friction:g}-m{self.payload:g}"
+
+
+class Plan:
+    """The agenda of one pipeline run (see ``runner.Agenda``)."""
+
+    def __init__(
+        self,
+        suite: Suite,
+        environments: Sequence[Environment],
+        seeds: Sequence[int],
+        store: Store,
+        *,
+        evaluate: bool = True,
+        speculative: bool = False,
+    ) -> None:
+        """Queue what can start at once.
+
+        Args:
+            suite: the rules.
+            environments: what to gauge.
+            seeds: seeds of the quality episodes.
+            store: finished episodes; those found there are not run again.
+            evaluate: whether quality episodes follow once the level is known.
+            speculative: play every level at once instead of searching step by step: more work, fewer steps in a row.
+        """
+        self.suite, self.environments, self.seeds = suite, list(environments), list(seeds)
+        self._store, self._evaluate, self._speculative = store, evaluate, speculative
+        self._queue: list[Episode] = []
+        self._of: dict[str, Environment] = {}
+        self.total_known = 0
+        self.done = 0
+        for environment in self.environments:
+            if environment.searched:
+                environment.low, environment.high = 0, suite.scoring.levels
+                self._search(environment)
+            elif evaluate:
+                self._queue_quality(environment)
+
+    # ---- the runner's side ----------------------------------------------------------------------------------------
+
+    def take(self, most: int) -> list[Episode]:
+        """Episodes that can start now, quality first: they are the longest."""
+        taken: list[Episode] = []
+        while self._queue and len(taken) < most:
+            self._queue.sort(key=lambda e: e.stage != "eval")
+            episode = self._queue.pop(0)
+            known = self._store.get(episode)
+            if known is None:
+                taken.append(episode)
+            else:
+                self._fold(known)
+        return taken
+
+    def finished(self, record: Record) -> None:
+        """Keep an episode's record and ask for what follows from it."""
+        self._store.put(record)
+        self._fold(record)
+
+    # ---- folding --------------------------------------------------------------------------------------------------
+
+    def _add(self, environment: Environment, episodes: Sequence[Episode]) -> None:
+        for episode in episodes:
+            self._of[episode.key] = environment
+        self._queue += episodes
+        self.total_known += len(episodes)
+
+    def _fold(self, record: Record) -> None:
+        self.done += 1
+        environment = self._of.pop(record.episode.key)
+        if record.episode.stage == "eval":
+            environment.records.append(record)
+            environment.records.sort(key=lambda r: self.seeds.index(r.episode.seed))
+            return
+        environment.tests[record.episode.level].record(bool(record.success))
+        self._search(environment)
+
+    def _search(self, environment: Environment) -> None:
+        """Go on with the binary search as far as the outcomes allow."""
+        if self._speculative and not environment.tests:
+            for level in range(1, self.suite.scoring.levels + 1):
+                self._queue_test(environment, level)
+        while environment.level is None:
+            if environment.low >= environment.high:
+                environment.level = environment.low
+                if self._evaluate and environment.level > 0:
+                    self._queue_quality(environment)
+                return
+            middle = (environment.low + environment.high + 1) // 2
+            passed = self._queue_test(environment, middle)
+            if passed is None:
+                return
+            if passed:
+                environment.low = middle
+            else:
+                environment.high = middle - 1
+
+    def _queue_test(self, environment: Environment, level: int) -> bool | None:
+        """Queue the next round of a level's test; returns its outcome if it has one."""
+        if level not in environment.tests:
+            scoring, seeds = self.suite.scoring, self.suite.matrix.search_seeds
+            environment.tests[level] = LevelTest(seeds, scoring.pass_rate, all_at_once=self._speculative)
+        test = environment.tests[level]
+        self._add(environment, [self._episode(environment, level, s, "search") for s in test.next_round()])
+        return test.passed if test.idle else None
+
+    def _queue_quality(self, environment: Environment) -> None:
+        level = environment.level or 0
+        self._add(environment, [self._episode(environment, level, s, "eval") for s in self.seeds])
+
+    def _episode(self, environment: Environment, level: int, seed: int, stage: str) -> Episode:
+        names = [g.name for g in self.suite.goals]
+        goals = tuple(n for n in names if (n == TARGET) == (stage == "search"))
+        return Episode(
+            terrain=environment.terrain,
+            level=level,
+            friction=environment.friction,
+            payload=environment.payload,
+            seed=seed,
+            stage=stage,
+            goals=goals,
+        )
+
+
+def make_environments(
+    suite: Suite,
+    *,
+    terrains: Sequence[str],
+    frictions: Sequence[float] | None,
+    payloads: Sequence[float] | None,
+    level: int | None,
+) -> list[Environment]:
+    """The environments of a run: terrain by terrain, payload by payload, friction by friction.
+
+    Args:
+        suite: the rules.
+        terrains: terrain names.
+        frictions: None for the suite's.
+        payloads: None for the suite's.
+        level: the level to play at; None to search for it.
+
+    Raises:
+        SuiteError: a level outside the suite's.
+    """
+    matrix = suite.matrix
+    if level is not None and not 1 <= level <= suite.scoring.levels:
+        raise SuiteError(f"level {level} does not exist; choose 1 to {suite.scoring.levels}")
+    crossed = matrix.crossed or frictions is not None or payloads is not None
+    pairs = [(f, p) for p in (payloads or matrix.payloads) for f in (frictions or matrix.frictions)]
+    if payloads is None and frictions is not None and not matrix.crossed:
+        pairs = [(f, p) for f, p in pairs if p == matrix.nominal_payload]
+    if not crossed:
+        pairs = [(f, p) for f, p in pairs if p == matrix.nominal_payload or f == matrix.nominal_friction]
+    found = []
+    for terrain in terrains:
+        flat = terrain == "flat"
+        for friction, payload in pairs:
+            found.append(
+                Environment(
+                    terrain=terrain,
+                    friction=friction,
+                    payload=payload,
+                    level=0 if flat else level,
+                    searched=not flat and level is None,
+                )
+            )
+    return found
