@@ -1,0 +1,106 @@
+"""Which tile each world stands on, and when its level changes (paper, game-inspired curriculum).
+
+All tiles of all kinds and levels are one palette of terrains; a new level is another terrain index at the next reset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from ..terrains.base import Terrain
+from ..terrains.training_tiles import LEVELLESS_KINDS, RANDOM_KINDS, make_tile
+from .environment_configuration import TerrainConfiguration, TileConfiguration
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainingPalette:
+    """All tiles of the kinds in use, and where each kind, level and variant is among them."""
+
+    terrains: tuple[Terrain, ...]
+    tiles: tuple[TileConfiguration, ...]
+    """Kinds in use; a kind's number is its place here."""
+    index: torch.Tensor
+    """Terrain index of every kind, level and variant, (K, L, V) int64; tiles repeat where a kind has no levels or no
+    chance."""
+
+    @property
+    def num_levels(self) -> int:
+        """Levels per kind, L."""
+        return self.index.shape[1]
+
+
+def build_palette(configuration: TerrainConfiguration) -> TrainingPalette:
+    """Build the tiles of every kind whose share is not zero.
+
+    Raises:
+        TerrainError: unknown kind, or more levels than tiles have.
+    """
+    tiles = tuple(t for t in configuration.tiles if t.share > 0)
+    terrains: list[Terrain] = []
+    index = torch.zeros(len(tiles), configuration.levels, configuration.variants, dtype=torch.int64)
+    for number, tile in enumerate(tiles):
+        for level in range(configuration.levels):
+            for variant in range(configuration.variants):
+                if tile.name in LEVELLESS_KINDS and level > 0:
+                    index[number, level] = index[number, 0]
+                elif tile.name not in RANDOM_KINDS and variant > 0:
+                    index[number, level, variant] = index[number, level, 0]
+                else:
+                    index[number, level, variant] = len(terrains)
+                    terrains.append(make_tile(tile.name, level, configuration.seed + variant))
+    return TrainingPalette(terrains=tuple(terrains), tiles=tiles, index=index)
+
+
+def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
+    """Kind of every world, (N,) int64: contiguous blocks in proportion to the shares, so that teacher and student
+    share every kind.
+
+    Raises:
+        ValueError: shares that are negative or all zero.
+    """
+    if min(shares, default=-1.0) < 0 or sum(shares) <= 0:
+        raise ValueError(f"shares of the terrain kinds are {list(shares)}; they must not be negative and not all zero")
+    total = sum(shares)
+    bounds = torch.tensor([sum(shares[: i + 1]) / total for i in range(len(shares))], dtype=torch.float64)
+    middle = (torch.arange(num_envs, dtype=torch.float64) + 0.5) / num_envs
+    return torch.searchsorted(bounds[:-1].contiguous(), middle, right=True)
+
+
+def next_level(
+    configuration: TerrainConfiguration,
+    *,
+    level: torch.Tensor,
+    num_levels: int,
+    farthest: torch.Tensor,
+    commanded: torch.Tensor,
+    fallen: torch.Tensor,
+    uniform: torch.Tensor,
+) -> torch.Tensor:
+    """Level of the next episode, were this one over.
+
+    Up after leaving the middle of the tile far enough; down after a fall, or with too little of the commanded way
+    made. Who masters the last level starts anywhere again, so that easy tiles are not forgotten.
+
+    Args:
+        configuration: distances and switches.
+        level: present level from 0, (N,) int64.
+        num_levels: L.
+        farthest: largest distance from the tile's middle in the episode [m], (N,).
+        commanded: largest distance that the commands would have led to, at the robot's own headings [m], (N,).
+        fallen: whether the episode ended by a fall, (N,) bool.
+        uniform: numbers in [0, 1), (N,).
+
+    Returns:
+        (N,) int64 in [0, L).
+    """
+    anywhere = (uniform * num_levels).long().clamp(max=num_levels - 1)
+    if not configuration.curriculum:
+        return anywhere
+    up = farthest > configuration.promotion_distance
+    slow = farthest < configuration.demotion_share * commanded
+    down = ~up & (slow | fallen if configuration.demote_falls else slow)
+    moved = level + up.long() - down.long()
+    return torch.where(moved >= num_levels, anywhere, moved.clamp_min(0))

@@ -1,0 +1,373 @@
+"""The training environment: rsl_rl's ``VecEnv`` on any physics backend.
+
+One step, in order: the action becomes joint targets with a drawn latency; the physics advances one control period;
+rewards, ends, curriculum and commands are judged on the new state; worlds whose episode is over are reset and others
+pushed; observations are made of the state after that, so that the first observation of an episode is fresh. Nothing
+in a step waits for the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from ..backends.base import PhysicsBackend, Scene
+from ..backends.registry import make_backend
+from ..policy.contract import PolicyContract, go2_contract
+from ..robots.base import JointParameters, Robot
+from ..robots.registry import load_robot
+from .curriculum import TrainingPalette, assign_kinds, build_palette
+from .domain_randomization import BodyParameters, draw_bodies
+from .environment_configuration import EnvironmentConfiguration
+from .step_graph import CapturedFunction
+from .step_program import (
+    AFTER_RESET,
+    AFTER_STEP,
+    ENDS,
+    METRICS,
+    EpisodeStart,
+    Observations,
+    StepProgram,
+    Verdict,
+    static_inputs,
+)
+
+STATE_VERSION = 1
+
+BackendMaker = Callable[[Scene], PhysicsBackend]
+
+
+class TrainingEnvironment(VecEnv):
+    """Vectorized locomotion environment. Observation groups: ``policy``, ``history`` and ``privileged``.
+
+    Attributes:
+        contract: the interface of the policies trained here, one frame of observation.
+        backend: the physics.
+        common_step_counter: environment steps taken in the run.
+    """
+
+    def __init__(
+        self,
+        configuration: EnvironmentConfiguration,
+        *,
+        backend: str | BackendMaker = "mujoco-warp",
+        device: str = "cuda:0",
+        threads: int = 1,
+        capture: bool = False,
+        palette: TrainingPalette | None = None,
+    ) -> None:
+        """Build the worlds and begin their first episodes.
+
+        Args:
+            configuration: the environment's settings.
+            backend: an engine's registry name, or a function that makes one from a scene.
+            device: torch device of the physics and of everything else.
+            threads: CPU threads for engines that use them.
+            capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
+            palette: the tiles; None builds them from the configuration.
+
+        Raises:
+            ValueError: a setting that makes no sense, such as ``capture`` without a CUDA device.
+            BackendError: the engine cannot do what is asked.
+        """
+        if capture and torch.device(device).type != "cuda":
+            raise ValueError(
+                f"capture=True needs a CUDA device, but the environment is on '{device}'; use capture=False there"
+            )
+        if configuration.num_envs < 1:
+            raise ValueError(f"num_envs is {configuration.num_envs}; an environment needs at least 1 world")
+        self.cfg = configuration
+        self.configuration = configuration
+        self.robot = load_robot(configuration.robot)
+        parameters = joint_parameters(self.robot, configuration)
+        self.palette = build_palette(configuration.terrain) if palette is None else palette
+        kind = assign_kinds([tile.share for tile in self.palette.tiles], configuration.num_envs)
+        level = self._start_levels(configuration)
+        scene = Scene(
+            robot=self.robot,
+            parameters=parameters,
+            terrains=self.palette.terrains,
+            terrain_index=tuple(self.palette.index[kind, level, 0].tolist()),
+            physics=configuration.physics,
+        )
+        self.backend = (
+            make_backend(backend, scene, device=device, threads=threads) if isinstance(backend, str) else backend(scene)
+        )
+        self.device = self.backend.device
+        self.num_envs = configuration.num_envs
+        self.num_actions = self.robot.num_joints
+        self.contract = training_contract(self.robot, parameters, configuration)
+        self._generator = torch.Generator(device=self.device)
+        self._generator.manual_seed(configuration.seed)
+        self._inputs = static_inputs(self.backend.state)
+        self.program = StepProgram(
+            configuration,
+            robot=self.robot,
+            parameters=parameters,
+            contract=self.contract,
+            palette=self.palette,
+            kind=kind.to(self.device),
+            inputs=self._inputs,
+            generator=self._generator,
+        )
+        self.max_episode_length = self.program.max_episode_length
+        self.kind = self.program.kind
+        self.common_step_counter = 0
+        self._kind_share = self._kind_averages()
+        self._bodies = draw_bodies(
+            configuration.randomization, self.num_envs, len(self.robot.collision_bodies), self._generator
+        )
+        self._bodies.apply(self.backend)
+        self._begin(level.to(self.device))
+        self._after_physics: Callable[[], Verdict] = self.program.after_physics
+        self._observe: Callable[[], Observations] = self.program.observe
+        if capture:
+            self._capture()
+
+    @staticmethod
+    def _start_levels(configuration: EnvironmentConfiguration) -> torch.Tensor:
+        """Levels at the start: random, since a pattern over the worlds would give the student's only every second
+        level.
+        """
+        terrain = configuration.terrain
+        highest = min(terrain.highest_start_level, terrain.levels - 1) if terrain.curriculum else terrain.levels - 1
+        random = torch.Generator().manual_seed(configuration.seed)
+        return torch.randint(highest + 1, (configuration.num_envs,), generator=random)
+
+    def _kind_averages(self) -> torch.Tensor:
+        """Matrix that averages over the worlds of each kind, (K, N)."""
+        kinds = torch.arange(len(self.palette.tiles), device=self.device)
+        of_kind = (self.kind[None, :] == kinds[:, None]).float()
+        return of_kind / of_kind.sum(dim=1, keepdim=True).clamp_min(1.0)
+
+    def _begin(self, level: torch.Tensor) -> None:
+        """Begin the first episode of every world."""
+        memory = self.program.memory
+        memory.level.copy_(level)
+        if self.program.push_steps > 0:
+            memory.push_phase.random_(self.program.push_steps, generator=self._generator)
+        everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        self.program.uniform.draw()
+        start = self.program.begin_episodes(everyone, torch.zeros_like(everyone), self.program.progress())
+        self._reset(start)
+        self._read(AFTER_STEP)
+        self._observations = _clone(self.program.observe())
+
+    def _capture(self) -> None:
+        """Capture both torch parts; what their warm-up changes is put back."""
+        memory, motors = self.program.memory, self.program.motors
+        before = memory.snapshot()
+        motors_before = {f.name: getattr(motors, f.name).clone() for f in fields(motors)}
+        with torch.no_grad():
+            self._after_physics = CapturedFunction(self.program.after_physics)
+            self._observe = CapturedFunction(self.program.observe)
+        memory.restore(before)
+        for name, values in motors_before.items():
+            getattr(motors, name).copy_(values)
+
+    # --- rsl_rl's interface -----------------------------------------------------------------------------------------
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps of every world's present episode, (N,) int64. Assigning copies into the same tensor."""
+        return self.program.memory.episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        self.program.memory.episode_length.copy_(value)
+
+    def get_observations(self) -> TensorDict:
+        """Present observations, copies."""
+        return self._pack(_clone(self._observations))
+
+    @torch.no_grad()
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance all worlds by one control period.
+
+        Args:
+            actions: raw network outputs, (N, J).
+
+        Returns:
+            Observations; rewards (N,); dones (N,) int64; extras with ``time_outs`` (N,) float and, every
+            ``log_interval`` steps, ``log``. All are new tensors that no later step touches.
+        """
+        program = self.program
+        program.action.copy_(actions)
+        program.uniform.draw()
+        self.backend.step(program.targets(), delay=program.delay())
+        self._read(AFTER_STEP)
+        verdict = self._after_physics()
+        self.common_step_counter += 1
+        extras: dict[str, Any] = {"time_outs": verdict.time_out.float()}
+        if self.common_step_counter % self.configuration.log_interval == 0:
+            extras["log"] = self._log()
+        self._reset(verdict.start)
+        if program.push_steps > 0:
+            self.backend.push(
+                verdict.push,
+                linear_velocity_w=verdict.push_linear_velocity,
+                angular_velocity_b=verdict.push_angular_velocity,
+            )
+        self._read(AFTER_RESET)
+        self._observations = _clone(self._observe())
+        return self._pack(_clone(self._observations)), verdict.reward.clone(), verdict.done.long(), extras
+
+    def close(self) -> None:
+        """Free the physics."""
+        self.backend.close()
+
+    # --- parts of a step --------------------------------------------------------------------------------------------
+
+    def _read(self, names: tuple[str, ...]) -> None:
+        state = self.backend.state
+        for name in names:
+            getattr(self._inputs, name).copy_(getattr(state, name))
+
+    def _reset(self, start: EpisodeStart) -> None:
+        self.program.motors.apply(self.backend)
+        self.backend.reset(
+            start.worlds,
+            base_position=start.base_position,
+            base_quaternion=start.base_quaternion,
+            joint_position=start.joint_position,
+            base_linear_velocity=start.base_linear_velocity,
+            base_angular_velocity=start.base_angular_velocity,
+            held_target=self.program.default_pose.expand(self.num_envs, -1),
+            terrain_index=self.program.memory.terrain_index,
+        )
+
+    def _pack(self, observations: Observations) -> TensorDict:
+        groups = {f.name: getattr(observations, f.name) for f in fields(observations)}
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+
+    def _log(self) -> dict[str, torch.Tensor]:
+        """What happened since the last log, as tensors on the device; sums start anew."""
+        memory, program = self.program.memory, self.program
+        terms = len(program.rewards.names)
+        finished = memory.finished_ends.sum()
+        values = torch.cat(
+            (
+                memory.finished_rewards / (memory.finished_steps * program.period),
+                memory.finished_ends / finished,
+                memory.metric_sums / memory.metric_steps,
+            )
+        )
+        memory.last_log.copy_(torch.where(torch.isfinite(values), values, memory.last_log))
+        for sums in (
+            memory.finished_rewards,
+            memory.finished_steps,
+            memory.finished_ends,
+            memory.metric_sums,
+            memory.metric_steps,
+        ):
+            sums.zero_()
+        names = [f"Episode_Reward/{n}" for n in program.rewards.names] + [f"Episode_Termination/{n}" for n in ENDS]
+        names += [f"Metrics/{n}" for n in METRICS]
+        assert len(names) == terms + len(ENDS) + len(METRICS)
+        log = dict(zip(names, memory.last_log.clone().unbind(), strict=True))
+        levels = (self._kind_share * memory.level.float()).sum(dim=1)
+        log |= {
+            f"Curriculum/{tile.name}": level for tile, level in zip(self.palette.tiles, levels.unbind(), strict=True)
+        }
+        log["Curriculum/mean_level"] = memory.level.float().mean()
+        log["Curriculum/progress"] = program.progress()
+        log["Physics/overflow_worlds"] = self.backend.state.overflowed.sum().float()
+        log["Physics/nan_resets"] = memory.diverged_total.float()
+        return log
+
+    # --- resuming ---------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that continuing needs: memory, random state, randomization, observations, and poses and
+        velocities of the physics.
+
+        The physics itself is put back by a reset: what an engine carries from step to step beside positions,
+        velocities and targets (a solver's warm start, contact caches) is lost. On an engine without such memory,
+        continuing equals never having stopped.
+        """
+        state = self.backend.state
+        return {
+            "version": STATE_VERSION,
+            "memory": self.program.memory.snapshot(),
+            "motors": {f.name: getattr(self.program.motors, f.name).clone() for f in fields(self.program.motors)},
+            "bodies": {f.name: getattr(self._bodies, f.name).clone() for f in fields(self._bodies)},
+            "observations": {f.name: getattr(self._observations, f.name).clone() for f in fields(self._observations)},
+            "generator": self._generator.get_state(),
+            "common_step_counter": self.common_step_counter,
+            "physics": {name: getattr(state, name).clone() for name in AFTER_RESET},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``. The environment must have been built with the same configuration.
+
+        Raises:
+            ValueError: the state is of another version or of another environment.
+        """
+        if state.get("version") != STATE_VERSION:
+            raise ValueError(
+                f"the saved environment has version {state.get('version')}, this program reads {STATE_VERSION}"
+            )
+        program = self.program
+        program.memory.restore({name: value.to(self.device) for name, value in state["memory"].items()})
+        for name, value in state["motors"].items():
+            getattr(program.motors, name).copy_(value)
+        self._bodies = BodyParameters(**{name: value.to(self.device) for name, value in state["bodies"].items()})
+        self._bodies.apply(self.backend)
+        program.motors.apply(self.backend)
+        self._observations = Observations(**{n: v.to(self.device).clone() for n, v in state["observations"].items()})
+        self._generator.set_state(state["generator"].cpu())
+        self.common_step_counter = state["common_step_counter"]
+        physics = {name: value.to(self.device) for name, value in state["physics"].items()}
+        program.action.copy_(program.memory.action)
+        self.backend.reset(
+            base_position=physics["base_position_w"],
+            base_quaternion=physics["base_quaternion_w"],
+            joint_position=physics["joint_position"],
+            base_linear_velocity=physics["base_linear_velocity_w"],
+            base_angular_velocity=physics["base_angular_velocity_b"],
+            joint_velocity=physics["joint_velocity"],
+            held_target=program.targets(),
+            terrain_index=program.memory.terrain_index,
+        )
+        self._read(AFTER_RESET)
+
+
+def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
+    """The joint constants of the training physics.
+
+    Raises:
+        ValueError: the robot has no such parameter set.
+    """
+    settings = configuration.joints
+    if settings.parameters not in robot.parameters:
+        known = ", ".join(robot.parameters)
+        raise ValueError(f"joints.parameters is '{settings.parameters}', but robot '{robot.name}' has: {known}")
+    changed = {
+        name: (value,) * robot.num_joints
+        for name in ("armature", "joint_damping", "friction_loss")
+        if (value := getattr(settings, name)) is not None
+    }
+    return replace(robot.parameters[settings.parameters], **changed)
+
+
+def training_contract(
+    robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
+) -> PolicyContract:
+    """The interface of a policy trained here: one frame of observation, the gains and the control period of the
+    training.
+    """
+    return replace(
+        go2_contract(robot),
+        stiffness=parameters.stiffness,
+        damping=parameters.damping,
+        control_period=configuration.physics.control_period,
+    )
+
+
+def _clone(observations: Observations) -> Observations:
+    return Observations(**{f.name: getattr(observations, f.name).clone() for f in fields(observations)})

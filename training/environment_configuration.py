@@ -1,0 +1,367 @@
+"""Settings of the training environment.
+
+Progress is a fraction of the run: environment steps taken so far (per environment) over
+``ScheduleConfiguration.horizon_steps``. Defaults are chosen for policies that transfer; ``docs/training.md`` lists
+every difference from the published code and its reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..backends.base import PhysicsOptions
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ramp:
+    """A number that moves linearly from ``start`` to ``end`` between two fractions of the run and stays there."""
+
+    start: float
+    """Value until ``begin``."""
+    end: float
+    """Value from ``until`` on."""
+    begin: float = 0.0
+    """Fraction of the run at which the change begins."""
+    until: float = 1.0
+    """Fraction of the run at which the change is complete."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScheduleConfiguration:
+    """What "a fraction of the run" means."""
+
+    horizon_steps: int = 240_000
+    """Environment steps, per environment, of the whole run: 24 steps times 10,000 iterations. Every ramp and stage is
+    a fraction of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointConfiguration:
+    """Joint and motor constants of the training physics."""
+
+    parameters: str = "training"
+    """Name of the robot's parameter set."""
+    armature: float | None = None
+    """Rotor inertia of every joint [kg·m²]; None keeps the set's."""
+    joint_damping: float | None = None
+    """Passive damping of every joint [N·m·s/rad]; None keeps the set's."""
+    friction_loss: float | None = None
+    """Dry friction of every joint [N·m]; None keeps the set's. 0 spares the solver twelve constraints per world."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseConfiguration:
+    """Half-widths of the uniform noise that every observation gets, in physical units. 0 turns an entry off."""
+
+    base_angular_velocity: float = 0.8
+    """[rad/s]. The gauge's value; the published training used 0.2."""
+    projected_gravity: float = 0.05
+    """Per component of the unit vector. The gauge adds none."""
+    joint_position: float = 0.01
+    """[rad]."""
+    joint_velocity: float = 3.0
+    """[rad/s]. The gauge's value; the published training used 1.5."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationConfiguration:
+    """What the networks see."""
+
+    history_length: int = 5
+    """Frames in the student's history, the current one included."""
+    noise: NoiseConfiguration = NoiseConfiguration()
+    scan_length: float = 1.6
+    """Extent of the height scan along the heading [m]."""
+    scan_width: float = 1.0
+    """Extent of the height scan across the heading [m]."""
+    scan_spacing: float = 0.1
+    """Distance between scan points [m]."""
+    scan_cell: float = 0.05
+    """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfiguration:
+    """Weights of the reward terms, per second: each step's term is multiplied by its weight and the control period. 0
+    leaves a term out.
+
+    Formulas are in ``rewards.py``; the paper's table of rewards is the source where nothing else is said.
+    """
+
+    linear_tracking: float = 1.0
+    """Tracking of the commanded horizontal velocity."""
+    yaw_tracking: float = 0.5
+    """Tracking of the commanded yaw rate."""
+    vertical_velocity: Ramp = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
+    """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
+    roll_pitch_rate: float = -0.05
+    """Squared roll and pitch rates."""
+    joint_acceleration: float = -2.5e-7
+    """Squared joint accelerations."""
+    joint_power: float = -2e-5
+    """Absolute mechanical power."""
+    torque: float = -1e-4
+    """Squared motor torques."""
+    base_height: Ramp = Ramp(start=-1.0, end=-10.0, begin=0.0, until=0.2)
+    """Squared error of the base's height over the ground below the trunk; grows against sagging."""
+    action_rate: float = -0.01
+    """Squared first difference of the actions."""
+    action_smoothness: float = -0.01
+    """Squared second difference of the actions."""
+    collision: float = -1.0
+    """Number of thighs and calves that touch something."""
+    joint_limits: float = -2.0
+    """Joint angle beyond the soft limits [rad]."""
+    foot_regulation: float = -0.05
+    """Squared foot speed close to the ground."""
+    hip_regulation: float = -0.05
+    """Absolute deviation of the hips from the standing pose [rad]."""
+    hip_symmetry: float = 0.0
+    """Left-right asymmetry of the hips at forward commands; the paper's fast task."""
+    roll: float = 0.0
+    """Squared sideways component of gravity; the gauge's orientation metric looks at roll alone."""
+    torque_change: float = 0.0
+    """Squared change of the motor torques between control steps [N²·m²]; the gauge's smoothness metric."""
+    stand_still: float = 0.0
+    """Absolute deviation from the standing pose [rad] under the zero command."""
+    termination: float = 0.0
+    """Falls, counted once and not per second."""
+
+    tracking_sigma: float = 0.25
+    """Width of the tracking kernels, exp(-error²/sigma) [m²/s² and rad²/s²]."""
+    dynamic_sigma: bool = True
+    """Whether sigma grows with command and terrain level (paper, dynamic velocity tracking precision adjustment)."""
+    sigma_linear_range: Range = (0.5, 1.5)
+    """Commanded speed between which sigma grows to the terrain's largest [m/s]."""
+    sigma_yaw_range: Range = (1.0, 2.0)
+    """Commanded yaw rate between which sigma grows to the terrain's largest [rad/s]."""
+    base_height_target: float = 0.38
+    """[m]."""
+    foot_height_scale: float = 0.025
+    """Foot regulation fades with foot height over this share of ``base_height_target``."""
+    foot_height_over: str = "foot"
+    """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
+    collision_force: float = 0.1
+    """Contact force from which a thigh or calf counts as touching [N]."""
+    soft_limit: float = 0.9
+    """Share of a joint's range, about its middle, that is free of the joint-limit penalty."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandStage:
+    """Ranges that commands are drawn from, from a fraction of the run on."""
+
+    begin: float
+    """Fraction of the run at which the stage begins."""
+    forward: Range
+    """Forward velocity [m/s]."""
+    lateral: Range
+    """Lateral velocity [m/s]."""
+    yaw: Range
+    """Yaw rate [rad/s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandConfiguration:
+    """What the robot is told to do (paper, command design)."""
+
+    stages: tuple[CommandStage, ...] = (
+        CommandStage(begin=0.0, forward=(-0.5, 0.5), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),
+        CommandStage(begin=0.1, forward=(-1.0, 1.0), lateral=(-1.0, 1.0), yaw=(-1.5, 1.5)),
+        CommandStage(begin=0.3, forward=(-2.0, 2.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
+    )
+    """Command curriculum; a terrain's own limits cap every stage."""
+    interval: float = 5.0
+    """Time between two draws [s]."""
+    dynamic: bool = True
+    """Whether the smallest speed drawn makes sure that the robot can still leave its tile in the rest of the episode.
+    """
+    required_distance: float = 5.0
+    """Distance that the commands of an episode shall add up to at least [m] (``dynamic``)."""
+    straight_probability: float = 0.3
+    """Share of the uniform draws with zero yaw rate. Published: 0; the gauge's commands are all straight or a pure
+    turn."""
+    extreme_probability: float = 0.2
+    """Share of draws with every axis at a limit or zero."""
+    extreme_zero_probability: float = 1.0 / 3.0
+    """Chance of each axis of an extreme command to be zero. Published: forward and lateral never are."""
+    flip_probability: float = 0.2
+    """Chance that an extreme command is followed by its opposite."""
+    stationary_probability: Ramp = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
+    """Share of stationary draws, without linear velocity."""
+    stationary_yaw_probability: float = 0.25
+    """Chance that a stationary command keeps its yaw rate, so that the robot turns on the spot. Published: always."""
+    stationary_longest: float = 3.0
+    """Longest stationary command [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TileConfiguration:
+    """One kind of training tile."""
+
+    name: str
+    """A kind out of ``terrains.training_tiles.TILE_KINDS``."""
+    share: float
+    """Share of the environments, relative to the other kinds'; 0 leaves the kind out."""
+    command_limits: tuple[float, float, float]
+    """Largest forward, lateral [m/s] and yaw [rad/s] command on this kind."""
+    sigma: float
+    """Largest tracking sigma on this kind (``RewardConfiguration.dynamic_sigma``)."""
+    ends: bool = True
+    """Whether the kind has an edge at which ``TerrainConfiguration.leave_distance`` acts."""
+
+
+_MODERATE, _SLOW = (1.5, 1.0, 1.5), (1.0, 1.0, 1.5)
+
+FLAT_TILE = TileConfiguration(name="flat", share=0.15, command_limits=(2.0, 1.0, 2.0), sigma=0.25, ends=False)
+"""Level ground without end."""
+ALL_TILES = (
+    TileConfiguration(name="wave", share=0.1, command_limits=_MODERATE, sigma=5.0 / 12.0),
+    TileConfiguration(name="slope_up", share=0.1, command_limits=_MODERATE, sigma=0.25),
+    TileConfiguration(name="slope_down", share=0.1, command_limits=_MODERATE, sigma=0.25),
+    TileConfiguration(name="rough_slope", share=0.05, command_limits=_MODERATE, sigma=0.25),
+    TileConfiguration(name="stairs_up", share=0.25, command_limits=_SLOW, sigma=0.5),
+    TileConfiguration(name="stairs_down", share=0.1, command_limits=_SLOW, sigma=0.5),
+    TileConfiguration(name="obstacles", share=0.15, command_limits=_SLOW, sigma=0.75),
+    FLAT_TILE,
+)
+"""Every kind. Limits and sigmas are the published ones; wave has twice its published share and obstacles less."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerrainConfiguration:
+    """Which ground, and how it gets harder."""
+
+    tiles: tuple[TileConfiguration, ...] = ALL_TILES
+    """Kinds of training tile."""
+    levels: int = 10
+    """Number of levels, from the easiest."""
+    variants: int = 2
+    """Different tiles per kind and level, where a kind has chance in it."""
+    seed: int = 0
+    """Seed of the tiles' chance."""
+    curriculum: bool = True
+    """Whether levels follow success; otherwise every episode draws its level."""
+    highest_start_level: int = 5
+    """Levels at the start are uniform from 0 to this."""
+    promotion_distance: float = 4.0
+    """Distance from the tile's middle (larger of |x|, |y|) beyond which the level rises [m]; 4 is the tile's edge."""
+    demotion_share: float = 0.5
+    """Share of the commanded way below which the level falls."""
+    demote_falls: bool = True
+    """Whether a fall before promotion lowers the level whatever the distance."""
+    leave_distance: float | None = 4.75
+    """Distance from the tile's middle at which an episode is cut short as a time-out [m]; None for never. Beyond the
+    edge there is only level ground, on which the published robots had the next tile."""
+    spawn_jitter: float = 1.0
+    """Episodes start up to this far from the tile's middle, in x and in y [m]."""
+    spread_probability: float = 0.1
+    """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; they do not move
+    levels."""
+    spread_distance: float = 3.0
+    """Those episodes start up to this far from the tile's middle, in x and in y [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetConfiguration:
+    """How episodes start."""
+
+    joint_scale: Range = (0.5, 1.5)
+    """Factor on the standing pose, per joint, within the joint limits."""
+    velocity: float = 0.5
+    """Largest component of the base's linear [m/s] and angular [rad/s] velocity."""
+    clearance: float | None = None
+    """Height of the base over the highest ground below the robot [m]; None for the robot's ``stand_height``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizationConfiguration:
+    """Ranges of what differs between worlds (paper, domain randomization table), uniform."""
+
+    friction: Range = (0.2, 1.25)
+    """Effective sliding friction, once per world. Published: 0.5 to 1.5; the gauge judges 0.2 to 1.0."""
+    base_mass: Range = (-1.0, 1.0)
+    """Added to the base's mass [kg], once per world."""
+    link_mass: Range = (0.9, 1.1)
+    """Factor on the mass of each other body, once per world."""
+    base_com: Range = (-0.03, 0.03)
+    """Shift of the base's centre of mass per axis [m], once per world."""
+    stiffness: Range = (0.9, 1.1)
+    """Factor on kp per joint, every reset."""
+    damping: Range = (0.9, 1.1)
+    """Factor on kd per joint, every reset."""
+    motor_offset: Range = (-0.035, 0.035)
+    """Added to the motor's position error per joint [rad], every reset."""
+    motor_strength: Range = (0.8, 1.2)
+    """Factor on the torque per joint after its limit, every reset."""
+    delay: Range = (0.0, 0.02)
+    """Time for which the previous target still acts [s], in whole substeps, every control step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushConfiguration:
+    """Sudden changes of the base's velocity."""
+
+    interval: float = 4.0
+    """Time between pushes of one world [s]; 0 for none."""
+    linear: float = 0.4
+    """Largest change of the horizontal velocity per axis [m/s]."""
+    angular: float = 0.6
+    """Largest change of the angular velocity per axis [rad/s]."""
+    add: bool = True
+    """Whether the change is added; otherwise it replaces the velocity, as published, which stops a fast robot dead."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerminationConfiguration:
+    """What ends an episode early."""
+
+    base_force: float = 1.0
+    """Contact force on the base body [N]."""
+    tilt: float | None = 1.4
+    """Angle between the base's z axis and the world's [rad]; None for no limit."""
+    joint_velocity: float = 150.0
+    """Joint speed beyond anything real, which counts as a diverged world [rad/s]."""
+
+
+TRAINING_PHYSICS = PhysicsOptions(
+    timestep=0.005,
+    substeps=4,
+    cone="pyramidal",
+    iterations=10,
+    ls_iterations=20,
+    tolerance=1e-6,
+    foot_condim=3,
+    self_collision=False,
+    torque_limits=True,
+)
+"""Physics of the published training, as far as the engines have it: 200 Hz, four substeps, sliding friction only."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentConfiguration:
+    """Everything about the training environment."""
+
+    robot: str = "go2"
+    """Registry name of the robot, or the path of its description."""
+    num_envs: int = 8192
+    """Number of worlds."""
+    seed: int = 0
+    """Seed of every draw the environment makes."""
+    episode_length: float = 25.0
+    """Longest episode [s]."""
+    physics: PhysicsOptions = TRAINING_PHYSICS
+    joints: JointConfiguration = JointConfiguration()
+    schedule: ScheduleConfiguration = ScheduleConfiguration()
+    observations: ObservationConfiguration = ObservationConfiguration()
+    rewards: RewardConfiguration = RewardConfiguration()
+    commands: CommandConfiguration = CommandConfiguration()
+    terrain: TerrainConfiguration = TerrainConfiguration()
+    reset: ResetConfiguration = ResetConfiguration()
+    randomization: RandomizationConfiguration = RandomizationConfiguration()
+    push: PushConfiguration = PushConfiguration()
+    termination: TerminationConfiguration = TerminationConfiguration()
+    log_interval: int = 8
+    """Environment steps between two logs of finished episodes; each log costs the learner's logger time."""

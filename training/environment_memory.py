@@ -1,0 +1,153 @@
+"""Everything the training environment remembers from step to step, in one place, so that saving it is saving all of
+it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+
+
+@dataclass(kw_only=True)
+class EnvironmentMemory:
+    """Tensors that steps change in place; they are never replaced, since a captured step holds on to them.
+
+    N worlds, J joints, T reward terms, E ways to end an episode, M metrics.
+    """
+
+    step: torch.Tensor
+    """Environment steps taken in the run, scalar int64."""
+    episode_length: torch.Tensor
+    """Control steps of the present episode, (N,) int64."""
+    level: torch.Tensor
+    """Level of the tile, (N,) int64."""
+    terrain_index: torch.Tensor
+    """Terrain of the present episode, (N,) int64."""
+    moves_level: torch.Tensor
+    """Whether the present episode counts for the curriculum, (N,) bool."""
+    farthest: torch.Tensor
+    """Largest distance from the tile's middle in this episode, larger of |x| and |y| [m], (N,)."""
+    commanded_way: torch.Tensor
+    """Where the commands of this episode would have led, at the robot's own headings [m], (N, 2)."""
+    commanded_farthest: torch.Tensor
+    """Largest distance of ``commanded_way`` from its start [m], (N,)."""
+    command: torch.Tensor
+    """Present command, (N, 3)."""
+    command_steps: torch.Tensor
+    """Control steps until the next draw, (N,) int64."""
+    command_extreme: torch.Tensor
+    """Whether the present command is an extreme one, (N,) bool."""
+    issued: torch.Tensor
+    """Sum of the linear commands issued in this episode [m/s], (N, 2)."""
+    action: torch.Tensor
+    """Raw action of the last step, (N, J)."""
+    previous_action: torch.Tensor
+    """Raw action of the step before, (N, J)."""
+    joint_velocity: torch.Tensor
+    """Joint velocities after the last step [rad/s], (N, J)."""
+    joint_acceleration: torch.Tensor
+    """Change of the joint velocities over the last step [rad/s²], (N, J)."""
+    joint_torque: torch.Tensor
+    """Torques of the last step [N·m], (N, J)."""
+    foot_force: torch.Tensor
+    """Norm of each foot's contact force after the last step [N], (N, F)."""
+    just_reset: torch.Tensor
+    """Worlds whose episode has just begun, (N,) bool."""
+    history: torch.Tensor
+    """Last frames with their noise, oldest first, (N, H, frame width)."""
+    push_phase: torch.Tensor
+    """Offset of each world's push clock, control steps, (N,) int64."""
+    episode_rewards: torch.Tensor
+    """Weighted rewards of the present episode by term, (N, T)."""
+    finished_rewards: torch.Tensor
+    """Weighted rewards of the episodes finished since the last log, (T,)."""
+    finished_steps: torch.Tensor
+    """Their control steps, scalar."""
+    finished_ends: torch.Tensor
+    """How many of them ended in which way, (E,)."""
+    metric_sums: torch.Tensor
+    """Sums over worlds and steps since the last log, (M,)."""
+    metric_steps: torch.Tensor
+    """Steps summed in ``metric_sums``, scalar."""
+    last_log: torch.Tensor
+    """Values logged last, kept where nothing new can be said, (T + E + M,)."""
+    diverged_total: torch.Tensor
+    """Diverged worlds that were reset in the run, scalar int64."""
+
+    @classmethod
+    def allocate(
+        cls,
+        num_envs: int,
+        *,
+        joints: int,
+        feet: int,
+        history: int,
+        frame: int,
+        terms: int,
+        ends: int,
+        metrics: int,
+        device: torch.device | str,
+    ) -> EnvironmentMemory:
+        """Zeros of the right shapes."""
+
+        def numbers(*shape: int) -> torch.Tensor:
+            return torch.zeros(shape, device=device)
+
+        def counts(*shape: int) -> torch.Tensor:
+            return torch.zeros(shape, dtype=torch.int64, device=device)
+
+        def flags() -> torch.Tensor:
+            return torch.zeros(num_envs, dtype=torch.bool, device=device)
+
+        return cls(
+            step=counts(),
+            episode_length=counts(num_envs),
+            level=counts(num_envs),
+            terrain_index=counts(num_envs),
+            moves_level=flags(),
+            farthest=numbers(num_envs),
+            commanded_way=numbers(num_envs, 2),
+            commanded_farthest=numbers(num_envs),
+            command=numbers(num_envs, 3),
+            command_steps=counts(num_envs),
+            command_extreme=flags(),
+            issued=numbers(num_envs, 2),
+            action=numbers(num_envs, joints),
+            previous_action=numbers(num_envs, joints),
+            joint_velocity=numbers(num_envs, joints),
+            joint_acceleration=numbers(num_envs, joints),
+            joint_torque=numbers(num_envs, joints),
+            foot_force=numbers(num_envs, feet),
+            just_reset=flags(),
+            history=numbers(num_envs, history, frame),
+            push_phase=counts(num_envs),
+            episode_rewards=numbers(num_envs, terms),
+            finished_rewards=numbers(terms),
+            finished_steps=numbers(),
+            finished_ends=numbers(ends),
+            metric_sums=numbers(metrics),
+            metric_steps=numbers(),
+            last_log=numbers(terms + ends + metrics),
+            diverged_total=counts(),
+        )
+
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        """Copies of all tensors by name."""
+        return {f.name: getattr(self, f.name).clone() for f in fields(self)}
+
+    def restore(self, snapshot: dict[str, torch.Tensor]) -> None:
+        """Copy a snapshot back.
+
+        Raises:
+            ValueError: a tensor is missing or has another shape.
+        """
+        for f in fields(self):
+            present, saved = getattr(self, f.name), snapshot.get(f.name)
+            if saved is None or saved.shape != present.shape:
+                found = "is missing" if saved is None else f"has shape {tuple(saved.shape)}"
+                raise ValueError(
+                    f"the saved environment does not fit: '{f.name}' {found}, this environment needs "
+                    f"{tuple(present.shape)}; resume with the run's own configuration"
+                )
+            present.copy_(saved)

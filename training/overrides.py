@@ -1,0 +1,181 @@
+"""``key=value`` settings on nested frozen dataclasses, converted to the type of the field they change.
+
+A key is a path of field names separated by dots. An element of a tuple is addressed by its number or, if it has a
+``name``, by that: ``terrain.tiles.stairs_up.share=0.3``. Values: numbers, ``true``/``false``, ``none`` where a field
+may be None, text, and tuples as numbers separated by commas.
+"""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Iterable
+from dataclasses import fields, is_dataclass, replace
+from difflib import get_close_matches
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+Options = TypeVar("Options")
+
+
+class TaskError(ValueError):
+    """An unknown task, key or value; the message names it and what is allowed."""
+
+
+def apply_overrides(configuration: Options, overrides: Iterable[str]) -> Options:
+    """A copy of a configuration with some settings changed.
+
+    Args:
+        configuration: a frozen dataclass, nested as deep as it likes.
+        overrides: ``key=value`` each; later ones win.
+
+    Raises:
+        TaskError: no ``=``, unknown key (with the nearest valid ones), or a value that does not fit.
+    """
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals or not key.strip():
+            raise TaskError(f"'{override}' is no setting; write key=value, for example {_example(configuration)}")
+        configuration = _set(configuration, key.strip().split("."), value.strip(), key.strip(), configuration)
+    return configuration
+
+
+def override_keys(configuration: Any, prefix: str = "") -> list[str]:
+    """All keys that a configuration has, depth first."""
+    keys: list[str] = []
+    for name, value in _children(configuration):
+        keys.extend(override_keys(value, f"{prefix}{name}.") if _has_children(value) else [prefix + name])
+    return keys
+
+
+def _children(value: Any) -> list[tuple[str, Any]]:
+    if is_dataclass(value):
+        return [(f.name, getattr(value, f.name)) for f in fields(value)]
+    return [(getattr(element, "name", str(i)), element) for i, element in enumerate(value)]
+
+
+def _has_children(value: Any) -> bool:
+    return is_dataclass(value) or (isinstance(value, tuple) and any(is_dataclass(element) for element in value))
+
+
+def _set(node: Any, path: list[str], text: str, key: str, root: Any) -> Any:
+    name, rest = path[0], path[1:]
+    if is_dataclass(node) and not isinstance(node, type):
+        known = {f.name for f in fields(node)}
+        if name not in known:
+            raise _unknown(key, root)
+        present = getattr(node, name)
+        if rest:
+            if not _has_children(present):
+                raise _unknown(key, root)
+            return _replaced(node, name, _set(present, rest, text, key, root), key)
+        if _has_children(present) and not isinstance(present, tuple) and not _takes_plain(node, name):
+            raise _group(key, present)
+        return _replaced(node, name, _convert(text, get_type_hints(type(node))[name], key), key)
+    elements = list(node)
+    names = [child for child, _ in _children(node)]
+    if name in names:
+        place = names.index(name)
+    elif name.isdecimal() and int(name) < len(elements):
+        place = int(name)
+    else:
+        raise _unknown(key, root)
+    if not rest:
+        raise _group(key, elements[place])
+    elements[place] = _set(elements[place], rest, text, key, root)
+    return tuple(elements)
+
+
+def _replaced(node: Any, name: str, value: Any, key: str) -> Any:
+    try:
+        return replace(node, **{name: value})
+    except (ValueError, TypeError) as error:
+        raise TaskError(f"'{key}' cannot be set: {error}") from error
+
+
+def _takes_plain(node: Any, name: str) -> bool:
+    """Whether a field that holds a dataclass may hold a number or text as well."""
+    hint = get_type_hints(type(node))[name]
+    return any(option in (int, float, str) for option in get_args(hint))
+
+
+def _group(key: str, value: Any) -> TaskError:
+    children = [child for child, _ in _children(value)]
+    shown = ", ".join(f"{key}.{child}" for child in children[:4]) + (" …" if len(children) > 4 else "")
+    return TaskError(f"'{key}' is a group of {len(children)} settings; set one of them: {shown}")
+
+
+def _unknown(key: str, root: Any) -> TaskError:
+    known = override_keys(root)
+    near = get_close_matches(key, known, n=3, cutoff=0.5)
+    last = key.rsplit(".", 1)[-1]
+    near += [k for k in known if k.rsplit(".", 1)[-1] == last and k not in near][:3]
+    if not near:
+        near = [
+            k
+            for end in get_close_matches(last, {k.rsplit(".", 1)[-1] for k in known}, n=3)
+            for k in known
+            if k.endswith(end)
+        ][:3]
+    if near:
+        return TaskError(f"unknown setting '{key}'; the nearest are: {', '.join(near[:3])}")
+    groups = sorted({k.split(".", 1)[0] for k in known})
+    return TaskError(f"unknown setting '{key}'; settings begin with: {', '.join(groups)}")
+
+
+def _example(configuration: Any) -> str:
+    key = override_keys(configuration)[0]
+    value = configuration
+    for name in key.split("."):
+        value = dict(_children(value))[name]
+    return f"{key}={value}"
+
+
+def _convert(text: str, hint: Any, key: str) -> Any:
+    """Text as a value of the annotated type."""
+    origin = get_origin(hint)
+    if origin in (Union, types.UnionType):
+        options = get_args(hint)
+        if type(None) in options and text.lower() in ("none", "null"):
+            return None
+        failures = []
+        for option in sorted((o for o in options if o is not type(None)), key=_strictness):
+            try:
+                return _convert(text, option, key)
+            except TaskError as error:
+                failures.append(error)
+        if type(None) in options:
+            raise TaskError(f"{failures[0]}, or none")
+        raise failures[0]
+    if origin is tuple:
+        return _convert_tuple(text, get_args(hint), key)
+    if hint is bool:
+        if text.lower() in ("true", "false"):
+            return text.lower() == "true"
+        raise TaskError(f"'{key}' is '{text}', but must be true or false")
+    if hint in (int, float):
+        kind = "a whole number" if hint is int else "a finite number"
+        try:
+            number = hint(text)
+        except ValueError:
+            raise TaskError(f"'{key}' is '{text}', but must be {kind}") from None
+        if not math.isfinite(number):
+            raise TaskError(f"'{key}' is '{text}', but must be {kind}")
+        return number
+    if hint is str:
+        return text
+    raise TaskError(f"'{key}' cannot be set to '{text}': it holds a {getattr(hint, '__name__', hint)}")
+
+
+def _strictness(option: Any) -> int:
+    """Order in which the members of a union are tried: text fits everything and comes last."""
+    order = [bool, int, float]
+    return order.index(option) if option in order else len(order) + (option is str)
+
+
+def _convert_tuple(text: str, options: tuple[Any, ...], key: str) -> tuple[Any, ...]:
+    parts = [part.strip() for part in text.strip("()[] ").split(",") if part.strip()]
+    if len(options) == 2 and options[1] is Ellipsis:
+        return tuple(_convert(part, options[0], key) for part in parts)
+    if len(parts) != len(options):
+        raise TaskError(f"'{key}' is '{text}', but must be {len(options)} values separated by commas")
+    return tuple(_convert(part, option, key) for part, option in zip(parts, options, strict=True))

@@ -1,0 +1,38 @@
+"""One draw of uniform numbers per step, handed out by name.
+
+A single kernel fills all random numbers that a step may need, whether or not it uses them. So a captured step is a
+pure function of its inputs, random numbers do not depend on what happened in other worlds, and one generator state is
+all that a checkpoint needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+
+class UniformColumns:
+    """Named blocks of columns of one (N, C) tensor of uniform numbers in [0, 1)."""
+
+    def __init__(self, widths: Mapping[str, int], num_envs: int, generator: torch.Generator) -> None:
+        """Allocate columns for every name on the generator's device."""
+        self._slices: dict[str, slice] = {}
+        total = 0
+        for name, width in widths.items():
+            self._slices[name] = slice(total, total + width)
+            total += width
+        self.values = torch.zeros(num_envs, total, device=generator.device)
+        self._generator = generator
+
+    def draw(self) -> None:
+        """Fill all columns anew."""
+        self.values.uniform_(generator=self._generator)
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        """Numbers of one name, (N, width), a view."""
+        return self.values[:, self._slices[name]]
+
+    def between(self, name: str, low: float, high: float) -> torch.Tensor:
+        """Numbers of one name, uniform between two bounds, (N, width)."""
+        return self[name] * (high - low) + low

@@ -1,0 +1,141 @@
+"""The tasks that can be trained, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from types import MappingProxyType
+
+from .configuration import NetworkConfiguration, RunConfiguration, TrainingConfiguration
+from .environment_configuration import (
+    FLAT_TILE,
+    CommandConfiguration,
+    CommandStage,
+    EnvironmentConfiguration,
+    Ramp,
+    RewardConfiguration,
+    ScheduleConfiguration,
+    TerrainConfiguration,
+)
+from .overrides import TaskError, apply_overrides
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What is to be learned, and how."""
+
+    name: str
+    """Name on the command line."""
+    title: str
+    """One line for people."""
+    environment: EnvironmentConfiguration
+    """Where it is learned."""
+    training: TrainingConfiguration
+    """How it is learned."""
+
+    def with_overrides(self, overrides: Iterable[str]) -> Task:
+        """The task with some settings changed: ``environment.…`` and ``training.…`` keys.
+
+        Raises:
+            TaskError: a key or value that does not fit.
+        """
+        settings = apply_overrides(_Settings(environment=self.environment, training=self.training), overrides)
+        return replace(self, environment=settings.environment, training=settings.training)
+
+    def with_horizon(self) -> Task:
+        """The task with schedules spread over exactly the run's own iterations."""
+        run = self.training.run
+        schedule = replace(self.environment.schedule, horizon_steps=run.iterations * run.steps_per_iteration)
+        return replace(self, environment=replace(self.environment, schedule=schedule))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Settings:
+    """What overrides may change."""
+
+    environment: EnvironmentConfiguration
+    training: TrainingConfiguration
+
+
+def _moe_cts() -> Task:
+    return Task(
+        name="go2-moe-cts",
+        title="Unitree Go2 on all terrains, Mixture-of-Experts student (the paper's method)",
+        environment=EnvironmentConfiguration(),
+        training=TrainingConfiguration(),
+    )
+
+
+def _cts() -> Task:
+    return Task(
+        name="go2-cts",
+        title="Unitree Go2 on all terrains, plain student",
+        environment=EnvironmentConfiguration(),
+        training=TrainingConfiguration(
+            network=NetworkConfiguration(student_encoder="mlp"), run=RunConfiguration(experiment="go2_cts")
+        ),
+    )
+
+
+def _flat() -> Task:
+    """Walks within minutes: no terrain, and full commands from the start, since the whole run is a few hundred
+    iterations.
+    """
+    environment = EnvironmentConfiguration(
+        num_envs=4096,
+        schedule=ScheduleConfiguration(horizon_steps=24 * 500),
+        terrain=TerrainConfiguration(
+            tiles=(FLAT_TILE,), levels=1, curriculum=False, leave_distance=None, spread_probability=0.0
+        ),
+        commands=CommandConfiguration(
+            stages=(
+                CommandStage(begin=0.0, forward=(-1.0, 1.0), lateral=(-0.6, 0.6), yaw=(-1.0, 1.0)),
+                CommandStage(begin=0.4, forward=(-1.5, 1.5), lateral=(-1.0, 1.0), yaw=(-1.5, 1.5)),
+                CommandStage(begin=0.7, forward=(-2.0, 2.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
+            ),
+            dynamic=False,
+        ),
+        rewards=RewardConfiguration(base_height=Ramp(start=-5.0, end=-10.0)),
+    )
+    training = TrainingConfiguration(
+        network=NetworkConfiguration(student_encoder="mlp"),
+        run=RunConfiguration(experiment="go2_flat", iterations=500, save_interval=100, gauge_interval=0),
+    )
+    return Task(
+        name="go2-flat", title="Unitree Go2 on level ground (quick)", environment=environment, training=training
+    )
+
+
+TASKS: Mapping[str, Task] = MappingProxyType({task.name: task for task in (_moe_cts(), _cts(), _flat())})
+"""All tasks by name."""
+
+
+def task_names() -> list[str]:
+    """Names of all tasks."""
+    return list(TASKS)
+
+
+def find_task(name: str, overrides: Iterable[str] = ()) -> Task:
+    """A task, with settings changed.
+
+    Schedules are spread over the run's iterations, unless ``environment.schedule.horizon_steps`` is set.
+
+    Args:
+        name: one of ``task_names()``.
+        overrides: ``environment.…=value`` and ``training.…=value``.
+
+    Raises:
+        TaskError: unknown task, or a key or value that does not fit.
+    """
+    if name not in TASKS:
+        near = get_close_matches(name, TASKS, n=2, cutoff=0.3)
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        raise TaskError(f"unknown task '{name}'; {hint}the tasks are: {', '.join(TASKS)}")
+    chosen = list(overrides)
+    task = TASKS[name].with_overrides(chosen)
+    own_horizon = any(o.split("=", 1)[0].strip() == "environment.schedule.horizon_steps" for o in chosen)
+    return task if own_horizon else task.with_horizon()
+
+
+__all__ = ["TASKS", "Task", "TaskError", "find_task", "task_names"]
