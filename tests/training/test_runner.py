@@ -1,0 +1,213 @@
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from gaitgauge.policy.loading import load_policy
+from gaitgauge.training.checkpoint import CheckpointError, read_checkpoint
+from gaitgauge.training.runner import TrainingDivergedError, TrainingRunner
+from gaitgauge.training.scoring import FunctionScorer
+from gaitgauge.training.seeding import seed_everything
+from toy_training import ToyEnv, toy_configuration, toy_contract
+
+
+def make(
+    log_dir: Path | None = None,
+    *,
+    seed: int = 0,
+    env: ToyEnv | None = None,
+    task: str = "toy",
+    configuration=None,
+    **arguments,
+):
+    seed_everything(seed)
+    return TrainingRunner(
+        env or ToyEnv(seed=seed),
+        configuration or toy_configuration(),
+        contract=toy_contract(),
+        task=task,
+        log_dir=log_dir,
+        **arguments,
+    )
+
+
+def flat(state, prefix=""):
+    if isinstance(state, torch.Tensor):
+        return {prefix: state}
+    if isinstance(state, dict):
+        items = state.items()
+    elif isinstance(state, list | tuple):
+        items = enumerate(state)
+    else:
+        return {prefix: state}
+    return {k: v for name, entry in items for k, v in flat(entry, f"{prefix}.{name}").items()}
+
+
+def assert_same(a, b, skip=()):
+    a, b = flat(a), flat(b)
+    assert a.keys() == b.keys()
+    for name in a:
+        if any(s in name for s in skip):
+            continue
+        if isinstance(a[name], torch.Tensor):
+            assert torch.equal(a[name], b[name]), name
+        else:
+            assert a[name] == b[name], name
+
+
+@pytest.mark.parametrize("encoder", ["mlp", "moe"])
+def test_continuing_equals_never_having_stopped(tmp_path, encoder):
+    whole, first, second = (tmp_path / n for n in ("whole", "first", "second"))
+    for folder in (whole, first, second):
+        folder.mkdir()
+    configuration = toy_configuration(encoder=encoder)
+    make(whole, configuration=configuration).learn(4)
+    make(first, configuration=configuration).learn(2)
+    # Another seed: everything that matters must come from the checkpoint.
+    resumed = make(second, seed=7, configuration=configuration)
+    resumed.load(str(first / "model_2.pt"))
+    resumed.learn(2)
+    a, b = read_checkpoint(whole / "model_4.pt"), read_checkpoint(second / "model_4.pt")
+    assert a["iter"] == b["iter"] == 4
+    # Wall-clock time and the run's name are all that may differ.
+    assert_same(a, b, skip=("total_time", "contract"))
+
+
+def test_a_checkpoint_is_a_policy(tmp_path):
+    runner = make(tmp_path)
+    outcome = runner.learn(1)
+    policy = load_policy(outcome.checkpoint)
+    assert policy.contract.provenance["iteration"] == 1
+    session = policy.session(8)
+    obs = ToyEnv(seed=3).get_observations()
+    action = session.act(obs["policy"])
+    # One frame after a start from zeros: the same history for both.
+    history = torch.zeros(8, 5, 45)
+    history[:, -1] = obs["policy"]
+    with torch.no_grad():
+        expected = runner.alg.actor.student(history)
+    assert torch.allclose(action, expected, atol=1e-6)
+
+
+def test_rsl_rl_log_keys(tmp_path):
+    seen = []
+    make(tmp_path, progress=seen.append, configuration=toy_configuration(steps=24)).learn(2)
+    keys = set(seen[-1].scalars)
+    assert {
+        "Train/mean_reward",
+        "Train/mean_episode_length",
+        "Train/mean_reward_teacher",
+        "Loss/value",
+        "Loss/surrogate",
+        "Loss/entropy",
+        "Loss/learning_rate",
+        "Loss/latent",
+        "Loss/load_balance",
+        "Policy/mean_std",
+        "Perf/total_fps",
+        "Perf/collection_time",
+        "Perf/learning_time",
+        "Metrics/reward",
+        "Episode/level",
+    } <= keys
+    assert seen[-1].iteration == 2 and seen[-1].scalars["Perf/total_steps"] == 2 * 24 * 8
+    assert list(tmp_path.glob("events.out.tfevents.*"))
+    assert json.loads((tmp_path / "run.json").read_text())["outcome"] == "finished"
+
+
+def test_logged_reward_is_the_mean_of_finished_episodes():
+    runner = make()
+    rewards, dones = torch.arange(8.0), torch.zeros(8, dtype=torch.bool)
+    for step in range(8):
+        done = dones.clone()
+        done[3] = step == 1
+        done[4] = step == 3
+        runner.logger.process_env_step(
+            rewards, done, {"log": {"a": torch.tensor(float(step)), "b": torch.tensor(float("nan"))}}
+        )
+    assert runner.logger.collect() == {"Episode/a": 3.5}
+    assert list(runner.logger.rewbuffer) == [6.0, 16.0]
+    assert list(runner.logger.group_returns["student"]) == [16.0]
+    assert list(runner.logger.group_returns["teacher"]) == [6.0]
+    assert runner.logger.cur_episode_length.tolist() == [8.0, 8.0, 8.0, 6.0, 4.0, 8.0, 8.0, 8.0]
+
+
+def test_sigterm_writes_a_checkpoint(tmp_path):
+    messages = []
+    runner = make(
+        tmp_path, message=messages.append, progress=lambda p: p.iteration == 3 and os.kill(os.getpid(), signal.SIGTERM)
+    )
+    before = signal.getsignal(signal.SIGTERM)
+    outcome = runner.learn(1000)
+    assert outcome.reason == "signal" and outcome.exit_code == 143
+    assert outcome.iteration == 4 and outcome.checkpoint == tmp_path / "model_4.pt"
+    assert read_checkpoint(outcome.checkpoint)["iter"] == 4
+    assert any("SIGTERM" in m for m in messages)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_time_limit(tmp_path):
+    outcome = make(tmp_path).learn(1000, max_seconds=0.0)
+    assert outcome.reason == "time" and outcome.iteration == 1 and outcome.checkpoint.exists()
+
+
+def test_nan_in_the_environment_is_counted_and_stops_the_run(tmp_path):
+    env = ToyEnv()
+    runner = make(tmp_path, env=env, configuration=toy_configuration(run={"nonfinite_limit": 0.2}))
+    runner.learn(1)
+    env.poison = 2
+    runner.learn(1)  # 1 of 8 environments: below the limit, kept out of learning
+    assert runner.logger.scalars["Physics/nonfinite_samples"] == 8
+    assert all(torch.isfinite(p).all() for p in runner.alg.actor.parameters())
+    strict = make(tmp_path, env=env)
+    with pytest.raises(TrainingDivergedError, match=r"8 of 64 environment samples .* last checkpoint"):
+        strict.learn(1)
+    assert read_checkpoint(tmp_path / "model_2.pt")["iter"] == 2
+
+
+def test_broken_weights_are_never_written(tmp_path):
+    runner = make(tmp_path)
+    runner.learn(1)
+    before = (tmp_path / "model_1.pt").read_bytes()
+    with torch.no_grad():
+        runner.alg.actor.student.actor[0].weight[0, 0] = float("nan")
+    with pytest.raises(TrainingDivergedError, match="not finite"):
+        runner.save(str(tmp_path / "model_1.pt"))
+    assert (tmp_path / "model_1.pt").read_bytes() == before
+
+
+def test_best_is_chosen_by_the_gauge(tmp_path):
+    scores = {1: 0.2, 2: 0.6, 3: 0.4}
+    scorer = FunctionScorer(lambda path, iteration: {"score": scores[iteration], "velocity": 0.1}, suite="quick")
+    seen = []
+    configuration = toy_configuration(run={"gauge_interval": 1})
+    runner = make(tmp_path, scorer=scorer, configuration=configuration, progress=seen.append)
+    runner.learn(3)
+    assert (runner.best_score, runner.best_iteration) == (0.6, 2)
+    assert read_checkpoint(tmp_path / "best.pt")["iter"] == 2
+    assert seen[-1].scalars["Gauge/quick/score"] == 0.4
+    assert (
+        load_policy("best", log_root=tmp_path.parent.parent).contract == load_policy(tmp_path / "model_2.pt").contract
+    )
+    resumed = make(tmp_path, seed=1)
+    resumed.load(str(tmp_path / "model_3.pt"))
+    assert resumed.best_score == 0.6
+
+
+def test_resume_refuses_what_does_not_fit(tmp_path):
+    make(tmp_path).learn(1)
+    path = str(tmp_path / "model_1.pt")
+    with pytest.raises(CheckpointError, match="of task 'toy', this run trains 'other'"):
+        make(task="other").load(path)
+    with pytest.raises(CheckpointError, match="--num-envs 8"):
+        make(env=ToyEnv(num_envs=16)).load(path)
+    with pytest.raises(CheckpointError, match="network"):
+        make(configuration=toy_configuration(encoder="mlp")).load(path)
+    damaged = tmp_path / "damaged.pt"
+    damaged.write_bytes(Path(path).read_bytes()[:2000])
+    with pytest.raises(CheckpointError, match="damaged"):
+        make().load(str(damaged))
+    with pytest.raises(CheckpointError, match="Cannot read"):
+        make().load(str(tmp_path / "none.pt"))

@@ -1,0 +1,1 @@
+"""Learning algorithms on rsl_rl's PPO."""

@@ -1,0 +1,171 @@
+"""Left-right mirror images of observations and actions of a legged robot.
+
+Mirroring at the robot's sagittal plane (y to -y) keeps the x and z entries of a vector and flips its y entry; of an
+axial vector such as an angular velocity it flips x and z and keeps y. Left legs change places with right legs, and
+joints that turn about the x axis (hip abduction) change sign.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from ...policy.contract import PolicyContract
+from ...robots.base import Robot
+
+# Name prefixes of the left legs and of their mirror images.
+LEG_PAIRS: tuple[tuple[str, str], ...] = (("FL", "FR"), ("RL", "RR"), ("LF", "RF"), ("LH", "RH"), ("left_", "right_"))
+# What the name of a joint about the x axis contains.
+ABDUCTION_MARKS: tuple[str, ...] = ("hip", "HAA", "abduction", "hx")
+
+
+class SymmetryError(ValueError):
+    """The robot's names or poses do not tell what its mirror image is."""
+
+
+@dataclass(frozen=True)
+class MirrorMap:
+    """A signed permutation of the entries of a vector; applied twice it gives the vector back."""
+
+    index: torch.Tensor
+    """Source entry of each entry, (D,) int64."""
+    sign: torch.Tensor
+    """Factor of each entry, (D,) float32."""
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        """Mirror ``values`` (..., D)."""
+        return values.index_select(-1, self.index) * self.sign
+
+    @property
+    def width(self) -> int:
+        """Number of entries D."""
+        return self.index.numel()
+
+    def to(self, device: torch.device | str) -> MirrorMap:
+        """The same map on another device."""
+        return MirrorMap(self.index.to(device), self.sign.to(device))
+
+    def flipped(self) -> MirrorMap:
+        """The same permutation with all signs changed."""
+        return MirrorMap(self.index, -self.sign)
+
+    @classmethod
+    def signs(cls, *sign: float) -> MirrorMap:
+        """Entries that stay in place."""
+        return cls(torch.arange(len(sign)), torch.tensor(sign))
+
+    @classmethod
+    def joined(cls, maps: Sequence[MirrorMap]) -> MirrorMap:
+        """The map of the concatenation of several vectors."""
+        offsets = [0]
+        for part in maps:
+            offsets.append(offsets[-1] + part.width)
+        index = torch.cat([part.index + offset for part, offset in zip(maps, offsets, strict=False)])
+        return cls(index, torch.cat([part.sign for part in maps]))
+
+
+VECTOR = MirrorMap.signs(1.0, -1.0, 1.0)
+AXIAL_VECTOR = MirrorMap.signs(-1.0, 1.0, -1.0)
+PLANAR_COMMAND = MirrorMap.signs(1.0, -1.0, -1.0)
+"""Forward, lateral and yaw speed."""
+
+
+def _mirrored_name(name: str) -> str:
+    for left, right in LEG_PAIRS:
+        for here, there in ((left, right), (right, left)):
+            if name.startswith(here):
+                return there + name[len(here) :]
+    return name
+
+
+def mirror_by_name(names: Sequence[str], flipped_marks: Sequence[str] = ()) -> MirrorMap:
+    """Map that exchanges entries named for left and right legs.
+
+    Args:
+        names: name of each entry, legs as prefix (``FL_hip_joint``).
+        flipped_marks: an entry whose name contains one of these changes sign.
+
+    Raises:
+        SymmetryError: an entry has no mirror image among the names.
+    """
+    position = {name: i for i, name in enumerate(names)}
+    missing = [name for name in names if _mirrored_name(name) not in position]
+    if missing:
+        raise SymmetryError(
+            f"No mirror image of {missing[0]!r} ({_mirrored_name(missing[0])!r}) among {', '.join(names)}."
+        )
+    index = torch.tensor([position[_mirrored_name(name)] for name in names])
+    sign = torch.tensor([-1.0 if any(mark in name for mark in flipped_marks) else 1.0 for name in names])
+    return MirrorMap(index, sign)
+
+
+def mirror_grid(rows: int, columns: int) -> MirrorMap:
+    """Map of a height scan of ``rows`` x positions (slow index) by ``columns`` y positions symmetric about zero (fast
+    index).
+    """
+    index = torch.arange(rows * columns).view(rows, columns).flip(1).flatten()
+    return MirrorMap(index, torch.ones(rows * columns))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mirror:
+    """Mirror maps of all observation groups and of the action."""
+
+    policy: MirrorMap
+    history: MirrorMap
+    privileged: MirrorMap
+    action: MirrorMap
+
+    def to(self, device: torch.device | str) -> Mirror:
+        """The same maps on another device."""
+        return Mirror(
+            policy=self.policy.to(device),
+            history=self.history.to(device),
+            privileged=self.privileged.to(device),
+            action=self.action.to(device),
+        )
+
+
+def build_mirror(
+    contract: PolicyContract, robot: Robot, *, scan_shape: tuple[int, int] = (17, 11), history_length: int | None = None
+) -> Mirror:
+    """Mirror maps for the training observations of a robot.
+
+    The privileged vector is base linear velocity, the noise-free policy frame, contact force per foot, torque per
+    joint, acceleration per joint and the height scan, in this order.
+
+    Args:
+        contract: gives the terms of the policy frame and the joint order.
+        robot: gives the foot names.
+        scan_shape: x and y positions of the height scan, y the fast index.
+        history_length: frames in the history group, frame by frame; None for the contract's.
+
+    Raises:
+        SymmetryError: names do not pair up, or the default pose is not its own mirror image.
+    """
+    joints = mirror_by_name(contract.joint_names, ABDUCTION_MARKS)
+    pose = torch.tensor(contract.default_joint_position)
+    if not torch.allclose(joints(pose), pose, atol=1e-6):
+        raise SymmetryError(
+            "The default pose is not its own mirror image, so joint positions relative to it cannot be mirrored: "
+            f"{contract.default_joint_position}."
+        )
+    terms = {
+        "base_linear_velocity_b": VECTOR,
+        "base_angular_velocity_b": AXIAL_VECTOR,
+        "projected_gravity_b": VECTOR,
+        "command": PLANAR_COMMAND,
+        "joint_position": joints,
+        "joint_velocity": joints,
+        "last_action": joints,
+    }
+    frame = MirrorMap.joined([terms[term.name] for term in contract.observation])
+    feet = mirror_by_name(robot.foot_names)
+    return Mirror(
+        policy=frame,
+        history=MirrorMap.joined([frame] * (history_length or contract.history.length)),
+        privileged=MirrorMap.joined([VECTOR, frame, feet, joints, joints, mirror_grid(*scan_shape)]),
+        action=joints,
+    )

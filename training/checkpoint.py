@@ -1,0 +1,164 @@
+"""Checkpoints: a policy file that also holds everything a run needs to continue as if it had never stopped.
+
+A checkpoint is a file of ``policy.native``'s format (contract, network, weights of the student), so every command
+that takes a policy takes it. Beside these it has rsl_rl's usual entries (``actor_state_dict`` … ``iter``) and
+``training``, what only a resumed run reads. It holds tensors and plain data only and is read without the ability to
+run code.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..policy.base import PolicyError
+from ..policy.contract import PolicyContract
+from ..policy.native import FORMAT, StoredNetwork, load_entries
+from ..policy.native import VERSION as POLICY_VERSION
+
+TRAINING_VERSION = 1
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint cannot be written or does not fit the run; the message says which file, why, and what to do."""
+
+
+def checkpoint_entries(contract: PolicyContract, network: StoredNetwork, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """The dictionary of a checkpoint: the entries of a policy file, and ``extra``.
+
+    Raises:
+        CheckpointError: ``extra`` holds something other than tensors and plain data, or takes a name of the policy
+        format.
+    """
+    entries: dict[str, Any] = {
+        "format": FORMAT,
+        "version": POLICY_VERSION,
+        "contract": contract.to_json(),
+        "network": {
+            "kind": "native",
+            "architecture": network.architecture,
+            "arguments": json.dumps(dict(network.arguments)),
+        },
+        "state_dict": {name: value.detach().to("cpu") for name, value in network.state_dict.items()},
+    }
+    if taken := entries.keys() & extra.keys():
+        raise CheckpointError(
+            f"A checkpoint entry cannot be named {', '.join(sorted(taken))}: the policy format uses these names."
+        )
+    for name, value in extra.items():
+        _require_plain(name, value)
+    return entries | dict(extra)
+
+
+def _require_plain(name: str, value: Any) -> None:
+    """Refuse what could not be read back without running code."""
+    if value is None or isinstance(value, bool | int | float | str | torch.Tensor):
+        return
+    if isinstance(value, Mapping):
+        for key, entry in value.items():
+            _require_plain(f"{name}.{key}", entry)
+    elif isinstance(value, list | tuple):
+        for i, entry in enumerate(value):
+            _require_plain(f"{name}[{i}]", entry)
+    else:
+        raise CheckpointError(
+            f"A checkpoint can hold tensors, numbers, texts, lists and dictionaries only; {name} is a "
+            f"{type(value).__name__}."
+        )
+
+
+def write_checkpoint(path: str | Path, entries: Mapping[str, Any]) -> None:
+    """Write a file that appears whole or not at all; whatever was there before survives a failure.
+
+    Raises:
+        CheckpointError: the file cannot be written, for example because the disk is full.
+    """
+    buffer = io.BytesIO()
+    torch.save(dict(entries), buffer)
+    write_bytes(path, buffer.getbuffer())
+
+
+def write_bytes(path: str | Path, data: bytes | memoryview) -> None:
+    """Write a file beside its destination, flush it to the disk and rename it into place.
+
+    Raises:
+        CheckpointError: the file cannot be written.
+    """
+    target = Path(path)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, target)
+        # The rename itself is durable only once the folder is.
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise CheckpointError(_write_failure(target, len(data), error)) from error
+
+
+def _write_failure(target: Path, size: int, error: OSError) -> str:
+    message = f"Cannot write '{target}' ({size / 1e6:.1f} MB): {error.strerror or error}"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        message += "; free some space and resume with --resume latest"
+    return message + ". Files written before are intact."
+
+
+def copy_checkpoint(source: Path, target: Path) -> None:
+    """Make ``target`` a copy of ``source``, whole or not at all.
+
+    Raises:
+        CheckpointError: it cannot be read or written.
+    """
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        shutil.copyfile(source, partial)
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, target)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise CheckpointError(_write_failure(target, source.stat().st_size if source.exists() else 0, error)) from error
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a training checkpoint onto the CPU.
+
+    Raises:
+        CheckpointError: no such file, damaged, or a policy without what training needs to continue.
+    """
+    file = Path(path)
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"Cannot read checkpoint '{path}': {error.strerror}.") from error
+    try:
+        entries = dict(load_entries(data, source=str(path)))
+    except PolicyError as error:
+        raise CheckpointError(f"Cannot resume: {error}.") from error
+    training = entries.get("training")
+    if entries.get("format") != FORMAT or not isinstance(training, Mapping):
+        raise CheckpointError(
+            f"Cannot resume from '{path}': it holds no training state; give a model_<iteration>.pt of a training run."
+        )
+    if training.get("version") != TRAINING_VERSION:
+        raise CheckpointError(
+            f"Cannot resume from '{path}': its training state has version {training.get('version')!r}, this "
+            "gaitgauge reads "
+            f"{TRAINING_VERSION}."
+        )
+    return entries

@@ -1,0 +1,215 @@
+"""Settings of the networks, the learning algorithm and the training run.
+
+The numbers are those of concurrent teacher-student learning as published with its Mixture-of-Experts encoder;
+``docs/training.md`` lists every deliberate difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
+from pathlib import PurePath
+from typing import Any
+
+STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
+SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "loss")
+LOAD_BALANCE_FORMS: tuple[str, ...] = ("sum", "mean")
+PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
+COMPILE_MODES: tuple[str, ...] = ("none", "default", "max-autotune-no-cudagraphs")
+
+
+class ConfigurationError(ValueError):
+    """A setting has a value that is not allowed; the message names the setting, the value and what is allowed."""
+
+
+def _choose(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ConfigurationError(f"{name} is {value!r}; allowed are {', '.join(allowed)}.")
+
+
+def _positive(owner: object, *names: str) -> None:
+    for name in names:
+        value = getattr(owner, name)
+        if not value > 0:
+            raise ConfigurationError(f"{name} is {value}; it must be greater than zero.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfiguration:
+    """Sizes of the networks. ELU everywhere, PyTorch's own initial weights."""
+
+    latent_width: int = 32
+    """Width of the latent that teacher and student encoders produce on the unit sphere."""
+    teacher_hidden: tuple[int, ...] = (512, 256)
+    """Hidden layers of the teacher encoder."""
+    student_encoder: str = "moe"
+    """``mlp`` (CTS), ``moe`` (MoE-CTS, the paper's) or ``moe_ng`` (experts that do not see the command)."""
+    student_hidden: tuple[int, ...] = (512, 256)
+    """Hidden layers of the student encoder, or of the experts' shared trunk."""
+    expert_count: int = 8
+    """Number of experts."""
+    expert_width: int = 256
+    """Private features of each expert."""
+    gate_hidden: tuple[int, ...] = (512, 256)
+    """Hidden layers of the gating network."""
+    actor_hidden: tuple[int, ...] = (512, 256, 128)
+    """Hidden layers of the actor, shared by teacher and student."""
+    critic_hidden: tuple[int, ...] = (512, 256, 128)
+    """Hidden layers of the critic, shared by teacher and student."""
+    initial_std: float = 1.0
+    """Initial standard deviation of the exploration noise, in network output units."""
+    minimum_std: float = 1e-6
+    """Smallest standard deviation of the exploration noise."""
+
+    def __post_init__(self) -> None:
+        _choose("student_encoder", self.student_encoder, STUDENT_ENCODERS)
+        _positive(self, "latent_width", "expert_count", "expert_width", "initial_std", "minimum_std")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlgorithmConfiguration:
+    """Concurrent teacher-student PPO. Defaults without a remark are the published ones."""
+
+    student_period: int = 4
+    """Environment i belongs to the student if i is a multiple of this, else to the teacher."""
+    epochs: int = 5
+    """Passes over the rollout."""
+    minibatches: int = 4
+    """Minibatches per pass; each holds teacher and student samples in the ratio of their environments."""
+    discount: float = 0.99
+    """Discount factor gamma."""
+    gae_lambda: float = 0.95
+    """Lambda of generalized advantage estimation."""
+    clip: float = 0.2
+    """Clip range of the probability ratio and of the value update."""
+    clip_value_loss: bool = True
+    """Whether the value update is clipped."""
+    value_coefficient: float = 1.0
+    """Weight of the value loss."""
+    entropy_coefficient: float = 0.01
+    """Weight of the entropy bonus."""
+    learning_rate: float = 1e-3
+    """Initial learning rate of teacher encoder, actor and critic."""
+    learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
+    """Bounds of the adaptive learning rate."""
+    desired_kl: float | None = 0.01
+    """KL divergence that the learning rate is adapted to after every minibatch; None keeps the rate fixed."""
+    max_gradient_norm: float = 1.0
+    """Gradient norm limit, of each optimizer."""
+    joint_gradient_clip: bool = True
+    """Whether actor side and critic share one gradient norm (published) or are clipped apart (as rsl_rl does)."""
+    student_learning_rate: float = 1e-3
+    """Learning rate of the student encoder's own Adam."""
+    load_balance_coefficient: float = 0.01
+    """Weight of the load balancing loss of the Mixture of Experts."""
+    load_balance: str = "sum"
+    """``sum`` over the experts (the paper's equation) or ``mean`` (the published code, K times weaker). With the
+    mean, all samples collapsing onto one of 8 experts costs 0.0011 beside a latent error of the order of 0.01, which
+    hardly counters a collapse."""
+    symmetry: str = "none"
+    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image) or ``loss`` (the
+    actor is pulled towards acting alike in mirrored states)."""
+    symmetry_coefficient: float = 1.0
+    """Weight of the mirror loss (``symmetry="loss"``)."""
+    precision: str = "tf32"
+    """Matrix products on a GPU: ``float32``, ``tf32`` or ``bfloat16`` (autocast; losses stay in float32)."""
+    cuda_graphs: bool = False
+    """Replay a minibatch step as one CUDA graph; single GPU only."""
+    compile_mode: str = "none"
+    """Mode of ``torch.compile`` for the loss functions: ``none``, ``default`` or ``max-autotune-no-cudagraphs``."""
+
+    def __post_init__(self) -> None:
+        _choose("symmetry", self.symmetry, SYMMETRY_MODES)
+        _choose("load_balance", self.load_balance, LOAD_BALANCE_FORMS)
+        _choose("precision", self.precision, PRECISIONS)
+        _choose("compile_mode", self.compile_mode, COMPILE_MODES)
+        _positive(self, "epochs", "minibatches", "learning_rate", "student_learning_rate", "max_gradient_norm", "clip")
+        if self.student_period < 2:
+            raise ConfigurationError(
+                f"student_period is {self.student_period}; it must be at least 2, or no environment is left to the "
+                "teacher."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfiguration:
+    """How long a run lasts and what it leaves behind."""
+
+    experiment: str = "go2_moe_cts"
+    """Name of the folder under ``logs/rsl_rl``."""
+    run_name: str = ""
+    """Appended to the date in the run directory's name."""
+    seed: int = 0
+    """Seed of every random generator; rank r of a multi-GPU run uses seed + r."""
+    steps_per_iteration: int = 24
+    """Environment steps of every environment between two updates."""
+    iterations: int = 10_000
+    """Updates of the whole run."""
+    save_interval: int = 500
+    """Updates between two checkpoints."""
+    gauge_interval: int = 500
+    """Updates between two gaugings of the student; 0 for none. Each writes a checkpoint."""
+    gauge_score: str = "score"
+    """Key of the gauge's result by which ``best.pt`` is chosen."""
+    gauge_wait: float = 900.0
+    """Longest wait for pending scores at the end of a run [s]."""
+    random_episode_start: bool = True
+    """Whether the first episodes start at random ages, so that resets spread over time."""
+    nonfinite_limit: float = 0.01
+    """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run
+    stops."""
+
+    def __post_init__(self) -> None:
+        _positive(self, "steps_per_iteration", "iterations", "save_interval", "nonfinite_limit")
+        if self.gauge_interval < 0:
+            raise ConfigurationError(f"gauge_interval is {self.gauge_interval}; it must be 0 (never) or positive.")
+        if not self.experiment or PurePath(self.experiment).name != self.experiment:
+            raise ConfigurationError(f"experiment is {self.experiment!r}; it must be a plain folder name.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfiguration:
+    """Everything about learning that is not the environment."""
+
+    network: NetworkConfiguration = NetworkConfiguration()
+    algorithm: AlgorithmConfiguration = AlgorithmConfiguration()
+    run: RunConfiguration = RunConfiguration()
+
+    def to_rsl_rl(self) -> dict[str, Any]:
+        """The dictionary that rsl_rl's runner and logger expect."""
+        return {
+            "num_steps_per_env": self.run.steps_per_iteration,
+            "save_interval": self.run.save_interval,
+            "run_name": self.run.run_name,
+            "experiment_name": self.run.experiment,
+            "seed": self.run.seed,
+            "logger": "tensorboard",
+            "check_for_nan": False,
+            "obs_groups": {"actor": ["policy"], "critic": ["privileged"]},
+            "algorithm": {"class_name": "gaitgauge.training.algorithms.cts:CTS", "configuration": self.algorithm},
+            "network": self.network,
+        }
+
+
+def to_plain(value: Any) -> Any:
+    """Configuration as plain data that YAML and JSON can hold and read back safely.
+
+    Dataclasses and mappings become dictionaries, tuples lists, enumerations their values, paths strings.
+
+    Raises:
+        TypeError: a value has no plain form.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): to_plain(v) for k, v in value.items()}
+    if isinstance(value, Enum):
+        return to_plain(value.value)
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, list | tuple | set | frozenset):
+        return [to_plain(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"A configuration value of type {type(value).__name__} has no plain form: {value!r}.")

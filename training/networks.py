@@ -1,0 +1,177 @@
+"""The networks of concurrent teacher-student learning.
+
+The student is the very network that is deployed: an architecture of ``policy.networks``, whose actor the teacher
+borrows. The teacher encoder and the critic exist in training only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from tensordict import TensorDict
+from torch import nn
+from torch.nn import functional
+
+from ..policy.networks import ARCHITECTURES, ExpertMixture, multilayer_perceptron
+from .configuration import ConfigurationError, NetworkConfiguration
+
+
+def student_architecture(
+    configuration: NetworkConfiguration,
+    *,
+    frame_width: int,
+    num_actions: int,
+    history_length: int,
+    command_entries: Sequence[int],
+) -> tuple[str, dict[str, Any]]:
+    """Name and arguments, plain data, of the deployed network in ``policy.networks``.
+
+    Args:
+        configuration: sizes.
+        frame_width: width of one observation frame.
+        num_actions: width of an action.
+        history_length: frames that the student sees, the current one included.
+        command_entries: entries of a frame that hold the command, which the experts of ``moe_ng`` do not see.
+
+    Raises:
+        ConfigurationError: ``moe_ng`` without command entries.
+    """
+    common: dict[str, Any] = {
+        "frame_width": frame_width,
+        "num_actions": num_actions,
+        "history_length": history_length,
+        "latent_width": configuration.latent_width,
+        "actor_hidden": list(configuration.actor_hidden),
+    }
+    if configuration.student_encoder == "mlp":
+        return "cts", {**common, "encoder_hidden": list(configuration.student_hidden)}
+    blind: list[int] = []
+    if configuration.student_encoder == "moe_ng":
+        if not command_entries:
+            raise ConfigurationError(
+                "student_encoder is 'moe_ng', but the observation frame has no command to hide from the experts."
+            )
+        blind = list(command_entries)
+    return "moe_cts", {
+        **common,
+        "num_experts": configuration.expert_count,
+        "expert_width": configuration.expert_width,
+        "trunk_hidden": list(configuration.student_hidden),
+        "gate_hidden": list(configuration.gate_hidden),
+        "expert_blind_to": blind,
+    }
+
+
+class CtsActor(nn.Module):
+    """Teacher encoder, student network (encoder and the shared actor) and exploration noise.
+
+    It has the surface of rsl_rl's actor models as far as its runner, its logger and PPO use it.
+    """
+
+    is_recurrent = False
+
+    def __init__(
+        self,
+        configuration: NetworkConfiguration,
+        *,
+        privileged_width: int,
+        architecture: str,
+        arguments: dict[str, Any],
+    ) -> None:
+        """Build all parts.
+
+        Args:
+            configuration: sizes.
+            privileged_width: width of the teacher's input.
+            architecture: name in ``policy.networks.ARCHITECTURES`` of the student network.
+            arguments: its arguments.
+        """
+        super().__init__()
+        self.architecture = architecture
+        self.arguments = arguments
+        self.teacher_encoder = multilayer_perceptron(
+            (privileged_width, *configuration.teacher_hidden, configuration.latent_width)
+        )
+        self.student = ARCHITECTURES[architecture](**arguments)
+        self.distribution = GaussianDistribution(
+            int(arguments["num_actions"]),
+            init_std=configuration.initial_std,
+            std_range=(configuration.minimum_std, 1e6),
+        )
+        self._frames = (int(arguments["history_length"]), int(arguments["frame_width"]))
+
+    def teacher_latent(self, privileged: torch.Tensor) -> torch.Tensor:
+        """Unit latents (N, L) from privileged observations (N, P)."""
+        return functional.normalize(self.teacher_encoder(privileged), dim=-1)
+
+    def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Unit latents (N, L) and gate weights (N, K), None without experts, from flat histories (N, H·F), oldest
+        frame first.
+        """
+        frames = history.unflatten(-1, self._frames)
+        if isinstance(self.student.encoder, ExpertMixture):
+            latent, weights = self.student.encoder(frames)
+            return functional.normalize(latent, dim=-1), weights
+        return functional.normalize(self.student.encoder(frames.flatten(1)), dim=-1), None
+
+    def action_mean(self, latent: torch.Tensor, policy: torch.Tensor) -> torch.Tensor:
+        """Mean actions (N, J) of the shared actor for latents (N, L) and current frames (N, F)."""
+        return self.student.actor(torch.cat((latent, policy), dim=-1))
+
+    def forward(
+        self,
+        observations: TensorDict,
+        masks: torch.Tensor | None = None,
+        hidden_state: None = None,
+        stochastic_output: bool = False,
+    ) -> torch.Tensor:
+        """Actions (N, J) of the student in every row; sampled if ``stochastic_output``."""
+        mean = self.action_mean(self.student_latent(observations["history"])[0], observations["policy"])
+        if not stochastic_output:
+            return mean
+        self.distribution.update(mean)
+        return self.distribution.sample()
+
+    @property
+    def output_std(self) -> torch.Tensor:
+        """Present standard deviation of the exploration noise, (J,)."""
+        return self.distribution.std_param.detach().clamp(*self.distribution.std_range)
+
+    def reset(self, dones: torch.Tensor | None = None, hidden_state: None = None) -> None:
+        """Nothing to forget: the history is part of the observation."""
+
+    def get_hidden_state(self) -> None:
+        """There is none."""
+
+    def update_normalization(self, observations: TensorDict) -> None:
+        """Observations are not normalized."""
+
+    def policy_parameters(self) -> list[nn.Parameter]:
+        """What reinforcement learning trains: teacher encoder, actor and exploration noise."""
+        return [*self.teacher_encoder.parameters(), *self.student.actor.parameters(), *self.distribution.parameters()]
+
+    def student_parameters(self) -> list[nn.Parameter]:
+        """What imitation of the teacher's latent trains: the student encoder."""
+        return list(self.student.encoder.parameters())
+
+
+class CtsCritic(MLPModel):
+    """rsl_rl's perceptron on ``[latent, privileged]``; callers pass the latent detached, so that values never train
+    the encoders.
+    """
+
+    def __init__(self, configuration: NetworkConfiguration, *, privileged_width: int) -> None:
+        example = TensorDict(
+            {"latent": torch.zeros(1, configuration.latent_width), "privileged": torch.zeros(1, privileged_width)},
+            batch_size=[1],
+        )
+        groups = {"critic": ["latent", "privileged"]}
+        super().__init__(example, groups, "critic", 1, hidden_dims=configuration.critic_hidden, activation="elu")
+
+    def value(self, latent: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
+        """Values (N, 1) for detached latents (N, L) and privileged observations (N, P)."""
+        return self.mlp(torch.cat((latent, privileged), dim=-1))

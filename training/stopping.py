@@ -1,0 +1,69 @@
+"""How a training run tells about itself, and how it is asked to stop."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingOutcome:
+    """How a call of ``learn`` ended."""
+
+    reason: str
+    """``finished``, ``time`` (limit reached) or ``signal``."""
+    iteration: int
+    """Completed iterations of the whole run."""
+    checkpoint: Path | None
+    """Last checkpoint, None without a run directory."""
+    exit_code: int
+    """0, or 128 + the signal's number."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """What a progress display gets after every iteration."""
+
+    iteration: int
+    total_iterations: int
+    elapsed: float
+    """Wall-clock time of this call of ``learn`` [s]."""
+    scalars: Mapping[str, float]
+    """What was logged, by key; see ``docs/training.md``."""
+    best_score: float | None
+    """Best score of the gauge so far."""
+    best_iteration: int | None
+
+
+class StopSignals:
+    """While active, SIGTERM and SIGINT ask for an orderly stop; a second SIGINT interrupts at once."""
+
+    def __init__(self, message: Callable[[str], None]) -> None:
+        """Report the request through ``message``."""
+        self.received: int | None = None
+        self._message = message
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignals:
+        # Python runs signal handlers in the main thread only and refuses to install them elsewhere.
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.received = number
+        self._message(f"{signal.Signals(number).name} received: finishing this iteration and writing a checkpoint.")
