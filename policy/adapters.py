@@ -55,20 +55,24 @@ def sidecar_contract(path: Path) -> PolicyContract | None:
     return None
 
 
-def contract_for_width(width: int, robot: Robot, *, order: str, provenance: Mapping[str, Any]) -> PolicyContract | None:
-    """The standard contract with as many frames as an input of this width holds, None if it is not a whole number of
-    frames.
+def contract_for_width(
+    width: int, robot: Robot, *, order: str, provenance: Mapping[str, Any], source: str
+) -> PolicyContract:
+    """The standard contract with as many frames as an input of this width holds.
+
+    Raises:
+        PolicyError: the width is not that of 1 to ``LONGEST_HISTORY`` frames.
     """
     frame = go2_contract(robot).frame_width
     frames, rest = divmod(width, frame)
     if rest or not 1 <= frames <= LONGEST_HISTORY:
-        return None
+        raise PolicyError(
+            f"'{source}' takes {width} values, which is no multiple of the standard observation's {frame}; "
+            "put a contract.json beside it that describes its observation"
+        )
     history = History(length=frames, order=order if frames > 1 else "frame-major")
-    assumed = {
-        **provenance,
-        "assumed": f"observation of {frame} entries, {frames} frame(s) {history.order}, gains of the robot",
-    }
-    return go2_contract(robot, history=history, provenance=assumed)
+    assumed = f"{frames} frame(s) of the standard observation of {frame} entries, {history.order}; gains of the robot"
+    return go2_contract(robot, history=history, provenance={**provenance, "assumed": assumed})
 
 
 def find_deploy_file(path: Path) -> Path | None:

@@ -51,3 +51,30 @@ class Policy(ABC):
     @abstractmethod
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes."""
+
+
+def check_observation(observation: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> None:
+    """Check that a session was handed ``rows`` observations of the contract's width.
+
+    Raises:
+        PolicyError: another shape; ``source`` is the policy's name in the message.
+    """
+    expected = (rows, contract.observation_width)
+    if tuple(observation.shape) != expected:
+        raise PolicyError(f"'{source}' takes observations of shape {expected}, not {tuple(observation.shape)}")
+
+
+def checked_action(action: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> torch.Tensor:
+    """A network's output as a fresh float32 tensor (rows, J). A batch of one may lack its batch axis.
+
+    Raises:
+        PolicyError: the output has another shape.
+    """
+    expected = (rows, contract.num_joints)
+    if rows == 1 and tuple(action.shape) == expected[1:]:
+        action = action.unsqueeze(0)
+    if tuple(action.shape) != expected:
+        raise PolicyError(
+            f"'{source}' gives an output of shape {tuple(action.shape)}; {expected}, one entry per joint, is needed"
+        )
+    return action.to(torch.float32, copy=True)

@@ -6,12 +6,24 @@ import io
 import re
 import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ..robots import Robot, load_robot
-from .adapters import checkpoint_network
-from .base import Policy, PolicyError
-from .contract import check_robot
-from .native import FORMAT, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
+from .adapters import (
+    LONGEST_HISTORY,
+    checkpoint_network,
+    contract_for_width,
+    deploy_contract,
+    find_deploy_file,
+    mjlab_contract,
+    sidecar_contract,
+)
+from .base import PolicyError
+from .contract import ContractError, PolicyContract, check_robot, go2_contract
+from .native import FORMAT, FilePolicy, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
+
+if TYPE_CHECKING:
+    from .onnx_file import OnnxFile
 
 LOG_ROOT = Path("logs/rsl_rl")
 PRETRAINED = Path(__file__).parent / "pretrained" / "go2.gauge.pt"
@@ -19,7 +31,7 @@ POLICY_NAMES = ("latest", "best", "pretrained")
 DEFAULT_ROBOT = "go2"
 
 
-def load_policy(path_or_name: str | Path, robot: Robot | None = None, *, log_root: Path = LOG_ROOT) -> Policy:
+def load_policy(path_or_name: str | Path, robot: Robot | None = None, *, log_root: Path = LOG_ROOT) -> FilePolicy:
     """Load a policy and try it on zeros.
 
     A file's content decides what it is, not its ending: the project's own format, TorchScript, ONNX, or a bare rsl_rl
@@ -97,7 +109,7 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _load(data: bytes, path: Path, source: str, robot: Robot) -> Policy:
+def _load(data: bytes, path: Path, source: str, robot: Robot) -> FilePolicy:
     """Load a file's content; ``path`` is where its sidecars are, ``source`` what the user called it."""
     kind = file_kind(data, source)
     if kind in ("torchscript", "onnx"):
@@ -107,15 +119,73 @@ def _load(data: bytes, path: Path, source: str, robot: Robot) -> Policy:
         stored = read_policy(entries, source=source)
         if isinstance(stored.network, StoredNetwork):
             return NativePolicy(stored.contract, stored.network, path=source)
-        return _foreign(stored.network, path, source, robot)
+        return _foreign(stored.network, path, source, robot, contract=stored.contract)
     found = checkpoint_network(entries, robot, path=path)
     if found is None:
         raise PolicyError(f"'{source}' is a torch.save file, but neither a gaitgauge policy nor an rsl_rl checkpoint")
     return NativePolicy(*found, path=source)
 
 
-def _foreign(file: ForeignFile, path: Path, source: str, robot: Robot) -> Policy:
-    raise PolicyError(f"'{source}' is a {file.kind} file, which cannot be loaded yet")
+def _foreign(
+    file: ForeignFile, path: Path, source: str, robot: Robot, *, contract: PolicyContract | None = None
+) -> FilePolicy:
+    """Load a TorchScript or ONNX file; ``contract`` is the one that was stored with it, None to look for one."""
+    if file.kind == "torchscript":
+        # Only those who load such a file wait for what it needs.
+        from .torchscript import TorchscriptPolicy, load_module
+
+        module, text = load_module(file.data, source=source)
+        if contract is None:
+            contract = _torchscript_contract(module, text, path, source, robot)
+        return TorchscriptPolicy(file.data, module, contract, path=source)
+    from .onnx_file import OnnxFile, OnnxPolicy
+
+    parsed = OnnxFile(file.data, source=source, folder=path.parent)
+    if contract is None:
+        contract = _onnx_contract(parsed, path, source, robot)
+    return OnnxPolicy(parsed, contract, path=source)
+
+
+def _torchscript_contract(module: Any, text: str, path: Path, source: str, robot: Robot) -> PolicyContract:
+    """The contract beside the file, in it, or the standard one with as many frames as the input is wide."""
+    from .torchscript import input_width
+
+    contract = sidecar_contract(path)
+    if contract is None and text:
+        contract = _stored_contract(text, source)
+    if contract is not None:
+        return contract
+    frame = go2_contract(robot).frame_width
+    width = input_width(module, [frame * n for n in range(1, LONGEST_HISTORY + 1)], source=source)
+    provenance = {"adapter": "TorchScript", "file": path.name}
+    return contract_for_width(width, robot, order="frame-major", provenance=provenance, source=source)
+
+
+def _onnx_contract(file: OnnxFile, path: Path, source: str, robot: Robot) -> PolicyContract:
+    """The contract beside the file, in its metadata, from its deploy.yaml, or the standard one for its input's
+    width.
+    """
+    contract = sidecar_contract(path)
+    if contract is not None:
+        return contract
+    if "contract" in file.metadata:
+        return _stored_contract(file.metadata["contract"], source)
+    deploy = find_deploy_file(path)
+    if deploy is not None:
+        return deploy_contract(deploy, robot)
+    contract = mjlab_contract(file.metadata, robot, source=source)
+    if contract is not None:
+        return contract
+    frame = go2_contract(robot).frame_width
+    provenance = {"adapter": "ONNX", "file": path.name}
+    return contract_for_width(file.width or frame, robot, order="term-major", provenance=provenance, source=source)
+
+
+def _stored_contract(text: str, source: str) -> PolicyContract:
+    try:
+        return PolicyContract.from_json(text)
+    except ContractError as error:
+        raise PolicyError(f"'{source}' carries a malformed contract: {error}") from error
 
 
 def file_kind(data: bytes, source: str) -> str:

@@ -30,7 +30,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from .base import Policy, PolicyError, PolicySession
+from .base import Policy, PolicyError, PolicySession, check_observation, checked_action
 from .contract import ContractError, PolicyContract
 from .networks import ARCHITECTURES
 
@@ -41,6 +41,7 @@ FOREIGN_KINDS = ("torchscript", "onnx")
 # What torch raises for damaged or foreign data, from the archive down to the tensors.
 LOAD_ERRORS = (
     RuntimeError,
+    torch.jit.Error,
     pickle.UnpicklingError,
     EOFError,
     OSError,
@@ -212,12 +213,19 @@ def build_network(stored: StoredNetwork, contract: PolicyContract, *, source: st
             f"'{source}': the network takes {network.frame_width} values, "
             f"but its contract's observation has {contract.observation_width}"
         )
-    session = NativeSession(network, 1, contract.num_joints, torch.device("cpu"), source)
+    session = NativeSession(network, 1, contract, torch.device("cpu"), source)
     session.act(torch.zeros(1, contract.observation_width))
     return network
 
 
-class NativePolicy(Policy):
+class FilePolicy(Policy):
+    """A policy that came out of a file and can be stored in one again."""
+
+    stored: StoredNetwork | ForeignFile
+    """Its network, for ``save_policy``."""
+
+
+class NativePolicy(FilePolicy):
     """A policy whose network is one of ``networks.py``."""
 
     def __init__(self, contract: PolicyContract, stored: StoredNetwork, *, path: str) -> None:
@@ -234,20 +242,22 @@ class NativePolicy(Policy):
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes, with a copy of the network."""
         network = copy.deepcopy(self.network).to(device)
-        return NativeSession(network, num_episodes, self.contract.num_joints, torch.device(device), self.path)
+        return NativeSession(network, num_episodes, self.contract, torch.device(device), self.path)
 
 
 class NativeSession(PolicySession):
     """Runs a network of ``networks.py`` and keeps its history and state."""
 
     def __init__(
-        self, network: nn.Module, num_episodes: int, num_joints: int, device: torch.device, source: str
+        self, network: Any, num_episodes: int, contract: PolicyContract, device: torch.device, source: str
     ) -> None:
-        """Take over a network on ``device``; ``source`` is its name for messages."""
-        self._network: Any = network
-        self._shape = (num_episodes, num_joints)
+        """Take over a network of ``ARCHITECTURES`` on ``device``; ``source`` is its name for messages."""
+        self._network = network
+        self._num_episodes = num_episodes
+        self._contract = contract
         self._source = source
-        self._history = torch.zeros(num_episodes, network.history_length, network.frame_width, device=device)  # type: ignore[arg-type]
+        frames, width = self._network.history_length, self._network.frame_width
+        self._history = torch.zeros(num_episodes, frames, width, device=device)
         self._initial: torch.Tensor | None = None
         if hasattr(network, "initial_state"):
             self._initial = self._network.initial_state(num_episodes).to(device)
@@ -266,11 +276,7 @@ class NativeSession(PolicySession):
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """See ``PolicySession``."""
-        expected = (self._shape[0], self._history.shape[2])
-        if tuple(observation.shape) != expected:
-            raise PolicyError(
-                f"'{self._source}' takes observations of shape {expected}, not {tuple(observation.shape)}"
-            )
+        check_observation(observation, self._num_episodes, self._contract, self._source)
         self._history = torch.cat((self._history[:, 1:], observation[:, None]), dim=1)
         with torch.no_grad():
             try:
@@ -280,9 +286,4 @@ class NativeSession(PolicySession):
                     action, self._state = self._network(self._history, self._state)
             except RuntimeError as error:
                 raise PolicyError(f"'{self._source}' failed: {first_line(error)}") from error
-        if tuple(action.shape) != self._shape:
-            raise PolicyError(
-                f"'{self._source}' gives an output of shape {tuple(action.shape)}; "
-                f"{self._shape}, one entry per joint, is needed"
-            )
-        return action
+        return checked_action(action, self._num_episodes, self._contract, self._source)

@@ -56,6 +56,9 @@ class MlpNetwork(nn.Module):
     State dict: ``network.<layer>.weight|bias``, and ``mean``, ``deviation`` (1, H·F) if ``normalize``.
     """
 
+    mean: torch.Tensor
+    deviation: torch.Tensor
+
     def __init__(
         self,
         *,
@@ -126,6 +129,8 @@ class ExpertMixture(nn.Module):
     softmax weighs the heads. State dict: ``trunk.<layer>.*``, ``gate.<layer>.*``, ``head_weight`` (K, latent, expert),
     ``head_bias`` (K, latent), with K = 1 if the experts share one head.
     """
+
+    seen: torch.Tensor
 
     def __init__(
         self,

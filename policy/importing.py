@@ -1,0 +1,43 @@
+"""Turns any policy that can be loaded into the project's own file, which then needs no sidecar."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from ..robots import Robot
+from .base import PolicyError
+from .contract import PolicyContract
+from .loading import LOG_ROOT, load_policy
+from .native import save_policy
+
+
+def import_policy(
+    source: str | Path, destination: str | Path, robot: Robot | None = None, *, log_root: Path = LOG_ROOT
+) -> PolicyContract:
+    """Write a policy and its contract into one file of the project's own format; its actions stay the same.
+
+    Networks that the project knows are stored as weights; a TorchScript or ONNX file is carried inside unchanged.
+
+    Args:
+        source: a file or name as in ``load_policy``.
+        destination: the file to write; an existing file is replaced only once the source has been loaded.
+        robot: as in ``load_policy``.
+        log_root: as in ``load_policy``.
+
+    Returns:
+        The contract that was stored.
+
+    Raises:
+        PolicyError: the source cannot be loaded, or the destination cannot be written.
+        ContractError: the policy is for another robot.
+    """
+    policy = load_policy(source, robot, log_root=log_root)
+    contract = replace(
+        policy.contract, provenance={**policy.contract.provenance, "imported_from": Path(policy.path).name}
+    )
+    try:
+        save_policy(destination, contract, policy.stored)
+    except OSError as error:
+        raise PolicyError(f"'{destination}' cannot be written: {error.strerror or error}") from error
+    return contract

@@ -1,0 +1,224 @@
+"""ONNX policies, run on the CPU by onnxruntime, in batches even where the file was exported for a batch of one.
+
+The batch axis is made symbolic in a copy of the graph; where the exporter wrote the batch of one into reshapes, these
+are opened as well. A copy is only used if it proves equal to running the original row by row; else that is what is
+done, which is slower.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from google.protobuf.message import DecodeError
+from onnx import numpy_helper
+from onnxruntime.capi import onnxruntime_pybind11_state as runtime_state
+
+from .base import PolicyError, PolicySession, check_observation, checked_action
+from .contract import PolicyContract
+from .native import FilePolicy, ForeignFile, first_line
+
+ACTION_NAMES = ("actions", "action")
+PROBE_EPISODES = 3
+PROBE_TOLERANCE = 1e-5
+_RUN_ERRORS = (
+    runtime_state.EPFail,
+    runtime_state.Fail,
+    runtime_state.InvalidArgument,
+    runtime_state.InvalidGraph,
+    runtime_state.InvalidProtobuf,
+    runtime_state.NoModel,
+    runtime_state.NoSuchFile,
+    runtime_state.NotFound,
+    runtime_state.NotImplemented,
+    runtime_state.RuntimeException,
+    RuntimeError,
+    ValueError,
+)
+
+
+class OnnxFile:
+    """A parsed ONNX file with one observation as its input."""
+
+    def __init__(self, data: bytes, *, source: str, folder: Path | None = None) -> None:
+        """Parse a file's content.
+
+        Args:
+            data: the content.
+            source: name for messages.
+            folder: where weights stored beside the file are.
+
+        Raises:
+            PolicyError: not ONNX, damaged, or without exactly one float input of shape (batch, width).
+        """
+        self.source = source
+        try:
+            self.model = onnx.load_model_from_string(data)
+            if folder is not None and any(
+                t.data_location == onnx.TensorProto.EXTERNAL for t in self.model.graph.initializer
+            ):
+                onnx.load_external_data_for_model(self.model, str(folder))
+            self.data = self.model.SerializeToString()
+            self.runtime = _runtime(self.data)
+        except (DecodeError, OSError, onnx.checker.ValidationError, *_RUN_ERRORS) as error:
+            raise PolicyError(f"'{source}' is not a usable ONNX file: {first_line(error)}") from error
+        inputs = self.runtime.get_inputs()
+        if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 2:
+            found = "; ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+            raise PolicyError(
+                f"'{source}' must have one float input of shape (batch, width), but has: {found or 'none'}"
+            )
+        outputs = [o.name for o in self.runtime.get_outputs()]
+        if not outputs:
+            raise PolicyError(f"'{source}' has no output")
+        self.input_name: str = inputs[0].name
+        self.output_name: str = next((n for n in ACTION_NAMES if n in outputs), outputs[0])
+        self.metadata: Mapping[str, str] = {p.key: p.value for p in self.model.metadata_props}
+        shape = inputs[0].shape
+        self.width: int | None = shape[1] if isinstance(shape[1], int) else None
+        """Width of the input, None if the file leaves it open."""
+        self.open_batch = not isinstance(shape[0], int)
+        """Whether the file was exported for any batch size."""
+
+    def variants(self) -> Iterator[bytes]:
+        """The file as exported, if for any batch size, and rewritten for one, mildest change first."""
+        if self.open_batch:
+            yield self.data
+        for open_reshapes in (False, True):
+            yield _with_open_batch(self.model, self.input_name, open_reshapes=open_reshapes)
+
+
+def _runtime(data: bytes) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    # What goes wrong is reported by exceptions; the log would only repeat it on the user's terminal.
+    options.log_severity_level = 4
+    return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+
+
+def _with_open_batch(model: onnx.ModelProto, input_name: str, *, open_reshapes: bool) -> bytes:
+    changed = onnx.ModelProto()
+    changed.CopyFrom(model)
+    graph = changed.graph
+    for value in (*(i for i in graph.input if i.name == input_name), *graph.output):
+        dimensions = value.type.tensor_type.shape.dim
+        if dimensions:
+            dimensions[0].dim_param = "batch"
+    # Shapes noted for inner values still say one.
+    del graph.value_info[:]
+    if open_reshapes:
+        constants = {t.name: t for t in graph.initializer}
+        for node in graph.node:
+            if node.op_type == "Constant":
+                constants.update((node.output[0], a.t) for a in node.attribute if a.name == "value")
+        for number, node in enumerate(n for n in graph.node if n.op_type == "Reshape"):
+            if node.input[1] in constants:
+                shape = numpy_helper.to_array(constants[node.input[1]]).copy()
+                if len(shape) > 1 and shape[0] == 1:
+                    # -1 infers the axis, 0 keeps the input's; only one axis may be inferred.
+                    shape[0] = 0 if -1 in shape[1:] else -1
+                    name = f"open_batch_shape_{number}"
+                    graph.initializer.append(numpy_helper.from_array(shape, name))
+                    node.input[1] = name
+    return changed.SerializeToString()
+
+
+class OnnxPolicy(FilePolicy):
+    """A policy in an ONNX file."""
+
+    def __init__(self, file: OnnxFile, contract: PolicyContract, *, path: str) -> None:
+        """Try the file on zeros and find a batched form of it.
+
+        Raises:
+            PolicyError: the file fails, or its input or output has another width than the contract says.
+        """
+        self.contract = contract
+        self.path = path
+        self.file = file
+        self.stored = ForeignFile(kind="onnx", data=file.data)
+        if file.width is not None and file.width != contract.observation_width:
+            raise PolicyError(
+                f"'{path}' takes {file.width} values, but its contract's observation has {contract.observation_width}"
+            )
+        self._rows = _Runner(file.data, file, contract, path)
+        self._rows.run(np.zeros((1, contract.observation_width), np.float32))
+        self._batch = self._proved_batch()
+
+    @property
+    def batched(self) -> bool:
+        """Whether one run of the file serves all episodes."""
+        return self._batch is not None
+
+    def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
+        """Start work on ``num_episodes`` episodes; the network runs on the CPU wherever the tensors are."""
+        data = self.file.data if self._batch is None else self._batch
+        runner = _Runner(data, self.file, self.contract, self.path)
+        return OnnxSession(runner, num_episodes, self.contract, torch.device(device), batched=self.batched)
+
+    def _proved_batch(self) -> bytes | None:
+        generator = np.random.default_rng(0)
+        probe = generator.standard_normal((PROBE_EPISODES, self.contract.observation_width)).astype(np.float32)
+        expected = np.concatenate([self._rows.run(probe[i : i + 1]) for i in range(PROBE_EPISODES)])
+        for variant in self.file.variants():
+            try:
+                actual = _Runner(variant, self.file, self.contract, self.path).run(probe)
+            except PolicyError:
+                continue
+            if np.allclose(actual, expected, rtol=PROBE_TOLERANCE, atol=PROBE_TOLERANCE, equal_nan=True):
+                return variant
+        return None
+
+
+class _Runner:
+    """Runs one form of a file and checks its output."""
+
+    def __init__(self, data: bytes, file: OnnxFile, contract: PolicyContract, source: str) -> None:
+        try:
+            self._runtime = _runtime(data)
+        except _RUN_ERRORS as error:
+            raise PolicyError(f"'{source}' cannot be prepared by onnxruntime: {first_line(error)}") from error
+        self._input, self._output = file.input_name, file.output_name
+        self._contract, self._source = contract, source
+
+    def run(self, observation: np.ndarray) -> np.ndarray:
+        try:
+            (action,) = self._runtime.run([self._output], {self._input: observation})
+        except _RUN_ERRORS as error:
+            raise PolicyError(
+                f"'{self._source}' fails on observations of shape {observation.shape}: {first_line(error)}"
+            ) from error
+        if not isinstance(action, np.ndarray):
+            raise PolicyError(f"'{self._source}' returns a {type(action).__name__}; a tensor of actions is needed")
+        return checked_action(torch.from_numpy(action), observation.shape[0], self._contract, self._source).numpy()
+
+
+class OnnxSession(PolicySession):
+    """Runs an ONNX file; it has no memory."""
+
+    def __init__(
+        self, runner: _Runner, num_episodes: int, contract: PolicyContract, device: torch.device, *, batched: bool
+    ) -> None:
+        """Keep a runner; ``batched`` says whether it takes all episodes at once."""
+        self.batched = batched
+        self._runner = runner
+        self._num_episodes = num_episodes
+        self._contract = contract
+        self._device = device
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """See ``PolicySession``: there is nothing to forget."""
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """See ``PolicySession``."""
+        check_observation(observation, self._num_episodes, self._contract, self._runner._source)
+        rows = np.ascontiguousarray(observation.detach().cpu().numpy(), dtype=np.float32)
+        if self.batched:
+            actions = self._runner.run(rows)
+        else:
+            actions = np.concatenate([self._runner.run(rows[i : i + 1]) for i in range(len(rows))])
+        return torch.from_numpy(actions).to(self._device)
