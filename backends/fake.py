@@ -1,8 +1,9 @@
 """An engine without physics, for tests of everything above the backends: it does what a script says and nothing else.
 
-Bases glide along a prescribed twist, joints are unit inertias on the real motor law (or sit exactly on their targets), contact forces
-are whatever the script says (by default the feet share the weight). Falls, divergence, penetration and overflow happen at given times.
-What the contract says about latency, masks, samples, watches, limits and randomized motors is honoured exactly.
+Bases glide along a prescribed twist, joints are unit inertias on the real motor law (or sit exactly on their targets),
+contact forces are whatever the script says (by default the feet share the weight). Falls, divergence, penetration and
+overflow happen at given times. What the contract says about latency, masks, samples, watches, limits and randomized
+motors is honoured exactly.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ FootForce = Callable[["FakeBackend"], torch.Tensor]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FakeScript:
-    """What happens in a ``FakeBackend``. Times are (N,), seconds since the world's last reset; infinity or None for never."""
+    """What happens in a ``FakeBackend``. Times are (N,), seconds since the last reset; infinity or None for never."""
 
     motion: Motion | None = None
-    """Called at every substep with the backend (its ``state``, ``targets`` and ``state.time`` are those before the substep); returns the
-    base's linear and angular velocity in the body frame, (N, 3) each [m/s, rad/s]. None: the base keeps its velocities."""
+    """Called at every substep with the backend, whose ``state`` is the one before it; returns the base's linear and
+    angular velocity in the body frame, (N, 3) each [m/s, rad/s]. None: the base keeps its velocities."""
     joint_law: str = "motor"
-    """``motor``: every joint is an inertia of ``joint_inertia`` on the motor law; ``track``: joints are on their targets at once."""
+    """``motor``: every joint is a ``joint_inertia`` on the motor law; ``track``: joints jump to their targets."""
     joint_inertia: float = 1.0
     """[kg·m²]."""
     total_mass: float = 15.0
@@ -56,7 +57,7 @@ class FakeScript:
     foot_force: FootForce | None = None
     """Ground force on each foot, world frame [N], (N, F, 3); None: each foot carries the same share of the weight."""
     fall_time: torch.Tensor | None = None
-    """From here on the base rolls onto its side whatever the motion says, then lies still; the base body carries the weight."""
+    """From here on the base rolls onto its side whatever the motion says, then lies still and carries the weight."""
     diverge_time: torch.Tensor | None = None
     """From here on the world's state is NaN and ``diverged`` is set."""
     penetration_time: torch.Tensor | None = None
@@ -91,7 +92,7 @@ class FakeBackend(PhysicsBackend):
         targets: joint targets that act at present [rad], (N, J); meaningless where ``limp``.
         limp: worlds whose motors have had no target since the reset, (N,) bool.
         terrain_index: terrain of each world, (N,) int64.
-        randomized: present values of every field of ``Randomization``, all worlds; ``friction`` is NaN where it was never set.
+        randomized: present values of every field of ``Randomization``, all worlds; ``friction`` is NaN where never set.
         resets: how often each world was reset, (N,) int64.
     """
 

@@ -1,11 +1,12 @@
 """Does an engine keep the physics contract? Checks that run against any ``PhysicsBackend``, a third party's included.
 
 ``run_conformance(name)`` runs them all and returns one result for each; nothing here prints, and nothing needs pytest.
-The expected values come from plain MuJoCo (C) loops and closed formulas in ``reference``, never from another engine of this package.
+The expected values come from plain MuJoCo (C) loops and closed formulas in ``reference``, never from another engine of
+this package.
 """
 
 from .bench import Bench, ConformanceError
-from .suite import Check, CheckResult, Outcome, all_checks, run_check, run_conformance
+from .suite import Check, CheckResult, Outcome, all_checks, make_bench, run_check, run_conformance
 
 __all__ = [
     "Bench",
@@ -14,6 +15,7 @@ __all__ = [
     "ConformanceError",
     "Outcome",
     "all_checks",
+    "make_bench",
     "run_check",
     "run_conformance",
 ]

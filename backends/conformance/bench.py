@@ -188,7 +188,7 @@ class Bench:
         return PhysicsOptions(**(options | changes))
 
     def soft(self, **changes: float) -> JointParameters:
-        """The robot's default joint parameters without dry friction, one value for all joints where a change is given."""
+        """The robot's default joint parameters without dry friction, one value for all joints where one is given."""
         base = self.robot.parameters[self.robot.default_parameters]
         values = {f.name: getattr(base, f.name) for f in fields(JointParameters)}
         values["friction_loss"] = (0.0,) * self.robot.num_joints

@@ -6,32 +6,46 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .bench import Bench, Worlds, expect, expect_close
 from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, level_stance
 from .suite import check
 
 
-def stand_still(bench: Bench, worlds: Worlds, *, seconds: float = 0.5, **start: Any) -> SimpleNamespace:
-    """Put stiff robots on their feet, each with another heading, let them come to rest and read the state.
+def stand_still(
+    bench: Bench,
+    worlds: Worlds,
+    *,
+    seconds: float = 0.5,
+    ground: ArrayLike = 0.0,
+    xy: ArrayLike = (0.0, 0.0),
+    turn: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    **reset: Any,
+) -> SimpleNamespace:
+    """Put robots on their feet, let them come to rest and read the state.
 
     Args:
         bench: the bench.
         worlds: worlds with ``Bench.stiff()`` joints.
         seconds: time to come to rest [s].
-        start: ``ground``, height of the ground below each robot [m], (N,); ``xy``, its place [m], (N, 2); ``turn``, turns of the
-            whole robot about its feet's plane, quaternions (N, 4), instead of the headings; the rest goes to ``Worlds.reset``.
+        ground: height of the ground below each robot [m], (N,).
+        xy: place of each robot [m], (N, 2).
+        turn: turn of the whole, level robot, quaternions (N, 4); None for another heading in each world.
+        mask: worlds to reset, (N,) bool; None for all.
+        reset: more arguments of ``Worlds.reset``.
     """
     stance = level_stance(Reference(bench.robot, worlds.backend.scene.parameters))
-    ground = np.broadcast_to(start.pop("ground", 0.0), (worlds.count,))
-    xy = np.broadcast_to(start.pop("xy", (0.0, 0.0)), (worlds.count, 2))
-    headings = np.array([axis_angle((0.0, 0.0, 1.0), a) for a in np.linspace(0.0, 2.5, worlds.count)])
-    turns = start.pop("turn", headings)
+    if turn is None:
+        turn = [axis_angle((0.0, 0.0, 1.0), angle) for angle in np.linspace(0.0, 2.5, worlds.count)]
+    height = np.broadcast_to(ground, (worlds.count,)) + stance.height
     worlds.reset(
-        base_position=np.c_[xy, ground + stance.height],
-        base_quaternion=np.array([composed(turn, stance.quaternion) for turn in turns]),
+        mask,
+        base_position=np.c_[np.broadcast_to(xy, (worlds.count, 2)), height],
+        base_quaternion=np.array([composed(each, stance.quaternion) for each in np.asarray(turn)]),
         held_target=worlds.default_pose,
-        **start,
+        **reset,
     )
     worlds.run(seconds)
     return worlds.read()
@@ -47,7 +61,7 @@ def pressure_point(state: SimpleNamespace) -> np.ndarray:
 def centers_of_mass(
     bench: Bench, worlds: Worlds, state: SimpleNamespace, changes: list[dict[str, Any]] | None = None
 ) -> np.ndarray:
-    """The reference's centre of mass in each world's present pose, (N, 3) [m]; ``changes`` as in ``Reference.change``."""
+    """The reference's centre of mass in each world's pose, (N, 3) [m]; ``changes`` as in ``Reference.change``."""
     found = []
     for row in range(worlds.count):
         reference = Reference(bench.robot, worlds.backend.scene.parameters)
@@ -100,7 +114,7 @@ def feet(bench: Bench) -> str:
 
 @check("contact/moment", "contact_forces", "plane")
 def moment(bench: Bench) -> str:
-    """The ground moment is about the mean contact point, and puts the pressure below the centre of mass of a robot at rest."""
+    """The ground moment is about the mean contact point; at rest its pressure is below the centre of mass."""
     with bench.worlds(bench.stiff()) as worlds:
         state = stand_still(bench, worlds, xy=[[0.0, 0.0], [0.8, 0.0], [0.0, -0.7], [1.0, 1.0]])
         radius = Reference(bench.robot, bench.stiff()).foot_radius
@@ -117,7 +131,7 @@ def moment(bench: Bench) -> str:
 
 @check("contact/bodies", "contact_forces", "plane")
 def bodies(bench: Bench) -> str:
-    """A robot on its back: body and foot forces add up to the ground force, which is the weight; the base carries some of it."""
+    """On its back, a robot's body and foot forces add up to the ground force, its weight; the base carries some."""
     with bench.worlds(bench.stiff()) as worlds:
         turned = np.array(
             [composed(axis_angle((0, 0, 1), a), [0.0, 1.0, 0.0, 0.0]) for a in np.linspace(0, 2, worlds.count)]
@@ -145,7 +159,7 @@ def bodies(bench: Bench) -> str:
 
 
 def back_height(reference: Reference, *, clearance: float = 0.001) -> float:
-    """Height of the base origin at which a robot on its back, in its default pose, just does not touch the ground [m]."""
+    """Height of the base origin at which a robot on its back, in its default pose, just clears the ground [m]."""
     reference.place((0.0, 0.0, 0.0))
     model, data = reference.model, reference.data
     top = 0.0

@@ -1,4 +1,4 @@
-"""Checks of friction: the randomized coefficient is the one that acts, whatever the model's own, in every world for itself."""
+"""Checks of friction: the randomized coefficient is the one that acts, in every world for itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HEADING_X = np.tile([1.0, 0.0, 0.0, 0.0], (4, 1))
 
 @check("friction/incline", "friction", "boxes", "per_world_terrain")
 def slides_or_stays(bench: Bench) -> str:
-    """A stiff robot on an incline slides exactly where tan(angle) exceeds the friction, below and above the model's own."""
+    """A stiff robot on an incline slides where tan(angle) exceeds the friction, below and above the model's own."""
     gentle, steep = 0.30, 0.45
     angle, friction = np.array([gentle, gentle, steep, steep]), np.array([0.2, 0.4, 0.4, 0.65])
     terrains = (incline(gentle, name="gentle"), incline(steep, name="steep"))

@@ -45,7 +45,7 @@ def _standing_height(bench: Bench) -> float:
 
 @check("ground/boxes", "boxes", "per_world_terrain")
 def boxes(bench: Bench) -> str:
-    """Every world has its own boxes where the terrain says, turned ones included; robots stand on them at their height."""
+    """Every world has its own boxes where its terrain says, turned ones included, and robots stand on them."""
     with bench.worlds(bench.stiff(), terrains=PALETTE, terrain_index=(0, 1, 2, 3)) as worlds:
         heights = np.array([float(t.height(x, y)) for t, (x, y) in zip(PALETTE, PLACES, strict=True)])
         turns = np.array([axis_angle((0.0, 1.0, 0.0), PITCH if row == 3 else 0.0) for row in range(worlds.count)])
@@ -78,7 +78,7 @@ def switch(bench: Bench) -> str:
         stand_still(bench, worlds, seconds=0.1, ground=np.array([0.0, 0.3, 0.0, 0.3]))
         chosen = np.array([True, True, False, False])
         index, ground = np.array([1, 0, 3, 3]), np.array([0.3, 0.0, 0.0, 0.3])
-        state = stand_still(bench, worlds, seconds=0.3, worlds=chosen, ground=ground, terrain_index=index)
+        state = stand_still(bench, worlds, seconds=0.3, mask=chosen, ground=ground, terrain_index=index)
         stance = _standing_height(bench)
         expect_close("base height above the new ground [m]", state.base_position_w[:, 2], ground + stance, 0.006)
         keep = np.array([1, 0, 0, 1])

@@ -53,7 +53,7 @@ def tilt_watch(bench: Bench) -> str:
 
 @check("health/penetration_watch", "penetration", "boxes", "per_world_terrain")
 def penetration_watch(bench: Bench) -> str:
-    """penetration_substep trips for a robot deep in a box, not for one that stands on it nor for one deep in the floor."""
+    """penetration_substep trips for a robot deep in a box, not for one that stands on it or is deep in the floor."""
     stance = level_stance(Reference(bench.robot, bench.soft()))
     terrains, index = (Terrain(name="conformance_flat", family="block"), BLOCK), (1, 1, 0, 0)
     with bench.worlds(bench.stiff(), terrains=terrains, terrain_index=index, watch_penetration=0.02) as worlds:
@@ -76,7 +76,7 @@ def penetration_watch(bench: Bench) -> str:
 
 @check("health/divergence")
 def divergence(bench: Bench) -> str:
-    """A world that got an infinite velocity or a NaN target is reported as diverged, the others go on untouched; a reset heals it."""
+    """An infinite velocity or a NaN target makes its world diverged; the others go on untouched, a reset heals it."""
     with bench.worlds() as worlds, bench.worlds() as untouched:
         for each in (worlds, untouched):
             stand(bench, each)

@@ -33,8 +33,9 @@ def posed(bench: Bench, count: int, *, seed: int = 1) -> dict[str, Any]:
     low, high = reference.joint_range.T
     pose = np.asarray(bench.robot.default_joint_position)
     joints = np.clip(pose + random.uniform(-0.3, 0.3, (count, len(pose))), low + 0.02, high - 0.02)
+    around = np.array([0.0, 0.0, 2.0])
     return {
-        "base_position": random.uniform(-0.5, 0.5, (count, 3)) + [0.0, 0.0, 2.0],
+        "base_position": around + random.uniform(-0.5, 0.5, (count, 3)),
         "base_quaternion": np.array([axis_angle(random.normal(size=3), a) for a in random.uniform(0.5, 2.5, count)]),
         "joint_position": joints,
         "base_linear_velocity": random.uniform(-1.0, 1.0, (count, 3)),
@@ -142,7 +143,7 @@ def feet(bench: Bench) -> str:
 
 @check("kinematics/frames")
 def frames(bench: Bench) -> str:
-    """Poses move the way the reported velocities say: linear in the world frame at the base origin, angular in the body frame."""
+    """Poses move as the velocities say: linear in the world frame at the base origin, angular in the body frame."""
     with bench.worlds() as worlds:
         asked = posed(bench, worlds.count, seed=3)
         asked["base_angular_velocity"] *= 3.0

@@ -16,7 +16,7 @@ def law(bench: Bench, target: np.ndarray, position: np.ndarray, velocity: np.nda
 
 
 def one_step_torques(worlds: Worlds, bench: Bench, *, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """(reported torque, torque by the plain law) of one substep from random joint states with targets up to ``reach`` [rad] away."""
+    """Reported torque and torque by the law after one substep from random states, targets ``reach`` [rad] away."""
     random = np.random.default_rng(5)
     asked = posed(bench, worlds.count, seed=5)
     target = asked["joint_position"] + random.uniform(-reach, reach, asked["joint_position"].shape)
@@ -61,7 +61,7 @@ def motor_strength(bench: Bench) -> str:
 
 @check("motors/gains", "gains")
 def motor_gains(bench: Bench) -> str:
-    """kp and kd are scaled for each world and joint on their own."""
+    """Stiffness and damping are scaled for each world and joint on their own."""
     random = np.random.default_rng(7)
     stiffness, damping = random.uniform(0.5, 1.5, (2, 4, bench.robot.num_joints))
     with bench.worlds() as worlds:
@@ -95,7 +95,7 @@ def motor_offset(bench: Bench) -> str:
 
 @check("motors/limp_and_held")
 def limp_and_held(bench: Bench) -> str:
-    """Motors are limp from a reset to the first target, unless the reset gives a held target; step(None) keeps the target."""
+    """Motors are limp from a reset to the first target, or hold the one that the reset gives; step(None) keeps it."""
     with bench.worlds() as worlds:
         asked = posed(bench, worlds.count, seed=10)
         worlds.reset(**asked)

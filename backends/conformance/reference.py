@@ -53,7 +53,7 @@ class Reference:
     def change(
         self, *, base_mass: float = 0.0, base_com: ArrayLike = (0.0, 0.0, 0.0), link_scale: ArrayLike = 1.0
     ) -> None:
-        """Change the model as ``Randomization`` describes it; ``link_scale`` is (B,), its entry for the base is ignored."""
+        """Change the model as ``Randomization`` says; ``link_scale`` is (B,), its entry for the base is ignored."""
         scale = np.broadcast_to(np.asarray(link_scale, dtype=np.float64), self.bodies.shape)
         for body, factor in zip(self.bodies, scale, strict=True):
             if body != self.base:
@@ -78,7 +78,7 @@ class Reference:
         qpos, qvel = self.data.qpos, self.data.qvel
         qpos[0:3], qpos[3:7] = base_position, base_quaternion
         qpos[self.at_position] = self.robot.default_joint_position if joint_position is None else joint_position
-        # MuJoCo's free joint: linear velocity of the body's origin in the world frame, angular velocity in the body frame
+        # MuJoCo's free joint: velocity of the body's origin in the world frame, angular velocity in the body frame
         qvel[0:3], qvel[3:6] = base_linear_velocity, base_angular_velocity
         qvel[self.at_velocity] = joint_velocity
         mujoco.mj_forward(self.model, self.data)

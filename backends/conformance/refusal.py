@@ -69,7 +69,7 @@ REQUESTS: dict[str, Callable[[Bench], None]] = {
     "deterministic": lambda bench: _build(bench, deterministic=True),
     "gpu": _cuda,
 }
-"""What to ask an engine for, by the capability that it takes. Contact forces have no request: they are NaN where not supported."""
+"""What to ask an engine for, by the capability that it takes; nobody asks for contact forces, they are just there."""
 
 
 def accepts_or_refuses(capability: str) -> Callable[[Bench], str]:

@@ -39,7 +39,10 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One check. Its ``run`` raises ``ConformanceError`` where the engine breaks the contract and returns what it measured, for the table."""
+    """One check.
+
+    Its ``run`` raises ``ConformanceError`` where the engine breaks the contract and returns what it measured.
+    """
 
     name: str
     """Room and subject, for example ``motors/latency``."""
@@ -104,28 +107,16 @@ def run_check(check: Check, bench: Bench) -> CheckResult:
     return CheckResult(name=check.name, outcome=outcome, detail=detail, seconds=perf_counter() - start)
 
 
-def run_conformance(
-    backend: str | type[PhysicsBackend],
-    device: str = "cpu",
-    *,
-    robot: Robot | None = None,
-    only: Sequence[str] = (),
-    report: Callable[[CheckResult], None] | None = None,
-) -> list[CheckResult]:
-    """Run the conformance checks against an engine.
+def make_bench(backend: str | type[PhysicsBackend], device: str = "cpu", *, robot: Robot | None = None) -> Bench:
+    """The test bench of an engine, for ``run_check``.
 
     Args:
         backend: registry name (``mujoco``, ``newton:kamino``, a plug-in's name), or a class.
         device: where its worlds live, ``cpu`` or ``cuda``.
         robot: the robot in the scenes, four-legged with spherical feet; None for the Go2.
-        only: beginnings of the names of the checks to run (``motors``, ``contact/rest``); empty for all.
-        report: called with each result as soon as it is there.
-
-    Returns:
-        One result for each check.
 
     Raises:
-        BackendError: the engine is unknown or not installed, does not declare its capabilities, or no check has such a name.
+        BackendError: the engine is unknown or not installed, or does not declare all capabilities.
     """
     name = backend if isinstance(backend, str) else backend.name
     found = backend_class(name) if isinstance(backend, str) else backend
@@ -143,7 +134,33 @@ def run_conformance(
     def make(scene: Scene, on: str) -> PhysicsBackend:
         return make_backend(name, scene, device=on) if isinstance(backend, str) else found(scene, device=on)
 
-    bench = Bench(make=make, capabilities=capabilities, robot=robot or load_robot("go2"), device=device)
+    return Bench(make=make, capabilities=capabilities, robot=robot or load_robot("go2"), device=device)
+
+
+def run_conformance(
+    backend: str | type[PhysicsBackend],
+    device: str = "cpu",
+    *,
+    robot: Robot | None = None,
+    only: Sequence[str] = (),
+    report: Callable[[CheckResult], None] | None = None,
+) -> list[CheckResult]:
+    """Run the conformance checks against an engine.
+
+    Args:
+        backend: as for ``make_bench``.
+        device: as for ``make_bench``.
+        robot: as for ``make_bench``.
+        only: beginnings of the names of the checks to run (``motors``, ``contact/rest``); empty for all.
+        report: called with each result as soon as it is there.
+
+    Returns:
+        One result for each check.
+
+    Raises:
+        BackendError: no check has such a name, or as ``make_bench``.
+    """
+    bench = make_bench(backend, device, robot=robot)
     chosen = [c for c in all_checks() if not only or any(c.name.startswith(o) for o in only)]
     if not chosen:
         known = ", ".join(sorted({c.name.partition("/")[0] for c in all_checks()}))

@@ -1,0 +1,201 @@
+"""The conformance checks must fail engines that are wrong: MuJoCo's engine with one fault at a time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gaitgauge.backends import BackendError, Capability, Randomization, Support
+from gaitgauge.backends.conformance import Outcome, all_checks, make_bench, run_check
+from gaitgauge.backends.conformance.reference import rotated
+from gaitgauge.backends.mujoco import MujocoBackend
+
+CHECKS = {check.name: check for check in all_checks()}
+
+
+class StateFault(MujocoBackend):
+    """An engine whose state is reported wrongly."""
+
+    @property
+    def state(self):
+        return self.spoil(super().state)
+
+
+class QuaternionXyzw(StateFault):
+    def spoil(self, state):
+        return replace(state, base_quaternion_w=state.base_quaternion_w.roll(-1, dims=-1))
+
+
+class AngularVelocityInWorld(StateFault):
+    def spoil(self, state):
+        turned = [rotated(q, v) for q, v in zip(state.base_quaternion_w, state.base_angular_velocity_b, strict=True)]
+        return replace(state, base_angular_velocity_b=torch.tensor(np.array(turned)))
+
+
+class VelocityOfTheCenterOfMass(StateFault):
+    def spoil(self, state):
+        arm = torch.tensor([0.021112, 0.0, -0.005366], dtype=torch.float64)
+        swing = torch.linalg.cross(state.base_angular_velocity_b, arm.expand(len(state.time), 3))
+        turned = [rotated(q, v) for q, v in zip(state.base_quaternion_w, swing, strict=True)]
+        return replace(state, base_linear_velocity_w=state.base_linear_velocity_w + torch.tensor(np.array(turned)))
+
+
+class FeetInAnotherOrder(StateFault):
+    def spoil(self, state):
+        return replace(state, foot_position_w=state.foot_position_w[:, [1, 0, 3, 2]])
+
+
+class MomentAboutTheOrigin(StateFault):
+    def spoil(self, state):
+        about_origin = state.ground_moment_w + torch.linalg.cross(state.contact_center_w, state.ground_force_w)
+        return replace(state, ground_moment_w=about_origin)
+
+
+class FootForceCountedTwice(StateFault):
+    def spoil(self, state):
+        bodies = state.body_contact_force_w.clone()
+        bodies[:, [3, 6, 9, 12]] += state.foot_contact_force_w
+        return replace(state, body_contact_force_w=bodies)
+
+
+class DivergenceHidden(StateFault):
+    def spoil(self, state):
+        return replace(state, diverged=torch.zeros_like(state.diverged))
+
+
+class LateTargets(MujocoBackend):
+    def step(self, joint_targets, *, delay=None, **rest):
+        later = None if delay is None else (delay + 1).clamp_max(self.scene.physics.substeps)
+        super().step(joint_targets, delay=later, **rest)
+
+
+class LateSample(MujocoBackend):
+    def step(self, joint_targets, *, sample_at=None, **rest):
+        later = None if sample_at is None else torch.where(sample_at > 0, sample_at % 10 + 1, sample_at)
+        super().step(joint_targets, sample_at=later, **rest)
+
+
+class StepsEverybody(MujocoBackend):
+    def step(self, joint_targets, *, worlds=None, **rest):
+        super().step(joint_targets, **rest)
+
+
+class ResetsForceNever(MujocoBackend):
+    def apply_force(self, force_w):
+        self.force = force_w.clone()
+        super().apply_force(force_w)
+
+    def reset(self, *args, **kwargs):
+        super().reset(*args, **kwargs)
+        if hasattr(self, "force"):
+            super().apply_force(self.force)
+
+
+class PushesAngularVelocityInWorld(MujocoBackend):
+    def push(self, worlds=None, *, linear_velocity_w=None, angular_velocity_b=None):
+        if angular_velocity_b is not None:
+            q = self.state.base_quaternion_w
+            filled = torch.where(angular_velocity_b.isnan(), self.state.base_angular_velocity_b, angular_velocity_b)
+            angular_velocity_b = torch.tensor(
+                [rotated(a * torch.tensor([1, -1, -1, -1]), v) for a, v in zip(q, filled, strict=True)]
+            )
+        super().push(worlds, linear_velocity_w=linear_velocity_w, angular_velocity_b=angular_velocity_b)
+
+
+class RandomizationFault(MujocoBackend):
+    """An engine that misunderstands randomization."""
+
+    def randomize(self, randomization, worlds=None):
+        super().randomize(self.spoil(randomization), worlds)
+
+
+class FrictionNeverAboveItsOwn(RandomizationFault):
+    def spoil(self, randomization):
+        friction = randomization.friction
+        return randomization if friction is None else replace(randomization, friction=friction.clamp_max(0.4))
+
+
+class FrictionOfTheFirstWorld(RandomizationFault):
+    def spoil(self, randomization):
+        friction = randomization.friction
+        return randomization if friction is None else replace(randomization, friction=friction[:1].expand_as(friction))
+
+
+class CenterOfMassMirrored(RandomizationFault):
+    def spoil(self, randomization):
+        shift = randomization.base_com_offset
+        mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+        return randomization if shift is None else replace(randomization, base_com_offset=shift * mirror)
+
+
+class MassesIgnored(RandomizationFault):
+    def spoil(self, randomization):
+        return replace(randomization, base_mass_offset=None, link_mass_scale=None)
+
+
+class ForgetsAtReset(MujocoBackend):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.built = True
+
+    def reset(self, *args, **kwargs):
+        if hasattr(self, "built"):
+            self.randomize(Randomization(base_mass_offset=torch.zeros(self.num_worlds)))
+        super().reset(*args, **kwargs)
+
+
+class SwallowsRequests(MujocoBackend):
+    @classmethod
+    def capabilities(cls):
+        nothing = Capability(support=Support.NONE)
+        return {**super().capabilities(), "external_force": nothing, "boxes": nothing, "motor_offset": nothing}
+
+
+class OverPromises(MujocoBackend):
+    def apply_force(self, force_w):
+        raise BackendError("external forces are not there in this engine; leave them out of the task")
+
+
+FAULTS = [
+    (QuaternionXyzw, "reset/state"),
+    (AngularVelocityInWorld, "reset/state"),
+    (AngularVelocityInWorld, "kinematics/frames"),
+    (VelocityOfTheCenterOfMass, "kinematics/frames"),
+    (FeetInAnotherOrder, "kinematics/feet"),
+    (MomentAboutTheOrigin, "contact/moment"),
+    (FootForceCountedTwice, "contact/feet"),
+    (DivergenceHidden, "health/divergence"),
+    (LateTargets, "motors/latency"),
+    (LateSample, "stepping/sample_at"),
+    (StepsEverybody, "stepping/mask"),
+    (ResetsForceNever, "disturbance/force_reset"),
+    (PushesAngularVelocityInWorld, "disturbance/push"),
+    (FrictionNeverAboveItsOwn, "friction/incline"),
+    (FrictionNeverAboveItsOwn, "friction/bodies"),
+    (FrictionOfTheFirstWorld, "friction/braking"),
+    (CenterOfMassMirrored, "model/base_com"),
+    (CenterOfMassMirrored, "model/base_com_motion"),
+    (MassesIgnored, "model/base_mass"),
+    (MassesIgnored, "model/base_mass_motion"),
+    (MassesIgnored, "model/link_mass_motion"),
+    (MassesIgnored, "model/link_mass"),
+    (ForgetsAtReset, "model/persistence"),
+    (SwallowsRequests, "refusal/external_force"),
+    (SwallowsRequests, "refusal/boxes"),
+    (SwallowsRequests, "refusal/motor_offset"),
+    (OverPromises, "refusal/external_force"),
+]
+
+
+@pytest.mark.parametrize(("engine", "check"), FAULTS, ids=lambda v: v if isinstance(v, str) else v.__name__)
+def test_fault_is_caught(engine, check):
+    result = run_check(CHECKS[check], make_bench(engine))
+    assert result.outcome is Outcome.FAILED
+    # by the comparison, not by the fault breaking the check itself
+    assert "Error: " not in result.detail
+
+
+def test_what_an_engine_cannot_do_is_neither_passed_nor_failed():
+    result = run_check(CHECKS["disturbance/force"], make_bench(SwallowsRequests))
+    assert result.outcome is Outcome.NOT_SUPPORTED
+    assert "external_force" in result.detail
