@@ -1,0 +1,143 @@
+"""Statistics and special cases of the command draws."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from gaitgauge.training.commands import COMMAND_COLUMNS, CommandGenerator
+from gaitgauge.training.environment_configuration import CommandConfiguration, CommandStage, Ramp
+
+COUNT = 40_000
+LIMITS = ((1.5, 1.0, 1.5), (0.6, 0.6, 9.0))
+STAGES = (
+    CommandStage(begin=0.0, forward=(-0.5, 0.5), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),
+    CommandStage(begin=0.5, forward=(-2.0, 3.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
+)
+PLAIN = CommandConfiguration(
+    stages=STAGES,
+    straight_probability=0.0,
+    extreme_probability=0.0,
+    flip_probability=0.0,
+    stationary_probability=Ramp(start=0.0, end=0.0),
+)
+
+
+def draw(configuration, *, progress=0.0, kind=0, count=COUNT, **changes):
+    generator = CommandGenerator(
+        configuration, terrain_limits=LIMITS, control_period=0.02, max_episode_length=1250, device="cpu"
+    )
+    random = torch.Generator().manual_seed(1)
+    state = {
+        "kind": torch.full((count,), kind),
+        "progress": torch.tensor(progress),
+        "episode_length": torch.zeros(count, dtype=torch.int64),
+        "issued": torch.zeros(count, 2),
+        "command": torch.zeros(count, 3),
+        "extreme": torch.zeros(count, dtype=torch.bool),
+    }
+    uniform = {name: torch.rand(count, width, generator=random) for name, width in COMMAND_COLUMNS.items()}
+    return generator.draw(uniform, **{**state, **changes})
+
+
+def share(mask):
+    return float(mask.float().mean())
+
+
+def test_ranges_are_those_of_the_stage_capped_by_the_terrain():
+    for progress, kind, forward, lateral, yaw in (
+        (0.0, 0, 0.5, 0.5, 1.0),
+        (0.5, 0, 1.5, 1.0, 1.5),
+        (0.9, 1, 0.6, 0.6, 2.0),
+    ):
+        highest = draw(PLAIN, progress=progress, kind=kind).command.abs().amax(dim=0)
+        assert highest.tolist() == pytest.approx([forward, lateral, yaw], rel=1e-3)
+        assert (highest <= torch.tensor([forward, lateral, yaw]) + 1e-6).all()
+
+
+def test_least_speed_lets_the_robot_leave_its_tile():
+    command = draw(PLAIN).command
+    # 5 m in 25 s.
+    assert float(command[:, :2].abs().min()) == pytest.approx(0.2, abs=1e-3)
+    assert share(command[:, 0] > 0) == pytest.approx(0.5, abs=0.01)
+    assert float(command[:, 2].abs().min()) < 0.01, "the yaw rate has no least value"
+    done = draw(PLAIN, issued=torch.full((COUNT, 2), 1.0)).command
+    assert float(done[:, :2].abs().min()) < 0.01, "7 m were commanded already"
+
+
+def test_least_speed_beyond_the_range_means_full_speed_either_way():
+    late = draw(PLAIN, episode_length=torch.full((COUNT,), 1200))
+    assert late.command[:, :2].abs().unique().tolist() == pytest.approx([0.5])
+    assert share(late.command[:, 0] > 0) == pytest.approx(0.5, abs=0.01)
+
+
+def test_uniform_draws_fill_both_sides_evenly():
+    free = replace(PLAIN, dynamic=False)
+    command = draw(free).command
+    assert command.mean(dim=0).tolist() == pytest.approx([0.0] * 3, abs=0.01)
+    assert command.std(dim=0).tolist() == pytest.approx([0.5 / 3**0.5, 0.5 / 3**0.5, 1.0 / 3**0.5], rel=0.02)
+    lopsided = draw(PLAIN, progress=1.0, kind=1, issued=torch.full((COUNT, 2), 9.0)).command
+    assert share(lopsided[:, 0] > 0) == pytest.approx(0.5, abs=0.01)
+
+
+def test_extreme_commands_have_every_axis_at_a_limit_or_zero():
+    only = replace(PLAIN, extreme_probability=1.0)
+    drawn = draw(only)
+    assert drawn.extreme.all()
+    combinations, counts = drawn.command.unique(dim=0, return_counts=True)
+    assert set(combinations.flatten().tolist()) == {-1.0, -0.5, 0.0, 0.5, 1.0}
+    assert len(combinations) == 26, "all of 3 x 3 x 3 but the zero command"
+    assert share((drawn.command == 0).sum(dim=1) == 2) == pytest.approx(6 / 27 + 1 / 27, abs=0.01)
+    assert counts.min() > COUNT / 27 * 0.85
+
+
+def test_opposite_follows_an_extreme_command():
+    flips = replace(PLAIN, flip_probability=0.3)
+    before = torch.tensor([0.5, -0.5, 1.0]).expand(COUNT, 3)
+    drawn = draw(flips, command=before, extreme=torch.ones(COUNT, dtype=torch.bool))
+    opposite = (drawn.command == -before).all(dim=1)
+    assert share(opposite) == pytest.approx(0.3, abs=0.01)
+    assert torch.equal(opposite, drawn.extreme), "an opposite is extreme, so it can be followed by its own opposite"
+    without = draw(flips, command=before)
+    assert not (without.command == -before).all(dim=1).any()
+
+
+def test_opposite_stays_in_an_asymmetric_range():
+    flips = replace(PLAIN, stages=(replace(STAGES[1], begin=0.0, forward=(-0.5, 1.2)),), flip_probability=1.0)
+    before = torch.tensor([1.2, 0.0, 0.0]).expand(COUNT, 3)
+    drawn = draw(flips, command=before, extreme=torch.ones(COUNT, dtype=torch.bool))
+    assert drawn.command[:, 0].unique().tolist() == [-0.5]
+
+
+def test_stationary_commands_are_mostly_all_zero_and_short():
+    still = replace(PLAIN, stationary_probability=Ramp(start=0.4, end=0.4), extreme_probability=0.2)
+    drawn = draw(still)
+    halted = (drawn.command[:, :2] == 0).all(dim=1) & ~drawn.extreme
+    assert share(halted) == pytest.approx(0.4, abs=0.01)
+    assert share((drawn.command[halted] == 0).all(dim=1)) == pytest.approx(0.75, abs=0.02)
+    assert drawn.steps[halted].unique().tolist() == [150]
+    assert drawn.steps[~halted].unique().tolist() == [250]
+
+
+def test_stationary_commands_wait_until_the_way_is_commanded():
+    still = replace(PLAIN, stationary_probability=Ramp(start=1.0, end=1.0))
+    # 0.4 m/s take 12.5 s, 625 steps, for 5 m: 100 steps before that there is no time to stand.
+    assert not (draw(still, episode_length=torch.full((COUNT,), 725)).command == 0).all(dim=1).any()
+    short = draw(still, episode_length=torch.full((COUNT,), 600))
+    assert short.steps.unique().tolist() == [25]
+
+
+def test_share_of_stationary_commands_follows_progress():
+    still = replace(PLAIN, stationary_probability=Ramp(start=0.0, end=0.2, until=0.1))
+    for progress, expected in ((0.0, 0.0), (0.05, 0.1), (0.4, 0.2)):
+        halted = (draw(still, progress=progress).command[:, :2] == 0).all(dim=1)
+        assert share(halted) == pytest.approx(expected, abs=0.01)
+
+
+def test_straight_share():
+    command = draw(replace(PLAIN, straight_probability=0.3)).command
+    assert share(command[:, 2] == 0) == pytest.approx(0.3, abs=0.01)
+
+
+def test_stages_must_be_in_order():
+    with pytest.raises(ValueError, match="first must begin at 0"):
+        draw(replace(PLAIN, stages=STAGES[1:]), count=2)

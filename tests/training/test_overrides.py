@@ -1,0 +1,133 @@
+"""Settings from the command line, and the tasks they apply to."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+from gaitgauge.training.overrides import TaskError, apply_overrides, override_keys
+from gaitgauge.training.tasks import TASKS, find_task, task_names
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wheel:
+    name: str = "front"
+    radius: float = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Engine:
+    power: float = 1.0
+    gears: int = 5
+    cooling: float | None = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Car:
+    engine: Engine = Engine()
+    wheels: tuple[Wheel, ...] = (Wheel(), Wheel(name="rear"))
+    seats: tuple[int, int] = (2, 3)
+    colours: tuple[str, ...] = ("red",)
+    open_roof: bool = False
+    label: str = "a"
+    limit: int | None = None
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("engine.power=2", Car(engine=Engine(power=2.0))),
+        ("engine.power=-1e-3", Car(engine=Engine(power=-1e-3))),
+        ("engine.gears = 6", Car(engine=Engine(gears=6))),
+        ("engine.cooling=none", Car(engine=Engine(cooling=None))),
+        ("engine.cooling=3", Car(engine=Engine(cooling=3.0))),
+        ("wheels.rear.radius=0.4", Car(wheels=(Wheel(), Wheel(name="rear", radius=0.4)))),
+        ("wheels.0.radius=0.4", Car(wheels=(Wheel(radius=0.4), Wheel(name="rear")))),
+        ("seats=1,2", Car(seats=(1, 2))),
+        ("seats=(4, 5)", Car(seats=(4, 5))),
+        ("colours=blue,green,grey", Car(colours=("blue", "green", "grey"))),
+        ("open_roof=True", Car(open_roof=True)),
+        ("label=x=y", Car(label="x=y")),
+        ("limit=7", Car(limit=7)),
+    ],
+)
+def test_values_take_the_field_s_type(override, expected):
+    changed = apply_overrides(Car(), [override])
+    assert changed == expected
+    assert type(changed.engine.power) is float and type(changed.engine.gears) is int
+
+
+def test_later_settings_win_and_the_original_stays():
+    car = Car()
+    assert apply_overrides(car, ["label=b", "label=c"]).label == "c"
+    assert car == Car()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("engine.powr=2", r"unknown setting 'engine.powr'; the nearest are: engine.power"),
+        ("power=2", r"engine.power"),
+        ("engine.power.x=2", r"unknown setting 'engine.power.x'"),
+        ("wheels.middle.radius=1", r"unknown setting .*wheels.front.radius"),
+        ("wheels.2.radius=1", r"unknown setting"),
+        ("qqqqqq=1", r"settings begin with: colours, engine, label"),
+        ("engine=2", r"'engine' is a group of 3 settings; set one of them: engine.power"),
+        ("wheels=2", r"'wheels' cannot be set|'wheels' is a group"),
+        ("label", r"'label' is no setting; write key=value"),
+        ("=3", r"no setting"),
+        ("engine.gears=2.5", r"'engine.gears' is '2.5', but must be a whole number"),
+        ("engine.power=fast", r"must be a finite number"),
+        ("engine.power=nan", r"must be a finite number"),
+        ("engine.cooling=x", r"must be a finite number, or none"),
+        ("open_roof=1", r"must be true or false"),
+        ("seats=1,2,3", r"must be 2 values separated by commas"),
+    ],
+)
+def test_mistakes_are_named(override, message):
+    with pytest.raises(TaskError, match=message):
+        apply_overrides(Car(), [override])
+
+
+def test_every_key_can_be_set_to_what_it_is():
+    task = TASKS["go2-moe-cts"]
+    for key in override_keys(task):
+        section, _, rest = key.partition(".")
+        if section not in ("environment", "training"):
+            continue
+        value = task
+        for name in key.split("."):
+            if isinstance(value, tuple):
+                value = next((v for v in value if getattr(v, "name", None) == name), None) or value[int(name)]
+            else:
+                value = getattr(value, name)
+        text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        assert task.with_overrides([f"{key}={text}"]) == task, key
+
+
+def test_tasks():
+    assert task_names() == ["go2-moe-cts", "go2-cts", "go2-flat"]
+    moe, plain, flat = (find_task(name) for name in task_names())
+    assert moe.training.network.student_encoder == "moe" and plain.training.network.student_encoder == "mlp"
+    assert plain.environment == moe.environment
+    assert [t.name for t in flat.environment.terrain.tiles] == ["flat"]
+
+
+def test_unknown_task_names_the_nearest():
+    with pytest.raises(TaskError, match=r"unknown task 'go2-moe'; did you mean go2-moe-cts.*the tasks are"):
+        find_task("go2-moe")
+
+
+def test_schedules_span_the_run_unless_told_otherwise():
+    assert find_task("go2-cts", ["training.run.iterations=50"]).environment.schedule.horizon_steps == 50 * 24
+    fixed = find_task("go2-cts", ["training.run.iterations=50", "environment.schedule.horizon_steps=77"])
+    assert fixed.environment.schedule.horizon_steps == 77
+
+
+def test_a_value_that_the_configuration_refuses_is_an_error_of_the_key():
+    with pytest.raises(TaskError, match=r"'training.network.student_encoder' cannot be set: .*moe_ng"):
+        find_task("go2-cts", ["training.network.student_encoder=transformer"])
+
+
+def test_task_name_cannot_be_overridden():
+    with pytest.raises(TaskError, match="unknown setting 'name'"):
+        find_task("go2-cts", ["name=x"])
+    assert replace(TASKS["go2-cts"], name="x") != TASKS["go2-cts"]

@@ -1,0 +1,162 @@
+"""Every reward term against a value worked out by hand, and how they are weighted."""
+
+import math
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from gaitgauge.training.environment_configuration import Ramp, RewardConfiguration
+from gaitgauge.training.rewards import REWARD_TERMS, RewardFunction, RewardInputs
+
+
+@pytest.fixture
+def quiet():
+    """Two worlds in which nothing happens: every penalty is zero and tracking is perfect."""
+    joints = torch.zeros(2, 12)
+    return RewardInputs(
+        base_linear_velocity_b=torch.zeros(2, 3),
+        base_angular_velocity_b=torch.zeros(2, 3),
+        projected_gravity_b=torch.tensor([[0.0, 0.0, -1.0]] * 2),
+        base_height=torch.full((2,), 0.38),
+        command=torch.zeros(2, 3),
+        sigma=torch.full((2, 3), 0.25),
+        joint_position=joints,
+        joint_velocity=joints,
+        joint_acceleration=joints,
+        joint_torque=joints,
+        previous_joint_torque=joints,
+        default_joint_position=torch.zeros(12),
+        soft_lower=torch.full((12,), -1.0),
+        soft_upper=torch.full((12,), 1.0),
+        hip_joints=torch.tensor([0, 3, 6, 9]),
+        action=joints,
+        previous_action=joints,
+        second_previous_action=joints,
+        foot_height=torch.ones(2, 4),
+        foot_velocity_w=torch.zeros(2, 4, 3),
+        touching_bodies=torch.zeros(2),
+        fallen=torch.zeros(2, dtype=torch.bool),
+        base_height_target=0.38,
+        foot_height_length=0.0095,
+    )
+
+
+def one_world(values, width):
+    """Row 0 holds ``values`` in its first entries, everything else is zero."""
+    tensor = torch.zeros(2, width)
+    tensor[0, : len(values)] = torch.tensor(values)
+    return tensor
+
+
+def joints(*values):
+    return one_world(values, 12)
+
+
+def at(index, *values):
+    tensor = torch.zeros(2, 12)
+    tensor[0, list(index)] = torch.tensor(values)
+    return tensor
+
+
+def feet(speeds):
+    tensor = torch.zeros(2, 4, 3)
+    tensor[0] = torch.tensor(speeds)
+    return tensor
+
+
+HEIGHTS = torch.tensor([[0.0095, 0.0, -0.3, 5.0], [1.0] * 4])
+
+CASES = {
+    "linear_tracking": (
+        {
+            "command": one_world([1.0, -0.5, 9.0], 3),
+            "base_linear_velocity_b": one_world([0.5, 0.0, 9.0], 3),
+            "sigma": torch.tensor([[0.25, 0.5, 1.0], [0.25] * 3]),
+        },
+        math.exp(-(0.25 / 0.25 + 0.25 / 0.5)),
+        1.0,
+    ),
+    "yaw_tracking": (
+        {
+            "command": one_world([9.0, 9.0, 1.0], 3),
+            "base_angular_velocity_b": one_world([9.0, 9.0, 0.4], 3),
+            "sigma": torch.tensor([[1.0, 1.0, 0.36], [0.25] * 3]),
+        },
+        math.exp(-1.0),
+        1.0,
+    ),
+    "vertical_velocity": ({"base_linear_velocity_b": one_world([9.0, 9.0, -0.5], 3)}, 0.25, 0.0),
+    "roll_pitch_rate": ({"base_angular_velocity_b": one_world([1.0, -2.0, 9.0], 3)}, 5.0, 0.0),
+    "joint_acceleration": ({"joint_acceleration": joints(3.0, -4.0)}, 25.0, 0.0),
+    "joint_power": ({"joint_torque": joints(2.0, -3.0), "joint_velocity": joints(-5.0, -1.0)}, 13.0, 0.0),
+    "torque": ({"joint_torque": joints(2.0, -3.0)}, 13.0, 0.0),
+    "base_height": ({"base_height": torch.tensor([0.28, 0.38])}, 0.01, 0.0),
+    "action_rate": ({"action": joints(1.0, 1.0), "previous_action": joints(0.0, 3.0)}, 5.0, 0.0),
+    "action_smoothness": (
+        {"action": joints(1.0, 2.0), "previous_action": joints(2.0, 1.0), "second_previous_action": joints(5.0, 0.0)},
+        4.0,
+        0.0,
+    ),
+    "collision": ({"touching_bodies": torch.tensor([3.0, 0.0])}, 3.0, 0.0),
+    "joint_limits": ({"joint_position": joints(1.25, -1.5, 0.9)}, 0.75, 0.0),
+    "foot_regulation": (
+        {
+            "foot_velocity_w": feet([[1.0, 1.0, 9.0], [3.0, 0.0, 0.0], [0.0, 2.0, 0.0], [9.0, 0.0, 0.0]]),
+            "foot_height": HEIGHTS,
+        },
+        2.0 * math.exp(-1.0) + 9.0 + 4.0,
+        0.0,
+    ),
+    "hip_regulation": ({"joint_position": at((0, 3, 4, 9), 0.2, -0.3, 5.0, 0.1)}, 0.6, 0.0),
+    "hip_symmetry": (
+        {"joint_position": at((0, 3, 6, 9), 0.2, -0.3, 0.1, 0.1), "command": one_world([-3.0, 0.0, 4.0], 3)},
+        0.6 * 0.3,
+        0.0,
+    ),
+    "roll": ({"projected_gravity_b": one_world([0.6, -0.2, 9.0], 3)}, 0.04, 0.0),
+    "torque_change": ({"joint_torque": joints(2.0, 1.0), "previous_joint_torque": joints(0.0, 4.0)}, 13.0, 0.0),
+    "stand_still": ({"joint_position": joints(0.5, -0.25)}, 0.75, 0.0),
+    "termination": ({"fallen": torch.tensor([True, False])}, 1.0, 0.0),
+}
+
+
+def test_every_term_has_a_case():
+    assert set(CASES) == set(REWARD_TERMS)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_term(quiet, name):
+    changes, expected, undisturbed = CASES[name]
+    value = REWARD_TERMS[name](replace(quiet, **changes))
+    assert value.tolist() == pytest.approx([expected, undisturbed], rel=1e-5, abs=1e-6)
+
+
+def test_stand_still_counts_under_the_zero_command_only(quiet):
+    moved = replace(quiet, joint_position=joints(0.5), command=one_world([0.0, 0.0, 0.1], 3))
+    assert REWARD_TERMS["stand_still"](moved).tolist() == [0.0, 0.0]
+
+
+def test_weights_are_per_second_but_for_falls(quiet):
+    settings = RewardConfiguration(termination=-5.0)
+    rewards = RewardFunction(settings, 0.02, "cpu")
+    inputs = replace(quiet, fallen=torch.tensor([True, False]), base_height=torch.tensor([0.48, 0.38]))
+    values = dict(zip(rewards.names, rewards(inputs, torch.tensor(0.0))[0].tolist(), strict=True))
+    assert values["linear_tracking"] == pytest.approx(0.02)
+    assert values["termination"] == pytest.approx(-5.0)
+    assert values["base_height"] == pytest.approx(-1.0 * 0.01 * 0.02, rel=1e-4)
+    assert "hip_symmetry" not in values, "terms without weight are not computed"
+
+
+def test_weights_follow_progress(quiet):
+    settings = RewardConfiguration(vertical_velocity=Ramp(start=-2.0, end=0.0, begin=0.25, until=0.75))
+    rewards = RewardFunction(settings, 1.0, "cpu")
+    inputs = replace(quiet, base_linear_velocity_b=one_world([0.0, 0.0, 1.0], 3))
+    column = rewards.names.index("vertical_velocity")
+    found = [float(rewards(inputs, torch.tensor(p))[0, column]) for p in (0.0, 0.25, 0.5, 0.75, 2.0)]
+    assert found == pytest.approx([-2.0, -2.0, -1.0, 0.0, 0.0])
+
+
+def test_every_weight_names_a_term():
+    settings = {"tracking_sigma", "dynamic_sigma", "sigma_linear_range", "sigma_yaw_range", "base_height_target"}
+    settings |= {"foot_height_scale", "foot_height_over", "collision_force", "soft_limit"}
+    assert {f.name for f in fields(RewardConfiguration)} - settings == set(REWARD_TERMS)
