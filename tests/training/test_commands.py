@@ -8,6 +8,7 @@ from gaitgauge.training.commands import COMMAND_COLUMNS, CommandGenerator
 from gaitgauge.training.environment_configuration import CommandConfiguration, CommandStage, Ramp
 
 COUNT = 40_000
+torch.set_num_threads(1)  # small tensors: threads only get in each other's way
 LIMITS = ((1.5, 1.0, 1.5), (0.6, 0.6, 9.0))
 STAGES = (
     CommandStage(begin=0.0, forward=(-0.5, 0.5), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),

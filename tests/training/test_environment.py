@@ -1,0 +1,342 @@
+"""The training environment as rsl_rl and the learner see it, on the scripted engine."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from gaitgauge.backends.fake import FakeBackend, FakeScript
+from gaitgauge.training.environment import TrainingEnvironment
+from gaitgauge.training.environment_configuration import (
+    CommandConfiguration,
+    CommandStage,
+    EnvironmentConfiguration,
+    JointConfiguration,
+    PushConfiguration,
+    RandomizationConfiguration,
+    ResetConfiguration,
+    TerminationConfiguration,
+)
+from small_environment import FLAT, STAIRS, gliding, idle, make
+
+NEVER = math.inf
+
+
+def times(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_surface():
+    environment = make(6)
+    assert (environment.num_envs, environment.num_actions, environment.max_episode_length) == (6, 12, 1250)
+    observations, reward, done, extras = idle(environment)
+    assert {name: tuple(observations[name].shape) for name in observations.keys()} == {  # noqa: SIM118
+        "policy": (6, 45),
+        "history": (6, 225),
+        "privileged": (6, 263),
+    }
+    assert all(observations[name].dtype == torch.float32 for name in ("policy", "history", "privileged"))
+    assert reward.shape == (6,) and reward.dtype == torch.float32
+    assert done.shape == (6,) and done.dtype == torch.int64
+    assert extras["time_outs"].shape == (6,)
+    assert "log" not in extras
+    again = environment.get_observations()
+    assert all(torch.equal(again[name], observations[name]) for name in ("policy", "history", "privileged"))
+
+
+def test_setting_the_episode_length_copies_in_place():
+    environment = make()
+    buffer = environment.episode_length_buf
+    environment.episode_length_buf = torch.full((8,), 1249)
+    assert environment.episode_length_buf is buffer
+    _, _, done, extras = idle(environment)
+    assert done.tolist() == [1] * 8 and extras["time_outs"].tolist() == [1.0] * 8
+    assert environment.episode_length_buf.tolist() == [0] * 8
+
+
+def test_nothing_handed_out_changes_later():
+    environment = make(script=gliding(0.3), seed=3)
+    action = torch.zeros(8, 12)
+    handed = [environment.get_observations()]
+    copies = [handed[0].clone()]
+    for _ in range(9):
+        observations, reward, done, extras = environment.step(action)
+        everything = {**observations, "reward": reward, "done": done, "time_outs": extras["time_outs"]}
+        everything |= extras.get("log", {})
+        handed.append(everything)
+        copies.append({name: value.clone() for name, value in everything.items()})
+    for given, copy in zip(handed, copies, strict=True):
+        for name in copy.keys():  # noqa: SIM118
+            assert torch.equal(given[name], copy[name]), name
+
+
+def test_action_becomes_targets_with_the_drawn_latency():
+    delayed = RandomizationConfiguration(motor_offset=(0.0, 0.0), delay=(0.02, 0.02))
+    environment = make(script=FakeScript(joint_law="track"), randomization=delayed)
+    action = torch.full((8, 12), 0.4)
+    default = environment.program.default_pose
+    environment.step(action)
+    assert environment.backend.state.joint_position[0].tolist() == pytest.approx(default.tolist(), abs=1e-6)
+    environment.step(action)
+    assert environment.backend.state.joint_position[0].tolist() == pytest.approx((default + 0.1).tolist(), abs=1e-6)
+
+
+def test_latency_is_uniform_over_whole_substeps():
+    environment = make(4000)
+    counts = torch.bincount(environment.program.delay(), minlength=5)
+    assert len(counts) == 5
+    assert (counts.float() / 4000).tolist() == pytest.approx([0.2] * 5, abs=0.03)
+    assert make(randomization=RandomizationConfiguration(delay=(0.0, 0.0))).program.delay() is None
+
+
+def test_falls_and_divergence_end_episodes_without_time_out():
+    script = FakeScript(fall_time=times(0.1, NEVER, NEVER, NEVER), diverge_time=times(NEVER, 0.1, NEVER, NEVER))
+    environment = make(4, script=script)
+    finished = torch.zeros(4)
+    for _ in range(8):
+        observations, reward, done, extras = idle(environment)
+        finished += done
+        assert extras["time_outs"].sum() == 0
+        for name in ("policy", "history", "privileged"):
+            assert observations[name].isfinite().all(), name
+        assert reward.isfinite().all()
+    assert finished.tolist() == [1.0, 1.0, 0.0, 0.0]
+    log = extras["log"]
+    assert float(log["Episode_Termination/base_contact"]) == pytest.approx(0.5)
+    assert float(log["Episode_Termination/diverged"]) == pytest.approx(0.5)
+    assert float(log["Physics/nan_resets"]) == 1.0
+
+
+def test_tilt_ends_an_episode():
+    rolling = FakeScript(
+        motion=lambda b: (
+            torch.zeros_like(b.force_w),
+            torch.tensor([10.0, 0.0, 0.0]).to(b.force_w).expand_as(b.force_w),
+        )
+    )
+    environment = make(script=rolling, termination=TerminationConfiguration(tilt=0.5))
+    ends = [bool(idle(environment)[2].any()) for _ in range(3)]
+    assert ends == [False, False, True], "10 rad/s take 0.05 s to 0.5 rad"
+    assert not any(
+        bool(idle(make(script=rolling, termination=TerminationConfiguration(tilt=None)))[2].any()) for _ in range(4)
+    )
+
+
+def test_impossible_joint_speed_counts_as_divergence():
+    environment = make(termination=TerminationConfiguration(joint_velocity=5.0))
+    environment.backend.state.joint_velocity[2] = 50.0
+    _, reward, done, _ = idle(environment)
+    assert done.tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
+    assert reward[2] == 0.0
+
+
+def test_leaving_the_tile_is_a_time_out():
+    environment = make(8, script=gliding(8.0), terrain=STAIRS)
+    stairs = environment.kind == 0
+    # The end is 4.75 m away from the middle. Robots start up to 1 m off it: the way out is 3.75 m to 8.2 m long.
+    left = torch.zeros(8)
+    for step in range(54):
+        _, _, done, extras = idle(environment)
+        assert torch.equal(done.float(), extras["time_outs"])
+        left += done
+        if step < 23:
+            assert left.sum() == 0
+    assert (left[stairs] >= 1).all()
+    assert (left[~stairs] == 0).all(), "level ground does not end"
+
+
+def test_first_observation_after_a_reset_is_fresh():
+    """Push, pose, ground and joints of the new episode, not those of the old one."""
+    environment = make(
+        64,
+        script=FakeScript(fall_time=torch.full((64,), 0.1, dtype=torch.float64)),
+        terrain=STAIRS,
+        reset=ResetConfiguration(),
+    )
+    while not (result := idle(environment))[2].any():
+        pass
+    observations, state, program = result[0], environment.backend.state, environment.program
+    privileged = observations["privileged"]
+    w, _, _, z = state.base_quaternion_w.float().unbind(1)
+    yaw = 2 * torch.atan2(z, w)
+    velocity = state.base_linear_velocity_w.float()
+    forward = torch.cos(yaw) * velocity[:, 0] + torch.sin(yaw) * velocity[:, 1]
+    assert torch.allclose(privileged[:, 0], 2.0 * forward, atol=1e-5)
+    assert velocity.abs().max() <= 0.5 + 1e-6 and velocity.std() > 0.2
+    assert torch.allclose(privileged[:, 3:6], 0.25 * state.base_angular_velocity_b.float(), atol=1e-6)
+    assert torch.allclose(privileged[:, 6:9], torch.tensor([0.0, 0.0, -1.0]).expand(64, 3), atol=1e-6)
+    assert torch.allclose(privileged[:, 12:24], state.joint_position.float() - program.default_pose, atol=1e-6)
+    assert (privileged[:, 24:76] == 0).all(), "no velocities, actions, forces, torques or accelerations yet"
+    ground = torch.tensor(
+        [
+            float(environment.palette.terrains[t].height(float(p[0]), float(p[1])))
+            for t, p in zip(environment.backend.terrain_index.tolist(), state.base_position_w, strict=True)
+        ]
+    )
+    middle = 76 + 93  # the scan point below the base
+    expected = (state.base_position_w[:, 2].float() - 0.5 - ground).clamp(-1, 1) * 2.5
+    assert torch.allclose(privileged[:, middle], expected, atol=1e-3)
+    assert (observations["history"][:, :180] == 0).all()
+    assert torch.equal(observations["history"][:, 180:], observations["policy"])
+
+
+def test_episodes_start_above_the_highest_ground_below_the_robot():
+    spread = replace(STAIRS, spread_probability=1.0)
+    environment = make(200, terrain=spread)
+    state = environment.backend.state
+    for index, position in zip(environment.backend.terrain_index.tolist(), state.base_position_w.tolist(), strict=True):
+        terrain = environment.palette.terrains[index]
+        below = float(terrain.height(position[0], position[1]))
+        assert position[2] >= below + environment.robot.stand_height - 1e-3
+        assert position[2] <= below + environment.robot.stand_height + 0.4
+    assert state.base_position_w[:, :2].abs().max() > 2.5
+
+
+def test_joints_start_within_their_limits():
+    environment = make(300, reset=ResetConfiguration())
+    position, program = environment.backend.state.joint_position.float(), environment.program
+    assert (position >= program.joint_lower - 1e-6).all() and (position <= program.joint_upper + 1e-6).all()
+    assert (position.std(dim=0) > 0.02).all()
+
+
+def test_pushes_change_the_velocity_of_the_worlds_due():
+    kicked = PushConfiguration(interval=0.2, linear=0.4, angular=0.6)
+    environment = make(400, push=kicked)
+    velocity = environment.backend.state.base_linear_velocity_w
+    pushed = torch.zeros(400, dtype=torch.bool)
+    for _ in range(10):
+        before = velocity.clone()
+        idle(environment)
+        now = (velocity != before).any(dim=1)
+        assert not (pushed & now).any(), "once per interval"
+        assert 10 < now.sum() < 80, "worlds have their own clocks"
+        pushed |= now
+    assert pushed.all()
+    assert (velocity[:, 2] == 0).all()
+    assert velocity[:, :2].abs().max() <= 0.4 and velocity[:, :2].std() == pytest.approx(0.4 / 3**0.5, rel=0.15)
+
+
+def test_pushes_add_or_replace():
+    for add, expected in ((True, 2.0), (False, 0.0)):
+        pushes = PushConfiguration(interval=0.02, linear=0.0, angular=0.0, add=add)
+        environment = make(push=pushes)
+        environment.backend.state.base_linear_velocity_w[:, 0] = 2.0
+        idle(environment)
+        assert environment.backend.state.base_linear_velocity_w[:, 0].tolist() == [expected] * 8
+
+
+def test_randomization_ranges():
+    ranges = RandomizationConfiguration(friction=(0.3, 0.9), stiffness=(0.8, 1.1), motor_offset=(-0.02, 0.05))
+    environment = make(2000, randomization=ranges)
+    drawn = environment.backend.randomized
+    for values, (low, high) in (
+        (drawn.friction, (0.3, 0.9)),
+        (drawn.base_mass_offset, (-1.0, 1.0)),
+        (drawn.link_mass_scale, (0.9, 1.1)),
+        (drawn.base_com_offset, (-0.03, 0.03)),
+        (drawn.stiffness_scale, (0.8, 1.1)),
+        (drawn.damping_scale, (0.9, 1.1)),
+        (drawn.motor_strength, (0.8, 1.2)),
+        (drawn.motor_offset, (-0.02, 0.05)),
+    ):
+        assert low - 1e-6 <= values.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < values.max() <= high + 1e-6
+        assert float(values.mean()) == pytest.approx((low + high) / 2, abs=0.03 * (high - low))
+
+
+def test_motors_are_redrawn_for_reset_worlds_only():
+    environment = make(4, script=FakeScript(fall_time=times(0.1, NEVER, NEVER, 0.1)))
+    drawn = environment.backend.randomized
+    before = {name: getattr(drawn, name).clone() for name in ("stiffness_scale", "motor_offset", "friction")}
+    while not idle(environment)[2].any():
+        pass
+    for name in ("stiffness_scale", "motor_offset"):
+        changed = (getattr(drawn, name) != before[name]).any(dim=1)
+        assert changed.tolist() == [True, False, False, True]
+    assert torch.equal(drawn.friction, before["friction"])
+
+
+def test_commands_hold_for_their_interval():
+    commands = CommandConfiguration(
+        stages=(CommandStage(begin=0.0, forward=(-1.0, 1.0), lateral=(-1.0, 1.0), yaw=(-1.0, 1.0)),),
+        interval=0.2,
+        extreme_probability=0.0,
+    )
+    environment = make(commands=commands)
+    command = environment.program.memory.command.clone()
+    for interval in range(3):
+        for step in range(10):
+            assert torch.equal(environment.program.memory.command, command), (interval, step)
+            observations = idle(environment)[0]
+        assert not (environment.program.memory.command == command).all(dim=1).any()
+        command = environment.program.memory.command.clone()
+        assert torch.allclose(observations["policy"][:, 6:9], command * torch.tensor([2.0, 2.0, 0.25]))
+
+
+def test_log_keys_and_values():
+    environment = make(script=gliding(0.0), log_interval=4, terrain=STAIRS)
+    environment.episode_length_buf = torch.full((8,), 1248)
+    logs = [idle(environment)[3].get("log") for _ in range(8)]
+    assert [log is not None for log in logs] == [False, False, False, True] * 2
+    log = logs[3]
+    names = set(log)
+    assert {"Episode_Reward/linear_tracking", "Episode_Termination/time_out", "Curriculum/stairs_up"} <= names
+    assert {"Curriculum/flat", "Physics/overflow_worlds", "Physics/nan_resets", "Metrics/yaw_rate_error"} <= names
+    assert all(isinstance(value, torch.Tensor) and value.dim() == 0 for value in log.values())
+    assert float(log["Episode_Termination/time_out"]) == 1.0
+    assert 0.0 < float(log["Episode_Reward/linear_tracking"]) <= 1.0
+    assert logs[7]["Episode_Reward/linear_tracking"] == log["Episode_Reward/linear_tracking"], "kept without new ends"
+
+
+def test_reward_is_the_sum_of_the_logged_terms():
+    environment = make(4, script=gliding(0.2), log_interval=1)
+    total = torch.zeros(4)
+    for _ in range(5):
+        total += idle(environment)[1]
+    assert torch.allclose(environment.program.memory.episode_rewards.sum(dim=1), total, atol=1e-6)
+
+
+def test_dynamic_sigma():
+    environment = make(5, terrain=STAIRS)
+    memory, program = environment.program.memory, environment.program
+    assert environment.kind.tolist() == [0, 0, 0, 1, 1]
+    commands = [[1.0, -0.5, 1.5], [2.0, 1.5, 3.0], [0.2, 0.0, 0.5], [2.0, 1.0, 2.0], [0.0, 0.0, 0.0]]
+    memory.command.copy_(torch.tensor(commands))
+    memory.level.copy_(torch.tensor([0, 8, 8, 2, 2]))
+    m0 = math.exp(0.1) - 1.0
+    expected = [
+        [0.25 + 0.5 * m0 * 0.25, 0.25, 0.25 + 0.5 * m0 * 0.25],
+        [0.5, 0.5, 0.5],
+        [0.25, 0.25, 0.25],
+        [0.25, 0.25, 0.25],
+        [0.25, 0.25, 0.25],
+    ]
+    assert torch.allclose(program.sigma(), torch.tensor(expected), atol=1e-6)
+
+
+def test_joint_constants_can_be_overridden():
+    joints = JointConfiguration(armature=0.02, friction_loss=0.0)
+    parameters = make(joints=joints).backend.scene.parameters
+    assert parameters.armature == (0.02,) * 12 and parameters.friction_loss == (0.0,) * 12
+    assert parameters.stiffness == (20.0,) * 12
+    with pytest.raises(ValueError, match=r"joints.parameters is 'nope', but robot 'go2' has: gauge, training"):
+        make(joints=JointConfiguration(parameters="nope"))
+
+
+def test_mistakes():
+    with pytest.raises(ValueError, match="capture=True needs a CUDA device"):
+        TrainingEnvironment(
+            EnvironmentConfiguration(num_envs=2, terrain=FLAT), backend=FakeBackend, device="cpu", capture=True
+        )
+    with pytest.raises(ValueError, match="num_envs is 0"):
+        make(0)
+
+
+def test_same_seed_same_run():
+    def run(seed):
+        environment = make(6, seed=seed, script=FakeScript(), push=PushConfiguration(interval=0.1))
+        return idle(environment, 12)[0]
+
+    first, second, other = run(1), run(1), run(2)
+    assert torch.equal(first["history"], second["history"])
+    assert not torch.equal(first["history"], other["history"])

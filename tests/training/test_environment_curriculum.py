@@ -1,0 +1,145 @@
+"""Assignment of tiles, moves between levels, and where worlds end up."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from gaitgauge.backends.fake import FakeScript
+from gaitgauge.terrains import TerrainError
+from gaitgauge.training.curriculum import assign_kinds, build_palette, next_level
+from gaitgauge.training.environment_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration, TileConfiguration
+from small_environment import STAIRS, gliding, idle, make
+
+
+def moved(configuration, **changes):
+    arguments = {
+        "level": 3,
+        "farthest": 0.0,
+        "commanded": 0.0,
+        "fallen": False,
+        "uniform": 0.25,
+        **changes,
+    }
+    tensors = {name: torch.tensor([value]) for name, value in arguments.items()}
+    return int(next_level(configuration, num_levels=10, **tensors)[0])
+
+
+@pytest.mark.parametrize(
+    ("situation", "expected"),
+    [
+        ({"farthest": 4.1}, 4),
+        ({"farthest": 3.9}, 3),
+        ({"farthest": 4.1, "fallen": True}, 4),
+        ({"farthest": 3.9, "fallen": True}, 2),
+        ({"farthest": 2.0, "commanded": 4.1}, 2),
+        ({"farthest": 2.0, "commanded": 3.9}, 3),
+        ({"farthest": 4.1, "commanded": 20.0}, 4),
+        ({"level": 0, "fallen": True}, 0),
+        ({"level": 9, "farthest": 4.1, "uniform": 0.25}, 2),
+        ({"level": 9, "farthest": 4.1, "uniform": 0.999}, 9),
+        ({"level": 9, "farthest": 3.0}, 9),
+    ],
+)
+def test_level_moves(situation, expected):
+    assert moved(TerrainConfiguration(), **situation) == expected
+
+
+def test_falls_may_be_forgiven():
+    assert moved(TerrainConfiguration(demote_falls=False), farthest=3.0, commanded=3.0, fallen=True) == 3
+
+
+def test_levels_are_drawn_without_curriculum():
+    assert moved(TerrainConfiguration(curriculum=False), farthest=4.1, uniform=0.75) == 7
+
+
+def test_kinds_are_blocks_in_proportion():
+    kind = assign_kinds([1.0, 2.0, 1.0], 16)
+    assert kind.tolist() == [0] * 4 + [1] * 8 + [2] * 4
+    shares = [tile.share for tile in ALL_TILES]
+    counts = torch.bincount(assign_kinds(shares, 8192), minlength=len(shares))
+    assert (counts / 8192).tolist() == pytest.approx([s / sum(shares) for s in shares], abs=2e-4)
+    with pytest.raises(ValueError, match="must not be negative and not all zero"):
+        assign_kinds([0.0, 0.0], 4)
+
+
+def test_students_and_teachers_share_every_kind_and_level():
+    environment = make(800, terrain=replace(STAIRS, levels=3))
+    student = torch.arange(800) % 4 == 0
+    level, kind = environment.program.memory.level, environment.kind
+    for k in range(2):
+        for lv in range(3):
+            here = (kind == k) & (level == lv)
+            assert 0.15 < float((here & student).sum() / here.sum()) < 0.36
+
+
+def test_palette_holds_each_tile_once():
+    configuration = TerrainConfiguration(levels=2, variants=3)
+    palette = build_palette(configuration)
+    assert palette.index.shape == (8, 2, 3)
+    names = [tile.name for tile in palette.tiles]
+    stairs, flat, wave = names.index("stairs_up"), names.index("flat"), names.index("wave")
+    assert palette.index[stairs].unique().numel() == 2, "no chance in stairs"
+    assert palette.index[flat].unique().numel() == 1
+    assert palette.index[wave].unique().numel() == 6
+    for k, tile in enumerate(palette.tiles):
+        for index in palette.index[k].flatten().tolist():
+            assert palette.terrains[index].name == f"tile_{tile.name}"
+    assert len({id(t) for t in palette.terrains}) == palette.index.unique().numel() == len(palette.terrains)
+
+
+def test_kinds_without_share_are_left_out():
+    tiles = (FLAT_TILE, replace(ALL_TILES[0], share=0.0))
+    palette = build_palette(TerrainConfiguration(tiles=tiles, levels=1))
+    assert [t.name for t in palette.tiles] == ["flat"]
+
+
+def test_unknown_kind():
+    tile = TileConfiguration(name="lava", share=1.0, command_limits=(1.0, 1.0, 1.0), sigma=0.25)
+    with pytest.raises(TerrainError, match="lava"):
+        build_palette(TerrainConfiguration(tiles=(tile,)))
+
+
+def test_worlds_climb_levels_and_get_the_tile_of_their_level():
+    environment = make(12, script=gliding(8.0), terrain=replace(STAIRS, highest_start_level=0))
+    memory = environment.program.memory
+    assert (memory.level == 0).all()
+    for _ in range(54):
+        idle(environment)
+    stairs = environment.kind == 0
+    assert (memory.level[stairs] >= 1).all()
+    expected = environment.palette.index[environment.kind, memory.level, 0]
+    assert torch.equal(memory.terrain_index, expected)
+    assert torch.equal(environment.backend.terrain_index, expected)
+
+
+def test_falls_lower_the_level_of_the_fallen():
+    never = float("inf")
+    fall = torch.tensor([0.1, never, 0.1, never], dtype=torch.float64)
+    environment = make(4, script=FakeScript(fall_time=fall), terrain=replace(STAIRS, tiles=STAIRS.tiles[:1]))
+    memory = environment.program.memory
+    memory.level.fill_(2)
+    while not idle(environment)[2].any():
+        pass
+    assert memory.level.tolist() == [1, 2, 1, 2]
+
+
+def test_episodes_spread_over_the_tile_do_not_move_levels():
+    spread = replace(STAIRS, spread_probability=1.0, tiles=STAIRS.tiles[:1])
+    environment = make(8, script=gliding(8.0), terrain=spread)
+    level = environment.program.memory.level.clone()
+    finished = sum(idle(environment)[2] for _ in range(60))
+    assert (finished > 0).all()
+    assert torch.equal(environment.program.memory.level, level)
+
+
+def test_commanded_way_follows_the_robot_s_heading():
+    environment = make(4, script=gliding(0.0, 0.0, 4.0))
+    memory = environment.program.memory
+    memory.command.copy_(torch.tensor([1.0, 0.0, 0.0]).expand(4, 3))
+    memory.command_steps.fill_(1000)
+    idle(environment, 39)
+    # Half a turn at 4 rad/s and 1 m/s: a half circle of radius 0.25 m.
+    assert memory.commanded_way.norm(dim=1).tolist() == pytest.approx([0.5] * 4, abs=0.02)
+    idle(environment, 39)
+    assert memory.commanded_way.norm(dim=1).tolist() == pytest.approx([0.0] * 4, abs=0.03)
+    assert memory.commanded_farthest.tolist() == pytest.approx([0.5] * 4, abs=0.02)

@@ -1,0 +1,97 @@
+"""Saving and continuing: on an engine that remembers nothing else, continuing equals never having stopped."""
+
+import pytest
+import torch
+from gaitgauge.backends.fake import FakeScript
+from gaitgauge.training.environment_configuration import (
+    CommandConfiguration,
+    CommandStage,
+    PushConfiguration,
+    Ramp,
+    ResetConfiguration,
+    ScheduleConfiguration,
+)
+from small_environment import STAIRS, make
+
+BUSY = {
+    "terrain": STAIRS,
+    "push": PushConfiguration(interval=0.1),
+    "reset": ResetConfiguration(),
+    "schedule": ScheduleConfiguration(horizon_steps=40),
+    "commands": CommandConfiguration(
+        stages=(
+            CommandStage(begin=0.0, forward=(-0.5, 0.5), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),
+            CommandStage(begin=0.5, forward=(-2.0, 2.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
+        ),
+        interval=0.1,
+        stationary_probability=Ramp(start=0.1, end=0.5),
+    ),
+    "log_interval": 5,
+    "episode_length": 0.5,
+}
+
+
+def busy(seed=0):
+    environment = make(12, seed=seed, script=FakeScript(), **BUSY)
+    environment.episode_length_buf = torch.arange(12) % 20
+    return environment
+
+
+def run(environment, steps, seed):
+    random = torch.Generator().manual_seed(seed)
+    rows = []
+    for _ in range(steps):
+        observations, reward, done, extras = environment.step(torch.randn(12, 12, generator=random) * 0.3)
+        rows.append({**observations, "reward": reward, "done": done, **extras, **extras.get("log", {})})
+        rows[-1].pop("log", None)
+    return rows
+
+
+def same(left, right):
+    assert len(left) == len(right)
+    for step, (a, b) in enumerate(zip(left, right, strict=True)):
+        assert a.keys() == b.keys()
+        for name in a:
+            assert torch.equal(a[name], b[name]), (step, name)
+
+
+def test_continuing_equals_never_having_stopped(tmp_path):
+    straight = busy()
+    run(straight, 17, 1)
+    torch.save(straight.state_dict(), tmp_path / "state.pt")
+    expected = run(straight, 30, 2)
+    assert sum(row["done"].sum() for row in expected) > 12
+
+    resumed = busy(seed=99)
+    run(resumed, 3, 5)
+    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    same(run(resumed, 30, 2), expected)
+    assert resumed.common_step_counter == straight.common_step_counter == 47
+
+
+def test_observations_come_back():
+    environment = busy()
+    run(environment, 5, 1)
+    saved, before = environment.state_dict(), environment.get_observations()
+    run(environment, 5, 2)
+    environment.load_state_dict(saved)
+    after = environment.get_observations()
+    assert all(torch.equal(before[name], after[name]) for name in ("policy", "history", "privileged"))
+
+
+def test_a_saved_state_does_not_change_with_the_run():
+    environment = busy()
+    run(environment, 5, 1)
+    saved = environment.state_dict()
+    step, level = saved["memory"]["step"].clone(), saved["physics"]["base_position_w"].clone()
+    run(environment, 5, 1)
+    assert torch.equal(saved["memory"]["step"], step) and torch.equal(saved["physics"]["base_position_w"], level)
+
+
+def test_states_of_other_environments_are_refused():
+    environment = busy()
+    state = environment.state_dict()
+    with pytest.raises(ValueError, match="has version 7, this program reads 1"):
+        environment.load_state_dict({**state, "version": 7})
+    with pytest.raises(ValueError, match=r"'episode_length' has shape \(12,\), this environment needs \(8,\)"):
+        make(8, **BUSY).load_state_dict(state)
