@@ -1,0 +1,673 @@
+# mypy: ignore-errors
+"""Warp kernels around a Newton solver: motor law, latency, watches, resets, terrain slots and the read-out of the state.
+
+They see Newton's own arrays only (joint coordinates, body poses and twists, contacts and contact forces), so that they serve every
+solver. Joints, bodies and shapes of all worlds lie one world after the other: entry ``world * per_world + local``.
+
+Newton's conventions: quaternions xyzw; a free joint's velocity is that of the body's centre of mass and its angular velocity, both
+in the world frame; ``body_qd`` likewise. The contract's are wxyz, the base's origin and the body frame.
+"""
+
+# Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+POSITION_LIMIT = wp.constant(1.0e5)
+"""A coordinate beyond this [m, rad] means that the world has diverged."""
+VELOCITY_LIMIT = wp.constant(1.0e4)
+"""A velocity beyond this [m/s, rad/s] means that the world has diverged."""
+PARKED_HEIGHT = wp.constant(100.0)
+"""Where the base of a diverged world waits for its reset [m]."""
+
+
+@wp.struct
+class Layout:
+    """Where things are in a world's share of Newton's arrays."""
+
+    coordinates: int
+    dofs: int
+    bodies: int
+    shapes: int
+    base: int
+    joint_q: wp.array[int]
+    joint_v: wp.array[int]
+    foot_body: wp.array[int]
+    foot_center: wp.array[wp.vec3]
+    """Centre of the foot sphere in the frame of its body [m]."""
+    shape_foot: wp.array[int]
+    """Index of the foot that a shape is, -1 for others."""
+    shape_body: wp.array[int]
+    """Index of the collision body that a shape belongs to, -1 for the ground and others."""
+    shape_ground: wp.array[int]
+    """1 for floor, walls and terrain."""
+    shape_slot: wp.array[int]
+    """Terrain slot of a shape, -1 for robot and floor."""
+
+
+@wp.struct
+class Motors:
+    """Motor law and targets."""
+
+    limit: wp.array[float]
+    stiffness: wp.array2d[float]
+    damping: wp.array2d[float]
+    strength: wp.array2d[float]
+    offset: wp.array2d[float]
+    dry_friction: wp.array[float]
+    """Dry friction that the kernel adds for solvers without it [N·m], and its slope around zero speed [N·m·s/rad]."""
+    dry_slope: wp.array[float]
+    requested: wp.array2d[float]
+    current: wp.array2d[float]
+    previous: wp.array2d[float]
+    limp: wp.array[int]
+    limp_before: wp.array[int]
+    delay: wp.array[int]
+    torque: wp.array2d[float]
+
+
+@wp.struct
+class Palette:
+    """Shapes of the palette's terrains, by terrain and slot. The slots are the boxes and, where there is one, the height field."""
+
+    pose: wp.array2d[wp.transform]
+    scale: wp.array2d[wp.vec3]
+    wall: wp.array2d[int]
+
+
+@wp.struct
+class ContactArrays:
+    """Newton's contacts of all worlds and the forces that the solver found for them."""
+
+    count: wp.array[int]
+    shape0: wp.array[int]
+    shape1: wp.array[int]
+    point0: wp.array[wp.vec3]
+    point1: wp.array[wp.vec3]
+    margin0: wp.array[float]
+    margin1: wp.array[float]
+    normal: wp.array[wp.vec3]
+    force: wp.array[wp.spatial_vector]
+    shape_body: wp.array[int]
+    """Newton's body of each shape, -1 for the ground."""
+
+
+@wp.struct
+class StateArrays:
+    """The tensors of a ``PhysicsState``, seen by Warp."""
+
+    time: wp.array[float]
+    base_position_w: wp.array[wp.vec3]
+    base_quaternion_w: wp.array[wp.vec4]
+    base_linear_velocity_w: wp.array[wp.vec3]
+    base_angular_velocity_b: wp.array[wp.vec3]
+    joint_position: wp.array2d[float]
+    joint_velocity: wp.array2d[float]
+    joint_torque: wp.array2d[float]
+    foot_position_w: wp.array2d[wp.vec3]
+    foot_velocity_w: wp.array2d[wp.vec3]
+    foot_contact_force_w: wp.array2d[wp.vec3]
+    foot_normal_force: wp.array2d[float]
+    foot_tangential_force: wp.array2d[float]
+    body_contact_force_w: wp.array2d[wp.vec3]
+    ground_force_w: wp.array[wp.vec3]
+    ground_moment_w: wp.array[wp.vec3]
+    contact_center_w: wp.array[wp.vec3]
+    contact_count: wp.array[wp.int64]
+    tilt_substep: wp.array[wp.int64]
+    penetration_substep: wp.array[wp.int64]
+    diverged: wp.array[wp.bool]
+    overflowed: wp.array[wp.bool]
+
+
+@wp.func
+def root_rotation(joint_q: wp.array[float], start: int) -> wp.quat:
+    """Orientation of the base."""
+    q = wp.quat(joint_q[start + 3], joint_q[start + 4], joint_q[start + 5], joint_q[start + 6])
+    return wp.normalize(q)
+
+
+@wp.func
+def root_origin_velocity(
+    layout: Layout, world: int, joint_q: wp.array[float], joint_qd: wp.array[float], com: wp.array[wp.vec3]
+) -> wp.vec3:
+    """Velocity of the base's origin, world frame, from that of its centre of mass."""
+    v = world * layout.dofs
+    spin = wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
+    arm = wp.quat_rotate(root_rotation(joint_q, world * layout.coordinates), com[world * layout.bodies + layout.base])
+    return wp.vec3(joint_qd[v], joint_qd[v + 1], joint_qd[v + 2]) - wp.cross(spin, arm)
+
+
+@wp.func
+def park(
+    layout: Layout,
+    world: int,
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+):
+    """Put a world that diverged into a state that harms nobody: at rest, high above the ground."""
+    for i in range(layout.coordinates):
+        joint_q[world * layout.coordinates + i] = 0.0
+    joint_q[world * layout.coordinates + 2] = PARKED_HEIGHT
+    joint_q[world * layout.coordinates + 6] = 1.0
+    for i in range(layout.dofs):
+        joint_qd[world * layout.dofs + i] = 0.0
+    for i in range(layout.bodies):
+        body_q[world * layout.bodies + i] = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
+        body_qd[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@wp.func
+def state_is_valid(layout: Layout, world: int, joint_q: wp.array[float], joint_qd: wp.array[float]) -> bool:
+    """Whether all coordinates and velocities of a world are finite and of this world."""
+    valid = bool(True)
+    for i in range(layout.coordinates):
+        if not (wp.abs(joint_q[world * layout.coordinates + i]) < POSITION_LIMIT):  # false for NaN, too
+            valid = False
+    for i in range(layout.dofs):
+        if not (wp.abs(joint_qd[world * layout.dofs + i]) < VELOCITY_LIMIT):
+            valid = False
+    return valid
+
+
+@wp.kernel
+def begin_period(
+    layout: Layout,
+    active: wp.array[int],
+    has_request: wp.array[int],
+    joints: int,
+    motors: Motors,
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    state: StateArrays,
+):
+    """Shift the targets and clear the watches of the worlds that will step; take invalid states and targets out of the game."""
+    world = wp.tid()
+    if active[world] == 0:
+        return
+    valid = state_is_valid(layout, world, joint_q, joint_qd)
+    for joint in range(joints):
+        motors.previous[world, joint] = motors.current[world, joint]
+        if has_request[0] != 0:
+            motors.current[world, joint] = motors.requested[world, joint]
+            if not (wp.abs(motors.requested[world, joint]) < POSITION_LIMIT):
+                valid = False
+    motors.limp_before[world] = motors.limp[world]
+    if has_request[0] != 0:
+        motors.limp[world] = 0
+    state.tilt_substep[world] = wp.int64(0)
+    state.penetration_substep[world] = wp.int64(0)
+    if not valid:
+        state.diverged[world] = True
+    if state.diverged[world]:
+        park(layout, world, joint_q, joint_qd, body_q, body_qd)
+
+
+@wp.kernel
+def keep_inactive(
+    layout: Layout,
+    active: wp.array[int],
+    restore: int,
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    warm_start: wp.array2d[float],
+    kept_q: wp.array[float],
+    kept_qd: wp.array[float],
+    kept_body_q: wp.array[wp.transform],
+    kept_body_qd: wp.array[wp.spatial_vector],
+    kept_warm_start: wp.array2d[float],
+):
+    """Save (or restore) what a step changes in the worlds that must not step."""
+    world, i = wp.tid()
+    if active[world] != 0:
+        return
+    q = world * layout.coordinates + i
+    v = world * layout.dofs + i
+    b = world * layout.bodies + i
+    if i < layout.coordinates:
+        if restore == 0:
+            kept_q[q] = joint_q[q]
+        else:
+            joint_q[q] = kept_q[q]
+    if i < layout.dofs:
+        if restore == 0:
+            kept_qd[v] = joint_qd[v]
+        else:
+            joint_qd[v] = kept_qd[v]
+    if i < layout.bodies:
+        if restore == 0:
+            kept_body_q[b] = body_q[b]
+            kept_body_qd[b] = body_qd[b]
+        else:
+            body_q[b] = kept_body_q[b]
+            body_qd[b] = kept_body_qd[b]
+    if i < warm_start.shape[1]:
+        if restore == 0:
+            kept_warm_start[world, i] = warm_start[world, i]
+        else:
+            warm_start[world, i] = kept_warm_start[world, i]
+
+
+@wp.kernel
+def motor_law(
+    substep: int,
+    layout: Layout,
+    motors: Motors,
+    diverged: wp.array[wp.bool],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    joint_f: wp.array[float],
+):
+    """Torque = clip(kp (target + offset - q) - kd q̇) · strength, with the target that acts in this substep (counted from 0)."""
+    world, joint = wp.tid()
+    target = motors.current[world, joint]
+    limp = motors.limp[world]
+    if substep < motors.delay[world]:
+        target = motors.previous[world, joint]
+        limp = motors.limp_before[world]
+    dof = world * layout.dofs + layout.joint_v[joint]
+    position = joint_q[world * layout.coordinates + layout.joint_q[joint]]
+    velocity = joint_qd[dof]
+    error = target + motors.offset[world, joint] - position
+    torque = motors.stiffness[world, joint] * error - motors.damping[world, joint] * velocity
+    torque = wp.clamp(torque, -motors.limit[joint], motors.limit[joint]) * motors.strength[world, joint]
+    if limp != 0 or diverged[world]:
+        torque = 0.0
+    motors.torque[world, joint] = torque
+    dry = motors.dry_friction[joint]
+    joint_f[dof] = torque - wp.clamp(motors.dry_slope[joint] * velocity, -dry, dry)
+
+
+@wp.kernel
+def end_substep(
+    substep: int,
+    upright_limit: float,
+    layout: Layout,
+    active: wp.array[int],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    warm_start: wp.array2d[float],
+    ticks: wp.array[int],
+    state: StateArrays,
+):
+    """Count the time, catch worlds whose state became invalid and park them, and watch the tilt of the others."""
+    world = wp.tid()
+    if active[world] == 0:
+        return
+    ticks[world] = ticks[world] + 1
+    if not state_is_valid(layout, world, joint_q, joint_qd):
+        state.diverged[world] = True
+    if state.diverged[world]:
+        park(layout, world, joint_q, joint_qd, body_q, body_qd)
+        for i in range(warm_start.shape[1]):
+            warm_start[world, i] = 0.0
+        return
+    q = world * layout.coordinates
+    upright = 1.0 - 2.0 * (joint_q[q + 3] * joint_q[q + 3] + joint_q[q + 4] * joint_q[q + 4])
+    if upright < upright_limit and state.tilt_substep[world] == wp.int64(0):
+        state.tilt_substep[world] = wp.int64(substep + 1)
+
+
+@wp.kernel
+def collect_overflow_bits(active: wp.array[int], bits: wp.array[int], mask: int, overflowed: wp.array[wp.bool]):
+    """Note the worlds in which a solver reports one of the masked overflows."""
+    world = wp.tid()
+    if active[world] != 0 and (bits[world] & mask) != 0:
+        overflowed[world] = True
+
+
+@wp.kernel
+def collect_overflow_flags(active: wp.array[int], flags: wp.array[wp.bool], overflowed: wp.array[wp.bool]):
+    """Note the worlds that a solver flags."""
+    world = wp.tid()
+    if active[world] != 0 and flags[world]:
+        overflowed[world] = True
+
+
+@wp.func
+def world_point(contacts: ContactArrays, shape: int, point: wp.vec3, body_q: wp.array[wp.transform]) -> wp.vec3:
+    """A contact point in the world frame."""
+    body = contacts.shape_body[shape]
+    if body < 0:
+        return point
+    return wp.transform_point(body_q[body], point)
+
+
+@wp.kernel
+def watch_penetration(
+    substep: int,
+    depth: float,
+    layout: Layout,
+    active: wp.array[int],
+    contacts: ContactArrays,
+    palette: Palette,
+    terrain: wp.array[int],
+    body_q: wp.array[wp.transform],
+    state: StateArrays,
+):
+    """Record the substep in which a part of the robot is deeper than ``depth`` in a terrain box or height field."""
+    c = wp.tid()
+    if c >= contacts.count[0]:
+        return
+    first, second = contacts.shape0[c], contacts.shape1[c]
+    if first < 0 or second < 0:
+        return
+    slot = wp.max(layout.shape_slot[first % layout.shapes], layout.shape_slot[second % layout.shapes])
+    if slot < 0:
+        return
+    world = first / layout.shapes
+    if active[world] == 0 or state.diverged[world] or palette.wall[terrain[world], slot] != 0:
+        return
+    apart = world_point(contacts, second, contacts.point1[c], body_q) - world_point(
+        contacts, first, contacts.point0[c], body_q
+    )
+    distance = wp.dot(apart, contacts.normal[c]) - contacts.margin0[c] - contacts.margin1[c]
+    # several contacts of one world write the same number
+    if distance < -depth and state.penetration_substep[world] == wp.int64(0):
+        state.penetration_substep[world] = wp.int64(substep + 1)
+
+
+@wp.kernel
+def read_base_and_joints(
+    select: wp.array[int],
+    value: int,
+    timestep: float,
+    layout: Layout,
+    ticks: wp.array[int],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_com: wp.array[wp.vec3],
+    live: StateArrays,
+    out: StateArrays,
+):
+    """Base and joints of the worlds whose ``select`` equals ``value``, and the flags of the live state."""
+    world, joint = wp.tid()
+    if select[world] != value:
+        return
+    out.joint_position[world, joint] = joint_q[world * layout.coordinates + layout.joint_q[joint]]
+    out.joint_velocity[world, joint] = joint_qd[world * layout.dofs + layout.joint_v[joint]]
+    if joint == 0:
+        q = world * layout.coordinates
+        v = world * layout.dofs
+        rotation = root_rotation(joint_q, q)
+        out.time[world] = float(ticks[world]) * timestep
+        out.base_position_w[world] = wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
+        out.base_quaternion_w[world] = wp.vec4(rotation[3], rotation[0], rotation[1], rotation[2])
+        out.base_linear_velocity_w[world] = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
+        out.base_angular_velocity_b[world] = wp.quat_rotate_inv(
+            rotation, wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
+        )
+        out.tilt_substep[world] = live.tilt_substep[world]
+        out.penetration_substep[world] = live.penetration_substep[world]
+        out.diverged[world] = live.diverged[world]
+        out.overflowed[world] = live.overflowed[world]
+
+
+@wp.kernel
+def read_feet(
+    select: wp.array[int],
+    value: int,
+    layout: Layout,
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_com: wp.array[wp.vec3],
+    out: StateArrays,
+):
+    """Positions and velocities of the feet."""
+    world, foot = wp.tid()
+    if select[world] != value:
+        return
+    body = world * layout.bodies + layout.foot_body[foot]
+    position = wp.transform_point(body_q[body], layout.foot_center[foot])
+    arm = position - wp.transform_point(body_q[body], body_com[body])
+    twist = body_qd[body]
+    out.foot_position_w[world, foot] = position
+    out.foot_velocity_w[world, foot] = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
+
+
+@wp.kernel
+def clear_forces(select: wp.array[int], value: int, joints: int, feet: int, bodies: int, out: StateArrays):
+    """Zero all forces of the selected worlds."""
+    world = wp.tid()
+    if select[world] != value:
+        return
+    for joint in range(joints):
+        out.joint_torque[world, joint] = 0.0
+    for foot in range(feet):
+        out.foot_contact_force_w[world, foot] = wp.vec3(0.0)
+        out.foot_normal_force[world, foot] = 0.0
+        out.foot_tangential_force[world, foot] = 0.0
+    for body in range(bodies):
+        out.body_contact_force_w[world, body] = wp.vec3(0.0)
+    out.ground_force_w[world] = wp.vec3(0.0)
+    out.ground_moment_w[world] = wp.vec3(0.0)
+    out.contact_center_w[world] = wp.vec3(0.0)
+    out.contact_count[world] = wp.int64(0)
+
+
+@wp.kernel
+def add_contacts(
+    select: wp.array[int],
+    value: int,
+    layout: Layout,
+    contacts: ContactArrays,
+    body_q: wp.array[wp.transform],
+    diverged: wp.array[wp.bool],
+    out: StateArrays,
+):
+    """Add each ground contact's force to its foot, body and world.
+
+    ``body_q`` are the poses in which the contacts were found. Moments and the centre are summed about the base's place in these poses,
+    which is near the contacts, to keep single precision; ``finish_contacts`` moves them.
+    """
+    c = wp.tid()
+    if c >= wp.min(contacts.count[0], contacts.normal.shape[0]):
+        return
+    first, second = contacts.shape0[c], contacts.shape1[c]
+    if first < 0 or second < 0:
+        return
+    world = first / layout.shapes
+    if select[world] != value or diverged[world]:
+        return
+    ground_first = layout.shape_ground[first % layout.shapes]
+    if ground_first + layout.shape_ground[second % layout.shapes] != 1:
+        return
+    # Newton reports the wrench on shape 0, at the contact point
+    wrench = contacts.force[c]
+    sign = float(1.0)
+    shape = first % layout.shapes
+    if ground_first == 1:
+        sign = -1.0
+        shape = second % layout.shapes
+    force = wp.spatial_top(wrench) * sign
+    normal = contacts.normal[c]
+    along = wp.abs(wp.dot(force, normal))
+    across = wp.length(force - normal * wp.dot(force, normal))
+    if along <= 0.0 and across <= 0.0:
+        return
+    one = world_point(contacts, first, contacts.point0[c], body_q) + normal * contacts.margin0[c]
+    two = world_point(contacts, second, contacts.point1[c], body_q) - normal * contacts.margin1[c]
+    arm = 0.5 * (one + two) - wp.transform_get_translation(body_q[world * layout.bodies + layout.base])
+    wp.atomic_add(out.ground_force_w, world, force)
+    wp.atomic_add(out.ground_moment_w, world, wp.spatial_bottom(wrench) * sign + wp.cross(arm, force))
+    if along > 0.0:
+        wp.atomic_add(out.contact_center_w, world, arm)
+        wp.atomic_add(out.contact_count, world, wp.int64(1))
+    foot = layout.shape_foot[shape]
+    body = layout.shape_body[shape]
+    if foot >= 0:
+        wp.atomic_add(out.foot_contact_force_w, world, foot, force)
+        wp.atomic_add(out.foot_normal_force, world, foot, along)
+        wp.atomic_add(out.foot_tangential_force, world, foot, across)
+    elif body >= 0:
+        wp.atomic_add(out.body_contact_force_w, world, body, force)
+
+
+@wp.kernel
+def finish_contacts(
+    select: wp.array[int], value: int, layout: Layout, body_q: wp.array[wp.transform], out: StateArrays
+):
+    """Turn the sums of ``add_contacts`` into the mean contact point and the moment about it."""
+    world = wp.tid()
+    if select[world] != value:
+        return
+    count = int(out.contact_count[world])
+    if count == 0:
+        out.contact_center_w[world] = wp.vec3(0.0)
+        return
+    base = wp.transform_get_translation(body_q[world * layout.bodies + layout.base])
+    center = out.contact_center_w[world] / float(count)
+    out.ground_moment_w[world] = out.ground_moment_w[world] - wp.cross(center, out.ground_force_w[world])
+    out.contact_center_w[world] = center + base
+
+
+@wp.kernel
+def read_torques(select: wp.array[int], value: int, motors: Motors, out: StateArrays):
+    """Motor torques of the last substep."""
+    world, joint = wp.tid()
+    if select[world] == value:
+        out.joint_torque[world, joint] = motors.torque[world, joint]
+
+
+@wp.kernel
+def reset_worlds(
+    layout: Layout,
+    active: wp.array[int],
+    has_held: wp.array[int],
+    position: wp.array2d[float],
+    quaternion: wp.array2d[float],
+    linear: wp.array2d[float],
+    angular: wp.array2d[float],
+    joint_position: wp.array2d[float],
+    joint_velocity: wp.array2d[float],
+    body_com: wp.array[wp.vec3],
+    motors: Motors,
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    external: wp.array[wp.spatial_vector],
+    external_other: wp.array[wp.spatial_vector],
+    ticks: wp.array[int],
+    state: StateArrays,
+):
+    """Put the masked worlds into the given state. ``requested`` holds the held targets."""
+    world, joint = wp.tid()
+    if active[world] == 0:
+        return
+    joint_q[world * layout.coordinates + layout.joint_q[joint]] = joint_position[world, joint]
+    joint_qd[world * layout.dofs + layout.joint_v[joint]] = joint_velocity[world, joint]
+    held = float(0.0)
+    if has_held[0] != 0:
+        held = motors.requested[world, joint]
+    motors.current[world, joint] = held
+    motors.previous[world, joint] = held
+    motors.torque[world, joint] = 0.0
+    if joint == 0:
+        q = world * layout.coordinates
+        v = world * layout.dofs
+        rotation = wp.normalize(
+            wp.quat(quaternion[world, 1], quaternion[world, 2], quaternion[world, 3], quaternion[world, 0])
+        )
+        spin = wp.quat_rotate(rotation, wp.vec3(angular[world, 0], angular[world, 1], angular[world, 2]))
+        arm = wp.quat_rotate(rotation, body_com[world * layout.bodies + layout.base])
+        velocity = wp.vec3(linear[world, 0], linear[world, 1], linear[world, 2]) + wp.cross(spin, arm)
+        for i in range(3):
+            joint_q[q + i] = position[world, i]
+            joint_qd[v + i] = velocity[i]
+            joint_qd[v + 3 + i] = spin[i]
+        for i in range(4):
+            joint_q[q + 3 + i] = rotation[i]
+        for i in range(layout.bodies):
+            external[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            external_other[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        motors.limp[world] = 1 - has_held[0]
+        motors.limp_before[world] = 1 - has_held[0]
+        ticks[world] = 0
+        state.diverged[world] = False
+        state.overflowed[world] = False
+        state.tilt_substep[world] = wp.int64(0)
+        state.penetration_substep[world] = wp.int64(0)
+
+
+@wp.kernel
+def place_terrain(
+    layout: Layout,
+    active: wp.array[int],
+    requested: wp.array[int],
+    terrains: int,
+    slot_shape: wp.array[int],
+    palette: Palette,
+    terrain: wp.array[int],
+    shape_transform: wp.array[wp.transform],
+    shape_scale: wp.array[wp.vec3],
+):
+    """Write the boxes and the height field of the masked worlds' new terrains."""
+    world, slot = wp.tid()
+    if active[world] == 0:
+        return
+    index = wp.clamp(requested[world], 0, terrains - 1)
+    if slot == 0:
+        terrain[world] = index
+    if slot >= slot_shape.shape[0]:
+        return
+    shape = world * layout.shapes + slot_shape[slot]
+    shape_transform[shape] = palette.pose[index, slot]
+    shape_scale[shape] = palette.scale[index, slot]
+
+
+@wp.kernel
+def push_base(
+    layout: Layout,
+    active: wp.array[int],
+    linear: wp.array2d[float],
+    angular: wp.array2d[float],
+    body_com: wp.array[wp.vec3],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+):
+    """Set the base's velocities; NaN keeps the present value."""
+    world = wp.tid()
+    if active[world] == 0:
+        return
+    v = world * layout.dofs
+    rotation = root_rotation(joint_q, world * layout.coordinates)
+    velocity = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
+    spin = wp.quat_rotate_inv(rotation, wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5]))
+    for i in range(3):
+        if not wp.isnan(linear[world, i]):
+            velocity[i] = linear[world, i]
+        if not wp.isnan(angular[world, i]):
+            spin[i] = angular[world, i]
+    spin = wp.quat_rotate(rotation, spin)
+    velocity = velocity + wp.cross(spin, wp.quat_rotate(rotation, body_com[world * layout.bodies + layout.base]))
+    for i in range(3):
+        joint_qd[v + i] = velocity[i]
+        joint_qd[v + 3 + i] = spin[i]
+
+
+@wp.kernel
+def move_center_of_mass(
+    layout: Layout,
+    nominal: wp.vec3,
+    offset: wp.array2d[float],
+    body_com: wp.array[wp.vec3],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+):
+    """Shift the base's centre of mass; its velocity follows, so that the base itself goes on as it did."""
+    world = wp.tid()
+    velocity = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
+    center = nominal + wp.vec3(offset[world, 0], offset[world, 1], offset[world, 2])
+    body_com[world * layout.bodies + layout.base] = center
+    v = world * layout.dofs
+    spin = wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
+    velocity = velocity + wp.cross(spin, wp.quat_rotate(root_rotation(joint_q, world * layout.coordinates), center))
+    for i in range(3):
+        joint_qd[v + i] = velocity[i]

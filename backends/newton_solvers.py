@@ -1,0 +1,379 @@
+"""The Newton solvers that this project runs, each behind the same few calls.
+
+A solver is added by measuring that it holds and walks the robot, saying in ``capabilities`` what it cannot do, and naming it in
+``SOLVERS``. What was measured on those that are not here is told in ``docs/newton.md``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
+
+import mujoco
+import newton
+import numpy as np
+import warp as wp
+
+from . import newton_kernels as kernels
+from . import newton_solver_kernels as solver_kernels
+from .base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
+from .newton_model import WorldModel, import_differences
+
+DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
+"""Contacts per world for which room is made, by the hardest shape of the palette; a robot that lies flat needs about 30."""
+
+_EXACT = Capability(support=Support.EXACT)
+
+
+def _declare(**others: Capability) -> dict[str, Capability]:
+    """Everything exact but what is named."""
+    return {name: others.get(name, _EXACT) for name in CAPABILITY_NAMES}
+
+
+class SolverAdapter(ABC):
+    """One Newton solver with its contacts."""
+
+    name: ClassVar[str]
+    """Name after the colon in ``newton:NAME``."""
+    capabilities: ClassVar[Mapping[str, Capability]]
+    gap: ClassVar[float]
+    """Distance at which the solver wants to hear of contacts, for each of the two shapes [m]."""
+    skin: ClassVar[bool]
+    """Whether the robot file's contact margins mean to this solver what they mean to MuJoCo."""
+    own_dry_friction: ClassVar[bool]
+    """Whether the solver knows the joints' dry friction; else the motor kernel adds it."""
+
+    warm_start: wp.array
+    """What the solver carries from step to step, (N, W); W is 1 and the entry unused where it carries nothing."""
+    contacts: newton.Contacts
+    observables: newton.solvers.SolverBase.Observables
+
+    @classmethod
+    def refuse(cls, scene: Scene) -> None:
+        """Raise ``BackendError`` where the scene asks for what the solver cannot do.
+
+        Raises:
+            BackendError: says what was asked for and what to change.
+        """
+        physics = scene.physics
+        for capability, asked, change in (
+            ("height_field", any(t.height_field is not None for t in scene.terrains), "use terrains of boxes"),
+            ("boxes", any(t.boxes for t in scene.terrains), "use flat terrains"),
+            ("foot_condim_6", physics.foot_condim == 6, "use PhysicsOptions(foot_condim=3), or None"),
+            ("elliptic_cone", physics.cone == "elliptic", "use PhysicsOptions(cone='pyramidal')"),
+            ("deterministic", physics.deterministic, "use PhysicsOptions(deterministic=False)"),
+        ):
+            if asked and cls.capabilities[capability].support is Support.NONE:
+                raise BackendError(
+                    f"Newton's {cls.name} solver has no support for {capability} ({cls.capabilities[capability].note}); {change}"
+                )
+
+    @abstractmethod
+    def __init__(self, world: WorldModel, scene: Scene) -> None:
+        """Make the solver and its contact buffers."""
+
+    @abstractmethod
+    def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
+        """One physics step. ``observe``: the contact forces are wanted."""
+
+    @abstractmethod
+    def collect_overflow(self, active: wp.array, overflowed: wp.array) -> None:
+        """Set the flags of the active worlds in which the last step dropped contacts or constraints."""
+
+    @abstractmethod
+    def reset(self, state: newton.State, mask: wp.array) -> None:
+        """Forget the past of the masked worlds; ``mask`` is (N + 1,) bool."""
+
+    @abstractmethod
+    def shapes_changed(self, terrain: wp.array) -> None:
+        """Take over poses, sizes and friction of the model's shapes; ``terrain`` is each world's, (N,)."""
+
+    @abstractmethod
+    def inertia_changed(self) -> None:
+        """Take over masses, inertias and centres of mass of the model's bodies."""
+
+
+def _contacts_per_world(scene: Scene, world: WorldModel) -> int:
+    """Contact capacity of a world."""
+    shape = "height_field" if world.slots.fields else "boxes" if len(world.layout.slot_shape) else "plane"
+    asked = scene.physics.contacts_per_world
+    if asked is not None and asked < 1:
+        raise BackendError(f"contacts_per_world is {asked}, but must be at least 1 (PhysicsOptions.contacts_per_world)")
+    return asked or DEFAULT_CONTACTS[shape]
+
+
+def _deterministic(physics: PhysicsOptions) -> wp.DeterministicMode | None:
+    """Warp's mode for what the options ask."""
+    return wp.DeterministicMode.RUN_TO_RUN if physics.deterministic else None
+
+
+class MujocoAdapter(SolverAdapter):
+    """Newton's MuJoCo solver: mujoco_warp behind Newton's model, state and contacts."""
+
+    name = "mujoco"
+    capabilities = _declare(
+        deterministic=Capability(
+            support=Support.APPROXIMATE, note="to the last bit on a CPU; on a GPU Newton's deterministic mode is asked for, without proof"
+        ),
+        height_field=Capability(support=Support.EXACT, note="about four times slower than boxes"),
+    )
+    gap = 0.0
+    skin = True
+    own_dry_friction = True
+
+    def __init__(self, world: WorldModel, scene: Scene) -> None:
+        physics, model = scene.physics, world.model
+        contacts = _contacts_per_world(scene, world)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the margins that it complains about are repaired below
+            self.solver = newton.solvers.SolverMuJoCo(
+                model,
+                nconmax=contacts,
+                njmax=_constraint_rows(scene, world, contacts),
+                iterations=physics.iterations,
+                ls_iterations=physics.ls_iterations,
+                tolerance=physics.tolerance,
+                solver="newton",
+                integrator="euler",
+                cone=physics.cone,
+                impratio=physics.impratio,
+                enable_multiccd=True,  # as in MuJoCo
+                include_sites=False,
+                deterministic=_deterministic(physics),
+            )
+        self._timestep = physics.timestep
+        self._data, self._model = self.solver.mjw_data, self.solver.mjw_model
+        self._check_import(world, scene)
+        geoms = self.solver.mjc_geom_to_newton_shape.numpy()
+        margin = np.zeros(geoms.shape, dtype=np.float32)
+        local = geoms[0] % world.layout.shapes
+        for geom, shape in enumerate(local):
+            if world.layout.shape_ground[shape] == 0:
+                margin[:, geom] = model.shape_margin.numpy()[shape]
+        self._margin = wp.array(margin, dtype=float, device=model.device)
+        self._fields = _FieldGeom(self.solver, world, scene) if world.slots.fields else None
+        self.warm_start = self._data.qacc_warmstart
+        self.contacts = newton.Contacts(self.solver.get_max_contact_count(), 0, device=model.device)
+        self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
+        # iterations that run out are no loss of contacts
+        full = [b for b in _overflow_bits() if b.name not in ("ITERATIONS", "LS_ITERATIONS", "EPA_HORIZON", "ALL", "NONE")]
+        self._overflow_mask = int(sum(full))
+
+    def _check_import(self, world: WorldModel, scene: Scene) -> None:
+        """Refuse a robot of which Newton's importer made something else than MuJoCo's compiler."""
+        shape_geom = {int(s): g for g, s in enumerate(self.solver.mjc_geom_to_newton_shape.numpy()[0])}
+        order = np.array([shape_geom[s] for s in range(world.reference.ngeom)])
+        wrong = import_differences(self.solver.mj_model, world.reference, order)
+        if wrong:
+            raise BackendError(
+                f"Newton imports robot '{scene.robot.name}' unlike MuJoCo: {'; '.join(wrong)}; use the backend 'mujoco-warp', "
+                "or change the robot's model file"
+            )
+
+    def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
+        """See ``SolverAdapter.step``."""
+        self.solver.step(
+            before, after, control, self.contacts, self._timestep, observables=self.observables if observe else None
+        )
+
+    def collect_overflow(self, active: wp.array, overflowed: wp.array) -> None:
+        """See ``SolverAdapter.collect_overflow``."""
+        wp.launch(
+            kernels.collect_overflow_bits,
+            dim=active.shape[0],
+            inputs=[active, self._data.overflow, self._overflow_mask, overflowed],
+            device=active.device,
+        )
+
+    def reset(self, state: newton.State, mask: wp.array) -> None:
+        """See ``SolverAdapter.reset``."""
+        self.solver.reset(state, mask, flags=0)
+
+    def shapes_changed(self, terrain: wp.array) -> None:
+        """See ``SolverAdapter.shapes_changed``."""
+        self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+        # Newton zeroes margins for fear of an old limit of mujoco_warp
+        wp.copy(self._model.geom_margin, self._margin)
+        if self._fields is not None:
+            self._fields.place(terrain)
+
+    def inertia_changed(self) -> None:
+        """See ``SolverAdapter.inertia_changed``."""
+        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+
+
+def _overflow_bits() -> type:
+    """mujoco_warp's overflow flags."""
+    from mujoco_warp import OverflowType
+
+    return OverflowType
+
+
+def _constraint_rows(scene: Scene, world: WorldModel, contacts: int) -> int:
+    """Constraint rows of one world: joint friction, joint limits and ``contacts`` contacts, feet with their own dimension."""
+    reference, elliptic = world.reference, scene.physics.cone == "elliptic"
+    rows = int(np.count_nonzero(reference.dof_frictionloss > 0)) + int(reference.jnt_limited.sum())
+    for name in scene.robot.foot_names:
+        dimension = max(int(reference.geom(name).condim[0]), 3)
+        # a foot has two contacts at most times: the ground and another box
+        rows += 2 * ((dimension - 3) if elliptic else 2 * (dimension - 3))
+    rows += contacts * (3 if elliptic else 4)
+    return 16 * -(-rows // 16)
+
+
+class _FieldGeom:
+    """The height-field geom of Newton's MuJoCo solver, whose field differs between worlds."""
+
+    def __init__(self, solver: newton.solvers.SolverMuJoCo, world: WorldModel, scene: Scene) -> None:
+        self._solver, slots, layout = solver, world.slots, world.layout
+        device, count = world.model.device, len(slots.fields)
+        shape_geom = {int(s): g for g, s in enumerate(solver.mjc_geom_to_newton_shape.numpy()[0])}
+        carriers = [int(layout.slot_shape[-1]), *map(int, layout.spare_fields)]
+        self._geom = shape_geom[carriers[0]]
+        ids = solver.mjw_model.geom_dataid.numpy()
+        asset = np.full(count, -1, dtype=np.int32)
+        for k, shape in enumerate(carriers):
+            for row in range(scene.num_worlds):
+                asset[(k * scene.num_worlds + row) % count] = ids[row % len(ids), shape_geom[shape]]
+        present = np.array([t.height_field is not None for t in scene.terrains])
+        low = np.array([float(np.min(f.heights)) for f in slots.fields])[slots.field]
+        top = np.array([float(np.max(f.heights)) for f in slots.fields])[slots.field] - low
+        base = np.array([f.base for f in slots.fields])[slots.field] + low
+        half = np.array([f.half_size for f in slots.fields])[slots.field]
+        position = slots.pose[:, -1, :3].copy()
+        position[:, 2] += np.where(present, low, 0.0)
+        box = np.stack(
+            [np.c_[np.zeros((len(present), 2)), 0.5 * (top - base)], np.c_[half, 0.5 * (top + base)]], axis=1
+        )
+        radius = np.sqrt((half**2).sum(1) + np.maximum(top, base) ** 2)
+        self._asset = wp.array(asset[slots.field], dtype=int, device=device)
+        self._position = wp.array(position, dtype=wp.vec3, device=device)
+        self._box = wp.array(box, dtype=wp.vec3, device=device)
+        self._radius = wp.array(radius, dtype=float, device=device)
+
+    def place(self, terrain: wp.array) -> None:
+        """Give every world the field of its terrain."""
+        model, data = self._solver.mjw_model, self._solver.mjw_data
+        wp.launch(
+            solver_kernels.place_mujoco_field,
+            dim=terrain.shape[0],
+            inputs=[terrain, self._geom, self._asset, self._position, self._box, self._radius],
+            outputs=[model.geom_dataid, model.geom_pos, data.geom_xpos, model.geom_aabb, model.geom_rbound],
+            device=terrain.device,
+        )
+
+
+class SteelAdapter(SolverAdapter):
+    """Newton's Steel solver: joint coordinates, hard contacts solved by projected Gauss-Seidel sweeps, Newton's own collisions."""
+
+    name = "steel"
+    capabilities = _declare(
+        height_field=Capability(support=Support.NONE, note="not measured yet"),
+        joint_friction=Capability(
+            support=Support.APPROXIMATE, note="an explicit torque that changes sign over a small speed: a joint at rest creeps"
+        ),
+        elliptic_cone=Capability(
+            support=Support.APPROXIMATE, note="friction is the exact cone of a hard contact; impratio has no meaning here"
+        ),
+        foot_condim_6=Capability(support=Support.NONE, note="contacts slide, they have no torsional or rolling friction"),
+        contact_forces=Capability(support=Support.APPROXIMATE, note="impulses of hard contacts divided by the timestep, without moments"),
+        deterministic=Capability(
+            support=Support.APPROXIMATE, note="to the last bit on a CPU; on a GPU Newton's deterministic mode is asked for, without proof"
+        ),
+    )
+    gap = 0.01
+    skin = False
+    own_dry_friction = False
+
+    @classmethod
+    def refuse(cls, scene: Scene) -> None:
+        """See ``SolverAdapter.refuse``; a pyramidal cone is refused too."""
+        super().refuse(scene)
+        if scene.physics.cone != "elliptic":
+            raise BackendError(
+                "Newton's steel solver has no pyramidal friction cone, its contacts slide on a true cone; use PhysicsOptions(cone='elliptic')"
+            )
+
+    def __init__(self, world: WorldModel, scene: Scene) -> None:
+        physics, model = scene.physics, world.model
+        contacts = _contacts_per_world(scene, world)
+        mode = _deterministic(physics)
+        self._timestep = physics.timestep
+        # one coefficient acts, and the mean of two equal ones is it: the feet's, until it is randomized
+        feet = float(np.mean([world.reference.geom(name).friction[0] for name in scene.robot.foot_names]))
+        model.shape_material_mu.fill_(feet)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.solver = newton.solvers.SolverSteel(
+                model,
+                iterations=physics.iterations,
+                enable_joint_limits=True,
+                joint_limit_activation_gap=0.1,
+                # point friction and no warm start: nothing is carried over, so that resets and masks leave no trace
+                friction_anchor_beta=0.0,
+                contact_warmstart=False,
+                enable_restitution=False,
+                articulation_constraint_max=3 * contacts + scene.robot.num_joints,
+                free_body_constraint_max=1,
+                warn_constraint_overflow=False,
+                deterministic=mode,
+            )
+            self._pipeline = newton.CollisionPipeline(
+                model, rigid_contact_max=contacts * scene.num_worlds + 256, deterministic=physics.deterministic
+            )
+        self.contacts = self._pipeline.contacts()
+        self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
+        self.warm_start = wp.zeros((scene.num_worlds, 1), dtype=float, device=model.device)
+
+    def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
+        """See ``SolverAdapter.step``."""
+        self._pipeline.collide(before, self.contacts)
+        self.solver.step(
+            before, after, control, self.contacts, self._timestep, observables=self.observables if observe else None
+        )
+
+    def collect_overflow(self, active: wp.array, overflowed: wp.array) -> None:
+        """See ``SolverAdapter.collect_overflow``."""
+        wp.launch(
+            kernels.collect_overflow_flags,
+            dim=active.shape[0],
+            inputs=[active, self.solver.constraint_overflow, overflowed],
+            device=active.device,
+        )
+
+    def reset(self, state: newton.State, mask: wp.array) -> None:
+        """See ``SolverAdapter.reset``."""
+        self.solver.reset(state, mask, flags=0)
+
+    def shapes_changed(self, terrain: wp.array) -> None:
+        """See ``SolverAdapter.shapes_changed``."""
+        self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+
+    def inertia_changed(self) -> None:
+        """See ``SolverAdapter.inertia_changed``."""
+        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+
+
+SOLVERS: Mapping[str, type[SolverAdapter]] = {each.name: each for each in (MujocoAdapter, SteelAdapter)}
+"""Solvers by name; the first is the default."""
+
+
+def dry_friction_slope(world: WorldModel, layout_dofs: np.ndarray, timestep: float) -> np.ndarray:
+    """Steepest slope of an explicit dry-friction torque around zero speed at which a step does not overshoot [N·m·s/rad].
+
+    A slope of half the joint's own inertia per step keeps even three coupled joints of a leg stable.
+
+    Args:
+        world: the model.
+        layout_dofs: MuJoCo's degree of freedom of each joint.
+        timestep: length of a physics step [s].
+    """
+    reference = world.reference
+    data = mujoco.MjData(reference)
+    mujoco.mj_forward(reference, data)
+    inertia = np.zeros((reference.nv, reference.nv))
+    mujoco.mj_fullM(reference, data, inertia)
+    own = 1.0 / np.diag(np.linalg.inv(inertia))
+    return 0.5 * own[layout_dofs] / timestep
