@@ -85,7 +85,7 @@ class PolicyFile:
 def first_line(error: BaseException) -> str:
     """The first line that says anything of an error's message, for messages of one sentence."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0].rstrip(".") if lines else type(error).__name__
+    return lines[0].partition(". ")[0].rstrip(".")[:200] if lines else type(error).__name__
 
 
 def save_policy(
@@ -178,10 +178,11 @@ def load_entries(data: bytes, *, source: str) -> Mapping[str, Any]:
     """
     try:
         entries = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        # torch's message recommends the unsafe way to load it, which is not for the user of a downloaded file to try.
+        raise PolicyError(f"'{source}' holds more than tensors and plain data, and was not loaded") from error
     except LOAD_ERRORS as error:
-        raise PolicyError(
-            f"'{source}' is damaged or holds more than tensors and plain data, and was not loaded: {first_line(error)}"
-        ) from error
+        raise PolicyError(f"'{source}' is damaged or truncated: {first_line(error)}") from error
     if not isinstance(entries, Mapping):
         raise PolicyError(f"'{source}' holds a {type(entries).__name__}, not a policy")
     return entries

@@ -117,14 +117,17 @@ def _with_open_batch(model: onnx.ModelProto, input_name: str, *, open_reshapes: 
             if node.op_type == "Constant":
                 constants.update((node.output[0], a.t) for a in node.attribute if a.name == "value")
         for number, node in enumerate(n for n in graph.node if n.op_type == "Reshape"):
-            if node.input[1] in constants:
+            if len(node.input) > 1 and node.input[1] in constants:
                 shape = numpy_helper.to_array(constants[node.input[1]]).copy()
-                if len(shape) > 1 and shape[0] == 1:
+                if len(shape) > 1 and shape[0] == 1 and 0 not in shape:
                     # -1 infers the axis, 0 keeps the input's; only one axis may be inferred.
                     shape[0] = 0 if -1 in shape[1:] else -1
                     name = f"open_batch_shape_{number}"
                     graph.initializer.append(numpy_helper.from_array(shape, name))
                     node.input[1] = name
+                    kept = [a for a in node.attribute if a.name != "allowzero"]
+                    del node.attribute[:]
+                    node.attribute.extend(kept)
     return changed.SerializeToString()
 
 

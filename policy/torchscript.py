@@ -314,7 +314,7 @@ def _run(module: Any, observation: torch.Tensor, rows: int, contract: PolicyCont
 def last_line(error: BaseException) -> str:
     """TorchScript puts its message behind the traceback."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1].rstrip(".") if lines else type(error).__name__
+    return lines[-1].rstrip(".")[:200] if lines else type(error).__name__
 
 
 def _reset(module: Any) -> None:

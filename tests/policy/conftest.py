@@ -1,7 +1,9 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from gaitgauge.policy.base import PolicySession
 from gaitgauge.policy.contract import PolicyContract, go2_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import CtsNetwork
@@ -40,6 +42,22 @@ def cts_file(tmp_path: Path, contract: PolicyContract, cts_stored: StoredNetwork
 
 
 @pytest.fixture(scope="session")
+def run() -> Callable[[PolicySession, torch.Tensor], torch.Tensor]:
+    """Gives the actions of a session over all steps from a reset; row 2 is reset once more before step 6."""
+
+    def run_session(session: PolicySession, observations: torch.Tensor) -> torch.Tensor:
+        session.reset()
+        actions = []
+        for step, observation in enumerate(observations):
+            if step == 6:
+                session.reset(torch.arange(observation.shape[0]) == 2)
+            actions.append(session.act(observation))
+        return torch.stack(actions)
+
+    return run_session
+
+
+@pytest.fixture(scope="session")
 def observations() -> torch.Tensor:
-    """Random observations of 6 episodes over 12 steps, (12, 6, 45)."""
-    return torch.randn(12, 6, 45, generator=torch.Generator().manual_seed(1))
+    """Random observations of 4 episodes over 10 steps, (10, 4, 45)."""
+    return torch.randn(10, 4, 45, generator=torch.Generator().manual_seed(1))

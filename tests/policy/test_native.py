@@ -10,18 +10,7 @@ from gaitgauge.policy.native import ForeignFile, StoredNetwork, save_policy
 from gaitgauge.policy.networks import CtsNetwork, ExpertMixture, MlpNetwork, MoeCtsNetwork
 from torch import nn
 
-RESET_STEP, RESET_ROW = 7, 2
-
-
-def run(session, observations, *, reset: bool = True) -> torch.Tensor:
-    """Actions of a session over all steps, one row reset on the way."""
-    session.reset()
-    actions = []
-    for step, observation in enumerate(observations):
-        if reset and step == RESET_STEP:
-            session.reset(torch.arange(observation.shape[0]) == RESET_ROW)
-        actions.append(session.act(observation))
-    return torch.stack(actions)
+EPISODES, RESET_STEP, RESET_ROW = 4, 6, 2
 
 
 def reference_cts(network: CtsNetwork, observations: torch.Tensor) -> np.ndarray:
@@ -52,11 +41,11 @@ def test_cts_follows_its_description(cts_network, cts_file, observations):
     np.testing.assert_allclose(mine, reference_cts(cts_network, observations[:, 0]), atol=1e-5)
 
 
-def test_batch_equals_rows_with_partial_reset(cts_file, observations):
+def test_batch_equals_rows_with_partial_reset(cts_file, observations, run):
     policy = load_policy(cts_file)
-    batch = run(policy.session(6), observations)
-    assert batch.shape == (12, 6, 12)
-    for row in range(6):
+    batch = run(policy.session(EPISODES), observations)
+    assert batch.shape == (10, EPISODES, 12)
+    for row in range(EPISODES):
         session = policy.session(1)
         steps = []
         for step, observation in enumerate(observations[:, row : row + 1]):
@@ -66,19 +55,19 @@ def test_batch_equals_rows_with_partial_reset(cts_file, observations):
         np.testing.assert_allclose(batch[:, row : row + 1], torch.stack(steps), atol=1e-6)
 
 
-def test_rows_do_not_influence_each_other(cts_file, observations):
+def test_rows_do_not_influence_each_other(cts_file, observations, run):
     policy = load_policy(cts_file)
     poisoned = observations.clone()
-    poisoned[3:, 4] = float("nan")
-    a, b = run(policy.session(6), observations), run(policy.session(6), poisoned)
-    others = torch.arange(6) != 4
+    poisoned[3:, 1] = float("nan")
+    a, b = run(policy.session(EPISODES), observations), run(policy.session(EPISODES), poisoned)
+    others = torch.arange(EPISODES) != 1
     assert torch.equal(a[:, others], b[:, others])
-    assert b[3:, 4].isnan().all()
+    assert b[3:, 1].isnan().all()
 
 
-def test_sessions_are_independent_and_repeatable(cts_file, observations):
+def test_sessions_are_independent_and_repeatable(cts_file, observations, run):
     policy = load_policy(cts_file)
-    first, second = policy.session(6), policy.session(6)
+    first, second = policy.session(EPISODES), policy.session(EPISODES)
     for observation in observations[:4]:
         second.act(observation)
     assert torch.equal(run(first, observations), run(second, observations))
@@ -114,7 +103,7 @@ def test_every_architecture_survives_its_file(tmp_path, contract, observations, 
     save_policy(path, contract, stored, extra={"iter": 10, "optimizer_state_dict": {"step": torch.ones(1)}})
     policy = load_policy(path)
     assert policy.contract == contract
-    session = policy.session(6)
+    session = policy.session(EPISODES)
     for observation in observations[: network.history_length]:
         action = session.act(observation)
     history = observations[: network.history_length].transpose(0, 1)
@@ -175,19 +164,19 @@ class Counter(nn.Module):
         return state.expand(-1, 12), state + 1.0
 
 
-def test_networks_may_keep_a_state(tmp_path, contract, observations, monkeypatch):
+def test_networks_may_keep_a_state(tmp_path, contract, observations, monkeypatch, run):
     monkeypatch.setitem(networks.ARCHITECTURES, "counter", Counter)
     path = tmp_path / "counter.pt"
     save_policy(path, contract, StoredNetwork(architecture="counter", arguments={}, state_dict={}))
-    actions = run(load_policy(path).session(6), observations)
-    assert actions[:, 0, 0].tolist() == [10.0 + i for i in range(12)]
-    assert actions[RESET_STEP:, RESET_ROW, 0].tolist() == [10.0 + i for i in range(12 - RESET_STEP)]
+    actions = run(load_policy(path).session(EPISODES), observations)
+    assert actions[:, 0, 0].tolist() == [10.0 + i for i in range(10)]
+    assert actions[RESET_STEP:, RESET_ROW, 0].tolist() == [10.0 + i for i in range(10 - RESET_STEP)]
 
 
 def test_wrong_inputs_and_widths(tmp_path, contract, cts_file, cts_stored):
-    session = load_policy(cts_file).session(6)
-    with pytest.raises(PolicyError, match=r"\(6, 45\)"):
-        session.act(torch.zeros(6, 44))
+    session = load_policy(cts_file).session(EPISODES)
+    with pytest.raises(PolicyError, match=r"\(4, 45\)"):
+        session.act(torch.zeros(EPISODES, 44))
     narrow = MlpNetwork(frame_width=45, num_actions=11, hidden=[8])
     arguments = {"frame_width": 45, "num_actions": 11, "hidden": [8]}
     stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=narrow.state_dict())

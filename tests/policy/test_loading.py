@@ -1,0 +1,244 @@
+import importlib.util
+import os
+import pickle
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaitgauge.policy import loading
+from gaitgauge.policy.base import PolicyError
+from gaitgauge.policy.contract import ContractError, PolicyContract
+from gaitgauge.policy.importing import import_policy
+from gaitgauge.policy.loading import load_policy
+from gaitgauge.policy.native import save_policy
+from gaitgauge.policy.networks import CtsNetwork, multilayer_perceptron
+from torch import nn
+
+ROOT = Path(__file__).parents[2]
+
+
+def refused(path: Path | str, **options: object) -> str:
+    """The message with which a file is refused; it must be one sentence on one line."""
+    with pytest.raises(PolicyError) as caught:
+        load_policy(path, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 400
+    return message
+
+
+class Hostile:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.marker),)
+
+
+@pytest.mark.parametrize(
+    "kind", ["plain pickle", "torch.save", "torch.save, old", "inside a checkpoint", "as TorchScript"]
+)
+def test_code_in_a_file_is_never_executed(tmp_path, cts_file, kind):
+    marker, path = tmp_path / "executed", tmp_path / "policy.pt"
+    hostile = Hostile(marker)
+    if kind == "plain pickle":
+        path.write_bytes(pickle.dumps(hostile))
+    elif kind == "torch.save":
+        torch.save(hostile, path)
+    elif kind == "torch.save, old":
+        torch.save(hostile, path, _use_new_zipfile_serialization=False)
+    elif kind == "inside a checkpoint":
+        torch.save({**torch.load(cts_file, weights_only=True), "infos": hostile}, path)
+    else:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("archive/data.pkl", pickle.dumps(hostile))
+            archive.writestr("archive/constants.pkl", pickle.dumps(hostile))
+            archive.writestr("archive/code/__torch__.py", "")
+            archive.writestr("archive/version", "3\n")
+    refused(path)
+    assert not marker.exists()
+    pickle.loads(pickle.dumps(hostile))
+    assert marker.exists(), "the file would not have done anything anyway"
+
+
+def test_missing_and_unsuitable_paths(tmp_path):
+    assert "nowhere.pt" in refused(tmp_path / "nowhere.pt")
+    assert "folder" in refused(tmp_path)
+    assert "regular" in refused("/dev/null")
+    assert "latest" in refused("lastest")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\x00" * 100,
+        b"just some text, longer than a header",
+        b"\x08\x07" + b"\xff" * 100,
+        b"PK\x03\x04 not an archive",
+        bytes(range(256)) * 10,
+    ],
+)
+def test_files_that_are_no_policies(tmp_path, content):
+    path = tmp_path / "policy.pt"
+    path.write_bytes(content)
+    assert "policy.pt" in refused(path)
+
+
+def test_other_archives_and_other_contents(tmp_path):
+    path = tmp_path / "policy.pt"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("letter.txt", "hello")
+    assert "zip" in refused(path)
+    for content in ({"weights": torch.ones(3)}, torch.ones(3), [1, 2], {"format": "other"}):
+        torch.save(content, path)
+        refused(path)
+    np.savez(path.with_suffix(".npz"), a=np.ones(3))
+    refused(path.with_suffix(".npz"))
+
+
+def test_truncated_and_damaged_files(tmp_path, cts_file):
+    whole = cts_file.read_bytes()
+    path = tmp_path / "policy.pt"
+    for length in (3, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        refused(path)
+    start = whole.index(b"gaitgauge-policy")
+    path.write_bytes(whole[:start] + b"\xff" * 40 + whole[start + 40 :])
+    refused(path)
+
+
+def test_robot_is_checked(cts_file, go2, contract, cts_stored, tmp_path):
+    assert load_policy(cts_file, go2).contract == contract
+    renamed = PolicyContract.from_dict({**contract.to_dict(), "joint_names": ("tail", *contract.joint_names[1:])})
+    save_policy(tmp_path / "tail.pt", renamed, cts_stored)
+    with pytest.raises(ContractError, match="tail"):
+        load_policy(tmp_path / "tail.pt", go2)
+
+
+def test_latest_and_best(tmp_path, cts_file):
+    def put(run: str, name: str) -> Path:
+        path = tmp_path / run / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(cts_file.read_bytes())
+        return path
+
+    assert "model_<iteration>.pt" in refused("latest", log_root=tmp_path)
+    put("go2_flat/2026-01-01_10-00-00", "model_900.pt")
+    put("go2_rough/2026-01-02_10-00-00_first", "model_50.pt")
+    last = put("go2_rough/2026-01-02_10-00-00_first", "model_1000.pt")
+    put("go2_rough/2026-01-02_10-00-00_first", "model_999.pt")
+    (tmp_path / "go2_rough" / "2026-01-03_10-00-00").mkdir()
+    assert loading.find_policy("latest", log_root=tmp_path) == last
+    assert load_policy("latest", log_root=tmp_path).path == "latest"
+    assert "best.pt" in refused("best", log_root=tmp_path)
+    best = put("go2_flat/2026-01-01_10-00-00", "best.pt")
+    assert loading.find_policy("best", log_root=tmp_path) == best
+
+
+def test_pretrained(monkeypatch, cts_file, tmp_path):
+    monkeypatch.setattr(loading, "PRETRAINED", tmp_path / "absent.pt")
+    assert "pretrained" in refused("pretrained")
+    monkeypatch.setattr(loading, "PRETRAINED", cts_file)
+    assert load_policy("pretrained").contract.observation_width == 45
+
+
+def checkpoint(path: Path, layers: nn.Module, prefix: str, key: str, **more: torch.Tensor) -> Path:
+    weights = {f"{prefix}{k}": v for k, v in layers.state_dict().items()}
+    noise = {"std": torch.ones(12), "critic.0.weight": torch.ones(3, 3)}
+    torch.save({key: {**weights, **noise, **more}, "optimizer_state_dict": {}, "iter": 5, "infos": None}, path)
+    return path
+
+
+@pytest.mark.parametrize(("prefix", "key"), [("actor.", "model_state_dict"), ("mlp.", "actor_state_dict")])
+def test_bare_checkpoints(tmp_path, observations, prefix, key):
+    layers = multilayer_perceptron((45, 16, 8, 12))
+    policy = load_policy(checkpoint(tmp_path / "model_5.pt", layers, prefix, key))
+    with torch.no_grad():
+        torch.testing.assert_close(policy.session(4).act(observations[0]), layers(observations[0]))
+    assert policy.contract.provenance["adapter"] == "rsl_rl checkpoint"
+
+
+def test_bare_checkpoint_with_normalization_and_activation(tmp_path, observations):
+    layers = multilayer_perceptron((45, 16, 12), activation="tanh")
+    normalizer = {
+        "obs_normalizer._mean": torch.full((1, 45), 0.5),
+        "obs_normalizer._std": torch.full((1, 45), 1.99),
+        "obs_normalizer._var": torch.full((1, 45), 1.99**2),
+        "obs_normalizer.count": torch.tensor(7),
+    }
+    path = checkpoint(tmp_path / "model_5.pt", layers, "mlp.", "actor_state_dict", **normalizer)
+    (tmp_path / "params").mkdir()
+    (tmp_path / "params" / "agent.yaml").write_text("actor:\n  hidden_dims: [16]\n  activation: tanh\n")
+    with torch.no_grad():
+        expected = layers((observations[0] - 0.5) / 2.0)
+        torch.testing.assert_close(load_policy(path).session(4).act(observations[0]), expected)
+
+
+def test_bare_checkpoint_of_a_student(tmp_path, cts_network: CtsNetwork, observations, run, cts_file):
+    weights = {k.replace("encoder.", "student_encoder."): v for k, v in cts_network.state_dict().items()}
+    torch.save({"model_state_dict": {**weights, "teacher_encoder.0.weight": torch.ones(2, 2)}}, tmp_path / "model_5.pt")
+    student = load_policy(tmp_path / "model_5.pt")
+    assert torch.equal(run(student.session(4), observations), run(load_policy(cts_file).session(4), observations))
+
+
+@pytest.mark.parametrize(("widths", "named"), [((48, 8, 12), "48"), ((45, 8, 10), "10"), ((225, 8, 12), "225")])
+def test_bare_checkpoints_of_other_widths(tmp_path, widths, named):
+    path = checkpoint(tmp_path / "model_5.pt", multilayer_perceptron(widths), "actor.", "model_state_dict")
+    assert named in refused(path)
+
+
+def test_bare_checkpoints_of_other_kinds(tmp_path):
+    path = checkpoint(tmp_path / "model_5.pt", nn.LSTM(45, 4), "memory_a.rnn.", "model_state_dict")
+    assert "memory_a" in refused(path)
+    torch.save({"model_state_dict": {}}, path)
+    refused(path)
+
+
+def test_import_makes_a_file_of_our_own(tmp_path, observations):
+    layers = multilayer_perceptron((45, 16, 12))
+    path = checkpoint(tmp_path / "model_5.pt", layers, "actor.", "model_state_dict")
+    contract = import_policy(path, tmp_path / "made" / "own.gauge.pt")
+    own = load_policy(tmp_path / "made" / "own.gauge.pt")
+    assert own.contract == contract
+    assert contract.provenance["imported_from"] == "model_5.pt"
+    assert torch.equal(own.session(4).act(observations[0]), load_policy(path).session(4).act(observations[0]))
+
+
+def test_import_leaves_the_destination_alone_if_it_fails(tmp_path, cts_file):
+    bad = tmp_path / "bad.pt"
+    bad.write_bytes(b"nothing of use in here, really")
+    before = cts_file.read_bytes()
+    with pytest.raises(PolicyError):
+        import_policy(bad, cts_file)
+    assert cts_file.read_bytes() == before
+    with pytest.raises(PolicyError, match="cannot be written"):
+        import_policy(cts_file, cts_file / "under_a_file.pt")
+
+
+def test_published_weights_are_converted_and_checked(tmp_path, observations, monkeypatch):
+    torch.manual_seed(1)
+    network = CtsNetwork().eval().requires_grad_(False)
+    frames = observations[:, 0]
+    history = torch.zeros(1, 5, 45)
+    actions = []
+    for frame in frames:
+        history = torch.cat((history[:, 1:], frame.view(1, 1, 45)), dim=1)
+        actions.append(network(history)[0].numpy())
+    weights = {k.replace("encoder.", "student_encoder."): v.numpy() for k, v in network.state_dict().items()}
+    sample = {"sample/observations": frames.numpy(), "sample/actions": np.array(actions)}
+    np.savez(tmp_path / "weights.npz", **weights, **sample)
+    spec = importlib.util.spec_from_file_location("import_public_cts", ROOT / "benchmarks" / "import_public_cts.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    monkeypatch.setattr(sys, "argv", ["import", str(tmp_path / "weights.npz"), str(tmp_path / "own.pt")])
+    script.main()
+    assert torch.equal(load_policy(tmp_path / "own.pt").session(1).act(frames[:1])[0], torch.from_numpy(actions[0]))
+    np.savez(tmp_path / "weights.npz", **weights, **{**sample, "sample/actions": np.array(actions) + 1e-3})
+    with pytest.raises(SystemExit, match="published"):
+        script.main()
