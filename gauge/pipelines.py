@@ -152,6 +152,12 @@ class Plan:
         self._store.put(record)
         self._fold(record)
 
+    def expected_left(self) -> float:
+        """Rough number of episodes still to come, searches that are not decided yet counted by their usual length."""
+        open_searches = sum(e.searched and e.level is None for e in self.environments)
+        later = open_searches * (4.0 + (len(self.seeds) if self._evaluate else 0))
+        return self.total_known - self.done + later
+
     # ---- folding --------------------------------------------------------------------------------------------------
 
     def _add(self, environment: Environment, episodes: Sequence[Episode]) -> None:
