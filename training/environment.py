@@ -59,6 +59,7 @@ class TrainingEnvironment(VecEnv):
         device: str = "cuda:0",
         threads: int = 1,
         capture: bool = False,
+        fuse: bool = False,
         palette: TrainingPalette | None = None,
     ) -> None:
         """Build the worlds and begin their first episodes.
@@ -69,6 +70,8 @@ class TrainingEnvironment(VecEnv):
             device: torch device of the physics and of everything else.
             threads: CPU threads for engines that use them.
             capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
+            fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels
+                into a few; takes a minute or two at the start, and numbers differ in the last digits.
             palette: the tiles; None builds them from the configuration.
 
         Raises:
@@ -126,6 +129,9 @@ class TrainingEnvironment(VecEnv):
         self._begin(level.to(self.device))
         self._after_physics: Callable[[], Verdict] = self.program.after_physics
         self._observe: Callable[[], Observations] = self.program.observe
+        if fuse:
+            self._after_physics = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
+            self._observe = torch.compile(self._observe, fullgraph=True, dynamic=False)
         if capture:
             self._capture()
 
@@ -164,8 +170,8 @@ class TrainingEnvironment(VecEnv):
         before = memory.snapshot()
         motors_before = {f.name: getattr(motors, f.name).clone() for f in fields(motors)}
         with torch.no_grad():
-            self._after_physics = CapturedFunction(self.program.after_physics)
-            self._observe = CapturedFunction(self.program.observe)
+            self._after_physics = CapturedFunction(self._after_physics)
+            self._observe = CapturedFunction(self._observe)
         memory.restore(before)
         for name, values in motors_before.items():
             getattr(motors, name).copy_(values)
@@ -215,7 +221,7 @@ class TrainingEnvironment(VecEnv):
             )
         self._read(AFTER_RESET)
         self._observations = _clone(self._observe())
-        return self._pack(_clone(self._observations)), verdict.reward.clone(), verdict.done.long(), extras
+        return self._pack(self._observations), verdict.reward.clone(), verdict.done.long(), extras
 
     def close(self) -> None:
         """Free the physics."""
