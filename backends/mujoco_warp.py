@@ -235,6 +235,18 @@ class MujocoWarpBackend(PhysicsBackend):
         contacts.row_capacity = data.njmax
         contacts.pyramidal = int(self.scene.physics.cone == "pyramidal")
         self._contacts = contacts
+        if shared.has_field and shared.model.geom_margin.any():
+            self._model.callback.contactfilter = self._correct_field_contacts
+
+    def _correct_field_contacts(self, _: mujoco_warp.Model, data: mujoco_warp.Data) -> None:
+        """Called by mujoco_warp between collision detection and the constraints."""
+        contact = data.contact
+        wp.launch(
+            kernels.correct_field_contacts,
+            dim=data.naconmax,
+            inputs=[data.nacon, contact.geom, contact.frame, contact.includemargin, int(self._shared.slot_geom[-1])]
+            + [contact.dist, contact.pos],
+        )
 
     def _reset_to_default(self) -> None:
         """Every world at its first terrain's origin in the default pose."""
