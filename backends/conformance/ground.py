@@ -127,11 +127,19 @@ def height_field(bench: Bench) -> str:
             rise = reference.foot_radius / np.cos(slope[row])
             ground = terrains[index[row]].height(x, y)
             expect_close(f"foot height in world {row} on a height field [m]", z, ground + rise, 0.005)
+        fluctuation = ""
         if bench.supports("contact_forces"):
+            # Single contacts with a triangle mesh may come and go; over many substeps they must carry the weight.
+            forces = []
+            for _ in range(30):
+                worlds.step(substeps=1)
+                forces.append(worlds.read().ground_force_w)
             weight = reference.mass * GRAVITY
             expected = np.tile([0.0, 0.0, weight], (worlds.count, 1))
-            expect_close("ground_force_w on height fields [N]", state.ground_force_w, expected, 0.05 * weight)
-    return f"heights {', '.join(f'{h:.2f}' for h in heights)} m"
+            bound = bench.bound("height_field", exact=0.03, approximate=0.06) * weight
+            expect_close("mean of ground_force_w on height fields [N]", np.mean(forces, axis=0), expected, bound)
+            fluctuation = f", weight fluctuates by {np.std(forces, axis=0)[:, 2].max() / weight:.1%} between substeps"
+    return f"heights {', '.join(f'{h:.2f}' for h in heights)} m{fluctuation}"
 
 
 @check("ground/walls", "boxes")

@@ -2,6 +2,7 @@
 
 import importlib.util
 from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
@@ -103,3 +104,9 @@ def test_an_engine_that_crashes_fails_its_checks_and_no_more():
     assert results["state/fields"].outcome is Outcome.PASSED
     assert results["state/time"].outcome is Outcome.FAILED
     assert results["state/time"].detail == "RuntimeError: solver exploded"
+
+
+def test_the_documentation_lists_every_check():
+    text = (Path(__file__).parents[2] / "docs" / "conformance.md").read_text()
+    missing = [c.name for c in CHECKS.values() if f"| `{c.name}` | {c.about.rstrip('.')} |" not in text]
+    assert [name for name in missing if not name.startswith("refusal/")] == []

@@ -96,9 +96,8 @@ class PushesAngularVelocityInWorld(MujocoBackend):
         if angular_velocity_b is not None:
             q = self.state.base_quaternion_w
             filled = torch.where(angular_velocity_b.isnan(), self.state.base_angular_velocity_b, angular_velocity_b)
-            angular_velocity_b = torch.tensor(
-                [rotated(a * torch.tensor([1, -1, -1, -1]), v) for a, v in zip(q, filled, strict=True)]
-            )
+            back = q * torch.tensor([1, -1, -1, -1])
+            angular_velocity_b = torch.tensor(np.array([rotated(a, v) for a, v in zip(back, filled, strict=True)]))
         super().push(worlds, linear_velocity_w=linear_velocity_w, angular_velocity_b=angular_velocity_b)
 
 

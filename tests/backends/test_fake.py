@@ -56,10 +56,10 @@ def test_a_constant_twist_draws_a_circle():
         linear[:, 0], angular[:, 2] = forward, yaw_rate
         return linear, angular
 
-    backend = started(FakeScript(motion=motion), timestep=0.001, substeps=20)
-    for _ in range(100):
+    backend = started(FakeScript(motion=motion), worlds=1)
+    for _ in range(50):
         backend.step(None)
-    state, angle, radius = backend.state, yaw_rate * 2.0, forward / yaw_rate
+    state, angle, radius = backend.state, yaw_rate * 1.0, forward / yaw_rate
     assert state.base_quaternion_w[0, 3].item() == pytest.approx(math.sin(angle / 2))
     expected = torch.tensor([radius * math.sin(angle), radius * (1 - math.cos(angle)), 0.3], dtype=torch.float64)
     torch.testing.assert_close(state.base_position_w[0], expected, atol=1e-3, rtol=0)
