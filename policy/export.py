@@ -1,0 +1,416 @@
+"""Exports of the project's own policies: TorchScript, ONNX and the ``deploy.yaml`` of the robot's C++ runtime.
+
+Every export is compared with the policy it was made from before it gets its name: an export that acts differently is
+never left behind.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import onnx
+import torch
+import yaml
+from torch import nn
+from torch.nn import functional
+
+from ..robots import Robot
+from .adapters import FOREIGN_TERMS, SDK_JOINTS, SDK_LEGS, deploy_contract, matching_joint
+from .base import Policy, PolicyError
+from .contract import TERM_WIDTH, History, PolicyContract, difference
+from .loading import load_policy
+from .native import NativePolicy
+from .networks import CtsNetwork, MlpNetwork, MoeCtsNetwork
+from .torchscript import CONTRACT_FILE
+
+TOLERANCE = 1e-5
+"""Largest difference of an action between an export and its policy."""
+CHECK_STEPS = 16
+ONNX_OPSET = 18
+
+# This project's observation terms as Isaac Lab, whose names the C++ runtime knows, calls them.
+DEPLOY_TERMS = {
+    "base_linear_velocity_b": "base_lin_vel",
+    "base_angular_velocity_b": "base_ang_vel",
+    "projected_gravity_b": "projected_gravity",
+    "command": "velocity_commands",
+    "joint_position": "joint_pos_rel",
+    "joint_velocity": "joint_vel_rel",
+    "last_action": "last_action",
+}
+
+
+class ExportError(PolicyError):
+    """A policy cannot be exported; the message says why."""
+
+
+class _LatentOutput(nn.Module):
+    """A CTS student as a function of its history: actions, latent, and gate weights where there are experts."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network: Any = network
+
+    def forward(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        extras: tuple[torch.Tensor, ...] = ()
+        if isinstance(self.network, MoeCtsNetwork):
+            mixture, weights = self.network.encoder(history)
+            extras = (weights,)
+        else:
+            mixture = self.network.encoder(history.flatten(1))
+        latent = functional.normalize(mixture, dim=-1)
+        return self.network.actor(torch.cat((latent, history[:, -1]), dim=-1)), latent, *extras
+
+
+class _WithMemory(nn.Module):
+    """Keeps the history of one robot, zero at the start, in a tensor that ``forward`` changes."""
+
+    def __init__(self, traced: nn.Module, history: torch.Tensor) -> None:
+        super().__init__()
+        self.network = traced
+        self.history = history.clone()
+
+    @torch.jit.export
+    def reset(self) -> None:
+        self.history = torch.zeros_like(self.history)
+
+    def remember(self, observation: torch.Tensor) -> torch.Tensor:
+        self.history = torch.cat((self.history[:, 1:], observation.unsqueeze(1)), dim=1)
+        return self.history
+
+
+class _MlpScript(_WithMemory):
+    """Observation (1, F) to actions (1, J)."""
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return self.network(self.remember(observation))
+
+
+class _CtsScript(_WithMemory):
+    """Observation (1, F) to actions (1, J) and (nothing, latent (1, L))."""
+
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor | None, torch.Tensor]]:
+        actions, latent = self.network(self.remember(observation))
+        weights: torch.Tensor | None = None
+        return actions, (weights, latent)
+
+
+class _MoeScript(_WithMemory):
+    """Observation (1, F) to actions (1, J) and (gate weights (1, K), latent (1, L))."""
+
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+        actions, latent, weights = self.network(self.remember(observation))
+        return actions, (weights, latent)
+
+
+_SCRIPTS: dict[type[nn.Module], type[_WithMemory]] = {
+    MlpNetwork: _MlpScript,
+    CtsNetwork: _CtsScript,
+    MoeCtsNetwork: _MoeScript,
+}
+
+
+class _TermMajor(nn.Module):
+    """Takes the history term by term, as Isaac Lab stacks it, and puts the frames together for the network."""
+
+    order: torch.Tensor
+
+    def __init__(self, network: nn.Module, order: torch.Tensor) -> None:
+        super().__init__()
+        self.network = network
+        self.register_buffer("order", order)
+        self.frames = (int(network.history_length), int(network.frame_width))  # type: ignore[arg-type]
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.network(obs[:, self.order].unflatten(1, self.frames))
+
+
+def term_major_order(contract: PolicyContract, frames: int) -> torch.Tensor:
+    """Position in a term-major history of each entry of the frame-major one, (frames * F,) int64; both oldest first."""
+    columns = []
+    start = 0
+    for term in contract.observation:
+        width = TERM_WIDTH[term.name] or contract.num_joints
+        block = start + torch.arange(frames * width).view(frames, width)
+        columns.append(block)
+        start += frames * width
+    return torch.cat(columns, dim=1).flatten()
+
+
+def export_torchscript(policy: Policy, path: str | Path) -> float:
+    """Write a TorchScript file for one robot: one observation (1, F) in, the history inside, ``reset()`` to clear it.
+
+    The output is that of the published training code, so that the file runs unchanged in the published evaluation:
+    the actions alone for a perceptron, ``(actions, (None, latent))`` for CTS, ``(actions, (gate weights, latent))``
+    for a Mixture of Experts. The contract lies in the archive as ``contract.json``.
+
+    Args:
+        policy: one of the project's own.
+        path: file to write; an existing one is replaced.
+
+    Returns:
+        Largest difference of an action to the policy's.
+
+    Raises:
+        ExportError: the policy is foreign or recurrent, the file cannot be written, or it acts differently.
+    """
+    network = _network(policy)
+    contract = policy.contract
+    history = torch.zeros(1, int(network.history_length), int(network.frame_width))  # type: ignore[arg-type]
+    core = network if isinstance(network, MlpNetwork) else _LatentOutput(network)
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        # torch announces TorchScript's retirement; the published evaluation and many deployments read nothing else.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        traced = torch.jit.trace(core.eval(), history, check_trace=False)
+        script = torch.jit.script(_SCRIPTS[type(network)](traced, history).eval())
+        torch.jit.save(script, buffer, _extra_files={CONTRACT_FILE: contract.to_json()})
+    return _write_checked(Path(path), buffer.getvalue(), lambda written: _largest_difference(policy, written))
+
+
+def export_onnx(policy: Policy, path: str | Path) -> float:
+    """Write a stateless ONNX file: ``obs`` (1, H·F), term by term and oldest first within a term, to ``actions`` (1,
+    J).
+
+    The metadata hold the contract in full precision under ``contract``, and what mjlab's runtime reads under its own
+    names.
+
+    Args:
+        policy: one of the project's own.
+        path: file to write; an existing one is replaced.
+
+    Returns:
+        Largest difference of an action to the policy's.
+
+    Raises:
+        ExportError: the policy is foreign or recurrent, the file cannot be written, or it acts differently.
+    """
+    network = _network(policy)
+    frames = int(network.history_length)  # type: ignore[arg-type]
+    module = _TermMajor(network, term_major_order(policy.contract, frames)).eval()
+    contract = stacked_contract(policy.contract, frames)
+    example = torch.zeros(1, contract.observation_width)
+    # The exporter tells its steps on standard output and in its log; failures arrive as exceptions.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            module,
+            (example,),
+            input_names=["obs"],
+            output_names=["actions"],
+            opset_version=ONNX_OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, {"contract": contract.to_json(), **mjlab_metadata(contract)})
+    return _write_checked(Path(path), model.SerializeToString(), lambda written: _largest_difference(policy, written))
+
+
+def export_deploy(policy: Policy, path: str | Path, robot: Robot) -> None:
+    """Write the ``deploy.yaml`` with which the robot's C++ runtime runs the ONNX file; it is read back and compared.
+
+    The runtime fills the history with the first observation where training had zeros; this lasts as many steps as the
+    history.
+
+    Args:
+        policy: one of the project's own.
+        path: file to write; an existing one is replaced.
+        robot: the robot the policy is for.
+
+    Raises:
+        ExportError: the robot's own joint numbers are not known, or the file cannot say what the contract says.
+    """
+    network = _network(policy)
+    contract = stacked_contract(policy.contract, int(network.history_length))  # type: ignore[arg-type]
+    text = yaml.safe_dump(deploy_settings(contract, robot), sort_keys=False, default_flow_style=None, width=120)
+
+    def check(written: Path) -> float:
+        wanted = replace(_spelled_out(contract), history=replace(contract.history, start="repeat"))
+        if lines := difference(wanted, _spelled_out(deploy_contract(written, robot))):
+            raise ExportError(f"a deploy.yaml cannot express this policy's contract: {lines.splitlines()[0]}")
+        return 0.0
+
+    _write_checked(Path(path), text.encode(), check)
+
+
+def export_policy(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path, float]:
+    """Write ``policy.pt`` (TorchScript), ``policy.onnx`` and ``deploy.yaml`` into a folder.
+
+    Returns:
+        The written files, with the largest difference of an action to the policy's.
+
+    Raises:
+        ExportError: see the three exports.
+    """
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExportError(f"Cannot create '{target}': {error.strerror}") from error
+    script, graph, deploy = target / "policy.pt", target / "policy.onnx", target / "deploy.yaml"
+    differences = {script: export_torchscript(policy, script), graph: export_onnx(policy, graph)}
+    export_deploy(policy, deploy, robot)
+    return differences | {deploy: 0.0}
+
+
+def stacked_contract(contract: PolicyContract, frames: int) -> PolicyContract:
+    """The contract of a network that is handed its whole history, term by term."""
+    return replace(contract, history=History(length=frames, order="term-major" if frames > 1 else "frame-major"))
+
+
+def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
+    """Metadata under mjlab's names. Lists are joined by commas; a term with a scale per entry joins them by
+    semicolons.
+    """
+
+    def numbers(values: tuple[float, ...]) -> str:
+        return ",".join(repr(v) for v in values)
+
+    terms = contract.observation
+    clips = [term.clip if isinstance(term.clip, float) else None for term in terms]
+    return {
+        "run_path": str(contract.provenance.get("run", "")),
+        "joint_names": ",".join(contract.joint_names),
+        "joint_stiffness": numbers(contract.stiffness),
+        "joint_damping": numbers(contract.damping),
+        "default_joint_pos": numbers(contract.default_joint_position),
+        "command_names": "twist",
+        "observation_names": ",".join(DEPLOY_TERMS[term.name] for term in terms),
+        "observation_terms_scale": ",".join(";".join(repr(s) for s in term.scale) for term in terms),
+        "observation_terms_clip": ",".join("-inf;inf" if c is None else f"{-c!r};{c!r}" for c in clips),
+        "observation_terms_history_length": ",".join([str(contract.history.length)] * len(terms)),
+        "observation_terms_flatten_history_dim": ",".join(["True"] * len(terms)),
+        "action_scale": numbers(contract.action_scale),
+    }
+
+
+def deploy_settings(contract: PolicyContract, robot: Robot) -> dict[str, Any]:
+    """The table of a ``deploy.yaml``; gains in the order of the robot's SDK, all else in the policy's.
+
+    Raises:
+        ExportError: the SDK's joint order is not known for this robot.
+    """
+    legs = SDK_LEGS.get(robot.name)
+    if legs is None:
+        raise ExportError(
+            f"a deploy.yaml numbers joints as the robot's SDK does, which is not known for robot '{robot.name}'"
+        )
+    numbered = [matching_joint(f"{leg}_{joint}", robot) for leg in legs for joint in SDK_JOINTS]
+    sdk = [numbered.index(name) for name in contract.joint_names]
+    policy = [contract.joint_names.index(name) for name in numbered]
+    clipped = any(term.clip is not None for term in contract.observation)
+    observations: dict[str, Any] = {"scale_first": True} if clipped else {}
+    for term in contract.observation:
+        width = TERM_WIDTH[term.name] or contract.num_joints
+        if isinstance(term.clip, tuple):
+            raise ExportError(
+                f"a deploy.yaml has one clip for all entries of an observation; '{term.name}' has {len(term.clip)}"
+            )
+        observations[DEPLOY_TERMS[term.name]] = {
+            "params": {"command_name": "base_velocity"} if term.name == "command" else {},
+            "clip": None if term.clip is None else [-term.clip, term.clip],
+            "scale": list(term.scale) if len(term.scale) == width else list(term.scale) * width,
+            "history_length": contract.history.length,
+        }
+    limits = zip(("lin_vel_x", "lin_vel_y", "ang_vel_z"), contract.command_limits, strict=True)
+    return {
+        "joint_ids_map": sdk,
+        "step_dt": contract.control_period,
+        "stiffness": [contract.stiffness[i] for i in policy],
+        "damping": [contract.damping[i] for i in policy],
+        "default_joint_pos": list(contract.default_joint_position),
+        "commands": {
+            "base_velocity": {"ranges": {name: [-limit, limit] for name, limit in limits} | {"heading": None}}
+        },
+        "actions": {
+            "JointPositionAction": {
+                "clip": None if contract.target_range is None else [list(r) for r in contract.target_range],
+                "joint_names": [".*"],
+                "scale": list(contract.action_scale),
+                "offset": list(contract.default_joint_position),
+                "joint_ids": None,
+            }
+        },
+        "observations": observations,
+    }
+
+
+def _spelled_out(contract: PolicyContract) -> PolicyContract:
+    """The same contract with a scale and a clip for every single entry, so that two can be compared."""
+
+    def every(values: float | tuple[float, ...], width: int) -> tuple[float, ...]:
+        listed = values if isinstance(values, tuple) else (values,)
+        return listed * width if len(listed) == 1 else listed
+
+    terms = []
+    for term in contract.observation:
+        width = TERM_WIDTH[term.name] or contract.num_joints
+        clip = None if term.clip is None else every(term.clip, width)
+        terms.append(replace(term, scale=every(term.scale, width), clip=clip))
+    return replace(contract, observation=tuple(terms))
+
+
+def _network(policy: Policy) -> nn.Module:
+    if not isinstance(policy, NativePolicy):
+        raise ExportError(
+            f"'{policy.path}' is an exported file already; export a checkpoint of the project's own format"
+        )
+    if type(policy.network) not in _SCRIPTS:
+        raise ExportError(f"no export is known for the network {type(policy.network).__name__} of '{policy.path}'")
+    return policy.network
+
+
+def _largest_difference(policy: Policy, written: Path) -> float:
+    """Run both on the same random observations, with a reset on the way, as the gauge would run them."""
+    exported = load_policy(written)
+    contract, stacked = policy.contract, exported.contract
+    frames = stacked.history.length
+    order = term_major_order(contract, frames)
+    ours, theirs = policy.session(1), exported.session(1)
+    generator = torch.Generator().manual_seed(0)
+    history = torch.zeros(1, frames, contract.frame_width)
+    largest = 0.0
+    for step in range(CHECK_STEPS):
+        if step in (0, CHECK_STEPS // 2):
+            ours.reset()
+            theirs.reset()
+            history.zero_()
+        frame = torch.randn(1, contract.frame_width, generator=generator)
+        history = torch.cat((history[:, 1:], frame[:, None]), dim=1)
+        given = torch.empty(1, history.numel())
+        given[:, order] = history.flatten(1)
+        difference_now = (ours.act(frame) - theirs.act(given if frames > 1 else frame)).abs().max()
+        largest = max(largest, float(difference_now))
+    if not largest <= TOLERANCE:
+        raise ExportError(
+            f"the export of '{policy.path}' differs from it by {largest:.2g} in an action; {TOLERANCE:g} is allowed"
+        )
+    return largest
+
+
+def _write_checked(path: Path, data: bytes, check: Callable[[Path], float]) -> float:
+    """Write beside the destination, check, and only then give it its name."""
+    partial = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        partial.write_bytes(data)
+        largest = check(partial)
+        os.replace(partial, path)
+    except OSError as error:
+        raise ExportError(f"'{path}' cannot be written: {error.strerror or error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return largest
+
+
+assert set(DEPLOY_TERMS.values()) <= set(FOREIGN_TERMS)

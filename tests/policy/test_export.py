@@ -1,0 +1,214 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+import yaml
+from gaitgauge.policy import export
+from gaitgauge.policy.adapters import deploy_contract
+from gaitgauge.policy.contract import PolicyContract, go2_contract
+from gaitgauge.policy.export import (
+    ExportError,
+    export_deploy,
+    export_onnx,
+    export_policy,
+    export_torchscript,
+    mjlab_metadata,
+    term_major_order,
+)
+from gaitgauge.policy.loading import load_policy
+from gaitgauge.policy.native import NativePolicy, StoredNetwork
+from gaitgauge.policy.networks import ARCHITECTURES
+from gaitgauge.robots import load_robot
+
+torch.set_num_threads(1)
+
+SMALL = {"actor_hidden": [32], "latent_width": 8}
+NETWORKS = {
+    "mlp": ("mlp", {"frame_width": 45, "num_actions": 12, "hidden": [32]}),
+    "normalized mlp with history": (
+        "mlp",
+        {"frame_width": 45, "num_actions": 12, "hidden": [32], "history_length": 3, "normalize": True},
+    ),
+    "cts": ("cts", SMALL | {"encoder_hidden": [32]}),
+    "moe": ("moe_cts", SMALL | {"num_experts": 4, "expert_width": 8, "trunk_hidden": [32], "gate_hidden": [16]}),
+    "blind moe": (
+        "moe_cts",
+        SMALL
+        | {"num_experts": 4, "expert_width": 8, "trunk_hidden": [32], "gate_hidden": [16]}
+        | {"expert_blind_to": [6, 7, 8], "shared_head": True},
+    ),
+}
+
+
+def make_policy(kind: str, contract: PolicyContract | None = None) -> NativePolicy:
+    torch.manual_seed(1)
+    architecture, arguments = NETWORKS[kind]
+    network = ARCHITECTURES[architecture](**arguments)
+    if "mean" in dict(network.named_buffers()):
+        network.mean.normal_()
+        network.deviation.uniform_(0.5, 2.0)
+    stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=network.state_dict())
+    contract = contract or go2_contract(load_robot("go2"), provenance={"run": "2026-01-01_00-00-00"})
+    return NativePolicy(contract, stored, path=f"{kind}.pt")
+
+
+@pytest.mark.parametrize("kind", list(NETWORKS))
+def test_torchscript_runs_step_by_step_like_the_policy(kind, tmp_path):
+    policy = make_policy(kind)
+    assert export_torchscript(policy, tmp_path / "policy.pt") <= 1e-5
+    module = torch.jit.load(tmp_path / "policy.pt")
+    session = policy.session(1)
+    for episode in range(2):
+        module.reset()
+        session.reset()
+        for _ in range(7):
+            observation = torch.randn(1, 45)
+            output = module(observation)
+            actions = output if isinstance(output, torch.Tensor) else output[0]
+            assert torch.allclose(actions, session.act(observation), atol=1e-6), episode
+    reloaded = load_policy(tmp_path / "policy.pt")
+    assert reloaded.contract == policy.contract and reloaded.contract.provenance == policy.contract.provenance
+    assert reloaded.batched
+
+
+def test_torchscript_output_is_the_published_one(tmp_path):
+    outputs = {}
+    for kind in ("mlp", "cts", "moe"):
+        export_torchscript(make_policy(kind), tmp_path / f"{kind}.pt")
+        module = torch.jit.load(tmp_path / f"{kind}.pt")
+        assert module.history.shape == (1, 1 if kind == "mlp" else 5, 45)
+        outputs[kind] = module(torch.zeros(1, 45))
+    assert outputs["mlp"].shape == (1, 12)
+    actions, (weights, latent) = outputs["cts"]
+    assert actions.shape == (1, 12) and weights is None and latent.shape == (1, 8)
+    actions, (weights, latent) = outputs["moe"]
+    assert actions.shape == (1, 12) and weights.shape == (1, 4) and float(weights.sum()) == pytest.approx(1.0)
+    assert float(latent.norm()) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def moe_onnx(tmp_path_factory):
+    """An exporter's run takes seconds, so that the fast tests share one."""
+    path = tmp_path_factory.mktemp("export") / "policy.onnx"
+    third = 1.0 / 3.0
+    policy = make_policy("moe", replace(go2_contract(load_robot("go2")), action_scale=(third,) * 12))
+    assert export_onnx(policy, path) <= 1e-5
+    return policy, path
+
+
+def test_onnx_takes_a_term_major_history(moe_onnx):
+    check_onnx(*moe_onnx)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(NETWORKS))
+def test_every_network_exports_to_onnx(kind, tmp_path):
+    policy = make_policy(kind)
+    export_onnx(policy, tmp_path / "policy.onnx")
+    check_onnx(policy, tmp_path / "policy.onnx")
+
+
+def check_onnx(policy: NativePolicy, path: Path) -> None:
+    runtime = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    (given,), (output,) = runtime.get_inputs(), runtime.get_outputs()
+    frames = policy.network.history_length
+    assert (given.name, output.name) == ("obs", "actions") and given.shape == [1, 45 * frames]
+    history = np.random.default_rng(0).standard_normal((frames, 45)).astype(np.float32)
+    blocks = np.split(history, [3, 6, 9, 21, 33], axis=1)
+    stacked = np.concatenate([b.ravel() for b in blocks])[None]
+    session = policy.session(1)
+    for frame in history:
+        expected = session.act(torch.from_numpy(frame[None]))
+    (actions,) = runtime.run(None, {"obs": stacked})
+    assert np.allclose(actions, expected.numpy(), atol=1e-5)
+
+
+def test_onnx_metadata(moe_onnx):
+    (policy, path), third = moe_onnx, 1.0 / 3.0
+    contract = policy.contract
+    metadata = {p.key: p.value for p in onnx.load(path).metadata_props}
+    stored = PolicyContract.from_dict(json.loads(metadata["contract"]))
+    assert stored.action_scale == (third,) * 12
+    assert (stored.history.length, stored.history.order, stored.history.start) == (5, "term-major", "zeros")
+    assert [float(v) for v in metadata["action_scale"].split(",")] == [third] * 12
+    assert metadata["joint_names"].split(",") == list(contract.joint_names)
+    assert metadata["observation_names"].split(",")[0] == "base_ang_vel"
+    assert metadata["observation_terms_history_length"] == "5,5,5,5,5,5"
+    assert metadata == {"contract": metadata["contract"], **mjlab_metadata(stored)}
+    assert load_policy(path).contract == stored
+
+
+def test_term_major_order():
+    contract = go2_contract(load_robot("go2"))
+    order = term_major_order(contract, 5)
+    assert sorted(order.tolist()) == list(range(225))
+    # Frame 0 begins the block of every term, the next frame follows within the block.
+    assert order[:9].tolist() == [0, 1, 2, 15, 16, 17, 30, 31, 32]
+    assert order[45:48].tolist() == [3, 4, 5]
+
+
+def test_deploy_file_says_what_the_contract_says(tmp_path):
+    robot = load_robot("go2")
+    stiffness = tuple(20.0 + i / 7.0 for i in range(12))
+    terms = tuple(
+        replace(t, clip=100.0 if t.name == "joint_velocity" else None) for t in go2_contract(robot).observation
+    )
+    contract = replace(go2_contract(robot), stiffness=stiffness, observation=terms)
+    policy = make_policy("moe", contract)
+    export_deploy(policy, tmp_path / "deploy.yaml", robot)
+    data = yaml.safe_load((tmp_path / "deploy.yaml").read_text())
+    assert data["joint_ids_map"] == [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
+    assert data["stiffness"][:3] == list(stiffness[3:6])  # the SDK begins with the front right leg
+    assert data["step_dt"] == 0.02
+    read = deploy_contract(tmp_path / "deploy.yaml", robot)
+    assert read.stiffness == stiffness and read.history.length == 5 and read.history.order == "term-major"
+
+
+def test_deploy_refuses_what_it_cannot_say(tmp_path):
+    robot = load_robot("go2")
+    terms = tuple(
+        replace(t, clip=(1.0, 2.0, 3.0)) if t.name == "command" else t for t in go2_contract(robot).observation
+    )
+    policy = make_policy("moe", replace(go2_contract(robot), observation=terms))
+    with pytest.raises(ExportError, match="one clip for all entries"):
+        export_deploy(policy, tmp_path / "deploy.yaml", robot)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ExportError, match="not known for robot 'other'"):
+        export_deploy(make_policy("moe"), tmp_path / "deploy.yaml", replace(robot, name="other"))
+
+
+@pytest.mark.slow
+def test_export_all(tmp_path):
+    written = export_policy(make_policy("moe"), tmp_path / "exported", load_robot("go2"))
+    assert sorted(p.name for p in (tmp_path / "exported").iterdir()) == ["deploy.yaml", "policy.onnx", "policy.pt"]
+    assert max(written.values()) <= 1e-5
+
+
+def test_a_wrong_export_is_not_left_behind(tmp_path, monkeypatch):
+    policy = make_policy("cts")
+    path = tmp_path / "policy.pt"
+    path.write_bytes(b"previous")
+    monkeypatch.setattr(export, "_LatentOutput", WrongOutput)
+    with pytest.raises(ExportError, match="differs from it by"):
+        export_torchscript(policy, path)
+    assert path.read_bytes() == b"previous" and [p.name for p in tmp_path.iterdir()] == ["policy.pt"]
+
+
+class WrongOutput(export._LatentOutput):
+    def forward(self, history):
+        actions, *rest = super().forward(history)
+        return actions + 1e-3, *rest
+
+
+def test_bad_input(tmp_path):
+    policy = make_policy("cts")
+    export_torchscript(policy, tmp_path / "policy.pt")
+    with pytest.raises(ExportError, match="exported file already"):
+        export_onnx(load_policy(tmp_path / "policy.pt"), tmp_path / "again.onnx")
+    with pytest.raises(ExportError, match="cannot be written: No such file"):
+        export_torchscript(policy, Path(tmp_path / "none" / "policy.pt"))
