@@ -193,7 +193,8 @@ def determinism(bench: Bench) -> str:
             for period in range(6):
                 worlds.step(wave(worlds, period), delay=[0, 2, 5, 10])
             ends.append(worlds.read())
-    expect_same("two runs", *ends, range(len(ends[0].time)))
+    first, second = ends
+    expect_same("two runs", first, second, range(len(first.time)))
     return "60 substeps with contacts, to the last bit"
 
 
