@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from . import newton_kernels as kernels
 from .base import BackendError, Capability, PhysicsBackend, PhysicsState, Randomization, Scene
-from .newton_model import build_world_model
+from .newton_model import BIRTH_HEIGHT, build_world_model
 from .newton_solvers import SOLVERS, SolverAdapter, dry_friction_slope
 
 LARGEST_TORQUE = 1e6
@@ -64,7 +64,7 @@ class NewtonBackend(PhysicsBackend):
         """
         _check_device(device)
         self.adapter.refuse(scene)
-        wp.config.quiet = True
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
         wp.init()
         self.scene, self.device, self.dtype = scene, torch.device(device), torch.float32
         if self.device.type == "cuda" and self.device.index is None:
@@ -247,13 +247,14 @@ class NewtonBackend(PhysicsBackend):
     def _warm_up(self) -> None:
         """Compile everything, while a graph cannot be in the way, and put all worlds at the origin."""
         n = self.num_worlds
-        origin, upright = torch.zeros((n, 3)), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1)
-        everywhere = {"base_position": origin.to(self.device), "base_quaternion": upright.to(self.device)}
-        self.reset(terrain_index=self._requested_terrain.to(torch.int64), **everywhere)
+        upright = torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=self.device).repeat(n, 1)
+        terrain = self._requested_terrain.to(torch.int64)
+        origin = torch.zeros((n, 3), device=self.device)
+        self.reset(base_position=origin + self._tensor([0.0, 0.0, BIRTH_HEIGHT]), base_quaternion=upright, terrain_index=terrain)
         self._run_period(1, masked=True, sampled=True)
         self._solver.inertia_changed()
         self.push()
-        self.reset(terrain_index=self._requested_terrain.to(torch.int64), **everywhere)
+        self.reset(base_position=origin, base_quaternion=upright, terrain_index=terrain)
 
     # ---- running kernels ----------------------------------------------------------------------------------------
 

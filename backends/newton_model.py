@@ -266,14 +266,28 @@ def _newton_field(field: HeightField) -> newton.Heightfield:
 
 
 def _distribute_fields(everything: newton.ModelBuilder, layout: WorldLayout, slots: SlotTables, scene: Scene) -> None:
-    """Let the worlds' field shapes carry all fields of the palette into the model; which one acts where is written later."""
+    """Let the worlds' field shapes carry all fields of the palette into the model; which one acts where is written later.
+
+    Newton copies a shape's field for every shape that bears it, so all but the carriers get a tiny one.
+    """
     if not slots.fields:
         return
-    sources = [_newton_field(field) for field in slots.fields]
-    carriers = [int(layout.slot_shape[-1]), *map(int, layout.spare_fields)]
-    for k, shape in enumerate(carriers):
+    tiny = _newton_field(HeightField(center=(0.0, 0.0), half_size=(0.01, 0.01), heights=np.zeros((2, 2))))
+    base = everything.custom_attributes["mujoco:hfield_base"].values
+    for shape in (int(layout.slot_shape[-1]), *map(int, layout.spare_fields)):
         for world in range(scene.num_worlds):
-            everything.shape_source[world * layout.shapes + shape] = sources[(k * scene.num_worlds + world) % len(sources)]
+            everything.shape_source[world * layout.shapes + shape] = tiny
+    for i, shape in enumerate(carriers(layout, slots, scene.num_worlds)):
+        field = slots.fields[i]
+        everything.shape_source[shape] = _newton_field(field)
+        # the solid below reaches down from the lowest node there, from height 0 here
+        base[shape] = field.base + float(np.min(field.heights))
+
+
+def carriers(layout: WorldLayout, slots: SlotTables, worlds: int) -> list[int]:
+    """The shape of the model that carries each height field of the palette."""
+    shapes = (int(layout.slot_shape[-1]), *map(int, layout.spare_fields))
+    return [(i % worlds) * layout.shapes + shapes[i // worlds] for i in range(len(slots.fields))]
 
 
 def _layout(
@@ -345,6 +359,9 @@ def import_differences(found: mujoco.MjModel, expected: mujoco.MjModel, order: N
         _compare(name, getattr(found, name), getattr(expected, name), wrong)
     for name in GEOM_FIELDS:
         _compare(name, getattr(found, name)[order], getattr(expected, name), wrong)
+    # the sizes that a round shape does not use are filled differently
+    used = np.arange(3) < np.array([_USED_SIZES.get(int(t), 3) for t in expected.geom_type])[:, None]
+    _compare("geom_size", np.where(used, found.geom_size[order], 0.0), np.where(used, expected.geom_size, 0.0), wrong)
     pairs = [_colliding(found, order), _colliding(expected, np.arange(expected.ngeom))]
     for a, b in sorted(pairs[0] ^ pairs[1]):
         names = f"'{expected.geom(a).name}' and '{expected.geom(b).name}'"
@@ -375,7 +392,6 @@ BODY_AND_JOINT_FIELDS = (
 """Model fields that must agree, bodies and joints in the same order in both models."""
 GEOM_FIELDS = (
     "geom_type",
-    "geom_size",
     "geom_pos",
     "geom_bodyid",
     "geom_condim",
@@ -386,6 +402,11 @@ GEOM_FIELDS = (
     "geom_solmix",
 )
 """Model fields of geoms that must agree."""
+_USED_SIZES = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): 2,
+}
 
 
 def _compare(name: str, found: NDArray, expected: NDArray, wrong: list[str]) -> None:

@@ -30,3 +30,30 @@ def place_mujoco_field(
     geom_aabb[world % geom_aabb.shape[0], geom, 0] = box[index, 0]
     geom_aabb[world % geom_aabb.shape[0], geom, 1] = box[index, 1]
     geom_rbound[world % geom_rbound.shape[0], geom] = radius[index]
+
+
+@wp.kernel
+def place_newton_field(
+    terrain: wp.array[int],
+    shapes: int,
+    shape: int,
+    from_index: wp.array[int],
+    from_source: wp.array[wp.uint64],
+    from_lower: wp.array[wp.vec3],
+    from_upper: wp.array[wp.vec3],
+    from_radius: wp.array[float],
+    index: wp.array[int],
+    source: wp.array[wp.uint64],
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+    radius: wp.array[float],
+):
+    """Let each world's height-field shape bear the field of the world's terrain."""
+    world = wp.tid()
+    field = terrain[world]
+    at = world * shapes + shape
+    index[at] = from_index[field]
+    source[at] = from_source[field]
+    lower[at] = from_lower[field]
+    upper[at] = from_upper[field]
+    radius[at] = from_radius[field]

@@ -19,7 +19,7 @@ import warp as wp
 from . import newton_kernels as kernels
 from . import newton_solver_kernels as solver_kernels
 from .base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
-from .newton_model import WorldModel, import_differences
+from .newton_model import WorldModel, carriers, import_differences
 
 DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
 """Contacts per world for which room is made, by the hardest shape of the palette; a robot that lies flat needs about 30."""
@@ -145,6 +145,7 @@ class MujocoAdapter(SolverAdapter):
             )
         self._timestep = physics.timestep
         self._data, self._model = self.solver.mjw_data, self.solver.mjw_model
+        self._model.opt.warn_overflow = 0  # alarms are reported per world, not printed by the device
         self._check_import(world, scene)
         geoms = self.solver.mjc_geom_to_newton_shape.numpy()
         margin = np.zeros(geoms.shape, dtype=np.float32)
@@ -230,13 +231,12 @@ class _FieldGeom:
         self._solver, slots, layout = solver, world.slots, world.layout
         device, count = world.model.device, len(slots.fields)
         shape_geom = {int(s): g for g, s in enumerate(solver.mjc_geom_to_newton_shape.numpy()[0])}
-        carriers = [int(layout.slot_shape[-1]), *map(int, layout.spare_fields)]
-        self._geom = shape_geom[carriers[0]]
+        self._geom = shape_geom[int(layout.slot_shape[-1])]
         ids = solver.mjw_model.geom_dataid.numpy()
-        asset = np.full(count, -1, dtype=np.int32)
-        for k, shape in enumerate(carriers):
-            for row in range(scene.num_worlds):
-                asset[(k * scene.num_worlds + row) % count] = ids[row % len(ids), shape_geom[shape]]
+        asset = np.zeros(count, dtype=np.int32)
+        for i, shape in enumerate(carriers(layout, slots, scene.num_worlds)):
+            row, local = divmod(shape, layout.shapes)
+            asset[i] = ids[row % len(ids), shape_geom[local]]
         present = np.array([t.height_field is not None for t in scene.terrains])
         low = np.array([float(np.min(f.heights)) for f in slots.fields])[slots.field]
         top = np.array([float(np.max(f.heights)) for f in slots.fields])[slots.field] - low
@@ -265,12 +265,42 @@ class _FieldGeom:
         )
 
 
+class _FieldShape:
+    """The height-field shape of Newton's own collision pipeline, whose field differs between worlds."""
+
+    def __init__(self, world: WorldModel, scene: Scene) -> None:
+        model, layout, slots = world.model, world.layout, world.slots
+        self._model, self._shapes, self._shape = model, layout.shapes, int(layout.slot_shape[-1])
+        shapes = np.array(carriers(layout, slots, scene.num_worlds))[slots.field]
+
+        def table(array: wp.array) -> wp.array:
+            return wp.array(array.numpy()[shapes], dtype=array.dtype, device=model.device)
+
+        self._arrays = (
+            model.shape_heightfield_index,
+            model.shape_source_ptr,
+            model.shape_collision_aabb_lower,
+            model.shape_collision_aabb_upper,
+            model.shape_collision_radius,
+        )
+        self._tables = tuple(table(array) for array in self._arrays)
+
+    def place(self, terrain: wp.array) -> None:
+        """Give every world the field of its terrain."""
+        wp.launch(
+            solver_kernels.place_newton_field,
+            dim=terrain.shape[0],
+            inputs=[terrain, self._shapes, self._shape, *self._tables],
+            outputs=list(self._arrays),
+            device=terrain.device,
+        )
+
+
 class SteelAdapter(SolverAdapter):
     """Newton's Steel solver: joint coordinates, hard contacts solved by projected Gauss-Seidel sweeps, Newton's own collisions."""
 
     name = "steel"
     capabilities = _declare(
-        height_field=Capability(support=Support.NONE, note="not measured yet"),
         joint_friction=Capability(
             support=Support.APPROXIMATE, note="an explicit torque that changes sign over a small speed: a joint at rest creeps"
         ),
@@ -323,6 +353,7 @@ class SteelAdapter(SolverAdapter):
             self._pipeline = newton.CollisionPipeline(
                 model, rigid_contact_max=contacts * scene.num_worlds + 256, deterministic=physics.deterministic
             )
+        self._fields = _FieldShape(world, scene) if world.slots.fields else None
         self.contacts = self._pipeline.contacts()
         self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
         self.warm_start = wp.zeros((scene.num_worlds, 1), dtype=float, device=model.device)
@@ -350,6 +381,8 @@ class SteelAdapter(SolverAdapter):
     def shapes_changed(self, terrain: wp.array) -> None:
         """See ``SolverAdapter.shapes_changed``."""
         self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+        if self._fields is not None:
+            self._fields.place(terrain)
 
     def inertia_changed(self) -> None:
         """See ``SolverAdapter.inertia_changed``."""
