@@ -428,7 +428,13 @@ class TrainingRunner(OnPolicyRunner):
         if state is None or not hasattr(self.env, "load_state_dict"):
             self._message(f"'{path}' holds no state of the environment: episodes start anew.")
             return False
-        self.env.load_state_dict(state)
+        try:
+            self.env.load_state_dict(state)
+        except (ValueError, KeyError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise CheckpointError(
+                f"Cannot resume from '{path}': its environment does not fit this run's settings: {reason}"
+            ) from error
         return True
 
     def _check_fits(self, path: str, entries: Mapping[str, Any]) -> None:

@@ -1,0 +1,51 @@
+"""The runner on the real environment, with a scripted engine in place of physics."""
+
+import torch
+from gaitgauge.policy.loading import load_policy
+from gaitgauge.training.algorithms.symmetry import build_mirror
+from gaitgauge.training.checkpoint import read_checkpoint
+from gaitgauge.training.runner import TrainingRunner
+from gaitgauge.training.seeding import seed_everything
+from small_environment import STAIRS, make
+from toy_training import toy_configuration
+
+
+def build(folder, seed=0, **algorithm):
+    seed_everything(seed)
+    environment = make(num_envs=8, terrain=STAIRS, seed=0)
+    configuration = toy_configuration(steps=6, algorithm=algorithm, run={"random_episode_start": True})
+    return TrainingRunner(
+        environment,
+        configuration,
+        contract=environment.contract,
+        task="toy",
+        log_dir=folder,
+        mirror=build_mirror(environment.contract, environment.robot, history_length=5),
+    )
+
+
+def test_resumes_exactly_with_the_training_environment(tmp_path):
+    whole, first, second = (tmp_path / name for name in ("whole", "first", "second"))
+    for folder in (whole, first, second):
+        folder.mkdir()
+    build(whole).learn(4)
+    build(first).learn(2)
+    resumed = build(second, seed=5)
+    resumed.load(str(first / "model_2.pt"))
+    resumed.learn(2)
+    a, b = (read_checkpoint(folder / "model_4.pt") for folder in (whole, second))
+    for name, value in a["actor_state_dict"].items():
+        assert torch.equal(value, b["actor_state_dict"][name]), name
+    for name, value in a["training"]["environment"]["memory"].items():
+        assert torch.equal(value, b["training"]["environment"]["memory"][name]), name
+    assert load_policy(whole / "model_4.pt").contract.hash == resumed.contract.hash
+
+
+def test_symmetry_fits_the_training_environment(tmp_path):
+    runner = build(None, symmetry="augment")
+    runner.learn(1)
+    groups = runner.env.get_observations()
+    mirror = runner.alg.mirror
+    assert [mirror.policy.width, mirror.history.width, mirror.privileged.width] == [
+        groups[name].shape[1] for name in ("policy", "history", "privileged")
+    ]
