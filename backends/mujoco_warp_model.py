@@ -1,7 +1,8 @@
-"""The model that all worlds of the mujoco_warp engine share, and the tables with which kernels give each world its own ground.
+"""The model that all worlds of the mujoco_warp engine share, and the tables that give each world its own ground.
 
-The model holds the robot without what is only seen, a floor, as many box geoms as the palette's fullest terrain needs, and one
-height-field geom if any terrain has a field. A world's terrain is a set of poses and sizes of these geoms, called slots.
+The model holds the robot without what is only seen, a floor, as many box geoms as the palette's fullest terrain needs,
+and one height-field geom if any terrain has a field. A world's terrain is a set of poses and sizes of these geoms, the
+slots.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ Integers = NDArray[np.int32]
 
 @dataclass(frozen=True, kw_only=True)
 class PaletteTables:
-    """Terrains as slot poses and sizes. T terrains, S slots: the boxes and, where a terrain has one, the height field at the end."""
+    """Terrains as slot poses and sizes. T terrains, S slots: the boxes and, if a terrain has one, the height field."""
 
     position: Floats
     """[m], (T, S, 3)."""
@@ -164,7 +165,7 @@ def build_shared_model(scene: Scene) -> SharedModel:
 
 
 def buffer_capacity(scene: Scene, shared: SharedModel) -> Capacity:
-    """Sizes of the buffers for contacts and constraints, from ``PhysicsOptions.contacts_per_world`` or the palette's shapes."""
+    """Sizes of the buffers, from ``PhysicsOptions.contacts_per_world`` or the palette's shapes."""
     model, physics = shared.model, scene.physics
     shape = "height_field" if shared.has_field else "boxes" if len(shared.slot_geom) else "plane"
     contacts = physics.contacts_per_world or DEFAULT_CONTACTS[shape]
@@ -187,7 +188,7 @@ def buffer_capacity(scene: Scene, shared: SharedModel) -> Capacity:
 
 
 def _strip(spec: mujoco.MjSpec) -> None:
-    """Remove what costs time and memory in thousands of worlds: actuators (the motor law is ours), sensors, lights, visual geoms."""
+    """Remove what costs time in thousands of worlds: actuators (the motor law is ours) and what is only seen."""
     for element in [*spec.actuators, *spec.sensors, *spec.lights, *spec.cameras]:
         spec.delete(element)
     inertial = all(body.explicitinertial for body in spec.bodies if body.name != "world")
@@ -334,6 +335,7 @@ def _geom(model: mujoco.MjModel, scene: Scene, name: str) -> int:
     found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
     if found < 0:
         raise BackendError(
-            f"foot '{name}' of robot '{scene.robot.name}' is no collision geom of {scene.robot.mjcf.name}; correct robot.toml"
+            f"foot '{name}' of robot '{scene.robot.name}' is no collision geom of {scene.robot.mjcf.name}; "
+            "correct robot.toml"
         )
     return int(found)
