@@ -11,12 +11,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import Enum
-from typing import ClassVar
-
-import torch
+from typing import TYPE_CHECKING, ClassVar
 
 from ..robots.base import JointParameters, Robot
 from ..terrains.base import Terrain
+
+if TYPE_CHECKING:
+    import torch  # only named here: what lists engines, suites and tasks need not wait for it
 
 
 class BackendError(RuntimeError):

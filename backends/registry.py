@@ -5,8 +5,10 @@ A name may carry a variant after a colon (``newton:kamino``); the variant is han
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 
 from .base import BackendError, PhysicsBackend, Scene
 
@@ -19,10 +21,55 @@ _OWN = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class BackendListing:
+    """What can be said about an engine without importing it."""
+
+    name: str
+    """Registry name."""
+    device: str
+    """Where it is meant to run: ``CPU``, ``GPU``, or ``?`` where only the engine knows."""
+    note: str
+    """One line for people."""
+    missing: tuple[str, ...]
+    """Packages that it needs and that are not installed."""
+
+
+# Device, packages and note of the project's own engines.
+_ABOUT: dict[str, tuple[str, tuple[str, ...], str]] = {
+    "mujoco": ("CPU", ("mujoco",), "MuJoCo on a thread pool, float64, the same on any number of threads; the judge"),
+    "mujoco-warp": (
+        "GPU",
+        ("mujoco_warp", "warp"),
+        "MuJoCo's equations on the GPU, float32; trains; runs on the CPU slowly (--device cpu)",
+    ),
+    "newton": (
+        "GPU",
+        ("newton", "mujoco_warp", "warp"),
+        "Newton with its MuJoCo solver; newton:SOLVER runs another one (newton:steel)",
+    ),
+}
+
+
 def backend_names() -> list[str]:
     """Names of all engines that can be asked for, the project's own first; ``fake`` is for tests and left out."""
     plugins = sorted({e.name for e in entry_points(group=GROUP)} - set(_OWN))
     return [n for n in _OWN if n != "fake"] + plugins
+
+
+def list_backends() -> list[BackendListing]:
+    """What is known of each of ``backend_names()``, quickly: no engine is imported."""
+    plugins = {e.name: e for e in entry_points(group=GROUP)}
+    listings = []
+    for name in backend_names():
+        if name in _ABOUT:
+            device, packages, note = _ABOUT[name]
+        else:
+            entry = plugins[name]
+            device, packages, note = "?", (entry.module.partition(".")[0],), f"plug-in, {entry.value}"
+        missing = tuple(p for p in packages if find_spec(p) is None)
+        listings.append(BackendListing(name=name, device=device, note=note, missing=missing))
+    return listings
 
 
 def backend_class(name: str) -> type[PhysicsBackend]:
@@ -42,7 +89,9 @@ def backend_class(name: str) -> type[PhysicsBackend]:
                 raise BackendError(f"unknown backend '{name}'; choose one of: {', '.join(backend_names())}")
             found = plugin.load()
     except ImportError as error:
-        raise BackendError(f"backend '{name}' needs the package '{error.name}', which is not installed: pip install {error.name}") from error
+        raise BackendError(
+            f"backend '{name}' needs the package '{error.name}', which is not installed: pip install {error.name}"
+        ) from error
     return found
 
 
@@ -58,5 +107,7 @@ def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int =
         return found(scene, device=device, threads=threads)
     with_variant = getattr(found, "with_solver", None)
     if with_variant is None:
-        raise BackendError(f"backend '{found.name}' has no solvers to choose from, so '{name}' cannot be built; use '{found.name}'")
+        raise BackendError(
+            f"backend '{found.name}' has no solvers to choose from, so '{name}' cannot be built; use '{found.name}'"
+        )
     return with_variant(variant)(scene, device=device, threads=threads)

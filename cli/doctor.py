@@ -1,0 +1,363 @@
+"""``gaitgauge doctor``: what this machine has, what it lacks, and what to do about it.
+
+What could hang or kill the process (GPU drivers, OpenGL) is tried in a child process.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
+from importlib.util import find_spec
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from rich.markup import escape
+from rich.table import Table
+
+from .inspect import table_console
+
+OK, WARNING, PROBLEM = "ok", "warning", "problem"
+_STYLES = {OK: "green", WARNING: "yellow", PROBLEM: "bold red"}
+_PATIENCE = 120.0
+"""Longest time that a child process may take [s]."""
+_FREE_DISK = 5.0
+"""Free space below which a training run with its checkpoints may not fit [GB]."""
+_FREE_MEMORY = 4.0
+"""Free memory below which the engines may not fit [GB]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One row of the table."""
+
+    what: str
+    status: str
+    """``ok``, ``warning`` (something optional is missing) or ``problem`` (the project does not work)."""
+    found: str
+    advice: str = ""
+    """What to do, where it is not ok."""
+
+
+def examine() -> bool:
+    """Print a table of all checks.
+
+    Returns:
+        False if there is a problem.
+    """
+    console = table_console()
+    table = Table(title="gaitgauge doctor", title_justify="left")
+    for name in ("check", "status", "found", "what to do"):
+        table.add_column(name, overflow="fold")
+    findings = []
+    with console.status("checking …"):
+        for check in CHECKS:
+            findings += list(check())
+    for each in findings:
+        status = f"[{_STYLES[each.status]}]{each.status}[/]"
+        table.add_row(each.what, status, escape(each.found), escape(each.advice))
+    console.print(table)
+    counts = {s: sum(f.status == s for f in findings) for s in (WARNING, PROBLEM)}
+    words = [f"{n} {s}{'s' if n > 1 else ''}" for s, n in counts.items() if n]
+    console.print(" and ".join(words) if words else "all is well")
+    return counts[PROBLEM] == 0
+
+
+# ---- packages -------------------------------------------------------------------------------------------------------
+
+
+def check_python() -> Iterator[Finding]:
+    """The interpreter's version."""
+    found = f"{platform.python_version()} in {sys.prefix}"
+    try:
+        wanted = SpecifierSet(metadata("gaitgauge").get("Requires-Python", ""))
+    except PackageNotFoundError:
+        wanted = SpecifierSet()
+    if wanted.contains(platform.python_version(), prereleases=True):
+        yield Finding(what="Python", status=OK, found=found)
+    else:
+        yield Finding(what="Python", status=PROBLEM, found=found, advice=f"use Python {wanted}")
+
+
+def check_packages() -> Iterator[Finding]:
+    """Each package that the project declares, against the range that it declares."""
+    try:
+        lines = requires("gaitgauge") or []
+    except PackageNotFoundError:
+        yield Finding(
+            what="gaitgauge",
+            status=PROBLEM,
+            found="not installed",
+            advice="run 'make install', or pip install the project",
+        )
+        return
+    for line in lines:
+        wanted = Requirement(line)
+        if wanted.marker is not None and not wanted.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            present = version(wanted.name)
+        except PackageNotFoundError:
+            yield Finding(what=wanted.name, status=PROBLEM, found="not installed", advice=f"pip install '{line}'")
+            continue
+        if wanted.specifier.contains(present, prereleases=True):
+            yield Finding(what=wanted.name, status=OK, found=present)
+        else:
+            found = f"{present}, but {wanted.specifier} is needed"
+            yield Finding(what=wanted.name, status=PROBLEM, found=found, advice=f"pip install '{line}'")
+
+
+# ---- devices --------------------------------------------------------------------------------------------------------
+
+_TORCH_PROBE = """
+import json, torch
+gpus = []
+if torch.cuda.is_available():
+    for i in range(torch.cuda.device_count()):
+        free, total = torch.cuda.mem_get_info(i)
+        gpus.append([torch.cuda.get_device_name(i), free / 1e9, total / 1e9])
+print(json.dumps([torch.version.cuda, gpus]))
+"""
+
+
+def check_gpu() -> Iterator[Finding]:
+    """Whether torch can use a GPU, which training needs."""
+    answer = _ask(_TORCH_PROBE)
+    if isinstance(answer, str):
+        yield Finding(
+            what="GPU (torch)", status=PROBLEM, found=f"torch fails: {answer}", advice="reinstall torch: make install"
+        )
+        return
+    built, gpus = answer
+    driver = _driver()
+    if gpus:
+        text = "; ".join(f"{name}, {free:.0f} of {total:.0f} GB free" for name, free, total in gpus)
+        yield Finding(what="GPU (torch)", status=OK, found=f"{text}; CUDA {built}, driver {driver or 'unknown'}")
+    elif driver and not built:
+        advice = "install a CUDA build of torch (pytorch.org, Get started), in the version that constraints.txt names"
+        yield Finding(
+            what="GPU (torch)", status=WARNING, found=f"driver {driver}, but torch is built without CUDA", advice=advice
+        )
+    elif driver:
+        advice = f"update the driver to one that CUDA {built} accepts; check with nvidia-smi"
+        yield Finding(
+            what="GPU (torch)", status=WARNING, found=f"driver {driver}, but torch finds no GPU", advice=advice
+        )
+    else:
+        advice = "evaluating needs none; train on a machine with an NVIDIA GPU"
+        yield Finding(what="GPU (torch)", status=WARNING, found="none", advice=advice)
+
+
+def _driver() -> str | None:
+    """Version of the NVIDIA driver, None where there is none."""
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        return None
+    try:
+        done = subprocess.run(
+            [program, "--query-gpu=driver_version", "--format=csv,noheader"], capture_output=True, text=True, timeout=20
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.splitlines()[0].strip() if done.returncode == 0 and done.stdout.strip() else None
+
+
+_WARP_PROBE = """
+import json, warp
+warp.config.log_level = warp.LOG_WARNING
+warp.init()
+print(json.dumps([str(d) for d in warp.get_devices()]))
+"""
+
+
+def check_warp() -> Iterator[Finding]:
+    """The devices of Warp, on which the training engines run."""
+    answer = _ask(_WARP_PROBE)
+    if isinstance(answer, str):
+        yield Finding(
+            what="Warp devices",
+            status=PROBLEM,
+            found=f"Warp fails: {answer}",
+            advice="reinstall warp-lang: make install",
+        )
+    elif any(d.startswith("cuda") for d in answer):
+        yield Finding(what="Warp devices", status=OK, found=", ".join(answer))
+    else:
+        advice = "mujoco-warp and newton run here with --device cpu only, slowly"
+        yield Finding(what="Warp devices", status=WARNING, found=", ".join(answer) or "none", advice=advice)
+
+
+_MUJOCO_PROBE = """
+import json, mujoco, mujoco.batch
+print(json.dumps([mujoco.__version__, mujoco.mj_versionString()]))
+"""
+
+
+def check_mujoco() -> Iterator[Finding]:
+    """Whether MuJoCo loads, with the batched stepping that the gauge runs on."""
+    answer = _ask(_MUJOCO_PROBE)
+    if isinstance(answer, str):
+        advice = "reinstall it: make install"
+        yield Finding(what="MuJoCo engine", status=PROBLEM, found=f"fails: {answer}", advice=advice)
+        return
+    package, library = answer
+    if package == library:
+        yield Finding(what="MuJoCo engine", status=OK, found=f"{library}, mujoco.batch, {os.cpu_count()} CPU threads")
+    else:
+        found = f"package {package} loads library {library}"
+        advice = "another MuJoCo comes first: unset LD_LIBRARY_PATH and MUJOCO_PATH"
+        yield Finding(what="MuJoCo engine", status=PROBLEM, found=found, advice=advice)
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------------
+
+_RENDER_PROBE = """
+import json, mujoco
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 3'/><geom type='plane' size='1 1 1' rgba='1 1 1 1'/></worldbody></mujoco>"
+)
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 32, 32)
+renderer.update_scene(data)
+print(json.dumps(int(renderer.render().max())))
+"""
+_PACKAGES_OF = {"egl": "libegl1 (and a GPU driver or libgl1-mesa-dri)", "osmesa": "libosmesa6"}
+
+
+def check_rendering() -> Iterator[Finding]:
+    """Which of MuJoCo's ways to render without a window work; one is enough for videos."""
+    works: dict[str, bool] = {}
+    for backend in ("egl", "osmesa"):
+        answer = _ask(_RENDER_PROBE, MUJOCO_GL=backend)
+        works[backend] = isinstance(answer, int) and answer > 0
+    for backend, good in works.items():
+        what = f"rendering ({backend})"
+        if good:
+            yield Finding(what=what, status=OK, found=f"works (MUJOCO_GL={backend})")
+        elif any(works.values()):
+            yield Finding(what=what, status=OK, found="does not work, but the other way does")
+        else:
+            advice = f"for videos, install {_PACKAGES_OF[backend]}, with apt on Debian and Ubuntu"
+            yield Finding(what=what, status=WARNING, found="does not work", advice=advice)
+
+
+def check_display() -> Iterator[Finding]:
+    """Whether a window can be opened."""
+    if sys.platform in ("darwin", "win32"):
+        yield Finding(what="display", status=OK, found="the system's own")
+        return
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if display:
+        yield Finding(what="display", status=OK, found=display)
+    else:
+        advice = (
+            "none is needed but for the viewer's window; in a browser it works without (viser), over ssh use ssh -X"
+        )
+        yield Finding(what="display", status=WARNING, found="neither DISPLAY nor WAYLAND_DISPLAY is set", advice=advice)
+
+
+def check_ffmpeg() -> Iterator[Finding]:
+    """The program that encodes videos."""
+    if find_spec("imageio_ffmpeg") is None:
+        yield Finding(
+            what="ffmpeg", status=PROBLEM, found="imageio-ffmpeg is not installed", advice="pip install imageio-ffmpeg"
+        )
+        return
+    import imageio_ffmpeg
+
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError:
+        advice = "for videos, install ffmpeg, or set IMAGEIO_FFMPEG_EXE to it"
+        yield Finding(what="ffmpeg", status=WARNING, found="no program for this platform", advice=advice)
+        return
+    yield Finding(what="ffmpeg", status=OK, found=program)
+
+
+# ---- room -----------------------------------------------------------------------------------------------------------
+
+
+def check_room() -> Iterator[Finding]:
+    """Free disk and memory, and whether the folders of runs and results can be written."""
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    advice = "" if free >= _FREE_DISK else f"make room: a training run may write up to {_FREE_DISK:g} GB"
+    yield Finding(
+        what="free disk", status=WARNING if advice else OK, found=f"{free:.1f} GB in {Path.cwd()}", advice=advice
+    )
+    memory = _free_memory()
+    if memory is not None:
+        advice = "" if memory >= _FREE_MEMORY else f"close programs: the engines may want {_FREE_MEMORY:g} GB"
+        yield Finding(what="free memory", status=WARNING if advice else OK, found=f"{memory:.1f} GB", advice=advice)
+    for name in ("logs", "results"):
+        yield _writable(Path(name))
+
+
+def _free_memory() -> float | None:
+    """Memory that programs can still get [GB], None where the system does not tell."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    kilobytes = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    return kilobytes[0] / 1e6 if kilobytes else None
+
+
+def _writable(folder: Path) -> Finding:
+    """Whether a folder, or the nearest one above it that exists, takes files."""
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    what = f"folder {folder}/"
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        advice = f"make {there} writable, or work in another folder"
+        return Finding(what=what, status=PROBLEM, found=f"{there}: {error.strerror}", advice=advice)
+    found = "writable" if there == folder.absolute() else "will be created when it is needed"
+    return Finding(what=what, status=OK, found=found)
+
+
+def _ask(program: str, **environment: str) -> object:
+    """Run a Python program in a child process.
+
+    Returns:
+        What it prints as JSON on its last line; if it fails, the last line of its error output.
+    """
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE,
+            env={**os.environ, **environment},
+        )
+    except subprocess.TimeoutExpired:
+        return f"no answer within {_PATIENCE:g} s"
+    lines = [line for line in (done.stdout if done.returncode == 0 else done.stderr).splitlines() if line.strip()]
+    if done.returncode != 0:
+        return lines[-1] if lines else f"ended with exit code {done.returncode}"
+    return json.loads(lines[-1])
+
+
+CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+    check_python,
+    check_packages,
+    check_gpu,
+    check_warp,
+    check_mujoco,
+    check_rendering,
+    check_display,
+    check_ffmpeg,
+    check_room,
+)
+"""All checks, in the order of the table."""

@@ -1,0 +1,249 @@
+"""``gaitgauge import`` and ``gaitgauge list``: looks at policies and at what can be named on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from .errors import UserError
+
+if TYPE_CHECKING:
+    from ..policy.contract import PolicyContract
+
+_PLAIN_WIDTH = 160
+"""Columns of a table where there is no terminal to ask."""
+_HASH = 12
+"""Digits of a contract's hash that are shown in lists; enough to tell policies apart by eye."""
+
+
+def table_console() -> Console:
+    """Standard output, wide enough for tables to stay whole where it is a file or a pipe."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=_PLAIN_WIDTH)
+
+
+# ---- import ---------------------------------------------------------------------------------------------------------
+
+
+def import_file(source: str, destination: Path, *, force: bool) -> None:
+    """Write a foreign policy as the project's own file, and print the contract that it got.
+
+    Args:
+        source: a policy file, or ``latest``, ``best``, ``pretrained``.
+        destination: the file to write; it appears whole or not at all.
+        force: replace the destination if it exists.
+
+    Raises:
+        UserError: the destination exists and is not to be replaced, or is a folder.
+        PolicyError, ContractError: the source is no policy, or the destination cannot be written.
+    """
+    if destination.is_dir():
+        raise UserError(
+            f"'{destination}' is a folder; give the file to write, for example '{destination}/policy.gauge.pt'"
+        )
+    if destination.exists() and not force:
+        raise UserError(f"'{destination}' already exists; give another name, or replace it with --force")
+    from ..policy.importing import import_policy
+
+    contract = import_policy(source, destination)
+    console = table_console()
+    console.print(f"wrote {escape(str(destination))}", soft_wrap=True)
+    console.print(contract_table(contract))
+
+
+def contract_table(contract: PolicyContract) -> Table:
+    """A policy contract for people."""
+    table = Table(show_header=False)
+    table.add_column("field")
+    table.add_column("value", overflow="fold")
+    history = contract.history
+    rows = {
+        "robot": contract.robot,
+        "joints": f"{contract.num_joints}: {', '.join(contract.joint_names)}",
+        "standing pose [rad]": _numbers(contract.default_joint_position),
+        "action scale [rad]": _numbers(contract.action_scale),
+        "action clip": "none" if contract.action_clip is None else f"{contract.action_clip:g}",
+        "stiffness [N·m/rad]": _numbers(contract.stiffness),
+        "damping [N·m·s/rad]": _numbers(contract.damping),
+        "control period [s]": f"{contract.control_period:g}",
+        "observation": ", ".join(f"{t.name} × {_numbers(t.scale)}" for t in contract.observation),
+        "history": "current frame"
+        if history.length == 1
+        else f"{history.length} frames, {history.order}, starts with {history.start}",
+        "observation width": str(contract.observation_width),
+        "command limits": "forward {:g} m/s, sideways {:g} m/s, turning {:g} rad/s".format(*contract.command_limits),
+        "made from": ", ".join(f"{k} {v}" for k, v in contract.provenance.items()) or "unknown",
+        "contract hash": contract.hash,
+    }
+    for name, value in rows.items():
+        table.add_row(name, escape(value))
+    return table
+
+
+def _numbers(values: Sequence[float]) -> str:
+    """Numbers in short: one where all are equal."""
+    shown = [f"{v:g}" for v in values]
+    return shown[0] if len(set(shown)) == 1 else "(" + ", ".join(shown) + ")"
+
+
+# ---- list -----------------------------------------------------------------------------------------------------------
+
+
+def list_things(what: str) -> None:
+    """Print a table of what can be named: a key of ``LISTS``.
+
+    Raises:
+        UserError: nothing of that name can be listed.
+    """
+    make = LISTS.get(what)
+    if make is None:
+        close = get_close_matches(what, LISTS, 1)
+        hint = f"did you mean '{close[0]}'? " if close else ""
+        raise UserError(f"cannot list '{what}'; {hint}choose one of: {', '.join(LISTS)}")
+    table_console().print(make())
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+def _robots() -> Table:
+    from ..robots import RobotError, load_robot, robot_names
+
+    table = _table(
+        "robots (--robot NAME, or a robot.toml)", "name", "title", "joints", "parameter sets", "speed limits"
+    )
+    for name in robot_names():
+        try:
+            robot = load_robot(name)
+        except RobotError as error:
+            table.add_row(name, escape(f"unusable: {error}"), "", "", "")
+            continue
+        sets = ", ".join(f"{s} (default)" if s == robot.default_parameters else s for s in robot.parameters)
+        forward, lateral, yaw = robot.command_limits
+        limits = f"{forward:g} m/s, {lateral:g} m/s, {yaw:g} rad/s"
+        table.add_row(name, robot.title, str(robot.num_joints), sets, limits)
+    return table
+
+
+# What the gauge's terrains are, and what their level changes.
+_TERRAINS = {
+    "flat": "level ground, no targets",
+    "slope_fd": "up a ramp, walking forward; steeper with the level",
+    "slope_bd": "the same ramp, walking backward",
+    "stairs_fd": "up a flight of stairs, walking forward; higher steps with the level",
+    "stairs_bd": "the same stairs, walking backward",
+    "wave": "rolling ground; higher waves with the level",
+    "obstacle": "five bars across the way, 1 m long and 1 m apart; higher with the level",
+}
+
+
+def _terrains() -> Table:
+    from ..terrains.gauge_terrains import LEVELS
+    from ..terrains.registry import gauge_terrain_names, terrain_names
+
+    table = _table("terrains (--terrain NAME, --level N)", "name", "levels", "what it is")
+    own = gauge_terrain_names()
+    for name in terrain_names():
+        levels = "none" if name == "flat" else f"{LEVELS[0]} to {LEVELS[-1]}" if name in own else "its own"
+        table.add_row(name, levels, _TERRAINS.get(name, "plug-in"))
+    return table
+
+
+def _backends() -> Table:
+    from ..backends.registry import list_backends
+
+    table = _table("backends (--backend NAME)", "name", "available here", "runs on", "what it is")
+    for each in list_backends():
+        available = (
+            "yes" if not each.missing else "no: pip install " + " ".join(p.replace("_", "-") for p in each.missing)
+        )
+        table.add_row(each.name, available, each.device, each.note)
+    return table
+
+
+def _suites() -> Table:
+    from ..gauge.suite import load_suite, suite_names
+
+    table = _table("suites (--suite NAME, or a .toml file)", "name", "version", "title", "metrics", "environments")
+    for name in suite_names():
+        suite = load_suite(name)
+        matrix = suite.matrix
+        if matrix.crossed:
+            conditions = len(matrix.frictions) * len(matrix.payloads)
+        else:
+            conditions = len(matrix.frictions) + sum(p != matrix.nominal_payload for p in matrix.payloads)
+        environments = len(matrix.terrains) * conditions
+        shape = f"{environments} ({len(matrix.terrains)} terrains × {conditions} conditions)"
+        table.add_row(name, suite.version, suite.title, str(len(suite.metrics.weights)), shape)
+    return table
+
+
+def _tasks() -> Table:
+    from ..training.tasks import TASKS
+
+    table = _table("tasks (gaitgauge train NAME)", "name", "title", "worlds", "iterations", "experiment folder")
+    for task in TASKS.values():
+        run = task.training.run
+        table.add_row(task.name, task.title, str(task.environment.num_envs), str(run.iterations), run.experiment)
+    return table
+
+
+def _policies() -> Table:
+    from ..policy.base import PolicyError
+    from ..policy.loading import LOG_ROOT, POLICY_NAMES, find_policy
+
+    table = _table("policies (a name, or any policy file)", "name", "file", "robot", "contract", "saved")
+    for name in POLICY_NAMES:
+        try:
+            path = find_policy(name)
+        except PolicyError:
+            table.add_row(name, "none yet", "", "", "")
+            continue
+        table.add_row(name, *_policy_row(path))
+    for run in sorted((r for r in LOG_ROOT.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True):
+        checkpoints = sorted(run.glob("model_*.pt"), key=_iteration)
+        for path in [*checkpoints[-1:], *run.glob("best.pt")]:
+            table.add_row("", *_policy_row(path))
+    return table
+
+
+def _iteration(path: Path) -> int:
+    number = path.stem.removeprefix("model_")
+    return int(number) if number.isdigit() else -1
+
+
+def _policy_row(path: Path) -> tuple[str, str, str, str]:
+    """File, robot, contract hash and time of a policy; what is wrong with it in the place of the robot."""
+    from ..policy.base import PolicyError
+    from ..policy.contract import ContractError
+    from ..policy.loading import load_policy
+
+    shown = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+    saved = f"{datetime.fromtimestamp(path.stat().st_mtime):%Y-%m-%d %H:%M}"
+    try:
+        contract = load_policy(path).contract
+    except (PolicyError, ContractError) as error:
+        return escape(str(shown)), escape(f"unusable: {error}"), "", saved
+    return escape(str(shown)), contract.robot, contract.hash[:_HASH], saved
+
+
+LISTS: dict[str, Callable[[], Table]] = {
+    "robots": _robots,
+    "terrains": _terrains,
+    "backends": _backends,
+    "suites": _suites,
+    "policies": _policies,
+    "tasks": _tasks,
+}
+"""What ``gaitgauge list`` can show."""
