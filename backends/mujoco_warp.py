@@ -39,6 +39,7 @@ from .mujoco_warp_arrays import (
     motion_arrays,
     palette_arrays,
     role_arrays,
+    shared_array,
     to_warp,
 )
 from .mujoco_warp_device import DeviceScope, bytes_per_world, find_device, is_memory_error, memory_advice
@@ -143,13 +144,13 @@ class MujocoWarpBackend(PhysicsBackend):
         self._external = wp.to_torch(self._data.xfrc_applied)
         self._upright_limit = -2.0 if scene.physics.watch_tilt is None else math.cos(scene.physics.watch_tilt)
         # the buffers once more, as the kernels see them
-        self._active_array, self._sample_array = wp.from_torch(self._active), wp.from_torch(self._sample_at)
-        self._request_array, self._terrain_array = wp.from_torch(self._has_request), wp.from_torch(self._terrain)
+        self._active_array, self._sample_array = shared_array(self._active), shared_array(self._sample_at)
+        self._request_array, self._terrain_array = shared_array(self._has_request), shared_array(self._terrain)
         self._reset_arrays = [
-            wp.from_torch(t) for t in (self._pose, self._twist, self._new_position, self._new_velocity)
+            shared_array(t) for t in (self._pose, self._twist, self._new_position, self._new_velocity)
         ]
-        self._kept_arrays = [wp.from_torch(self._kept), wp.from_torch(self._kept_overflow)]
-        self._new_terrain_array = wp.from_torch(self._new_terrain)
+        self._kept_arrays = [shared_array(self._kept), shared_array(self._kept_overflow)]
+        self._new_terrain_array = shared_array(self._new_terrain)
 
     def _floats(self, *shape: int) -> torch.Tensor:
         return torch.zeros(shape, dtype=torch.float32, device=self.device)

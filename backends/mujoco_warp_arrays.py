@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type, assignment"
 """Arrays of the mujoco_warp engine as Warp's kernels see them, bundled by purpose, and what fills the bundles.
 
 N worlds, J joints, F feet, G geoms, S terrain slots. Numbers are float32 and int32 unless said otherwise.
@@ -5,6 +6,7 @@ N worlds, J joints, F feet, G geoms, S terrain slots. Numbers are float32 and in
 
 # Warp reads the annotations of structs: no ``from __future__ import annotations`` here.
 from dataclasses import fields
+from typing import Any
 
 import mujoco_warp
 import numpy as np
@@ -165,9 +167,14 @@ class ContactArrays:
     pyramidal: int
 
 
-def to_warp(values: np.ndarray, dtype: type) -> wp.array:
+def to_warp(values: np.ndarray, dtype: type) -> Any:
     """Copy a constant table to the current Warp device."""
     return wp.array(np.ascontiguousarray(values), dtype=dtype)
+
+
+def shared_array(tensor: torch.Tensor, dtype: type | None = None) -> Any:
+    """The tensor's memory as a Warp array; ``dtype`` makes vectors of the last axis."""
+    return wp.from_torch(tensor, dtype=dtype)
 
 
 def allocate_state(
@@ -187,7 +194,7 @@ def allocate_state(
         tensor = torch.zeros((worlds, *shape), dtype=scalars.get(item.name, torch.float32), device=device)
         vector = item.name not in scalars and item.name.endswith(("_w", "_b"))
         dtype = (wp.vec4 if shape == (4,) else wp.vec3) if vector else None
-        setattr(arrays, item.name, wp.from_torch(tensor, dtype=dtype))
+        setattr(arrays, item.name, shared_array(tensor, dtype))
         tensors[item.name] = tensor
     return PhysicsState(**tensors), arrays
 

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from .base import BackendError, Randomization, Scene
-from .mujoco_warp_arrays import Motors, to_warp
+from .mujoco_warp_arrays import Motors, shared_array, to_warp
 from .mujoco_warp_model import SharedModel
 
 BATCHED_FIELDS = (
@@ -52,9 +52,9 @@ class WorldParameters:
         motors = Motors()
         motors.joint_q, motors.joint_v = to_warp(shared.joint_q, int), to_warp(shared.joint_v, int)
         motors.limit = to_warp(limit.numpy(), float)
-        motors.stiffness, motors.damping = wp.from_torch(self._stiffness), wp.from_torch(self._damping)
-        motors.strength, motors.offset = wp.from_torch(self._strength), wp.from_torch(self._offset)
-        motors.requested, motors.delay = wp.from_torch(self.requested), wp.from_torch(self.delay)
+        motors.stiffness, motors.damping = shared_array(self._stiffness), shared_array(self._damping)
+        motors.strength, motors.offset = shared_array(self._strength), shared_array(self._offset)
+        motors.requested, motors.delay = shared_array(self.requested), shared_array(self.delay)
         for name in ("current", "previous", "torque"):
             setattr(motors, name, wp.zeros((n, joints), dtype=float))
         motors.limp, motors.limp_before = wp.full(n, 1, dtype=int), wp.full(n, 1, dtype=int)
