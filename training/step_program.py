@@ -8,7 +8,7 @@ Between them the environment resets, randomizes and pushes the physics.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import mujoco
 import torch
@@ -61,9 +61,7 @@ def joint_ranges(robot: Robot) -> torch.Tensor:
 
 def static_inputs(state: PhysicsState) -> PhysicsState:
     """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32."""
-    return replace(
-        state, **{f.name: _float32(getattr(state, f.name)).clone() for f in fields(state) if f.name in AFTER_STEP}
-    )
+    return PhysicsState(**{f.name: _float32(getattr(state, f.name)).clone() for f in fields(PhysicsState)})
 
 
 def _float32(value: torch.Tensor) -> torch.Tensor:
@@ -310,7 +308,8 @@ class StepProgram:
         memory.foot_force.copy_(state.foot_contact_force_w.norm(dim=-1))
         self._follow_commands(place, heading_xy)
         push, push_linear, push_angular = self._push(done)
-        start = self.begin_episodes(done, fallen, progress)
+        # A diverged world is the engine's failure: it moves no level.
+        start = self.begin_episodes(done, fallen & ~diverged, progress)
         return Verdict(
             reward=terms.sum(dim=1),
             done=done,

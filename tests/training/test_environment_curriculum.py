@@ -123,6 +123,15 @@ def test_falls_lower_the_level_of_the_fallen():
     assert memory.level.tolist() == [1, 2, 1, 2]
 
 
+def test_divergence_moves_no_level():
+    diverge = torch.tensor([0.1, float("inf")], dtype=torch.float64)
+    environment = make(2, script=FakeScript(diverge_time=diverge), terrain=replace(STAIRS, tiles=STAIRS.tiles[:1]))
+    environment.program.memory.level.fill_(2)
+    while not idle(environment)[2].any():
+        pass
+    assert environment.program.memory.level.tolist() == [2, 2]
+
+
 def test_episodes_spread_over_the_tile_do_not_move_levels():
     spread = replace(STAIRS, spread_probability=1.0, tiles=STAIRS.tiles[:1])
     environment = make(8, script=gliding(8.0), terrain=spread)
