@@ -105,7 +105,7 @@ def deploy_contract(path: Path, robot: Robot) -> PolicyContract:
         return _deploy_contract(data, path, robot)
     except ContractError as error:
         raise PolicyError(f"'{path}' does not give a valid policy contract: {error}") from error
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         if isinstance(error, PolicyError):
             raise
         raise PolicyError(f"'{path}' lacks or garbles an entry of a deploy.yaml: {error!r}") from error
@@ -222,7 +222,7 @@ def mjlab_contract(metadata: Mapping[str, str], robot: Robot, *, source: str) ->
         return _mjlab_contract(metadata, robot, source)
     except ContractError as error:
         raise PolicyError(f"the metadata of '{source}' do not give a valid policy contract: {error}") from error
-    except (KeyError, IndexError, ValueError) as error:
+    except (KeyError, IndexError, ValueError, OverflowError) as error:
         if isinstance(error, PolicyError):
             raise
         raise PolicyError(f"the metadata of '{source}' lack or garble an entry: {error!r}") from error

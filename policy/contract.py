@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from typing import Any
@@ -36,17 +36,23 @@ class ContractError(ValueError):
 
 
 def _number(name: str, value: Any, *, positive: bool = False) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    # The comparison is exact for whole numbers of any size, and false for NaN.
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not -sys.float_info.max <= value <= sys.float_info.max:
         raise ContractError(f"contract field '{name}' must be a finite number, not {value!r}")
     if positive and value <= 0:
         raise ContractError(f"contract field '{name}' must be above zero, not {value!r}")
     return float(value)
 
 
-def _numbers(name: str, values: Any, count: int | None = None) -> tuple[float, ...]:
+def _entries(name: str, values: Any) -> Iterable[Any]:
     if isinstance(values, (str, Mapping)) or not isinstance(values, Iterable):
-        raise ContractError(f"contract field '{name}' must be a list of numbers, not {values!r}")
-    numbers = tuple(_number(f"{name}[{i}]", v) for i, v in enumerate(values))
+        raise ContractError(f"contract field '{name}' must be a list, not {values!r}")
+    return values
+
+
+def _numbers(name: str, values: Any, count: int | None = None) -> tuple[float, ...]:
+    numbers = tuple(_number(f"{name}[{i}]", v) for i, v in enumerate(_entries(name, values)))
     if count is not None and len(numbers) != count:
         raise ContractError(f"contract field '{name}' has {len(numbers)} entries; {count} are needed")
     return numbers
@@ -72,7 +78,7 @@ class ObservationTerm:
     """Largest magnitude after scaling, for all entries or per entry; None for no clipping."""
 
     def __post_init__(self) -> None:
-        if self.name not in TERM_WIDTH:
+        if _text("observation.name", self.name) not in TERM_WIDTH:
             raise ContractError(f"unknown observation term '{self.name}'; choose from: {', '.join(TERM_WIDTH)}")
         where = f"observation.{self.name}"
         object.__setattr__(self, "scale", _numbers(f"{where}.scale", self.scale))
@@ -166,11 +172,10 @@ class PolicyContract:
         if self.action_clip is not None:
             put("action_clip", _number("action_clip", self.action_clip, positive=True))
         if self.target_range is not None:
-            put("target_range", tuple(_numbers(f"target_range[{i}]", r, 2) for i, r in enumerate(self.target_range)))
-            if len(self.target_range) != joints:
-                raise ContractError(
-                    f"contract field 'target_range' has {len(self.target_range)} entries; {joints} are needed"
-                )
+            ranges = list(_entries("target_range", self.target_range))
+            if len(ranges) != joints:
+                raise ContractError(f"contract field 'target_range' has {len(ranges)} entries; {joints} are needed")
+            put("target_range", tuple(_numbers(f"target_range[{i}]", r, 2) for i, r in enumerate(ranges)))
         put("observation", tuple(self.observation))
         if not self.observation:
             raise ContractError("contract field 'observation' lists no terms")
@@ -217,9 +222,7 @@ class PolicyContract:
             ContractError: a field is unknown, missing or malformed.
         """
         values = _checked_fields(cls, data, "")
-        terms = values["observation"]
-        if isinstance(terms, (str, Mapping)) or not isinstance(terms, Iterable):
-            raise ContractError(f"contract field 'observation' must be a list of terms, not {terms!r}")
+        terms = _entries("observation", values["observation"])
         values["observation"] = tuple(
             ObservationTerm(**_checked_fields(ObservationTerm, t, f"observation[{i}].")) for i, t in enumerate(terms)
         )

@@ -20,7 +20,7 @@ from .adapters import (
 )
 from .base import PolicyError
 from .contract import ContractError, PolicyContract, check_robot, go2_contract
-from .native import FORMAT, FilePolicy, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
+from .native import FORMAT, LOAD_ERRORS, FilePolicy, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
 
 if TYPE_CHECKING:
     from .onnx_file import OnnxFile
@@ -197,7 +197,7 @@ def file_kind(data: bytes, source: str) -> str:
     if data[:4] == b"PK\x03\x04":
         try:
             names = zipfile.ZipFile(io.BytesIO(data)).namelist()
-        except (zipfile.BadZipFile, ValueError, OSError) as error:
+        except LOAD_ERRORS as error:
             raise PolicyError(f"'{source}' is a damaged or truncated archive") from error
         inner = {n.partition("/")[2] for n in names}
         if "constants.pkl" in inner and any(n.startswith("code/") for n in inner):

@@ -22,6 +22,8 @@ import io
 import json
 import os
 import pickle
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,6 +53,8 @@ LOAD_ERRORS = (
     TypeError,
     AttributeError,
     AssertionError,
+    zipfile.BadZipFile,
+    zlib.error,
 )
 
 

@@ -98,7 +98,8 @@ def _runtime(data: bytes) -> onnxruntime.InferenceSession:
     options.inter_op_num_threads = 1
     # What goes wrong is reported by exceptions; the log would only repeat it on the user's terminal.
     options.log_severity_level = 4
-    return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    # Without its fall-back, which would only try the CPU again and print that it does.
+    return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"], enable_fallback=0)
 
 
 def _with_open_batch(model: onnx.ModelProto, input_name: str, *, open_reshapes: bool) -> bytes:

@@ -329,6 +329,6 @@ def _declared_attributes(data: bytes, *, source: str) -> frozenset[str]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             sources = [archive.read(n).decode() for n in archive.namelist() if n.endswith(".py") and "/code/" in n]
-    except (zipfile.BadZipFile, UnicodeDecodeError) as error:
+    except LOAD_ERRORS as error:
         raise PolicyError(f"'{source}' is a damaged TorchScript file: {first_line(error)}") from error
     return frozenset(name for source in sources for name in _DECLARATION.findall(source))
