@@ -1,0 +1,110 @@
+"""Speed of learning without an environment: rollout bookkeeping and updates on random data.
+
+    python benchmarks/learning_speed.py --num-envs 8192 --device cuda:0
+
+Prints, for each variant of the algorithm's settings, the time of a rollout's forward passes, of one update, and the
+environment steps a second that learning alone would allow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from gaitgauge.policy.contract import go2_contract
+from gaitgauge.robots import load_robot
+from gaitgauge.training.algorithms.cts import CTS
+from gaitgauge.training.algorithms.symmetry import build_mirror
+from gaitgauge.training.configuration import AlgorithmConfiguration, RunConfiguration, TrainingConfiguration
+from tensordict import TensorDict
+
+WIDTHS = {"policy": 45, "history": 225, "privileged": 263}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "float32": {"precision": "float32"},
+    "tf32": {},
+    "bfloat16": {"precision": "bfloat16"},
+    "tf32, CUDA graphs": {"cuda_graphs": True},
+    "bfloat16, CUDA graphs": {"precision": "bfloat16", "cuda_graphs": True},
+    "tf32, compiled": {"compile_mode": "default"},
+    "tf32, compiled, CUDA graphs": {"compile_mode": "default", "cuda_graphs": True},
+    "bfloat16, compiled, CUDA graphs": {"precision": "bfloat16", "compile_mode": "default", "cuda_graphs": True},
+    "tf32, CUDA graphs, augmented": {"cuda_graphs": True, "symmetry": "augment"},
+}
+
+
+def measure(settings: dict[str, Any], *, num_envs: int, steps: int, repeat: int, device: str) -> dict[str, float]:
+    """Seconds of a rollout and of an update, means over ``repeat`` iterations after as many to warm up."""
+    torch.manual_seed(0)
+    configuration = TrainingConfiguration(
+        algorithm=AlgorithmConfiguration(**settings), run=RunConfiguration(steps_per_iteration=steps)
+    )
+    robot = load_robot("go2")
+    arguments = configuration.to_rsl_rl() | {
+        "mirror": build_mirror(go2_contract(robot), robot, history_length=5),
+        "multi_gpu": None,
+    }
+    groups = {name: torch.randn(num_envs, width, device=device) for name, width in WIDTHS.items()}
+    observations = TensorDict(groups, batch_size=[num_envs])
+    environment: Any = SimpleNamespace(num_envs=num_envs, num_actions=robot.num_joints)
+    algorithm = CTS.construct_algorithm(observations, environment, arguments, device)
+    rewards, dones = torch.randn(num_envs, device=device), torch.zeros(num_envs, dtype=torch.bool, device=device)
+    on_gpu = torch.device(device).type == "cuda"
+    times = {"rollout": 0.0, "update": 0.0}
+    for iteration in range(2 * repeat):
+        marks = []
+        for part in ("start", "rollout", "update"):
+            if part == "rollout":
+                with torch.inference_mode():
+                    for _ in range(steps):
+                        algorithm.act(observations)
+                        algorithm.process_env_step(observations, rewards, dones, {"time_outs": dones})
+                    algorithm.compute_returns(observations)
+            elif part == "update":
+                algorithm.update()
+            if on_gpu:
+                torch.cuda.synchronize()
+            marks.append(time.perf_counter())
+        if iteration >= repeat:
+            times["rollout"] += (marks[1] - marks[0]) / repeat
+            times["update"] += (marks[2] - marks[1]) / repeat
+    return times | {"memory_gb": torch.cuda.max_memory_allocated() / 1e9 if on_gpu else 0.0}
+
+
+def main() -> None:
+    """Measure all variants that the device can run."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--num-envs", type=int, default=8192)
+    parser.add_argument("--steps", type=int, default=24)
+    parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--variants", nargs="*", help="names, default all", default=list(VARIANTS))
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    results = {}
+    for name in options.variants:
+        settings = VARIANTS[name]
+        if settings.get("cuda_graphs") and torch.device(options.device).type != "cuda":
+            continue
+        if torch.device(options.device).type == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+        result = measure(
+            settings, num_envs=options.num_envs, steps=options.steps, repeat=options.repeat, device=options.device
+        )
+        speed = options.num_envs * options.steps / (result["rollout"] + result["update"])
+        results[name] = result | {"steps_per_second": speed}
+        print(
+            f"{name:36s} rollout {result['rollout'] * 1e3:8.1f} ms   update {result['update'] * 1e3:8.1f} ms   "
+            f"{speed:12,.0f} steps/s   {result['memory_gb']:5.1f} GB",
+            flush=True,
+        )
+    if options.out:
+        options.out.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
