@@ -25,14 +25,14 @@ from .curriculum import TrainingPalette, assign_kinds, build_palette
 from .domain_randomization import BodyParameters, draw_bodies
 from .environment_configuration import EnvironmentConfiguration
 from .step_graph import CapturedFunction
-from .step_program import (
+from .step_program import StepProgram
+from .step_records import (
     AFTER_RESET,
     AFTER_STEP,
     ENDS,
     METRICS,
     EpisodeStart,
     Observations,
-    StepProgram,
     Verdict,
     static_inputs,
 )

@@ -6,7 +6,7 @@ import pytest
 import torch
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import ALL_TILES, EnvironmentConfiguration, TerrainConfiguration
-from gaitgauge.training.step_program import AFTER_RESET, AFTER_STEP
+from gaitgauge.training.step_records import AFTER_RESET, AFTER_STEP
 
 torch.set_num_threads(1)
 
