@@ -126,17 +126,26 @@ def describe_run(
     }
 
 
+def read_run_json(run: Path) -> dict[str, Any]:
+    """Entries of a run directory's ``run.json``, none if there is no such file.
+
+    Raises:
+        CheckpointError: it is damaged.
+    """
+    path = run / "run.json"
+    if not path.exists():
+        return {}
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise CheckpointError(f"Cannot read '{path}': {error}.") from error
+
+
 def update_run_json(run: Path, changes: Mapping[str, Any]) -> None:
     """Merge entries into ``run.json``, creating it if needed.
 
     Raises:
         CheckpointError: it is damaged or cannot be written.
     """
-    path = run / "run.json"
-    data: dict[str, Any] = {}
-    if path.exists():
-        try:
-            data = json.loads(path.read_text())
-        except (OSError, json.JSONDecodeError) as error:
-            raise CheckpointError(f"Cannot read '{path}': {error}.") from error
-    write_bytes(path, (json.dumps(data | to_plain(changes), indent=2) + "\n").encode())
+    data = read_run_json(run) | to_plain(changes)
+    write_bytes(run / "run.json", (json.dumps(data, indent=2) + "\n").encode())

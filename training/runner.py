@@ -34,7 +34,7 @@ from .checkpoint import (
 )
 from .configuration import TrainingConfiguration
 from .logger import RunLogger
-from .run_directory import update_run_json
+from .run_directory import read_run_json, update_run_json
 from .scoring import Scorer, ScoreReport
 from .seeding import random_state, restore_random_state
 from .stopping import Progress, StopSignals, TrainingOutcome
@@ -305,6 +305,9 @@ class TrainingRunner(OnPolicyRunner):
                 self.best_score, self.best_iteration = score, report.iteration
                 if report.path.exists():
                     copy_checkpoint(report.path, report.path.with_name("best.pt"))
+                if self.log_dir is not None:
+                    best = {"best_score": self.best_score, "best_iteration": self.best_iteration}
+                    update_run_json(self.log_dir, best)
                 self._message(f"Best gauge score so far: {score:.4f} at iteration {report.iteration}.")
 
     def _snapshot(self, total: int, elapsed: float) -> Progress:
@@ -408,6 +411,10 @@ class TrainingRunner(OnPolicyRunner):
             ) from error
         self.current_learning_iteration = entries["iter"]
         self.best_score, self.best_iteration = training["best_score"], training["best_iteration"]
+        # A score may have come back, and best.pt been replaced, after the checkpoint was written.
+        noted = read_run_json(self.log_dir) if self.log_dir else {}
+        if (score := noted.get("best_score")) is not None and (self.best_score is None or score > self.best_score):
+            self.best_score, self.best_iteration = score, noted["best_iteration"]
         self._submitted = self.current_learning_iteration
         local: Mapping[str, Any] | None = training
         if training["world_size"] != self.gpu_world_size:

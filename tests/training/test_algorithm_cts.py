@@ -192,7 +192,9 @@ def test_load_balance_forms():
         loss, metrics = algorithm._compute_student_loss(rows)
         losses[form] = float(metrics[1])
         assert float(loss.detach()) == pytest.approx(float(metrics[0]) + 0.01 * float(metrics[1]), rel=1e-5)
-    weights = algorithm.actor.student_latent(algorithm.storage.student_history.flatten(0, 1)[rows])[1].mean(dim=0)
+    weights = (
+        algorithm.actor.student_latent(algorithm.storage.student_history.flatten(0, 1)[rows])[1].detach().mean(dim=0)
+    )
     assert losses["sum"] == pytest.approx(float((weights - 0.25).square().sum()), rel=1e-4)
     assert losses["mean"] == pytest.approx(losses["sum"] / 4, rel=1e-5)
 

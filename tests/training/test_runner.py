@@ -194,6 +194,9 @@ def test_best_is_chosen_by_the_gauge(tmp_path):
     resumed = make(tmp_path, seed=1)
     resumed.load(str(tmp_path / "model_3.pt"))
     assert resumed.best_score == 0.6
+    # The score of iteration 2 came back before checkpoint 1 was resumed from: the same run directory remembers it.
+    resumed.load(str(tmp_path / "model_1.pt"))
+    assert (resumed.best_score, resumed.best_iteration) == (0.6, 2)
 
 
 def test_resume_refuses_what_does_not_fit(tmp_path):
