@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import mujoco
+import mujoco_warp
 import newton
 import numpy as np
 import warp as wp
@@ -104,18 +105,13 @@ def _contacts_per_world(scene: Scene, world: WorldModel) -> int:
     return asked or DEFAULT_CONTACTS[shape]
 
 
-def _deterministic(physics: PhysicsOptions) -> wp.DeterministicMode | None:
-    """Warp's mode for what the options ask."""
-    return wp.DeterministicMode.RUN_TO_RUN if physics.deterministic else None
-
-
 class MujocoAdapter(SolverAdapter):
     """Newton's MuJoCo solver: mujoco_warp behind Newton's model, state and contacts."""
 
     name = "mujoco"
     capabilities = _declare(
         deterministic=Capability(
-            support=Support.APPROXIMATE, note="to the last bit on a CPU; on a GPU Newton's deterministic mode is asked for, without proof"
+            support=Support.APPROXIMATE, note="to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces"
         ),
         height_field=Capability(support=Support.EXACT, note="about four times slower than boxes"),
     )
@@ -141,10 +137,12 @@ class MujocoAdapter(SolverAdapter):
                 impratio=physics.impratio,
                 enable_multiccd=True,  # as in MuJoCo
                 include_sites=False,
-                deterministic=_deterministic(physics),
             )
         self._timestep = physics.timestep
         self._data, self._model = self.solver.mjw_data, self.solver.mjw_model
+        if physics.deterministic:
+            # mujoco_warp's own mode; Newton's switch for it asks Warp for one in which Newton's kernels do not compile
+            self._model.opt.deterministic = int(mujoco_warp.DeterminismType.ATOMICS)
         self._model.opt.warn_overflow = 0  # alarms are reported per world, not printed by the device
         self._check_import(world, scene)
         geoms = self.solver.mjc_geom_to_newton_shape.numpy()
@@ -159,8 +157,8 @@ class MujocoAdapter(SolverAdapter):
         self.contacts = newton.Contacts(self.solver.get_max_contact_count(), 0, device=model.device)
         self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
         # iterations that run out are no loss of contacts
-        full = [b for b in _overflow_bits() if b.name not in ("ITERATIONS", "LS_ITERATIONS", "EPA_HORIZON", "ALL", "NONE")]
-        self._overflow_mask = int(sum(full))
+        overflow = mujoco_warp.OverflowType
+        self._overflow_mask = int(overflow.ALL & ~(overflow.ITERATIONS | overflow.LS_ITERATIONS | overflow.EPA_HORIZON))
 
     def _check_import(self, world: WorldModel, scene: Scene) -> None:
         """Refuse a robot of which Newton's importer made something else than MuJoCo's compiler."""
@@ -203,13 +201,6 @@ class MujocoAdapter(SolverAdapter):
     def inertia_changed(self) -> None:
         """See ``SolverAdapter.inertia_changed``."""
         self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
-
-
-def _overflow_bits() -> type:
-    """mujoco_warp's overflow flags."""
-    from mujoco_warp import OverflowType
-
-    return OverflowType
 
 
 def _constraint_rows(scene: Scene, world: WorldModel, contacts: int) -> int:
@@ -272,10 +263,19 @@ class _FieldShape:
         model, layout, slots = world.model, world.layout, world.slots
         self._model, self._shapes, self._shape = model, layout.shapes, int(layout.slot_shape[-1])
         shapes = np.array(carriers(layout, slots, scene.num_worlds))[slots.field]
-
-        def table(array: wp.array) -> wp.array:
-            return wp.array(array.numpy()[shapes], dtype=array.dtype, device=model.device)
-
+        half = np.array([f.half_size for f in slots.fields])[slots.field]
+        low, top = (np.array([float(limit(f.heights)) for f in slots.fields])[slots.field] for limit in (np.min, np.max))
+        # replicated shapes share the bounds of the first, whatever field they bear
+        lower, upper = np.c_[-half, low], np.c_[half, top]
+        radius = np.linalg.norm(np.maximum(np.abs(lower), np.abs(upper)), axis=1)
+        device = model.device
+        self._tables = (
+            wp.array(model.shape_heightfield_index.numpy()[shapes], dtype=int, device=device),
+            wp.array(model.shape_source_ptr.numpy()[shapes], dtype=wp.uint64, device=device),
+            wp.array(lower, dtype=wp.vec3, device=device),
+            wp.array(upper, dtype=wp.vec3, device=device),
+            wp.array(radius, dtype=float, device=device),
+        )
         self._arrays = (
             model.shape_heightfield_index,
             model.shape_source_ptr,
@@ -283,7 +283,6 @@ class _FieldShape:
             model.shape_collision_aabb_upper,
             model.shape_collision_radius,
         )
-        self._tables = tuple(table(array) for array in self._arrays)
 
     def place(self, terrain: wp.array) -> None:
         """Give every world the field of its terrain."""
@@ -310,7 +309,7 @@ class SteelAdapter(SolverAdapter):
         foot_condim_6=Capability(support=Support.NONE, note="contacts slide, they have no torsional or rolling friction"),
         contact_forces=Capability(support=Support.APPROXIMATE, note="impulses of hard contacts divided by the timestep, without moments"),
         deterministic=Capability(
-            support=Support.APPROXIMATE, note="to the last bit on a CPU; on a GPU Newton's deterministic mode is asked for, without proof"
+            support=Support.APPROXIMATE, note="to the last bit on a CPU; on a GPU by Newton's mode, but for sums of contact forces"
         ),
     )
     gap = 0.01
@@ -329,7 +328,6 @@ class SteelAdapter(SolverAdapter):
     def __init__(self, world: WorldModel, scene: Scene) -> None:
         physics, model = scene.physics, world.model
         contacts = _contacts_per_world(scene, world)
-        mode = _deterministic(physics)
         self._timestep = physics.timestep
         # one coefficient acts, and the mean of two equal ones is it: the feet's, until it is randomized
         feet = float(np.mean([world.reference.geom(name).friction[0] for name in scene.robot.foot_names]))
@@ -348,7 +346,7 @@ class SteelAdapter(SolverAdapter):
                 articulation_constraint_max=3 * contacts + scene.robot.num_joints,
                 free_body_constraint_max=1,
                 warn_constraint_overflow=False,
-                deterministic=mode,
+                deterministic=wp.DeterministicMode.RUN_TO_RUN if physics.deterministic else None,
             )
             self._pipeline = newton.CollisionPipeline(
                 model, rigid_contact_max=contacts * scene.num_worlds + 256, deterministic=physics.deterministic
