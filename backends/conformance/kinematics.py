@@ -77,6 +77,10 @@ def state_fields(bench: Bench) -> str:
         for name in FORCE_FIELDS:
             expect_close(f"{name} after a reset", getattr(state, name), 0.0, 0.0)
         expect(not state.diverged.any() and not state.overflowed.any(), "a fresh world is diverged or overflowed")
+        kept = backend.state.clone()
+        worlds.reset(base_position=np.full((n, 3), 2.0))
+        expect_close("base height in a clone of an earlier state [m]", kept.base_position_w[:, 2].cpu(), 1.0, 1e-6)
+        expect_close("base height of the present state [m]", worlds.read().base_position_w[:, 2], 2.0, 1e-6)
     return f"{str(backend.dtype).removeprefix('torch.')} on {backend.device}"
 
 

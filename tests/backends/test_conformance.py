@@ -1,6 +1,5 @@
 """Every engine of the project against the conformance checks."""
 
-import importlib.util
 from functools import cache
 from pathlib import Path
 
@@ -26,7 +25,7 @@ FAKE_CANNOT = (
     "health/penetration_watch",
 )
 FAKE_CAN = [name for name in CHECKS if not name.startswith(FAKE_CANNOT)]
-MODULES = {"mujoco-warp": "gaitgauge.backends.mujoco_warp", "newton": "gaitgauge.backends.newton"}
+WARP_ENGINES = ("mujoco-warp", "newton", "newton:steel")
 
 bench_of = cache(make_bench)
 
@@ -38,8 +37,6 @@ def outcome(engine, check):
 
 
 def run_all(engine, device):
-    if engine in MODULES and importlib.util.find_spec(MODULES[engine]) is None:
-        pytest.skip(f"the engine '{engine}' is not there yet")
     results = run_conformance(engine, device, only=FAKE_CAN if engine == "fake" else ())
     failed = [f"{r.name}: {r.detail}" for r in results if r.outcome is Outcome.FAILED]
     assert not failed, "\n".join(failed)
@@ -56,13 +53,13 @@ def test_mujoco(check):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", MODULES)
+@pytest.mark.parametrize("engine", WARP_ENGINES)
 def test_warp_engines_on_the_cpu(engine):
     run_all(engine, "cpu")
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("engine", [*MODULES, "fake"])
+@pytest.mark.parametrize("engine", [*WARP_ENGINES, "fake"])
 def test_on_a_gpu(engine):
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
