@@ -1,0 +1,291 @@
+"""Geometry of the report's charts: pure functions from rows of ``results.json`` to coordinates in an SVG view box.
+
+The templates draw these numbers and compute nothing themselves. Coordinates are SVG user units, x to the
+right, y downwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+Row = Mapping[str, Any]
+
+FLAT = "flat"
+TERRAIN_LABELS = {
+    "slope_fd": "slope, forward",
+    "slope_bd": "slope, backward",
+    "stairs_fd": "stairs, forward",
+    "stairs_bd": "stairs, backward",
+}
+LEVELS = 10
+"""Least upper end of the level axis."""
+
+STRIP_WIDTH = 200.0
+_STRIP_INSET = 5.0
+_RADAR_WIDTH, _RADAR_HEIGHT, _RADAR_RADIUS = 500.0, 410.0, 150.0
+_PANEL_WIDTH, _PANEL_HEIGHT = 190.0, 156.0
+_PANEL_LEFT, _PANEL_RIGHT, _PANEL_TOP, _PANEL_BOTTOM = 34.0, 6.0, 8.0, 38.0
+_CELL = 17.0
+_WIDE = 25.0
+"""Width of a cell that holds a number."""
+_LEGEND = 130.0
+"""Least width of a map, that of its axes' names."""
+_HEAT_LEFT, _HEAT_TOP, _HEAT_BOTTOM = 34.0, 4.0, 34.0
+
+
+def terrain_label(name: str) -> str:
+    """A terrain's name for readers."""
+    return TERRAIN_LABELS.get(name, name.replace("_", " "))
+
+
+def number(value: float) -> str:
+    """A number as short as it goes, with a true minus sign."""
+    return f"{value:g}".replace("-", "−")
+
+
+def strip(row: Mapping[str, Any]) -> dict[str, Any]:
+    """One line of a score chart: marks for the statistics and a band for the interval.
+
+    Args:
+        row: ``mean50`` and, where known, ``mean``, ``mean25`` and ``interval``, all in [0, 1].
+
+    Returns:
+        ``ticks``: x of 0, 0.25 … 1; ``band``: (x, width) or None; ``marks``: x by statistic.
+    """
+    interval = row.get("interval")
+    band = None
+    if interval is not None:
+        low, high = (_strip_x(v) for v in interval)
+        band = (low, _round(max(high - low, 1.0)))
+    marks = {s: _strip_x(row[s]) for s in ("mean", "mean25", "mean50") if row.get(s) is not None}
+    return {"ticks": [_strip_x(i / 4) for i in range(5)], "band": band, "marks": marks}
+
+
+def _strip_x(value: float) -> float:
+    return _linear(value, (0.0, 1.0), (_STRIP_INSET, STRIP_WIDTH - _STRIP_INSET))
+
+
+def radar(terrains: Mapping[str, Row], statistics: Mapping[str, str]) -> dict[str, Any] | None:
+    """Scores of the terrains on spokes, the first upwards and the others clockwise; None for fewer than three terrains.
+
+    Args:
+        terrains: terrain by name, with one value in [0, 1] for each statistic.
+        statistics: label of each statistic, in the order in which they are drawn.
+    """
+    if len(terrains) < 3:
+        return None
+    centre = (_RADAR_WIDTH / 2, _RADAR_HEIGHT / 2)
+    angles = [2.0 * math.pi * i / len(terrains) for i in range(len(terrains))]
+
+    def at(angle: float, value: float) -> tuple[float, float]:
+        radius = _RADAR_RADIUS * value
+        return _round(centre[0] + radius * math.sin(angle)), _round(centre[1] - radius * math.cos(angle))
+
+    spokes = []
+    for angle, (name, row) in zip(angles, terrains.items(), strict=True):
+        x, y = at(angle, 1.0)
+        label_x, label_y = at(angle, 1.0 + 16.0 / _RADAR_RADIUS)
+        side = math.sin(angle)
+        anchor = "middle" if abs(side) < 0.2 else "start" if side > 0 else "end"
+        lift = -14.0 if math.cos(angle) > 0.9 else 8.0 if math.cos(angle) < -0.9 else 0.0
+        label = {"x": label_x, "y": _round(label_y + lift), "anchor": anchor, "text": terrain_label(name)}
+        spokes.append({"x": x, "y": y, "label": label, "value": row["mean50"]})
+    rings = [
+        {"value": v, "points": [at(a, v) for a in angles], "label": (_round(centre[0] + 4), at(0.0, v)[1])}
+        for v in (0.2, 0.4, 0.6, 0.8, 1.0)
+    ]
+    shapes = [
+        {
+            "statistic": s,
+            "label": label,
+            "points": [at(a, t[s]) for a, t in zip(angles, terrains.values(), strict=True)],
+        }
+        for s, label in statistics.items()
+    ]
+    size = (_RADAR_WIDTH, _RADAR_HEIGHT)
+    return {"size": size, "centre": centre, "spokes": spokes, "rings": rings, "shapes": shapes}
+
+
+def sweep(rows: Sequence[Row], *, axis: str, quantity: str) -> list[dict[str, Any]]:
+    """Small multiples, one for each terrain: a quantity over friction or payload where only that one varies.
+
+    Args:
+        rows: environments.
+        axis: ``friction`` or ``payload``.
+        quantity: ``level`` or ``score``; environments without it are left out.
+
+    Returns:
+        Panels with ``terrain``, ``size``, ``frame``, ``x_ticks``, ``y_ticks``, ``points`` and ``fixed``: the value of
+        the axis that does not vary. A terrain with fewer than two values along the axis, or whose axes are crossed, has
+        none.
+    """
+    other = _other(axis)
+    series: list[tuple[str, float, list[Row]]] = []
+    for terrain, group in _by_terrain(rows, quantity).items():
+        lines = [[r for r in group if r[other] == v] for v in sorted({r[other] for r in group})]
+        lines = [sorted(line, key=lambda r: r[axis]) for line in lines if len(line) > 1]
+        if len(lines) == 1:
+            series.append((terrain, lines[0][0][other], lines[0]))
+    if not series:
+        return []
+    everything = [r for _, _, line in series for r in line]
+    values = sorted({r[axis] for r in everything})
+    top = _top(everything, quantity)
+    left, right = _PANEL_LEFT, _PANEL_WIDTH - _PANEL_RIGHT
+    upper, lower = _PANEL_TOP, _PANEL_HEIGHT - _PANEL_BOTTOM
+
+    def x_of(value: float) -> float:
+        return _linear(value, (values[0], values[-1]), (left + 8.0, right - 8.0))
+
+    def y_of(value: float) -> float:
+        return _linear(value, (0.0, top), (lower, upper))
+
+    steps = [top * i / 4 for i in range(5)] if quantity == "score" else [0.0, top / 2, top]
+    panels = []
+    for terrain, fixed, line in series:
+        panels.append(
+            {
+                "terrain": terrain_label(terrain),
+                "axis": axis,
+                "quantity": quantity,
+                "fixed": fixed,
+                "size": (_PANEL_WIDTH, _PANEL_HEIGHT),
+                "frame": (left, right, upper, lower),
+                "x_ticks": [{"x": x_of(v), "label": number(v)} for v in _thin(values)],
+                "y_ticks": [{"y": y_of(v), "label": number(v)} for v in steps],
+                "points": [_point(r, axis, quantity, x_of, y_of) for r in line],
+            }
+        )
+    return panels
+
+
+def _point(row: Row, axis: str, quantity: str, x_of: Any, y_of: Any) -> dict[str, Any]:
+    interval = row.get("interval") if quantity == "score" else None
+    value = row[quantity]
+    unit = " kg" if axis == "payload" else ""
+    shown = f"{value:.4f}" if quantity == "score" else number(value)
+    return {
+        "x": x_of(row[axis]),
+        "y": y_of(value),
+        "whisker": None if interval is None else [y_of(v) for v in interval],
+        "failed": row["level"] == 0 if quantity == "level" else bool(row.get("falls") or row.get("diverged")),
+        "title": f"{axis} {number(row[axis])}{unit}: {quantity} {shown}",
+    }
+
+
+def heat(rows: Sequence[Row], *, quantity: str) -> list[dict[str, Any]]:
+    """For terrains whose frictions and payloads are crossed: one map each, friction to the right, payload upwards.
+
+    Args:
+        rows: environments.
+        quantity: ``level`` or ``score``; environments without it are left out.
+    """
+    maps = []
+    for terrain, group in _by_terrain(rows, quantity).items():
+        frictions, payloads = (sorted({r[a] for r in group}) for a in ("friction", "payload"))
+        if min(len(frictions), len(payloads)) < 2 or len(group) < len(frictions) + len(payloads):
+            continue
+        top = _top(rows, quantity)
+        bottom = _HEAT_TOP + _CELL * len(payloads)
+        cells = [
+            {
+                "x": _round(_HEAT_LEFT + _WIDE * frictions.index(r["friction"])),
+                "y": _round(bottom - _CELL * (payloads.index(r["payload"]) + 1)),
+                "share": round(r[quantity] / top, 3),
+                "text": f"{r['score']:.2f}".removeprefix("0") if quantity == "score" else number(r["level"]),
+                "title": f"friction {number(r['friction'])}, payload {number(r['payload'])} kg: {number(r[quantity])}",
+            }
+            for r in group
+        ]
+        maps.append(
+            {
+                "terrain": terrain_label(terrain),
+                "quantity": quantity,
+                "size": (_HEAT_LEFT + max(_WIDE * len(frictions), _LEGEND) + 8.0, bottom + _HEAT_BOTTOM),
+                "cell": (_WIDE, _CELL),
+                "cells": cells,
+                "x_ticks": [
+                    {"x": _round(_HEAT_LEFT + _WIDE * (frictions.index(v) + 0.5)), "label": number(v)}
+                    for v in _thin(frictions)
+                ],
+                "y_ticks": [
+                    {"y": _round(bottom - _CELL * (i + 0.5)), "label": number(v)} for i, v in enumerate(payloads)
+                ],
+                "bottom": bottom,
+            }
+        )
+    return maps
+
+
+def searches(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Outcomes of the level searches, one chart for each terrain: an environment to the row, a level to the column."""
+    charts = []
+    top = int(_top([r for r in rows if r.get("level") is not None], "level"))
+    several = len({r["payload"] for r in rows}) > 1
+    left = 62.0 if several else 30.0
+    for terrain in dict.fromkeys(r["terrain"] for r in rows if r.get("search")):
+        group = [r for r in rows if r["terrain"] == terrain and r.get("search")]
+        group.sort(key=lambda r: (r["payload"], r["friction"]))
+        lines: list[dict[str, Any]] = []
+        for i, row in enumerate(group):
+            y = _HEAT_TOP + _CELL * i
+            outcomes = {int(k): v for k, v in row["search"].items()}
+            label = number(row["friction"]) + (f", {number(row['payload'])} kg" if several else "")
+            lines.append(
+                {
+                    "label": label,
+                    "y": y,
+                    "passed": [left + _CELL * (k - 1) for k, v in sorted(outcomes.items()) if v],
+                    "failed": [left + _CELL * (k - 1) for k, v in sorted(outcomes.items()) if not v],
+                    "open": [left + _CELL * (k - 1) for k in range(1, top + 1) if k not in outcomes],
+                    "reached": left + _CELL * (row["level"] - 1) if row["level"] else None,
+                }
+            )
+        bottom = _HEAT_TOP + _CELL * len(group)
+        charts.append(
+            {
+                "terrain": terrain_label(terrain),
+                "size": (left + _CELL * top + 6.0, bottom + _HEAT_BOTTOM),
+                "cell": _CELL,
+                "left": left,
+                "bottom": bottom,
+                "lines": lines,
+                "x_ticks": [{"x": _round(left + _CELL * (k - 0.5)), "label": str(k)} for k in range(1, top + 1)],
+                "axis": "friction μ, payload" if several else "friction μ",
+            }
+        )
+    return charts
+
+
+def _by_terrain(rows: Sequence[Row], quantity: str) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.get(quantity) is not None:
+            found.setdefault(row["terrain"], []).append(row)
+    return found
+
+
+def _other(axis: str) -> str:
+    return "payload" if axis == "friction" else "friction"
+
+
+def _top(rows: Sequence[Row], quantity: str) -> float:
+    """Upper end of the axis of a quantity."""
+    if quantity == "score":
+        return 1.0
+    return float(max([LEVELS, *(r["level"] for r in rows if r.get("level") is not None)]))
+
+
+def _thin(values: Sequence[float]) -> Sequence[float]:
+    """Every n-th value, so that at most six labels stand beside each other; the first always."""
+    return values[:: math.ceil(len(values) / 6)]
+
+
+def _linear(value: float, domain: tuple[float, float], span: tuple[float, float]) -> float:
+    return _round(span[0] + (value - domain[0]) / (domain[1] - domain[0]) * (span[1] - span[0]))
+
+
+def _round(value: float) -> float:
+    return round(value, 2)

@@ -1,0 +1,332 @@
+"""``report.html``: one self-contained page with what ``results.json`` holds. It loads nothing from anywhere."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any
+
+import jinja2
+
+from . import charts
+from .charts import FLAT, Row, number, terrain_label
+from .results import SCHEMA
+from .store import StoreError, write_atomically
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+STATISTIC_LABELS = {"mean": "mean", "mean50": "mean@50", "mean25": "mean@25"}
+"""In the order in which the radar draws them."""
+
+METRIC_LABELS: Mapping[str, tuple[str, str]] = {
+    "lin_vel_err": ("linear velocity tracking", "linear velocity"),
+    "ang_vel_err": ("angular velocity tracking", "angular velocity"),
+    "dof_limits": ("joint limits", "joint limits"),
+    "dof_power": ("joint power", "joint power"),
+    "orientation_stability": ("orientation stability", "orien\u00adtation"),
+    "torque_smoothness": ("torque smoothness", "smooth\u00adness"),
+    "zmp_margin": ("ZMP margin", "ZMP margin"),
+    "friction_margin": ("friction margin", "friction margin"),
+}
+"""Long and short label; other metrics go by their name."""
+
+_SHOWN = 6
+"""Environments that a warning names before it says how many more there are."""
+_LONGEST = 400
+"""Characters of a provenance entry."""
+
+
+def write_report(folder: Path) -> Path:
+    """Write ``report.html`` beside the results that it shows, all or nothing.
+
+    Args:
+        folder: folder of a finished run.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        StoreError: the folder holds no results, or damaged ones, or some of another version.
+    """
+    source = folder / "results.json"
+    try:
+        results = json.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise StoreError(f"{folder} holds no results.json; run gaitgauge evaluate with --out {folder} first") from error
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{source} cannot be read ({error}); run gaitgauge evaluate again with --resume") from error
+    page = folder / "report.html"
+    write_atomically(page, render(results))
+    return page
+
+
+def render(results: Mapping[str, Any]) -> str:
+    """The page of some results, as HTML text. Whatever they contain is shown as text and never becomes markup.
+
+    Raises:
+        StoreError: results of another schema.
+    """
+    if not isinstance(results, Mapping) or results.get("schema") != SCHEMA:
+        found = results.get("schema") if isinstance(results, Mapping) else None
+        raise StoreError(f"the results have schema {found!r}, this version reads {SCHEMA}; evaluate the policy again")
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"fixed": _fixed, "number": number, "terrain": terrain_label, "metric": metric_label}
+    environment.filters |= {"short_metric": lambda name: metric_label(name, short=True), "grouped": _grouped}
+    return environment.get_template("report.html.j2").render(report_data(results))
+
+
+def metric_label(name: str, *, short: bool = False) -> str:
+    """A metric's name for readers; ``short`` for a column's head."""
+    labels = METRIC_LABELS.get(name)
+    return labels[short] if labels else name.replace("_", " ")
+
+
+def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything that the page shows, in the order and the coordinates in which it is shown.
+
+    Args:
+        results: content of ``results.json``.
+
+    Returns:
+        Plain data for ``templates/report.html.j2``.
+    """
+    rows: list[Row] = results["environments"]
+    evaluated = results["score"] is not None
+    terrains: Mapping[str, Row] = results["terrains"]
+    searched = any("search" in r for r in rows)
+    both = (("friction", "over friction"), ("payload", "over payload"))
+    level_figures = _figures(rows, "level", both) if searched else []
+    return {
+        "title": PurePath(results["policy"]["path"].replace("\\", "/")).name,
+        "suite": results["suite"],
+        "subtitle": _subtitle(results),
+        "evaluated": evaluated,
+        "searched": searched,
+        "score": results["score"],
+        "score_interval": results["score_interval"],
+        "score_strip": _score_strip(results["score"], results["score_interval"]),
+        "groups": _groups(results),
+        "level": results["level"],
+        "level_label": "mean maximum level" if searched else "mean level played",
+        "counts": _counts(results),
+        "warnings": warnings(results),
+        "statistics": STATISTIC_LABELS,
+        "terrains": {
+            name: {
+                **row,
+                "strip": charts.strip(row) if evaluated else None,
+                "environments": _environments_of(rows, name),
+            }
+            for name, row in terrains.items()
+        },
+        "radar": charts.radar(terrains, STATISTIC_LABELS) if evaluated else None,
+        "level_figures": level_figures,
+        "score_figures": _figures(rows, "score", both) if evaluated else [],
+        "metrics": {name: {**row, "strip": charts.strip(row)} for name, row in results["metrics"].items()},
+        "metric_matrix": metric_matrix(rows),
+        "searches": charts.searches(rows),
+        "rows": [_row(r) for r in rows],
+        "events": any(r.get(flag) for r in rows for flag in _FLAGS),
+        "metric_names": list(results["metrics"]),
+        "terrain_order": {name: i for i, name in enumerate(terrains)},
+        "several_payloads": len({r["payload"] for r in rows}) > 1,
+        "sources": sources(results),
+        "versions": results["provenance"]["versions"],
+        "command": results["provenance"]["command"],
+    }
+
+
+def warnings(results: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What went wrong in a run, gravest first.
+
+    Returns:
+        For each kind ``severity`` (``grave`` or ``note``), ``headline``, ``meaning`` and ``places``, the worst first.
+    """
+    rows: Sequence[Row] = results["environments"]
+    health = results["health"]
+    total = f"{health['episodes']} quality episodes"
+    found = []
+    if health["diverged"]:
+        headline = f"physics diverged in {health['diverged']} of {total}"
+        meaning = (
+            "The simulation became invalid there; each counts as a fall. The engine or its settings may be at fault."
+        )
+        found.append(_warning("grave", headline, meaning, _places(rows, "diverged")))
+    if health["overflowed"]:
+        headline = f"contacts dropped in {health['overflowed']} of {total}"
+        meaning = "The engine had no room for all contacts or constraints there, so these values are not exact."
+        found.append(_warning("grave", headline, meaning, _places(rows, "overflowed")))
+    if health["falls"]:
+        headline = f"{_plural(health['falls'], 'fall')} in {total}"
+        meaning = "A fall ends its sub-command; the suite says what it costs."
+        found.append(_warning("grave", headline, meaning, _places(rows, "falls")))
+    failed = [r for r in rows if r["level"] == 0]
+    if failed:
+        searched = sum("search" in r for r in rows)
+        headline = f"not even level 1 passed in {len(failed)} of {searched} searched environments"
+        meaning = "They score zero and no quality is measured there."
+        found.append(_warning("note", headline, meaning, _places(failed, None)))
+    restarted = sum(r.get("restarted", 0) for r in rows)
+    if restarted:
+        headline = f"restarts in {restarted} of {total}"
+        meaning = "A foot sank into the terrain, and the goal was started again once, as the suite says."
+        found.append(_warning("note", headline, meaning, _places(rows, "restarted")))
+    return found
+
+
+def _warning(severity: str, headline: str, meaning: str, places: list[str]) -> dict[str, Any]:
+    return {"severity": severity, "headline": headline, "meaning": meaning, "places": places}
+
+
+def _places(rows: Sequence[Row], key: str | None) -> list[str]:
+    """Names of environments, those with the highest count of ``key`` first, cut to a readable number."""
+    chosen = list(rows) if key is None else sorted((r for r in rows if r.get(key)), key=lambda r: -r[key])
+    payloads = len({r["payload"] for r in rows}) > 1
+    names = []
+    for row in chosen[:_SHOWN]:
+        name = f"{terrain_label(row['terrain'])}, μ {number(row['friction'])}"
+        name += f", {number(row['payload'])} kg" if payloads else ""
+        names.append(name + (f" ({row[key]})" if key else ""))
+    return names + ([f"and {len(chosen) - _SHOWN} more"] if len(chosen) > _SHOWN else [])
+
+
+def metric_matrix(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Mean@50 of each metric on each terrain, at the levels reached and not weighted by them.
+
+    Returns:
+        Value by metric within terrain: the mean over the terrain's environments that were played.
+    """
+    matrix: dict[str, dict[str, float]] = {}
+    for terrain in dict.fromkeys(r["terrain"] for r in rows if "metrics" in r):
+        played = [r for r in rows if r["terrain"] == terrain and "metrics" in r]
+        tables = [{**r["metrics"], "quality": r["quality"]} for r in played]
+        matrix[terrain] = {m: sum(t[m]["mean50"] for t in tables) / len(tables) for m in tables[0]}
+    return matrix
+
+
+def sources(results: Mapping[str, Any]) -> dict[str, str]:
+    """Where the results come from, as labelled texts."""
+    policy, provenance = results["policy"], results["provenance"]
+    suite = results["suite"]
+    entries = {
+        "policy": policy["path"],
+        "policy file, SHA-256": policy["file_sha256"],
+        "policy contract, SHA-256": policy["contract_hash"],
+        "suite": f"{suite['name']} {suite['version']}: {suite['title']}",
+        "pipeline": results["pipeline"],
+        "robot": results["robot"],
+        "engine": _engine(results),
+        "machine": f"{provenance['host']}: {provenance['machine']}",
+        "date": provenance["date"],
+        "time": f"{_duration(provenance['seconds'])} on {provenance['device']}, CPU threads: {provenance['threads']}",
+        "physics steps": _grouped(provenance["physics_steps"]) + _rate(provenance),
+    }
+    for key, value in policy["provenance"].items():
+        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        entries[f"policy: {key}"] = text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
+    return entries
+
+
+def _engine(results: Mapping[str, Any]) -> str:
+    backend: str = results["backend"]
+    version = results["provenance"]["versions"].get(backend.partition(":")[0])
+    return f"{backend} {version}" if version else backend
+
+
+def _rate(provenance: Mapping[str, Any]) -> str:
+    """Physics steps per second, where the run was long enough and not wholly resumed."""
+    if not provenance["physics_steps"] or provenance["seconds"] < 1.0:
+        return ""
+    return f" ({_grouped(round(provenance['physics_steps'] / provenance['seconds']))} a second)"
+
+
+def _subtitle(results: Mapping[str, Any]) -> list[str]:
+    suite = results["suite"]
+    return [
+        f"{suite['name']} {suite['version']}",
+        f"{results['pipeline']} pipeline",
+        f"robot {results['robot']}",
+        f"engine {_engine(results)}",
+        results["provenance"]["date"][:10],
+    ]
+
+
+def _counts(results: Mapping[str, Any]) -> str:
+    """How much the results rest on, in one line."""
+    rows, episodes = results["environments"], results["health"]["episodes"]
+    parts = [_plural(len(results["terrains"]), "terrain"), _plural(len(rows), "environment")]
+    return " · ".join([*parts, _plural(episodes, "quality episode")] if episodes else parts)
+
+
+def _plural(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def _environments_of(rows: Sequence[Row], terrain: str) -> int:
+    return sum(r["terrain"] == terrain for r in rows)
+
+
+def _groups(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    intervals = results.get("groups_interval", {})
+    return {
+        name: {"value": value, "interval": intervals.get(name), "strip": _score_strip(value, intervals.get(name))}
+        for name, value in results["groups"].items()
+    }
+
+
+def _score_strip(value: float | None, interval: Sequence[float] | None) -> dict[str, Any] | None:
+    return None if value is None else charts.strip({"mean50": value, "interval": interval})
+
+
+def _figures(rows: Sequence[Row], quantity: str, axes: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
+    """Charts of a quantity over friction and over payload, or over both where they are crossed."""
+    figures: list[dict[str, Any]] = []
+    for axis, words in axes:
+        panels = charts.sweep(rows, axis=axis, quantity=quantity)
+        if panels:
+            fixed = {p["fixed"] for p in panels}
+            where = ""
+            if axis == "payload" and len(fixed) == 1:
+                where = f" at friction {number(fixed.pop())}"
+            elif len({r["payload"] for r in rows}) > 1 and len(fixed) == 1:
+                where = f" at payload {number(fixed.pop())} kg"
+            failed = any(p["failed"] for panel in panels for p in panel["points"])
+            figures.append({"kind": "lines", "title": words + where, "panels": panels, "failed": failed})
+    maps = charts.heat(rows, quantity=quantity)
+    if maps:
+        figures.append({"kind": "heat", "title": "over friction and payload", "panels": maps, "failed": False})
+    return figures
+
+
+def _row(row: Row) -> dict[str, Any]:
+    """A line of the table of environments."""
+    flags = [f"{row[k]} {word}" for k, word in _FLAGS.items() if row.get(k)]
+    return {"falls": None, "metrics": {}, **row, "flat": row["terrain"] == FLAT, "flags": flags}
+
+
+_FLAGS = {"diverged": "diverged", "overflowed": "overflowed", "restarted": "restarted"}
+
+
+def _fixed(value: float | None, digits: int = 4) -> str:
+    """A number with fixed decimals; a dash for what does not exist."""
+    return "–" if value is None else f"{value:.{digits}f}".replace("-", "−")
+
+
+def _grouped(value: int) -> str:
+    """A whole number with thin spaces between thousands."""
+    return f"{value:,}".replace(",", "\u202f")
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min {rest:02d} s" if hours else f"{minutes} min {rest:02d} s"

@@ -1,0 +1,366 @@
+"""The report: what it shows for every pipeline, where its charts put known data, and that hostile text stays text."""
+
+import json
+import math
+import re
+import zlib
+from copy import deepcopy
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from gaitgauge.gauge import charts
+from gaitgauge.gauge.episodes import Episode, Record
+from gaitgauge.gauge.pipelines import LevelTest, make_environments
+from gaitgauge.gauge.report import STATISTIC_LABELS, metric_matrix, render, report_data, warnings, write_report
+from gaitgauge.gauge.results import fold, health
+from gaitgauge.gauge.store import StoreError
+from gaitgauge.gauge.suite import load_suite
+
+HOSTILE = 'a/<img src="http://evil.example/x.png" onerror=alert(1)></script><script>alert(2)</script>&"\'.pt'
+REACH = {"slope_fd": 7, "slope_bd": 6, "stairs_fd": 9, "stairs_bd": 4, "wave": 8, "obstacle": 3}
+
+
+def played(suite, environment, seed, generator):
+    """A quality episode of random but plausible samples: harder ground and slipperier floors are worse."""
+    names = [*suite.metrics.weights, "quality"]
+    goals = ("diagonal_velocity", "max_velocity")
+    centre = 0.82 - 0.03 * (environment.level or 0) - 0.15 * (environment.friction < 0.35)
+    by_metric = np.array([0.12 * math.sin(zlib.crc32(n.encode())) for n in names])
+    samples = np.clip(centre + by_metric + 0.12 * generator.standard_normal((120, len(names))), 0, 1).astype(np.float32)
+    episode = Episode(
+        terrain=environment.terrain,
+        level=environment.level or 0,
+        friction=environment.friction,
+        payload=environment.payload,
+        seed=seed,
+        stage="eval",
+        goals=goals,
+    )
+    return Record(
+        episode=episode,
+        falls=int(generator.random() < 0.04),
+        columns=tuple(names),
+        samples=samples,
+        goal_index=np.repeat([0, 1], 60).astype(np.int16),
+        part_index=np.tile(np.repeat(np.arange(6), 10), 2).astype(np.int16),
+    )
+
+
+def search(environment, reached, levels):
+    """Fill in the outcomes of a binary search that ends at the level reached."""
+    low, high = 0, levels
+    while low < high:
+        middle = (low + high + 1) // 2
+        test = LevelTest([0, 1, 2, 3, 4], 0.8, all_at_once=True)
+        test.next_round()
+        for _ in range(5):
+            test.record(middle <= reached)
+        environment.tests[middle] = test
+        low, high = (middle, high) if middle <= reached else (low, middle - 1)
+    environment.level = low
+
+
+def sample(pipeline="stress", suite="robogauge-1.1", resamples=10, **choices):
+    """What ``evaluate`` would write, from synthetic records; a copy for the test to change."""
+    return deepcopy(_sample(pipeline, suite, resamples, **choices))
+
+
+@cache
+def _sample(pipeline, suite, resamples, reach=None, **choices):
+    suite = load_suite(suite)
+    suite = replace(suite, scoring=replace(suite.scoring, bootstrap=resamples))
+    generator = np.random.default_rng(0)
+    chosen = {"terrains": suite.matrix.terrains, "frictions": None, "payloads": None, "level": None, **choices}
+    environments = make_environments(suite, **chosen)
+    for environment in environments:
+        if environment.searched:
+            handicap = round(6 * max(0.0, 0.4 - environment.friction) + max(0.0, environment.payload))
+            search(
+                environment,
+                max(0, (REACH[environment.terrain] if reach is None else reach) - 2 * handicap),
+                suite.scoring.levels,
+            )
+        if pipeline != "level" and (environment.level or environment.terrain == "flat"):
+            environment.records = [played(suite, environment, s, generator) for s in suite.matrix.seeds]
+    results = fold(suite, environments, (*suite.metrics.weights, "quality"))
+    policy = {"path": "policies/go2_cts.pt", "contract_hash": "ab" * 32, "file_sha256": "cd" * 32}
+    return results | {
+        "policy": policy | {"provenance": {"adapter": "TorchScript", "steps": 5}},
+        "pipeline": pipeline,
+        "backend": "mujoco",
+        "robot": "go2",
+        "health": dict(health(environments)),
+        "provenance": {
+            "versions": {"python": "3.11.2", "gaitgauge": "0.1.0", "mujoco": "3.17.0", "torch": "2.13.0"},
+            "command": "gaitgauge evaluate policies/go2_cts.pt --suite robogauge-1.1",
+            "date": "2026-01-02T03:04:05+00:00",
+            "host": "lab",
+            "machine": "x86_64, 2 CPUs, Linux 6.1",
+            "device": "cpu",
+            "threads": 2,
+            "seconds": 152.5,
+            "physics_steps": 1_234_567,
+        },
+    }
+
+
+PIPELINES = {
+    "base": {"terrains": ("flat",), "frictions": (0.6,), "payloads": (0.0,)},
+    "multi": {"terrains": ("slope_fd", "wave"), "frictions": (0.4, 0.6), "payloads": (0.0, 2.0), "level": 5},
+    "level": {"terrains": tuple(REACH)},
+    "stress": {},
+}
+
+
+@pytest.fixture(scope="module")
+def stress():
+    return sample()
+
+
+class Page(HTMLParser):
+    """Collects tags with their attributes, and text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.words, self.open = [], [], []
+        self.feed(text)
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in ("meta", "input", "img", "link", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag, f"</{tag}> closes nothing"
+
+    def handle_data(self, data):
+        if self.open[-1:] not in (["style"], ["script"]):
+            self.words.append(data)
+
+    def count(self, tag):
+        return sum(t == tag for t, _ in self.tags)
+
+
+@pytest.mark.parametrize("pipeline", PIPELINES)
+def test_every_pipeline_renders_well_formed_and_shows_its_environments(pipeline):
+    results = sample(pipeline, **PIPELINES[pipeline])
+    text = render(results)
+    page = Page(text)
+    assert not page.open
+    assert "None" not in page.text
+    assert "nan" not in page.text.lower().split()
+    rows = text.partition('<table class="all')[2].partition("</table>")[0]
+    assert rows.count("<tr>") == len(results["environments"]) + 1
+    shown = f"{results['score']:.4f}" if pipeline != "level" else f"{results['level']:.2f}"
+    assert re.search(rf'class="score">{re.escape(shown)}\b', text)
+    assert ("no quality episodes" in page.text) == (pipeline == "level")
+
+
+def test_policy_that_passes_nothing_is_a_result():
+    results = sample(terrains=("wave", "obstacle"), frictions=(0.4, 0.6), reach=0)
+    page = Page(render(results))
+    assert "Not even level 1 passed in 4 of 4 searched environments" in page.text
+    assert results["level"] == 0
+    assert "0.00 of 10" in page.text
+
+
+def test_overflow_and_divergence_stand_at_the_top_and_in_the_table():
+    results = sample("base", **PIPELINES["base"])
+    results["health"] |= {"diverged": 1, "overflowed": 2}
+    results["environments"][0] |= {"diverged": 1, "overflowed": 2}
+    text = Page(render(results)).text
+    assert "events" not in Page(render(sample("base", **PIPELINES["base"]))).text
+    assert "No falls" not in text
+    assert text.index("Physics diverged in 1 of 3") < text.index("Contacts dropped in 2 of 3") < text.index("Terrains")
+    assert text.index("Environments") < text.index("1 diverged") < text.index("2 overflowed")
+
+
+def test_page_asks_for_nothing_from_outside(stress):
+    text = render(stress | {"policy": stress["policy"] | {"path": HOSTILE}})
+    for _, attributes in Page(text).tags:
+        assert not {"src", "href", "srcset", "action", "data", "xlink:href"} & attributes.keys()
+    assert not re.search(r"@import|url\(|fetch\(|XMLHttpRequest", text)
+    assert "default-src 'none'" in text
+
+
+@pytest.mark.parametrize("place", ["path", "command", "terrain", "host", "provenance", "version", "suite"])
+def test_hostile_text_stays_text(place):
+    results = sample("base", **PIPELINES["base"])
+    match place:
+        case "path":
+            results["policy"]["path"] = HOSTILE
+        case "command" | "host":
+            results["provenance"][place] = HOSTILE
+        case "terrain":
+            results["terrains"] = {HOSTILE: results["terrains"]["flat"]}
+            results["environments"][0] |= {"terrain": HOSTILE, "level": 3, "search": {"5": False, "3": True}}
+        case "provenance":
+            results["policy"]["provenance"] = {HOSTILE: {"a": HOSTILE}}
+        case "version":
+            results["provenance"]["versions"] = {HOSTILE: HOSTILE}
+        case "suite":
+            results["suite"] = dict.fromkeys(("name", "version", "title"), HOSTILE)
+    page = Page(render(results))
+    assert page.count("img") == 0
+    assert page.count("script") == 1
+    assert "onerror=alert(1)" in page.text
+    assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
+
+
+@pytest.mark.parametrize(("suite", "environments"), [("robogauge-1.1", 63), ("gaitgauge-1", 91)])
+def test_full_run_stays_small(suite, environments):
+    results = sample(suite=suite)
+    assert len(results["environments"]) == environments
+    assert len(render(results).encode()) < 300_000
+
+
+def test_report_is_written_beside_the_results(tmp_path, stress):
+    (tmp_path / "results.json").write_text(json.dumps(stress), encoding="utf-8")
+    path = write_report(tmp_path)
+    assert path == tmp_path / "report.html"
+    assert path.read_text(encoding="utf-8") == render(stress)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html", "results.json"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [(None, "holds no results.json"), ("{", "cannot be read"), ("[]", "schema")]
+)
+def test_missing_or_damaged_results_are_one_clear_sentence(tmp_path, content, words):
+    (tmp_path / "report.html").write_text("earlier")
+    if content is not None:
+        (tmp_path / "results.json").write_text(content)
+    with pytest.raises(StoreError, match=words):
+        write_report(tmp_path)
+    assert (tmp_path / "report.html").read_text() == "earlier"
+
+
+def test_radar_puts_values_on_their_spokes():
+    terrains = {
+        n: {"mean": 1.0, "mean25": 0.0, "mean50": v} for n, v in zip("abcd", (1.0, 0.5, 0.25, 0.0), strict=True)
+    }
+    radar = charts.radar(terrains, STATISTIC_LABELS)
+    (x, y), radius = radar["centre"], radar["centre"][1] - radar["spokes"][0]["y"]
+    shapes = {s["statistic"]: s["points"] for s in radar["shapes"]}
+    assert shapes["mean50"] == [(x, y - radius), (x + radius / 2, y), (x, y + radius / 4), (x, y)]
+    assert shapes["mean25"] == [(x, y)] * 4
+    assert shapes["mean"] == [(s["x"], s["y"]) for s in radar["spokes"]]
+    assert [s["label"]["anchor"] for s in radar["spokes"]] == ["middle", "start", "middle", "end"]
+
+
+def test_two_terrains_have_bars_in_place_of_a_radar():
+    data = report_data(sample("multi", **PIPELINES["multi"]))
+    assert data["radar"] is None
+    marks = data["terrains"]["wave"]["strip"]["marks"]
+    row = data["terrains"]["wave"]
+    assert marks["mean50"] == pytest.approx(5 + 190 * row["mean50"], abs=0.01)
+    assert marks["mean25"] < marks["mean50"] < marks["mean"]
+
+
+def row(terrain="wave", friction=0.6, payload=0.0, level=5, **more):
+    return {"terrain": terrain, "friction": friction, "payload": payload, "level": level, **more}
+
+
+def test_sweep_puts_levels_between_nought_and_ten():
+    rows = [
+        row(friction=1.0, level=10),
+        row(friction=0.2, level=0),
+        row(friction=0.6, level=5),
+        row("stairs_fd", level=3),
+    ]
+    (panel,) = charts.sweep(rows, axis="friction", quantity="level")
+    left, right, top, bottom = panel["frame"]
+    points = panel["points"]
+    assert panel["terrain"] == "wave"
+    assert [p["y"] for p in points] == [bottom, (top + bottom) / 2, top]
+    assert [p["x"] for p in points] == [left + 8, (left + right) / 2, right - 8]
+    assert [p["failed"] for p in points] == [True, False, False]
+
+
+def test_sweep_draws_whiskers_at_the_interval_and_marks_falls():
+    rows = [row("flat", f, level=None, score=0.5, interval=[0.25, 0.75], falls=f > 0.5) for f in (0.4, 0.8)]
+    (panel,) = charts.sweep(rows, axis="friction", quantity="score")
+    _, _, top, bottom = panel["frame"]
+    for point in panel["points"]:
+        assert point["whisker"] == [bottom - 0.25 * (bottom - top), bottom - 0.75 * (bottom - top)]
+    assert [p["failed"] for p in panel["points"]] == [False, True]
+
+
+def test_payloads_have_their_own_axis_at_the_nominal_friction():
+    figures = report_data(sample(suite="gaitgauge-1"))["level_figures"]
+    assert [f["title"] for f in figures] == ["over friction at payload 0 kg", "over payload at friction 0.6"]
+    assert [len(p["points"]) for p in figures[1]["panels"]] == [5] * 6
+
+
+def test_crossed_payloads_become_a_map():
+    rows = [row(friction=f, payload=p, level=int(10 * f)) for f in (0.2, 0.6, 1.0) for p in (-1.0, 2.0)]
+    assert charts.sweep(rows, axis="friction", quantity="level") == []
+    assert charts.sweep(rows, axis="payload", quantity="level") == []
+    (chart,) = charts.heat(rows, quantity="level")
+    cells = {c["title"]: c for c in chart["cells"]}
+    low, high = cells["friction 0.2, payload −1 kg: 2"], cells["friction 1, payload 2 kg: 10"]
+    assert (low["share"], high["share"]) == (0.2, 1.0)
+    assert high["x"] - low["x"] == 2 * chart["cell"][0]
+    assert low["y"] - high["y"] == chart["cell"][1]
+
+
+def test_search_chart_tells_passed_missed_and_untried_levels():
+    rows = [row(level=6, search={"5": True, "8": False, "7": False, "6": True}), row("flat", level=None)]
+    (chart,) = charts.searches(rows)
+    (line,) = chart["lines"]
+    column = [round((x - chart["left"]) / chart["cell"]) + 1 for x in line["passed"] + line["failed"] + line["open"]]
+    assert column == [5, 6, 7, 8, 1, 2, 3, 4, 9, 10]
+    assert line["reached"] == chart["left"] + 5 * chart["cell"]
+
+
+def test_search_that_passes_nothing_marks_no_level():
+    (chart,) = charts.searches([row(level=0, search={"5": False, "2": False, "1": False})])
+    assert chart["lines"][0]["reached"] is None
+
+
+def test_warnings_name_what_failed_and_where():
+    rows = [
+        row(level=0, search={"1": False}),
+        row("stairs_fd", falls=2, diverged=1, overflowed=0, restarted=0),
+        row("slope_fd", falls=5, diverged=0, overflowed=0, restarted=3),
+    ]
+    found = warnings({"environments": rows, "health": {"episodes": 6, "falls": 7, "diverged": 1, "overflowed": 0}})
+    assert [w["severity"] for w in found] == ["grave", "grave", "note", "note"]
+    assert found[0]["headline"] == "physics diverged in 1 of 6 quality episodes"
+    assert found[1]["places"] == ["slope, forward, μ 0.6 (5)", "stairs, forward, μ 0.6 (2)"]
+    assert found[2]["headline"] == "not even level 1 passed in 1 of 1 searched environments"
+    assert found[3]["places"] == ["slope, forward, μ 0.6 (3)"]
+
+
+def test_long_lists_of_places_are_cut():
+    rows = [row(friction=round(0.1 * i, 1), falls=1) for i in range(1, 10)]
+    (warning,) = warnings({"environments": rows, "health": {"episodes": 9, "falls": 9, "diverged": 0, "overflowed": 0}})
+    assert len(warning["places"]) == 7
+    assert warning["places"][-1] == "and 3 more"
+
+
+def test_healthy_run_says_so():
+    results = sample("base", **PIPELINES["base"])
+    results["health"] |= {"falls": 0}
+    results["environments"][0]["falls"] = 0
+    assert warnings(results) == []
+    assert "No falls, no divergence" in render(results)
+
+
+def test_metric_matrix_is_the_mean_over_played_environments():
+    rows = [
+        row(level=2, quality={"mean50": 0.2}, metrics={"m": {"mean50": 0.4}}),
+        row(level=3, quality={"mean50": 0.4}, metrics={"m": {"mean50": 0.8}}),
+        row(level=0, quality=None),
+    ]
+    assert metric_matrix(rows) == {"wave": {"m": pytest.approx(0.6), "quality": pytest.approx(0.3)}}
+
+
+def test_unknown_metrics_and_terrains_go_by_their_names(stress):
+    results = json.loads(json.dumps(stress).replace("dof_power", "heart_rate").replace("obstacle", "gravel_pit"))
+    page = Page(render(results))
+    assert "heart rate" in page.text
+    assert "gravel pit" in page.text
