@@ -30,6 +30,7 @@ from .base import (
     Support,
 )
 from .mujoco_model import CONTACT_SLOTS, FOOT_SLOTS, build_models
+from .mujoco_state import RECORDED, BatchState, Records, StateLayout
 
 _STAGE = mujoco.mjtStage.mjSTAGE_VEL.value
 _INVALID = [
@@ -71,11 +72,10 @@ class MujocoBackend(PhysicsBackend):
         self._batch = mujoco.batch.Batch(nominal, n, threads, True)
         self._batch.set_models(self._models)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        tilt = scene.physics.watch_tilt
+        self._tilt_bound = 0.0 if tilt is None else 0.5 * (1.0 - np.cos(tilt))
         self._ctrl, self._applied = self._batch.bind("ctrl"), self._batch.bind("xfrc_applied")
         self._time = self._batch.bind("time")
-        self._torque = self._batch.bind("actuator_force")
-        self._sites = self._batch.bind("site_xpos")
-        self._sensors = self._batch.bind("sensordata")
         self._index_model(nominal)
         self._randomized: dict[int, dict[str, Array]] = {}
         joints = robot.num_joints
@@ -85,8 +85,19 @@ class MujocoBackend(PhysicsBackend):
         self._kd_over_kp = np.zeros((n, joints))
         self._update_gain_ratio(range(n))
         self._warned = np.zeros((n, 2), dtype=np.int64)
-        self._state, self._state_arrays = self._allocate()
-        self._sample, self._sample_arrays = self._allocate()
+        self._live = {
+            "time": self._time,
+            "qpos": self._qpos,
+            "qvel": self._qvel,
+            "torque": self._batch.bind("actuator_force"),
+            "sites": self._batch.bind("site_xpos"),
+            "sensors": self._batch.bind("sensordata"),
+        }
+        layout = StateLayout(nominal, scene)
+        self._state = BatchState(layout, self._live)
+        self._sample = BatchState(layout, {k: v.copy() for k, v in self._live.items()})
+        self._deep = layout.penetration
+        self._buffers: dict[tuple[int, int], Records] = {}
         stand = torch.tensor([0.0, 0.0, robot.stand_height], dtype=torch.float64).repeat(n, 1)
         self.reset(base_position=stand, base_quaternion=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, 1))
 
@@ -101,118 +112,19 @@ class MujocoBackend(PhysicsBackend):
             raise BackendError(f"body '{robot.base_body}' of robot '{robot.name}' must carry a free joint and come first")
         self._joint_q = np.array([model.joint(j).qposadr[0] for j in robot.joint_names])
         self._joint_v = np.array([model.joint(j).dofadr[0] for j in robot.joint_names])
-        self._foot_sites = np.array([model.site(f).id for f in robot.foot_names])
         self._bodies = np.array([model.body(b).id for b in robot.collision_bodies])
-
-        def columns(name: str) -> NDArray[np.int64]:
-            sensor = model.sensor(name)
-            return np.arange(sensor.adr[0], sensor.adr[0] + sensor.dim[0])
-
-        self._at_velocity = np.stack([columns(f"velocity_{f}") for f in robot.foot_names])
-        self._at_net = np.stack([columns(f"net_{f}") for f in robot.foot_names])
-        self._at_each = np.stack([columns(f"each_{f}") for f in robot.foot_names])
-        self._at_body = np.stack([columns(f"body_{b}") for b in robot.collision_bodies])
-        self._at_ground = columns("ground_net")
-        self._at_points = columns("ground_each").reshape(CONTACT_SLOTS, 7)
-        watched = self.scene.physics.watch_penetration is not None
-        self._at_penetration = columns("penetration") if watched else None
-        # the body that a foot geom belongs to reports its force too: it is subtracted there
-        owner = [model.geom(f).bodyid[0] for f in robot.foot_names]
-        self._foot_owner = [int(np.flatnonzero(self._bodies == o)[0]) for o in owner]
-
-    def _allocate(self) -> tuple[PhysicsState, dict[str, NDArray]]:
-        """A state of zeros, and the numpy views of its tensors."""
-        n, robot = self.num_worlds, self.scene.robot
-        j, f, b = robot.num_joints, len(robot.foot_names), len(robot.collision_bodies)
-        shapes: dict[str, tuple[int, ...]] = {
-            "base_position_w": (3,),
-            "base_quaternion_w": (4,),
-            "base_linear_velocity_w": (3,),
-            "base_angular_velocity_b": (3,),
-            "joint_position": (j,),
-            "joint_velocity": (j,),
-            "joint_torque": (j,),
-            "foot_position_w": (f, 3),
-            "foot_velocity_w": (f, 3),
-            "foot_contact_force_w": (f, 3),
-            "foot_normal_force": (f,),
-            "foot_tangential_force": (f,),
-            "body_contact_force_w": (b, 3),
-            "ground_force_w": (3,),
-            "ground_moment_w": (3,),
-            "contact_center_w": (3,),
-        }
-        types = {"tilt_substep": np.int64, "penetration_substep": np.int64, "contact_count": np.int64}
-        flags = ("diverged", "overflowed")
-        arrays: dict[str, NDArray] = {}
-        for item in fields(PhysicsState):
-            kind = bool if item.name in flags else types.get(item.name, np.float64)
-            arrays[item.name] = np.zeros((n, *shapes.get(item.name, ())), dtype=kind)
-        return PhysicsState(**{k: torch.from_numpy(v) for k, v in arrays.items()}), arrays
 
     # ---- reading ------------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> PhysicsState:
-        """State after the last call; the tensors change with the next one."""
+        """State after the last call, as views of MuJoCo's memory: they change with the next call."""
         return self._state
 
     @property
     def sample(self) -> PhysicsState:
         """Snapshot taken by the last ``step(sample_at=…)``."""
         return self._sample
-
-    def _read(self, out: dict[str, NDArray], rows: NDArray[np.int64] | slice, *, forces: bool = True) -> None:
-        """Write the present state of the given worlds into ``out``."""
-        qpos, qvel, sensors = self._qpos[rows], self._qvel[rows], self._sensors[rows]
-        out["time"][rows] = self._time[rows]
-        out["base_position_w"][rows] = qpos[:, 0:3]
-        out["base_quaternion_w"][rows] = qpos[:, 3:7]
-        out["base_linear_velocity_w"][rows] = qvel[:, 0:3]
-        out["base_angular_velocity_b"][rows] = qvel[:, 3:6]
-        out["joint_position"][rows] = qpos[:, self._joint_q]
-        out["joint_velocity"][rows] = qvel[:, self._joint_v]
-        out["foot_position_w"][rows] = self._sites[rows][:, self._foot_sites]
-        out["foot_velocity_w"][rows] = sensors[:, self._at_velocity]
-        names = ("tilt_substep", "penetration_substep", "diverged", "overflowed")
-        if out is not self._state_arrays:
-            for name in names:
-                out[name][rows] = self._state_arrays[name][rows]
-        if not forces:
-            for name in (
-                "joint_torque",
-                "foot_contact_force_w",
-                "foot_normal_force",
-                "foot_tangential_force",
-                "body_contact_force_w",
-                "ground_force_w",
-                "ground_moment_w",
-                "contact_center_w",
-                "contact_count",
-            ):
-                out[name][rows] = 0
-            return
-        out["joint_torque"][rows] = self._torque[rows]
-        # MuJoCo reports the force of the first object on the second: the robot's on the ground
-        feet = -sensors[:, self._at_net]
-        out["foot_contact_force_w"][rows] = feet
-        each = sensors[:, self._at_each].reshape(len(feet), len(self._at_each), FOOT_SLOTS, 3)
-        out["foot_normal_force"][rows] = each[..., 0].sum(-1)
-        out["foot_tangential_force"][rows] = np.hypot(each[..., 1], each[..., 2]).sum(-1)
-        bodies = -sensors[:, self._at_body]
-        for foot, owner in enumerate(self._foot_owner):
-            bodies[:, owner] -= feet[:, foot]
-        out["body_contact_force_w"][rows] = bodies
-        ground = sensors[:, self._at_ground]
-        force = -ground[:, 0:3]
-        points = sensors[:, self._at_points]
-        active = points[:, :, 1] > 0
-        count = active.sum(1)
-        center = (points[:, :, 4:7] * active[..., None]).sum(1) / np.maximum(count, 1)[:, None]
-        out["ground_force_w"][rows] = force
-        out["ground_moment_w"][rows] = -ground[:, 3:6] + np.cross(ground[:, 6:9] - center, force)
-        out["contact_center_w"][rows] = center
-        out["contact_count"][rows] = count
 
     # ---- acting -------------------------------------------------------------------------------------------------
 
@@ -260,9 +172,9 @@ class MujocoBackend(PhysicsBackend):
         self._held[rows] = 0.0 if held_target is None else held_target.numpy()[rows]
         self._batch.forward(rows.astype(np.int32), stage=_STAGE)
         self._warned[rows] = self._warning_counts(rows)
-        for name in ("diverged", "overflowed", "tilt_substep", "penetration_substep"):
-            self._state_arrays[name][rows] = 0
-        self._read(self._state_arrays, rows, forces=False)
+        for flags in self._state.flags.values():
+            flags[rows] = 0
+        self._state.forget_forces(rows)
 
     def _switch_terrain(self, rows: NDArray[np.int64], index: NDArray[np.int64]) -> None:
         """Give worlds another model of the palette, with their own randomization on it."""
@@ -288,69 +200,70 @@ class MujocoBackend(PhysicsBackend):
         if len(rows) == 0:
             return
         total = self.scene.physics.substeps if substeps is None else substeps
-        ids = rows.astype(np.int32)
-        switch = np.full(self.num_worlds, -1, dtype=np.int64)
+        held, offset = self._held[rows], self._offset[rows]
+        switch = np.full(len(rows), total, dtype=np.int64)
+        targets = held
         if joint_targets is not None:
-            targets = joint_targets.to(torch.float64).numpy()
-            switch[rows] = 0 if delay is None else delay.numpy()[rows]
-        sample = np.zeros(self.num_worlds, dtype=np.int64)
-        if sample_at is not None:
-            sample[rows] = sample_at.numpy()[rows]
-        state = self._state_arrays
-        state["tilt_substep"][rows] = 0
-        state["penetration_substep"][rows] = 0
-        for start, count in self._segments(rows, switch, sample, total):
-            due = rows[switch[rows] == start]
-            if len(due):
-                self._held[due] = targets[due]
-                self._limp[due] = False
-            self._write_ctrl(rows)
-            self._batch.step(ids, count, _STAGE)
-            done = start + count
-            self._watch(rows, done)
-            due = rows[sample[rows] == done]
-            if len(due):
-                self._flag(due)
-                self._read(self._sample_arrays, due)
-        self._flag(rows)
-        self._read(self._state_arrays, slice(None) if len(rows) == self.num_worlds else rows)
-
-    def _segments(
-        self, rows: NDArray[np.int64], switch: NDArray[np.int64], sample: NDArray[np.int64], total: int
-    ) -> list[tuple[int, int]]:
-        """(first substep, number of substeps) of the runs between which nothing has to be looked at or changed."""
-        physics = self.scene.physics
-        if physics.watch_tilt is not None or physics.watch_penetration is not None or self._limp[rows].any():
-            breaks = np.arange(total + 1)
-        else:
-            breaks = np.unique(np.concatenate([[0, total], switch[rows], sample[rows]]))
-            breaks = breaks[(breaks >= 0) & (breaks <= total)]
-        return [(int(a), int(b - a)) for a, b in zip(breaks[:-1], breaks[1:], strict=True)]
-
-    def _write_ctrl(self, rows: NDArray[np.int64]) -> None:
-        """Targets of the affine motors; limp motors get the target at which the law gives no torque."""
-        ctrl = self._held[rows] + self._offset[rows]
+            targets = joint_targets.to(torch.float64).numpy()[rows]
+            broken = ~np.isfinite(targets).all(1)
+            if broken.any():
+                targets = np.where(broken[:, None], held, targets)
+                self._state.flags["diverged"][rows[broken]] = True
+            switch = np.zeros(len(rows), dtype=np.int64) if delay is None else delay.numpy()[rows]
+        waits = np.arange(total) < switch[:, None]
+        control = np.where(waits[..., None], held[:, None], targets[:, None]) + offset[:, None]
         limp = self._limp[rows]
+        records = self._play(rows[~limp], control[~limp])
         if limp.any():
-            loose = rows[limp]
-            ctrl[limp] = self._qpos[np.ix_(loose, self._joint_q)] + self._kd_over_kp[loose] * (
-                self._qvel[np.ix_(loose, self._joint_v)]
-            )
-        self._ctrl[rows] = ctrl
+            records = _merge(limp, records, self._play_limp(rows[limp], control[limp], waits[limp]))
+        if joint_targets is not None:  # a target that waits for the whole step acts from the next one on
+            self._held[rows] = targets
+            self._limp[rows] = False
+        self._batch.forward(rows.astype(np.int32), stage=_STAGE)
+        self._watch(rows, records)
+        self._flag(rows)
+        self._state.renew(rows)
+        if sample_at is not None:
+            at = sample_at.numpy()[rows]
+            if at.any():
+                self._sample.take(self._state, rows, records, at)
 
-    def _watch(self, rows: NDArray[np.int64], substep: int) -> None:
+    def _play(self, rows: NDArray[np.int64], control: Array) -> Records:
+        """Step worlds with the given controls, (rows, substeps, J); returns what was recorded after each substep."""
+        n, count = control.shape[:2]
+        key = (n, count)
+        if key not in self._buffers:
+            shapes = {name: getattr(self._batch, name).shape[1:] for name in RECORDED}
+            self._buffers[key] = {name: np.zeros((n, count, *shape)) for name, shape in shapes.items()}
+        out = self._buffers[key]
+        if n:
+            self._batch.rollout(count, control, ids=rows.astype(np.int32), record=RECORDED, out=out)
+        return out
+
+    def _play_limp(self, rows: NDArray[np.int64], control: Array, waits: NDArray[np.bool_]) -> Records:
+        """The same for worlds whose motors hang limp while they wait: they get the target at which the law gives no torque."""
+        parts = []
+        for substep in range(control.shape[1]):
+            loose = self._qpos[np.ix_(rows, self._joint_q)] + self._kd_over_kp[rows] * (
+                self._qvel[np.ix_(rows, self._joint_v)]
+            )
+            now = np.where(waits[:, substep, None], loose, control[:, substep])
+            parts.append({k: v.copy() for k, v in self._play(rows, now[:, None]).items()})
+        return {name: np.concatenate([p[name] for p in parts], axis=1) for name in RECORDED}
+
+    def _watch(self, rows: NDArray[np.int64], records: Records) -> None:
         """Record the first substep at which a watched limit was exceeded."""
-        physics, state = self.scene.physics, self._state_arrays
+        physics, flags = self.scene.physics, self._state.flags
+        flags["tilt_substep"][rows] = 0
+        flags["penetration_substep"][rows] = 0
         if physics.watch_tilt is not None:
-            quaternion = self._qpos[rows, 3:7]
-            upright = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
-            over = rows[(upright < np.cos(physics.watch_tilt)) & (state["tilt_substep"][rows] == 0)]
-            state["tilt_substep"][over] = substep
-        if self._at_penetration is not None:
-            found, distance = self._sensors[rows][:, self._at_penetration].T
-            deep = (found > 0) & (distance < -float(physics.watch_penetration or 0.0))
-            over = rows[deep & (state["penetration_substep"][rows] == 0)]
-            state["penetration_substep"][over] = substep
+            qpos = records["qpos"]
+            over = qpos[:, :, 4] ** 2 + qpos[:, :, 5] ** 2 > self._tilt_bound
+            flags["tilt_substep"][rows] = _first(over)
+        if self._deep is not None:
+            # no contact reads 0
+            over = records["sensordata"][:, :, self._deep] < -float(physics.watch_penetration or 0.0)
+            flags["penetration_substep"][rows] = _first(over)
 
     def _warning_counts(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Number of MuJoCo's invalid-state and buffer-full warnings so far, (rows, 2)."""
@@ -359,9 +272,11 @@ class MujocoBackend(PhysicsBackend):
 
     def _flag(self, rows: NDArray[np.int64]) -> None:
         """Set ``diverged`` and ``overflowed`` from MuJoCo's warnings."""
+        if not self._batch.warning[:, :, 1].any():
+            return
         new = self._warning_counts(rows) > self._warned[rows]
-        self._state_arrays["diverged"][rows] |= new[:, 0]
-        self._state_arrays["overflowed"][rows] |= new[:, 1]
+        self._state.flags["diverged"][rows] |= new[:, 0]
+        self._state.flags["overflowed"][rows] |= new[:, 1]
 
     # ---- changing the model ---------------------------------------------------------------------------------------
 
@@ -434,9 +349,6 @@ class MujocoBackend(PhysicsBackend):
                 old = self._qvel[rows, first : first + 3]
                 self._qvel[rows, first : first + 3] = np.where(np.isnan(new), old, new)
         self._batch.forward(rows.astype(np.int32), stage=_STAGE)
-        self._state_arrays["base_linear_velocity_w"][rows] = self._qvel[rows, 0:3]
-        self._state_arrays["base_angular_velocity_b"][rows] = self._qvel[rows, 3:6]
-        self._state_arrays["foot_velocity_w"][rows] = self._sensors[rows][:, self._at_velocity]
 
     def apply_force(self, force_w: torch.Tensor) -> None:
         """See ``PhysicsBackend.apply_force``."""
@@ -446,3 +358,18 @@ class MujocoBackend(PhysicsBackend):
     def close(self) -> None:
         """Drop the worlds."""
         self._models.clear()
+
+
+def _first(over: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Position (1-based) of the first true entry of each row, 0 where there is none."""
+    return np.where(over.any(1), over.argmax(1) + 1, 0)
+
+
+def _merge(limp: NDArray[np.bool_], others: Records, records: Records) -> Records:
+    """Records of limp and other worlds, back in their common order."""
+    merged = {}
+    for name in RECORDED:
+        merged[name] = np.empty((len(limp), *records[name].shape[1:]))
+        merged[name][limp] = records[name]
+        merged[name][~limp] = others[name]
+    return merged

@@ -16,8 +16,10 @@ CONTACT_SLOTS = 12
 """Ground contacts reported one by one, the strongest first; a robot that lies flat has about this many."""
 FOOT_SLOTS = 3
 """Contacts reported one by one for each foot."""
-PARKED = {"size": [0.01, 0.01, 0.01], "pos": [0.0, 0.0, -1.0], "contype": 0, "conaffinity": 0}
-"""Unused boxes of a layout: they meet nothing."""
+NOTHING = {"contype": 2, "conaffinity": 0}
+"""Meets nothing, yet counts as a collision geom, so that all models of a layout have bounding-volume trees of one size."""
+PARKED = {"size": [0.01, 0.01, 0.01], "pos": [0.0, 0.0, -1.0], **NOTHING}
+"""Unused boxes of a layout."""
 
 
 def robot_spec(scene: Scene) -> mujoco.MjSpec:
@@ -108,7 +110,7 @@ def add_terrain(
         half = (1.0, 1.0) if field is None else field.half_size
         hfield.size = np.array([half[0], half[1], top, 0.1 if field is None else field.base])
         hfield.userdata = (heights / top).astype(np.float32).ravel()
-        place = {"pos": [*field.center, 0.0]} if field is not None else {"contype": 0, "conaffinity": 0}
+        place = {"pos": [*field.center, 0.0]} if field is not None else NOTHING
         body.add_geom(name="field", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field", **place)
 
 
@@ -161,7 +163,12 @@ def build_models(scene: Scene) -> list[mujoco.MjModel]:
         add_terrain(spec, terrain, walls=walls, blocks=blocks, field_shape=shape)
         add_report_sensors(spec, scene)
         try:
-            models.append(spec.compile())
+            model = spec.compile()
         except ValueError as error:
             raise BackendError(f"MuJoCo cannot build terrain '{terrain.name}' level {terrain.level}: {error}") from error
+        if shape is not None and terrain.height_field is not None:
+            # the compiler stretches heights to [0, 1]; what the height field says is what must stand
+            heights = terrain.height_field.heights
+            model.hfield_data[:] = (heights / max(float(heights.max()), 1e-6)).ravel()
+        models.append(model)
     return models

@@ -31,9 +31,10 @@ from .store import RunFolder, write_atomically
 from .suite import Suite, SuiteError, load_suite
 
 PACKAGES = ("gaitgauge", "mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib")
-_SLOTS = 32
+_SLOTS = 24
 """Worlds on the CPU: enough to keep the threads busy, few enough for the policy's batch to cost little."""
 _MANY_SLOTS = 64
+"""Worlds on the CPU for runs of many environments."""
 
 
 @dataclass(frozen=True, kw_only=True)

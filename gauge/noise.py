@@ -6,8 +6,11 @@ import random
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from .episodes import Episode
 from .suite import Noise
@@ -46,7 +49,7 @@ class ReferenceStream(NoiseStream):
     def __init__(self, noise: Noise, joints: int, slots: int, device: torch.device) -> None:
         self._noise, self._joints, self._device = noise, joints, device
         self._seeds: list[int] = []
-        self._generators: list[random.Random] = []
+        self._generators: list[_PythonGenerator] = []
         self._length = 0
         self._widths = 2 * joints + 12
         self._uniform = torch.zeros(0, 0, self._widths, device=device)
@@ -60,7 +63,7 @@ class ReferenceStream(NoiseStream):
         """See ``NoiseStream.assign``."""
         if episode.seed not in self._seeds:
             self._seeds.append(episode.seed)
-            self._generators = [random.Random(s) for s in self._seeds]
+            self._generators = [_PythonGenerator(s) for s in self._seeds]
             length, self._length = self._length, 0
             self._uniform = self._uniform.new_zeros(len(self._seeds), 0, self._widths)
             self._delays = self._delays.new_zeros(len(self._seeds), 0)
@@ -69,15 +72,12 @@ class ReferenceStream(NoiseStream):
 
     def _extend(self, length: int) -> None:
         """Draw further control steps of every seed, until there are ``length``."""
-        uniform, delays = [], []
-        for generator in self._generators:
-            rows, late = [], []
-            for _ in range(length - self._length):
-                rows.append([generator.uniform(-h, h) for h in self._half])
-                late.append(generator.randint(0, self._noise.latency))
-            uniform.append(rows)
-            delays.append(late)
-        self._uniform = torch.cat((self._uniform, torch.tensor(uniform, device=self._device)), dim=1)
+        count = length - self._length
+        tables = [g.draw(count, len(self._half), self._noise.latency) for g in self._generators]
+        uniform = np.stack([low_to_high(u, self._half) for u, _ in tables])
+        delays = np.stack([d for _, d in tables])
+        new = torch.tensor(uniform, dtype=torch.float32, device=self._device)
+        self._uniform = torch.cat((self._uniform, new), dim=1)
         self._delays = torch.cat((self._delays, torch.tensor(delays, device=self._device)), dim=1)
         self._length = length
 
@@ -96,6 +96,54 @@ class ReferenceStream(NoiseStream):
             "base_angular_velocity_b": values[:, -3:],
         }
         return terms, self._delays[self._row, step]
+
+
+class _PythonGenerator:
+    """Many draws of ``random.Random(seed)`` at once: the same Mersenne twister, read as whole words through NumPy."""
+
+    def __init__(self, seed: int) -> None:
+        state = random.Random(seed).getstate()[1]
+        self._twister = np.random.MT19937()
+        self._twister.state = {
+            "bit_generator": "MT19937",
+            "state": {"key": np.array(state[:-1], dtype=np.uint32), "pos": state[-1]},
+        }
+        self._words = np.zeros(0, dtype=np.uint64)
+
+    def draw(self, count: int, width: int, most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """``count`` times ``width`` calls of ``random()`` followed by one of ``randint(0, most)``.
+
+        Returns:
+            (count, width) in [0, 1), and (count,).
+        """
+        bits = (most + 1).bit_length()
+        uniform, whole = np.zeros((count, width)), np.zeros(count, dtype=np.int64)
+        at = 0
+        for row in range(count):
+            self._need(at + 2 * width + 64)
+            pairs = self._words[at : at + 2 * width]
+            uniform[row] = ((pairs[0::2] >> 5) * 67108864.0 + (pairs[1::2] >> 6)) / 9007199254740992.0
+            at += 2 * width
+            while True:  # randint draws again until the number is small enough
+                self._need(at + 1)
+                number = int(self._words[at]) >> (32 - bits)
+                at += 1
+                if number <= most:
+                    break
+            whole[row] = number
+        self._words = self._words[at:]
+        return uniform, whole
+
+    def _need(self, words: int) -> None:
+        if len(self._words) < words:
+            more = self._twister.random_raw(max(words, 1 << 16))
+            self._words = np.concatenate((self._words, more))
+
+
+def low_to_high(unit: NDArray[np.float64], half: Sequence[float]) -> NDArray[np.float64]:
+    """Numbers in [0, 1) as ``random.uniform(-half, half)`` maps them; ``unit`` (…, W), ``half`` (W,)."""
+    low = -np.asarray(half)
+    return low + (np.asarray(half) - low) * unit
 
 
 class CounterStream(NoiseStream):

@@ -30,9 +30,12 @@ class PolicySession(ABC):
         """Forget what the policy remembers of the masked episodes, (N,) bool, None for all."""
 
     @abstractmethod
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """Raw network output (N, J) float32, in the contract's joint order, for observations (N,
         ``contract.observation_width``) float32.
+
+        ``rows`` are the indices of the episodes whose action matters, None for all: a session may save itself the others,
+        whose actions are then arbitrary. Observations of all episodes enter their memories either way.
 
         The output is not checked: a policy may return NaN, and the caller decides what that means.
 

@@ -279,13 +279,17 @@ class NativeSession(PolicySession):
         if self._initial is not None:
             self._state = torch.where(episodes[:, None], self._initial, self._state)
 
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         check_observation(observation, self._num_episodes, self._contract, self._source)
         self._history = torch.cat((self._history[:, 1:], observation[:, None]), dim=1)
         with torch.no_grad():
             try:
-                if self._initial is None:
+                if self._initial is None and rows is not None:
+                    some = checked_action(self._network(self._history[rows]), len(rows), self._contract, self._source)
+                    action = some.new_zeros(self._num_episodes, some.shape[1])
+                    action[rows] = some
+                elif self._initial is None:
                     action = self._network(self._history)
                 else:
                     action, self._state = self._network(self._history, self._state)

@@ -217,7 +217,7 @@ class OnnxSession(PolicySession):
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """See ``PolicySession``: there is nothing to forget."""
 
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         check_observation(observation, self._num_episodes, self._contract, self._runner._source)
         rows = np.ascontiguousarray(observation.detach().cpu().numpy(), dtype=np.float32)

@@ -265,7 +265,7 @@ class BatchSession(PolicySession):
                 value = torch.where(mask, initial, part._c.getattr(memory.name))
             part._c.setattr(memory.name, value)
 
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         return _run(self._module, observation, self._num_episodes, self._contract, self._source)
 
@@ -290,7 +290,7 @@ class CopiesSession(PolicySession):
         for row in rows:
             self._modules[row] = copy.deepcopy(self._fresh)
 
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         check_observation(observation, len(self._modules), self._contract, self._source)
         rows = zip(self._modules, observation.split(1), strict=True)
