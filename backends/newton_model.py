@@ -1,7 +1,7 @@
-"""Builds Newton models from a scene, and checks what Newton's importer made of the robot's file against MuJoCo's compiler.
+"""Builds Newton models from a scene, and checks what Newton's importer made of the robot's file.
 
-Every world holds the robot, a floor, as many boxes as the palette's fullest terrain needs and one height field if any terrain has
-one. Which boxes lie where is a matter of poses and sizes, called slots, that a reset may change.
+Every world holds the robot, a floor, as many boxes as the palette's fullest terrain needs and one height field if any
+terrain has one. Which boxes lie where is a matter of poses and sizes, called slots, that a reset may change.
 """
 
 from __future__ import annotations
@@ -110,7 +110,9 @@ def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> W
         try:
             world.add_mjcf(source, parse_visuals=False, parse_sites=False, parse_mujoco_options=False)
         except (ValueError, RuntimeError, NotImplementedError) as error:
-            raise BackendError(f"Newton cannot import robot '{scene.robot.name}' ({scene.robot.mjcf.name}): {error}") from error
+            raise BackendError(
+                f"Newton cannot import robot '{scene.robot.name}' ({scene.robot.mjcf.name}): {error}"
+            ) from error
     _repair_import(world, reference, scene, gap=gap, skin=skin)
     robot_shapes = len(world.shape_type)
     slots = _slot_tables(scene.terrains)
@@ -127,7 +129,7 @@ def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> W
 
 
 def _compiled_robot(scene: Scene) -> tuple[mujoco.MjModel, str]:
-    """The robot with the scene's constants, and without motors, sensors and what is only seen: compiled, and as MJCF text."""
+    """The robot with the scene's constants, less motors, sensors and what is only seen: compiled, and as MJCF text."""
     spec = robot_spec(scene)
     for element in [*spec.actuators, *spec.sensors, *spec.lights, *spec.cameras, *spec.keys]:
         spec.delete(element)
@@ -146,17 +148,21 @@ def _leaf(label: str) -> str:
     return label.rpartition("/")[2]
 
 
-def _repair_import(world: newton.ModelBuilder, reference: mujoco.MjModel, scene: Scene, *, gap: float, skin: bool) -> None:
+def _repair_import(
+    world: newton.ModelBuilder, reference: mujoco.MjModel, scene: Scene, *, gap: float, skin: bool
+) -> None:
     """Give the imported robot MuJoCo's values wherever Newton has a place for them, in full precision.
 
-    Newton reads the file itself: six digits of it, its own defaults for what is not written, and its own idea of margins and gaps.
+    Newton reads the file itself: six digits of it, its own defaults for what is not written, its own margins and gaps.
     """
     robot = scene.robot
     bodies = [_leaf(label) for label in world.body_label]
     expected = [reference.body(i).name for i in range(1, reference.nbody)]
     if bodies != expected:
         raise BackendError(f"Newton imports the bodies {bodies} of robot '{robot.name}', but MuJoCo has {expected}")
-    if world.joint_type[0] != newton.JointType.FREE or any(t != newton.JointType.REVOLUTE for t in world.joint_type[1:]):
+    if world.joint_type[0] != newton.JointType.FREE or any(
+        t != newton.JointType.REVOLUTE for t in world.joint_type[1:]
+    ):
         raise BackendError(f"robot '{robot.name}' must be one free base with hinge joints only to run in Newton")
     matrix = np.zeros(9)
     for i in range(len(bodies)):
@@ -175,7 +181,9 @@ def _repair_import(world: newton.ModelBuilder, reference: mujoco.MjModel, scene:
         dof, start = int(joint.dofadr[0]), world.joint_qd_start[i]
         world.joint_armature[start] = float(reference.dof_armature[dof])
         world.joint_friction[start] = float(reference.dof_frictionloss[dof])
-        world.joint_damping[start] = float(reference.dof_damping[dof, 0] if reference.dof_damping.ndim > 1 else reference.dof_damping[dof])
+        world.joint_damping[start] = float(
+            reference.dof_damping[dof, 0] if reference.dof_damping.ndim > 1 else reference.dof_damping[dof]
+        )
         if joint.limited[0]:
             world.joint_limit_lower[start], world.joint_limit_upper[start] = map(float, joint.range)
         # the motors are ours: no drive of Newton's, no effort limit
@@ -202,7 +210,9 @@ def _joint(world: newton.ModelBuilder, name: str, robot: str) -> int:
     """Index of a joint."""
     found = [i for i, label in enumerate(world.joint_label) if _leaf(label) == name]
     if not found:
-        raise BackendError(f"joint '{name}' of robot '{robot}' is not in its model file; correct joint_names in robot.toml")
+        raise BackendError(
+            f"joint '{name}' of robot '{robot}' is not in its model file; correct joint_names in robot.toml"
+        )
     return found[0]
 
 
@@ -232,13 +242,14 @@ def _slot_tables(terrains: tuple[Terrain, ...]) -> SlotTables:
 def _add_ground(
     world: newton.ModelBuilder, slots: SlotTables, scene: Scene, *, gap: float
 ) -> tuple[list[int], list[int]]:
-    """Add floor, box slots and the height field; returns the slots' shapes and the spare shapes of more fields than worlds."""
+    """Add floor, box slots and height field; returns the shapes of the slots and the spare fields."""
     material = newton.ModelBuilder.ShapeConfig(mu=1.0, mu_torsional=0.005, mu_rolling=0.0001, gap=gap, margin=0.0)
     world.add_ground_plane(cfg=material)
     boxes = slots.pose.shape[1] - bool(slots.fields)
     parked = wp.transform(wp.vec3(*PARKED), wp.quat_identity())
     shapes = [
-        world.add_shape_box(-1, xform=parked, hx=PARKED_SIZE, hy=PARKED_SIZE, hz=PARKED_SIZE, cfg=material) for _ in range(boxes)
+        world.add_shape_box(-1, xform=parked, hx=PARKED_SIZE, hy=PARKED_SIZE, hz=PARKED_SIZE, cfg=material)
+        for _ in range(boxes)
     ]
     spare = []
     if slots.fields:
@@ -266,7 +277,7 @@ def _newton_field(field: HeightField) -> newton.Heightfield:
 
 
 def _distribute_fields(everything: newton.ModelBuilder, layout: WorldLayout, slots: SlotTables, scene: Scene) -> None:
-    """Let the worlds' field shapes carry all fields of the palette into the model; which one acts where is written later.
+    """Let the worlds' field shapes carry all fields of the palette into the model; which acts where is written later.
 
     Newton copies a shape's field for every shape that bears it, so all but the carriers get a tiny one.
     """
@@ -308,7 +319,9 @@ def _layout(
     ):
         missing = [name for name in names if name not in known]
         if missing:
-            raise BackendError(f"{what} '{missing[0]}' of robot '{robot.name}' is not in {robot.mjcf.name}; correct robot.toml")
+            raise BackendError(
+                f"{what} '{missing[0]}' of robot '{robot.name}' is not in {robot.mjcf.name}; correct robot.toml"
+            )
     if bodies[robot.base_body] != 0:
         raise BackendError(f"body '{robot.base_body}' of robot '{robot.name}' must carry the free joint and come first")
     joints = [_joint(world, name, robot.name) for name in robot.joint_names]
@@ -427,7 +440,9 @@ def _colliding(model: mujoco.MjModel, order: NDArray) -> set[tuple[int, int]]:
             a, b = int(order[i]), int(order[j])
             body = sorted((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])))
             related = body[0] == body[1] or (body[0] != 0 and int(model.body_parentid[body[1]]) == body[0])
-            masks = model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]
+            masks = (
+                model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]
+            )
             if masks and not related and (body[0] << 16) + body[1] not in excluded:
                 found.add((i, j))
     return found

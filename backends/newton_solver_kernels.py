@@ -1,4 +1,5 @@
 # mypy: ignore-errors
+# ruff: noqa: ANN201
 """Warp kernels that know the inside of one Newton solver."""
 
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.

@@ -1,7 +1,7 @@
 """The Newton solvers that this project runs, each behind the same few calls.
 
-A solver is added by measuring that it holds and walks the robot, saying in ``capabilities`` what it cannot do, and naming it in
-``SOLVERS``. What was measured on those that are not here is told in ``docs/newton.md``.
+A solver is added by measuring that it holds and walks the robot, saying in ``capabilities`` what it cannot do, and
+naming it in ``SOLVERS``. What was measured on those that are not here is told in ``docs/newton.md``.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import warp as wp
 
 from . import newton_kernels as kernels
 from . import newton_solver_kernels as solver_kernels
-from .base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
+from .base import CAPABILITY_NAMES, BackendError, Capability, Scene, Support
 from .newton_model import WorldModel, carriers, import_differences
 
 DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
-"""Contacts per world for which room is made, by the hardest shape of the palette; a robot that lies flat needs about 30."""
+"""Contacts per world for which room is made, by the palette's hardest shape; a robot that lies flat needs about 30."""
 
 _EXACT = Capability(support=Support.EXACT)
 
@@ -67,9 +67,8 @@ class SolverAdapter(ABC):
             ("deterministic", physics.deterministic, "use PhysicsOptions(deterministic=False)"),
         ):
             if asked and cls.capabilities[capability].support is Support.NONE:
-                raise BackendError(
-                    f"Newton's {cls.name} solver has no support for {capability} ({cls.capabilities[capability].note}); {change}"
-                )
+                note = cls.capabilities[capability].note
+                raise BackendError(f"Newton's {cls.name} solver has no support for {capability} ({note}); {change}")
 
     @abstractmethod
     def __init__(self, world: WorldModel, scene: Scene) -> None:
@@ -111,7 +110,8 @@ class MujocoAdapter(SolverAdapter):
     name = "mujoco"
     capabilities = _declare(
         deterministic=Capability(
-            support=Support.APPROXIMATE, note="to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces"
+            support=Support.APPROXIMATE,
+            note="to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces",
         ),
         height_field=Capability(support=Support.EXACT, note="about four times slower than boxes"),
     )
@@ -167,8 +167,8 @@ class MujocoAdapter(SolverAdapter):
         wrong = import_differences(self.solver.mj_model, world.reference, order)
         if wrong:
             raise BackendError(
-                f"Newton imports robot '{scene.robot.name}' unlike MuJoCo: {'; '.join(wrong)}; use the backend 'mujoco-warp', "
-                "or change the robot's model file"
+                f"Newton imports robot '{scene.robot.name}' unlike MuJoCo: {'; '.join(wrong)}; "
+                "use the backend 'mujoco-warp', or change the robot's model file"
             )
 
     def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
@@ -204,7 +204,7 @@ class MujocoAdapter(SolverAdapter):
 
 
 def _constraint_rows(scene: Scene, world: WorldModel, contacts: int) -> int:
-    """Constraint rows of one world: joint friction, joint limits and ``contacts`` contacts, feet with their own dimension."""
+    """Constraint rows of one world: joint friction, joint limits and contacts, feet with their own dimension."""
     reference, elliptic = world.reference, scene.physics.cone == "elliptic"
     rows = int(np.count_nonzero(reference.dof_frictionloss > 0)) + int(reference.jnt_limited.sum())
     for name in scene.robot.foot_names:
@@ -264,7 +264,9 @@ class _FieldShape:
         self._model, self._shapes, self._shape = model, layout.shapes, int(layout.slot_shape[-1])
         shapes = np.array(carriers(layout, slots, scene.num_worlds))[slots.field]
         half = np.array([f.half_size for f in slots.fields])[slots.field]
-        low, top = (np.array([float(limit(f.heights)) for f in slots.fields])[slots.field] for limit in (np.min, np.max))
+        low, top = (
+            np.array([float(limit(f.heights)) for f in slots.fields])[slots.field] for limit in (np.min, np.max)
+        )
         # replicated shapes share the bounds of the first, whatever field they bear
         lower, upper = np.c_[-half, low], np.c_[half, top]
         radius = np.linalg.norm(np.maximum(np.abs(lower), np.abs(upper)), axis=1)
@@ -296,20 +298,27 @@ class _FieldShape:
 
 
 class SteelAdapter(SolverAdapter):
-    """Newton's Steel solver: joint coordinates, hard contacts solved by projected Gauss-Seidel sweeps, Newton's own collisions."""
+    """Newton's Steel solver: joint coordinates, hard contacts by projected Gauss-Seidel, Newton's own collisions."""
 
     name = "steel"
     capabilities = _declare(
         joint_friction=Capability(
-            support=Support.APPROXIMATE, note="an explicit torque that changes sign over a small speed: a joint at rest creeps"
+            support=Support.APPROXIMATE,
+            note="an explicit torque that changes sign over a small speed: a joint at rest creeps",
         ),
         elliptic_cone=Capability(
-            support=Support.APPROXIMATE, note="friction is the exact cone of a hard contact; impratio has no meaning here"
+            support=Support.APPROXIMATE,
+            note="friction is the exact cone of a hard contact; impratio has no meaning here",
         ),
-        foot_condim_6=Capability(support=Support.NONE, note="contacts slide, they have no torsional or rolling friction"),
-        contact_forces=Capability(support=Support.APPROXIMATE, note="impulses of hard contacts divided by the timestep, without moments"),
+        foot_condim_6=Capability(
+            support=Support.NONE, note="contacts slide, they have no torsional or rolling friction"
+        ),
+        contact_forces=Capability(
+            support=Support.APPROXIMATE, note="impulses of hard contacts divided by the timestep, without moments"
+        ),
         deterministic=Capability(
-            support=Support.APPROXIMATE, note="to the last bit on a CPU; on a GPU by Newton's mode, but for sums of contact forces"
+            support=Support.APPROXIMATE,
+            note="to the last bit on a CPU; on a GPU by Newton's mode, but for sums of contact forces",
         ),
     )
     gap = 0.01
@@ -322,7 +331,8 @@ class SteelAdapter(SolverAdapter):
         super().refuse(scene)
         if scene.physics.cone != "elliptic":
             raise BackendError(
-                "Newton's steel solver has no pyramidal friction cone, its contacts slide on a true cone; use PhysicsOptions(cone='elliptic')"
+                "Newton's steel solver has no pyramidal friction cone, its contacts slide on a true cone; "
+                "use PhysicsOptions(cone='elliptic')"
             )
 
     def __init__(self, world: WorldModel, scene: Scene) -> None:
@@ -391,20 +401,19 @@ SOLVERS: Mapping[str, type[SolverAdapter]] = {each.name: each for each in (Mujoc
 """Solvers by name; the first is the default."""
 
 
-def dry_friction_slope(world: WorldModel, layout_dofs: np.ndarray, timestep: float) -> np.ndarray:
-    """Steepest slope of an explicit dry-friction torque around zero speed at which a step does not overshoot [N·m·s/rad].
+def dry_friction_slope(reference: mujoco.MjModel, dofs: np.ndarray, timestep: float) -> np.ndarray:
+    """Steepest slope of an explicit dry-friction torque around zero speed that does not overshoot [N·m·s/rad], (J,).
 
     A slope of half the joint's own inertia per step keeps even three coupled joints of a leg stable.
 
     Args:
-        world: the model.
-        layout_dofs: MuJoCo's degree of freedom of each joint.
+        reference: the robot.
+        dofs: degree of freedom of each joint, (J,).
         timestep: length of a physics step [s].
     """
-    reference = world.reference
     data = mujoco.MjData(reference)
     mujoco.mj_forward(reference, data)
     inertia = np.zeros((reference.nv, reference.nv))
     mujoco.mj_fullM(reference, data, inertia)
     own = 1.0 / np.diag(np.linalg.inv(inertia))
-    return 0.5 * own[layout_dofs] / timestep
+    return 0.5 * own[dofs] / timestep
