@@ -77,7 +77,8 @@ def motor_law(substep: int, motors: Motors, motion: Motion) -> None:
     velocity = motion.qvel[world, motors.joint_v[joint]]
     error = target + motors.offset[world, joint] - position
     torque = motors.stiffness[world, joint] * error - motors.damping[world, joint] * velocity
-    torque = wp.clamp(torque, -motors.limit[joint], motors.limit[joint]) * motors.strength[world, joint]
+    if not wp.isnan(torque):  # clamp would hide an invalid target
+        torque = wp.clamp(torque, -motors.limit[joint], motors.limit[joint]) * motors.strength[world, joint]
     if limp != 0:
         torque = 0.0
     motors.torque[world, joint] = torque

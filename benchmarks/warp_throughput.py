@@ -1,0 +1,259 @@
+"""Control steps a second and memory of the mujoco-warp engine, with everything that training does to it.
+
+Each control step is 4 substeps of 5 ms (pyramidal cone, 10 solver iterations, feet with sliding friction only, no
+self-collision) of a standing and stepping Go2: new joint targets and latencies, physics, reading the whole state,
+resets of 2 % of the worlds on a new terrain of the palette, and new friction, gains, strengths and offsets for these.
+Every configuration runs in a process of its own, so that memory is measured from a clean start.
+
+    python benchmarks/warp_throughput.py --out throughput.json
+    python benchmarks/warp_throughput.py --worlds 8192 --ground boxes field --steps 400
+
+From a checkout that is not installed, a link named ``gaitgauge`` to the repository in a folder on PYTHONPATH is enough.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
+
+SIZES = (1024, 2048, 4096, 8192, 16384, 32768, 65536)
+GROUNDS = ("plane", "boxes", "field")
+BOXES = 24
+PALETTE = 16
+RESET_SHARE = 0.02
+WARMUP = 50
+
+
+def make_palette(ground: str) -> tuple:
+    """Terrains of one kind, different from each other, centred on the origin."""
+    import numpy as np
+    from gaitgauge.terrains.base import Box, HeightField, Terrain
+
+    if ground == "plane":
+        return (Terrain(name="plane", family="plane"),)
+    random = np.random.default_rng(0)
+    terrains = []
+    for i in range(PALETTE):
+        if ground == "boxes":
+            # a staircase of long treads that rises from the middle to both sides
+            rise, tread = 0.02 + 0.008 * i, 0.31
+            steps = [(side * (0.8 + tread * (k + 0.5)), rise * (k + 1)) for k in range(BOXES // 2) for side in (1, -1)]
+            boxes = tuple(Box(center=(x, 0.0, h / 2), half_size=(tread / 2, 4.0, h / 2)) for x, h in steps)
+            terrains.append(Terrain(name="boxes", family="boxes", level=i, boxes=boxes))
+        else:
+            heights = 0.02 + (0.01 + 0.003 * i) * random.random((161, 161))
+            field = HeightField(center=(0.0, 0.0), half_size=(8.0, 8.0), heights=heights)
+            terrains.append(Terrain(name="field", family="field", level=i, height_field=field))
+    return tuple(terrains)
+
+
+def measure(ground: str, worlds: int, device: str, steps: int) -> dict:
+    """Build, warm up and time one configuration."""
+    import torch
+    from gaitgauge.backends.base import PhysicsOptions, Randomization, Scene
+    from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
+    from gaitgauge.robots import load_robot
+
+    gpu = device.startswith("cuda")
+
+    def synchronize() -> None:
+        if gpu:
+            torch.cuda.synchronize(device)
+
+    def free() -> int:
+        return torch.cuda.mem_get_info(device)[0] if gpu else 0
+
+    if gpu:
+        torch.zeros(1, device=device)
+        from warp import init
+
+        init()
+    robot = load_robot("go2")
+    terrains = make_palette(ground)
+    physics = PhysicsOptions(
+        timestep=0.005,
+        substeps=4,
+        cone="pyramidal",
+        impratio=1.0,
+        iterations=10,
+        ls_iterations=20,
+        tolerance=1e-6,
+        foot_condim=3,
+        self_collision=False,
+    )
+    scene = Scene(
+        robot=robot,
+        parameters=robot.parameters["training"],
+        terrains=terrains,
+        terrain_index=tuple(i % len(terrains) for i in range(worlds)),
+        physics=physics,
+    )
+    free_before, start = free(), perf_counter()
+    backend = MujocoWarpBackend(scene, device=device)
+    synchronize()
+    build_seconds = perf_counter() - start
+    pose = torch.tensor(robot.default_joint_position, device=device)
+    quaternion = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(worlds, 1)
+    position = torch.zeros((worlds, 3), device=device)
+    flags = {"overflowed": torch.zeros(worlds, dtype=torch.bool, device=device)}
+    flags["diverged"] = flags["overflowed"].clone()
+
+    def reset(mask: torch.Tensor | None) -> None:
+        position[:, :2] = 1.2 * torch.rand((worlds, 2), device=device) - 0.6
+        position[:, 2] = robot.stand_height
+        index = torch.randint(len(terrains), (worlds,), device=device)
+        backend.reset(mask, base_position=position, base_quaternion=quaternion, terrain_index=index)
+
+    def random_parameters(mask: torch.Tensor | None) -> None:
+        def scale(low: float, high: float) -> torch.Tensor:
+            return low + (high - low) * torch.rand((worlds, robot.num_joints), device=device)
+
+        backend.randomize(
+            Randomization(
+                friction=0.5 + torch.rand(worlds, device=device),
+                stiffness_scale=scale(0.9, 1.1),
+                damping_scale=scale(0.9, 1.1),
+                motor_strength=scale(0.8, 1.2),
+                motor_offset=scale(-0.035, 0.035),
+            ),
+            mask,
+        )
+
+    def control_step() -> torch.Tensor:
+        targets = pose + 0.25 * torch.randn((worlds, robot.num_joints), device=device)
+        backend.step(targets, delay=torch.randint(0, 5, (worlds,), device=device))
+        state = backend.state
+        observation = torch.cat(
+            [
+                state.base_quaternion_w,
+                state.base_linear_velocity_w,
+                state.base_angular_velocity_b,
+                state.joint_position,
+                state.joint_velocity,
+                state.joint_torque,
+                state.foot_position_w.flatten(1),
+                state.foot_velocity_w.flatten(1),
+                state.foot_contact_force_w.flatten(1),
+                state.body_contact_force_w.flatten(1),
+                state.ground_moment_w,
+            ],
+            dim=1,
+        )
+        flags["overflowed"] |= state.overflowed
+        flags["diverged"] |= state.diverged
+        mask = (torch.rand(worlds, device=device) < RESET_SHARE) | state.diverged
+        reset(mask)
+        random_parameters(mask)
+        return observation.abs().mean()
+
+    reset(None)
+    masses = Randomization(
+        base_mass_offset=2.0 * torch.rand(worlds, device=device) - 1.0,
+        base_com_offset=0.06 * torch.rand((worlds, 3), device=device) - 0.03,
+        link_mass_scale=0.9 + 0.2 * torch.rand((worlds, len(robot.collision_bodies)), device=device),
+    )
+    backend.randomize(masses)
+    random_parameters(None)
+    for _ in range(WARMUP if gpu else 2):
+        control_step()
+    synchronize()
+    start = perf_counter()
+    for _ in range(steps):
+        mean = control_step()
+    synchronize()
+    seconds = perf_counter() - start
+    used = free_before - free()
+    targets = pose.repeat(worlds, 1)
+    start = perf_counter()
+    for _ in range(steps):
+        backend.step(targets)
+    synchronize()
+    physics_seconds = perf_counter() - start
+    return {
+        "ground": ground,
+        "worlds": worlds,
+        "steps": steps,
+        "control_steps_per_second": worlds * steps / seconds,
+        "control_steps_per_second_without_resets": worlds * steps / physics_seconds,
+        "milliseconds_per_control_step": 1e3 * seconds / steps,
+        "build_seconds": build_seconds,
+        "bytes_per_world": used / worlds,
+        "overflowed_share": float(flags["overflowed"].float().mean()),
+        "diverged_share": float(flags["diverged"].float().mean()),
+        "mean_observation": float(mean),
+    }
+
+
+def in_own_process(ground: str, worlds: int, device: str, steps: int) -> dict:
+    """Run ``measure`` in a fresh interpreter; a configuration that fails is a row with its error."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "row.json"
+        command = [sys.executable, __file__, "--single", ground, str(worlds), "--device", device, "--steps", str(steps)]
+        done = subprocess.run(
+            [*command, "--out", str(out)], capture_output=True, text=True, env=os.environ, check=False
+        )
+        if out.exists():
+            return json.loads(out.read_text())
+        reason = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()[-1]
+        return {"ground": ground, "worlds": worlds, "error": reason}
+
+
+def hardware(device: str) -> dict:
+    """What the numbers were measured on."""
+    import torch
+
+    packages = ("torch", "warp-lang", "mujoco", "mujoco-warp")
+    entry = {"python": platform.python_version(), "versions": {p: version(p) for p in packages}}
+    entry["device"] = torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.processor()
+    return entry
+
+
+def main() -> None:
+    """Measure all configurations asked for, print a table and write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, nargs="+", default=list(SIZES), help="numbers of worlds")
+    parser.add_argument("--ground", nargs="+", choices=GROUNDS, default=["boxes", "field"], help="kinds of ground")
+    parser.add_argument("--steps", type=int, default=200, help="control steps to time")
+    parser.add_argument("--device", default="cuda", help="cuda, cuda:1 or cpu")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    parser.add_argument(
+        "--single", nargs=2, metavar=("GROUND", "WORLDS"), help="measure one configuration in this process"
+    )
+    arguments = parser.parse_args()
+    if arguments.single:
+        row = measure(arguments.single[0], int(arguments.single[1]), arguments.device, arguments.steps)
+        text = json.dumps(row)
+        if arguments.out is None:
+            print(text)
+        else:
+            arguments.out.write_text(text)
+        return
+    print(
+        f"{'ground':8} {'worlds':>7} {'M control steps/s':>18} {'physics alone':>15} {'kB/world':>9} {'overflowed':>11}"
+    )
+    rows = []
+    for ground in arguments.ground:
+        for worlds in arguments.worlds:
+            row = in_own_process(ground, worlds, arguments.device, arguments.steps)
+            rows.append(row)
+            if "error" in row:
+                print(f"{ground:8} {worlds:7} {row['error']}", flush=True)
+                continue
+            rate, alone = row["control_steps_per_second"] / 1e6, row["control_steps_per_second_without_resets"] / 1e6
+            memory = row["bytes_per_world"] / 1e3
+            share = row["overflowed_share"]
+            print(f"{ground:8} {worlds:7} {rate:18.3f} {alone:15.3f} {memory:9.1f} {share:11.2%}", flush=True)
+            if arguments.out is not None:
+                arguments.out.write_text(json.dumps({"hardware": hardware(arguments.device), "rows": rows}, indent=2))
+
+
+if __name__ == "__main__":
+    main()
