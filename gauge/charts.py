@@ -224,7 +224,7 @@ def searches(rows: Sequence[Row]) -> list[dict[str, Any]]:
     charts = []
     top = int(_top([r for r in rows if r.get("level") is not None], "level"))
     several = len({r["payload"] for r in rows}) > 1
-    left = 62.0 if several else 30.0
+    left = 72.0 if several else 30.0
     for terrain in dict.fromkeys(r["terrain"] for r in rows if r.get("search")):
         group = [r for r in rows if r["terrain"] == terrain and r.get("search")]
         group.sort(key=lambda r: (r["payload"], r["friction"]))

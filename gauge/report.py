@@ -165,7 +165,7 @@ def warnings(results: Mapping[str, Any]) -> list[dict[str, Any]]:
         found.append(_warning("grave", headline, meaning, _places(rows, "overflowed")))
     if health["falls"]:
         headline = f"{_plural(health['falls'], 'fall')} in {total}"
-        meaning = "A fall ends its sub-command; the suite says what it costs."
+        meaning = "The robot tilted beyond the suite's limit; the suite says what that ends and what it costs."
         found.append(_warning("grave", headline, meaning, _places(rows, "falls")))
     failed = [r for r in rows if r["level"] == 0]
     if failed:
