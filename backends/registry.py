@@ -10,7 +10,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 
-from .base import BackendError, PhysicsBackend, Scene
+from .base import BackendError, PhysicsBackend, Scene, Support
 
 GROUP = "gaitgauge.backends"
 _OWN = {
@@ -95,19 +95,57 @@ def backend_class(name: str) -> type[PhysicsBackend]:
     return found
 
 
+def find_backend(name: str, device: str) -> type[PhysicsBackend]:
+    """The class that ``make_backend`` builds, variant and device checked, without building anything.
+
+    Raises:
+        BackendError: unknown engine or variant, missing package, or a device that is not there or that the engine
+            cannot use.
+    """
+    found = _with_variant(name)
+    _check_device(found, device)
+    return found
+
+
 def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int = 1) -> PhysicsBackend:
     """Build the worlds of ``scene`` in the engine ``name`` (``mujoco``, ``newton:kamino`` …).
 
     Raises:
         BackendError: unknown engine, missing package, or something the engine cannot do.
     """
+    return _with_variant(name)(scene, device=device, threads=threads)
+
+
+def _with_variant(name: str) -> type[PhysicsBackend]:
     found = backend_class(name)
     variant = name.partition(":")[2]
     if not variant:
-        return found(scene, device=device, threads=threads)
+        return found
     with_variant = getattr(found, "with_solver", None)
     if with_variant is None:
         raise BackendError(
             f"backend '{found.name}' has no solvers to choose from, so '{name}' cannot be built; use '{found.name}'"
         )
-    return with_variant(variant)(scene, device=device, threads=threads)
+    return with_variant(variant)
+
+
+def _check_device(found: type[PhysicsBackend], device: str) -> None:
+    """Refuse devices that do not exist, and a GPU for an engine that does not run on one."""
+    import torch  # listing engines must not wait for it
+
+    try:
+        wanted = torch.device(device)
+    except RuntimeError as error:
+        raise BackendError(f"there is no device '{device}'; give cpu, cuda or cuda:N (--device)") from error
+    if wanted.type not in ("cpu", "cuda"):
+        raise BackendError(f"device '{device}' is not supported; give cpu, cuda or cuda:N (--device)")
+    if wanted.type == "cpu":
+        return
+    if found.capabilities()["gpu"].support is Support.NONE:
+        raise BackendError(
+            f"backend '{found.name}' runs on the CPU, not on '{device}'; use --device cpu, or mujoco-warp"
+        )
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if (wanted.index or 0) >= count:
+        have = f"torch finds {count}" if count else "torch finds none (see 'gaitgauge doctor')"
+        raise BackendError(f"there is no GPU for device '{device}': {have}; use --device cpu")

@@ -93,6 +93,7 @@ class _display:  # noqa: N801  (reads as a verb where it is used)
         self._rate: tuple[float, float] | None = None
 
     def __enter__(self) -> Callable[[Status], None]:
+        self._last = time.monotonic()
         if self._console.is_terminal:
             self._bar = Progress(
                 TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"), TimeElapsedColumn()

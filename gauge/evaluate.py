@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from ..backends import Scene, make_backend
-from ..backends.registry import backend_class
+from ..backends.registry import find_backend
 from ..policy.base import Policy
 from ..policy.contract import check_robot
 from ..policy.loading import find_policy, load_policy
@@ -84,7 +84,7 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
             f"suite '{suite.name}' needs the joint parameters '{suite.parameters}', which robot '{robot.name}' lacks; "
             f"it has {', '.join(sorted(robot.parameters))} (robot.toml)"
         )
-    backend_class(request.backend)
+    find_backend(request.backend, request.device)
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:
         if not 0.0 < friction <= 10.0:

@@ -1,0 +1,61 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from gaitgauge.cli.main import app
+from gaitgauge.policy.contract import PolicyContract, go2_contract
+from gaitgauge.policy.native import StoredNetwork, save_policy
+from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.robots import load_robot
+from typer.testing import CliRunner, Result
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    """Runs a command line in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def invoke(*arguments: object) -> Result:
+        return CliRunner().invoke(app, [str(a) for a in arguments])
+
+    return invoke
+
+
+@pytest.fixture
+def refused(run: Callable[..., Result]) -> Callable[..., str]:
+    """Runs a command line that must end with one clear sentence, and returns it."""
+
+    def invoke(*arguments: object) -> str:
+        result = run(*arguments)
+        assert result.exit_code not in (0, None)
+        assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+        lines = result.stderr.splitlines()
+        assert len(lines) == 1, result.stderr
+        assert lines[0].startswith("gaitgauge: ")
+        assert "Traceback" not in result.output
+        return lines[0].removeprefix("gaitgauge: ")
+
+    return invoke
+
+
+@pytest.fixture(scope="session")
+def contract() -> PolicyContract:
+    return go2_contract(load_robot("go2"))
+
+
+@pytest.fixture(scope="session")
+def stored() -> StoredNetwork:
+    """A network that holds the standing pose."""
+    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
+    network = MlpNetwork(**arguments)
+    zeros = {name: torch.zeros_like(value) for name, value in network.state_dict().items()}
+    return StoredNetwork(architecture="mlp", arguments=arguments, state_dict=zeros)
+
+
+@pytest.fixture
+def policy(tmp_path: Path, contract: PolicyContract, stored: StoredNetwork) -> Path:
+    """A policy that stands still, beside the folder of the command line."""
+    path = tmp_path / "standing.gauge.pt"
+    save_policy(path, contract, stored)
+    return path

@@ -1,0 +1,81 @@
+"""The whole command on a suite of a few seconds."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+SUITE = """
+extends = "gaitgauge-1"
+name = "tiny"
+title = "a few seconds"
+goals = [{ name = "max_velocity", phases = [0.3, 0.1] }, { name = "target_pos_velocity", phases = [] }]
+
+[matrix]
+terrains = ["flat", "slope_fd"]
+frictions = [0.6, 0.9]
+payloads = [0.0]
+seeds = [0, 1]
+search_seeds = [100, 101]
+
+[commands]
+target_time = { slope = 0.3, wave = 0.3, stairs = 0.3, obstacle = 0.3 }
+
+[settling]
+longest = 0.3
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path) -> Path:
+    path = tmp_path / "tiny.toml"
+    path.write_text(SUITE)
+    return path
+
+
+def reproducible(folder: Path) -> tuple[dict, bytes]:
+    """What must be the same whenever the same command runs."""
+    results = json.loads((folder / "results.json").read_text())
+    del results["provenance"]
+    return results, (folder / "episodes.csv").read_bytes()
+
+
+def test_results_and_their_reproducibility(run, refused, tmp_path, policy, tiny):
+    command = ("evaluate", policy, "--suite", tiny, "--out")
+    done = run(*command, tmp_path / "first", "--threads", 1)
+    assert done.exit_code == 0, done.output
+    assert "score" in done.stdout
+    assert str(tmp_path / "first" / "results.json") in done.stdout.replace("\n", "")
+    results = json.loads((tmp_path / "first" / "results.json").read_text())
+    assert results["suite"]["name"] == "tiny"
+    assert set(results["terrains"]) == {"flat", "slope_fd"}
+    assert len(results["environments"]) == 4
+    assert 0.0 <= results["score"] <= 1.0
+    assert len(results["metrics"]) == 8
+    assert results["policy"]["contract_hash"]
+    assert results["provenance"]["versions"]["mujoco"]
+    assert "<html" in (tmp_path / "first" / "report.html").read_text()
+
+    assert "--resume" in refused(*command, tmp_path / "first")
+    assert json.loads((tmp_path / "first" / "results.json").read_text()) == results
+
+    again = run(*command, tmp_path / "second", "--threads", 2, "--json")
+    assert again.exit_code == 0, again.output
+    printed = json.loads(again.stdout)
+    del printed["provenance"]
+    assert reproducible(tmp_path / "second") == reproducible(tmp_path / "first")
+    assert printed == reproducible(tmp_path / "first")[0]
+
+    episodes = sorted((tmp_path / "second" / "episodes").glob("*.npz"))
+    kept, lost = episodes[::2], episodes[1::2]
+    for path in [*lost, tmp_path / "second" / "results.json", tmp_path / "second" / "episodes.csv"]:
+        path.unlink()
+    before = {path: path.stat().st_mtime_ns for path in kept}
+    resumed = run(*command, tmp_path / "second", "--resume")
+    assert resumed.exit_code == 0, resumed.output
+    assert reproducible(tmp_path / "second") == reproducible(tmp_path / "first")
+    assert {path: path.stat().st_mtime_ns for path in kept} == before
+
+    other = refused(*command, tmp_path / "first", "--seed", 5, "--resume")
+    assert "another run" in other
+    assert json.loads((tmp_path / "first" / "results.json").read_text()) == results
