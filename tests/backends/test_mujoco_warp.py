@@ -11,6 +11,7 @@ from gaitgauge.backends import BackendError, PhysicsOptions, PhysicsState, Rando
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
 from gaitgauge.backends.mujoco_warp_device import bytes_per_world, find_device, is_memory_error, memory_advice
 from gaitgauge.backends.mujoco_warp_model import PARKED, Capacity, buffer_capacity, build_shared_model
+from gaitgauge.backends.mujoco_warp_order import CONTACT_FIELDS, ROW_FIELDS
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Box, HeightField, Terrain
@@ -312,6 +313,74 @@ def test_a_target_delayed_by_the_whole_period_acts_in_the_next():
     assert backend.state.joint_torque.abs().max() < 0.5  # still the held pose
     backend.step(pose + 0.5, delay=whole)
     assert (backend.state.joint_torque > 0.5).all()  # the first step's target
+
+
+# ---- order -----------------------------------------------------------------------------------------------------------
+
+
+def shuffle_contacts(data, random):
+    count = int(data.nacon.numpy()[0])
+    order = random.permutation(count)
+    for name in CONTACT_FIELDS:
+        array = getattr(data.contact, name)
+        values = array.numpy().copy()
+        values[:count] = values[:count][order]
+        array.assign(values)
+
+
+@pytest.mark.slow
+def test_deterministic_mode_does_not_depend_on_the_order_of_contacts():
+    wanted = scene(FLAT, BOXES, COARSE, deterministic=True, **TRAINING)
+    runs = []
+    for shuffled in (False, True):
+        backend, random = MujocoWarpBackend(wanted), np.random.default_rng(0)
+        callback, generator = backend._model.callback, torch.Generator().manual_seed(0)
+        if shuffled:
+            inner = callback.contactfilter
+
+            def mix(model, data, inner=inner, random=random):
+                shuffle_contacts(data, random)
+                inner(model, data)
+
+            callback.contactfilter = mix
+        arguments = upright(backend, [0.31, 0.51, 0.61])
+        backend.reset(**arguments)
+        for _ in range(12):
+            backend.step(arguments["held_target"] + 0.3 * torch.randn((3, 12), generator=generator))
+        runs.append(backend.state)
+    assert (runs[0].contact_count > 0).all()
+    for item in fields(PhysicsState):
+        assert torch.equal(getattr(runs[0], item.name), getattr(runs[1], item.name)), item.name
+
+
+@pytest.mark.slow
+def test_rows_come_into_order_and_contacts_find_theirs():
+    backend = MujocoWarpBackend(scene(FLAT, BOXES, COARSE, deterministic=True, **TRAINING))
+    arguments = upright(backend, [0.31, 0.51, 0.61])
+    backend.reset(**arguments)
+    for _ in range(12):
+        backend.step(arguments["held_target"])
+    data, random = backend._data, np.random.default_rng(0)
+    before = {name: getattr(data.efc, name).numpy().copy() for name in ROW_FIELDS}
+    address = data.contact.efc_address.numpy().copy()
+    for name in ROW_FIELDS:
+        mixed = before[name].copy()
+        for world in range(3):
+            first = int(data.ne.numpy()[world] + data.nf.numpy()[world] + data.nl.numpy()[world])
+            last = int(data.nefc.numpy()[world])
+            assert last - first >= 8 and (last - first) % 4 == 0  # pyramids of sliding contacts have 4 rows
+            blocks = np.arange(first, last).reshape(-1, 4)[::-1].ravel()
+            mixed[world, first:last] = before[name][world, blocks]
+            joints = slice(int(data.ne.numpy()[world]), int(data.ne.numpy()[world] + data.nf.numpy()[world]))
+            mixed[world, joints] = before[name][world, joints][::-1]
+        getattr(data.efc, name).assign(mixed)
+    data.contact.efc_address.assign(random.permutation(address))
+    backend._order.sort_rows(data)
+    for name in ROW_FIELDS:
+        np.testing.assert_array_equal(getattr(data.efc, name).numpy(), before[name], err_msg=name)
+    count = int(data.nacon.numpy()[0])
+    active = address[:count, 0] >= 0
+    np.testing.assert_array_equal(data.contact.efc_address.numpy()[:count][active], address[:count][active])
 
 
 # ---- GPU ---------------------------------------------------------------------------------------------------------
