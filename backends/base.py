@@ -312,7 +312,7 @@ class PhysicsBackend(ABC):
     def apply_force(self, force_w: torch.Tensor) -> None:
         """External force on the base's centre of mass [N], (N, 3), that acts until changed or the world is reset."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  (an engine may have nothing to free)
         """Free what the engine holds. A closed backend must not be used again."""
 
 

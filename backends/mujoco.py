@@ -54,13 +54,16 @@ class MujocoBackend(PhysicsBackend):
         exact["gpu"] = Capability(support=Support.NONE, note="runs on CPU threads")
         exact["penetration"] = Capability(support=Support.EXACT, note="seen one substep late")
         exact["contact_forces"] = Capability(
-            support=Support.EXACT, note=f"single points of the {CONTACT_SLOTS} strongest contacts, {FOOT_SLOTS} for each foot"
+            support=Support.EXACT,
+            note=f"single points of the {CONTACT_SLOTS} strongest contacts, {FOOT_SLOTS} for each foot",
         )
         return exact
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         if torch.device(device).type != "cpu":
-            raise BackendError(f"backend 'mujoco' runs on the CPU, not on device '{device}'; use --device cpu, or mujoco-warp")
+            raise BackendError(
+                f"backend 'mujoco' runs on the CPU, not on device '{device}'; use --device cpu, or mujoco-warp"
+            )
         self.scene = scene
         self.device = torch.device("cpu")
         self.dtype = torch.float64
@@ -109,7 +112,9 @@ class MujocoBackend(PhysicsBackend):
         free = model.joint(model.body(robot.base_body).jntadr[0])
         self._base = model.body(robot.base_body).id
         if free.type[0] != mujoco.mjtJoint.mjJNT_FREE or free.qposadr[0] != 0:
-            raise BackendError(f"body '{robot.base_body}' of robot '{robot.name}' must carry a free joint and come first")
+            raise BackendError(
+                f"body '{robot.base_body}' of robot '{robot.name}' must carry a free joint and come first"
+            )
         self._joint_q = np.array([model.joint(j).qposadr[0] for j in robot.joint_names])
         self._joint_v = np.array([model.joint(j).dofadr[0] for j in robot.joint_names])
         self._bodies = np.array([model.body(b).id for b in robot.collision_bodies])
@@ -244,8 +249,9 @@ class MujocoBackend(PhysicsBackend):
         """The same for worlds whose motors hang limp while they wait: they get the target at which the law gives no torque."""
         parts = []
         for substep in range(control.shape[1]):
-            loose = self._qpos[np.ix_(rows, self._joint_q)] + self._kd_over_kp[rows] * (
-                self._qvel[np.ix_(rows, self._joint_v)]
+            loose = (
+                self._qpos[np.ix_(rows, self._joint_q)]
+                + self._kd_over_kp[rows] * (self._qvel[np.ix_(rows, self._joint_v)])
             )
             now = np.where(waits[:, substep, None], loose, control[:, substep])
             parts.append({k: v.copy() for k, v in self._play(rows, now[:, None]).items()})
@@ -288,7 +294,9 @@ class MujocoBackend(PhysicsBackend):
             if value is None:
                 continue
             if len(value) != len(rows):
-                raise BackendError(f"Randomization.{item.name} has {len(value)} rows for {len(rows)} worlds; give one row for each")
+                raise BackendError(
+                    f"Randomization.{item.name} has {len(value)} rows for {len(rows)} worlds; give one row for each"
+                )
             for row, entry in zip(rows, value.to(torch.float64).numpy(), strict=True):
                 self._randomized.setdefault(int(row), {})[item.name] = entry
         for row in rows:
@@ -332,7 +340,9 @@ class MujocoBackend(PhysicsBackend):
         for row in rows:
             model = self._models[row]
             gain = model.actuator_gainprm[:, 0]
-            self._kd_over_kp[row] = np.divide(-model.actuator_biasprm[:, 2], gain, out=np.zeros_like(gain), where=gain > 0)
+            self._kd_over_kp[row] = np.divide(
+                -model.actuator_biasprm[:, 2], gain, out=np.zeros_like(gain), where=gain > 0
+            )
 
     def push(
         self,

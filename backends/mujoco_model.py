@@ -30,7 +30,9 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
     option.timestep = physics.timestep
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     if physics.cone not in ("elliptic", "pyramidal"):
-        raise BackendError(f"friction cone '{physics.cone}' does not exist; use 'elliptic' or 'pyramidal' (PhysicsOptions.cone)")
+        raise BackendError(
+            f"friction cone '{physics.cone}' does not exist; use 'elliptic' or 'pyramidal' (PhysicsOptions.cone)"
+        )
     elliptic = physics.cone == "elliptic"
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
     option.impratio = physics.impratio
@@ -41,7 +43,9 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
     for j, name in enumerate(robot.joint_names):
         joint = spec.joint(name)
         if joint is None:
-            raise BackendError(f"joint '{name}' of robot '{robot.name}' is not in {robot.mjcf.name}; correct joint_names in robot.toml")
+            raise BackendError(
+                f"joint '{name}' of robot '{robot.name}' is not in {robot.mjcf.name}; correct joint_names in robot.toml"
+            )
         joint.armature = constants.armature[j]
         joint.damping = np.array([constants.joint_damping[j], 0.0, 0.0])
         joint.frictionloss = constants.friction_loss[j]
@@ -130,7 +134,10 @@ def add_report_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
     everything = (tree, "environment")
     for foot in robot.foot_names:
         spec.add_sensor(
-            name=f"velocity_{foot}", type=mujoco.mjtSensor.mjSENS_FRAMELINVEL, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=foot
+            name=f"velocity_{foot}",
+            type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+            objtype=mujoco.mjtObj.mjOBJ_SITE,
+            objname=foot,
         )
         contact(f"net_{foot}", "netforce", ("force",), 1, robot=(geom, foot), other=everything)
         contact(f"each_{foot}", "maxforce", ("force",), FOOT_SLOTS, robot=(geom, foot), other=everything)
@@ -165,7 +172,9 @@ def build_models(scene: Scene) -> list[mujoco.MjModel]:
         try:
             model = spec.compile()
         except ValueError as error:
-            raise BackendError(f"MuJoCo cannot build terrain '{terrain.name}' level {terrain.level}: {error}") from error
+            raise BackendError(
+                f"MuJoCo cannot build terrain '{terrain.name}' level {terrain.level}: {error}"
+            ) from error
         if shape is not None and terrain.height_field is not None:
             # the compiler stretches heights to [0, 1]; what the height field says is what must stand
             heights = terrain.height_field.heights

@@ -69,7 +69,7 @@ def run_evaluation(
 
 
 def default_device(backend: str) -> str:
-    """cuda for the Warp engines where there is one, else cpu.
+    """Where an engine runs by default: cuda for the Warp engines where there is one, else cpu.
 
     Raises:
         UserError: a Warp engine on a machine without a GPU.
@@ -80,7 +80,9 @@ def default_device(backend: str) -> str:
 
     if torch.cuda.is_available():
         return "cuda"
-    raise UserError(f"backend '{backend}' wants a GPU and this machine has none; add --device cpu (slow), or use --backend mujoco")
+    raise UserError(
+        f"backend '{backend}' wants a GPU and this machine has none; add --device cpu (slow), or use --backend mujoco"
+    )
 
 
 class _display:  # noqa: N801  (reads as a verb where it is used)
@@ -96,7 +98,10 @@ class _display:  # noqa: N801  (reads as a verb where it is used)
         self._last = time.monotonic()
         if self._console.is_terminal:
             self._bar = Progress(
-                TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"), TimeElapsedColumn()
+                TextColumn("[bold]{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[text]}"),
+                TimeElapsedColumn(),
             )
             self._task = self._bar.add_task("gauging", total=1.0, text="")
             self._live = Live(self._bar, console=self._console, refresh_per_second=4)
@@ -114,14 +119,20 @@ class _display:  # noqa: N801  (reads as a verb where it is used)
         self._last = now
         done = 1.0 - status.remaining_work
         left = status.seconds * status.remaining_work / done if done > 0.02 else None
-        text = f"{status.done} of about {round(status.done / max(done, 1e-6))} episodes" if done > 0.02 else f"{status.done} episodes"
+        text = (
+            f"{status.done} of about {round(status.done / max(done, 1e-6))} episodes"
+            if done > 0.02
+            else f"{status.done} episodes"
+        )
         places = sorted({f"{e.terrain} L{e.level}" if e.level else e.terrain for e in status.active})
         running = ", ".join(places[:5]) + (f" and {len(places) - 5} more" if len(places) > 5 else "")
         remaining = f"about {_duration(left)} left" if left is not None else "estimating time"
         if self._live:
             self._bar.update(self._task, completed=done, text=f"{text}, {remaining}\n  now: {running}")
         else:
-            self._console.print(f"{_duration(status.seconds)}: {text}, {remaining}; now: {running}", highlight=False, soft_wrap=True)
+            self._console.print(
+                f"{_duration(status.seconds)}: {text}, {remaining}; now: {running}", highlight=False, soft_wrap=True
+            )
 
 
 def _duration(seconds: float) -> str:
@@ -132,14 +143,26 @@ def _duration(seconds: float) -> str:
 def print_results(console: Console, results: Mapping[str, Any]) -> None:
     """Tables of terrains and metrics, then the score."""
     suite = results["suite"]
-    table = Table(title=f"{suite['name']} {suite['version']}, {results['pipeline']}, on {results['backend']}", title_justify="left")
-    for name, right in (("terrain", False), ("level", True), ("mean", True), ("mean@25", True), ("mean@50", True), ("95 % interval", True)):
+    table = Table(
+        title=f"{suite['name']} {suite['version']}, {results['pipeline']}, on {results['backend']}",
+        title_justify="left",
+    )
+    for name, right in (
+        ("terrain", False),
+        ("level", True),
+        ("mean", True),
+        ("mean@25", True),
+        ("mean@50", True),
+        ("95 % interval", True),
+    ):
         table.add_column(name, justify="right" if right else "left")
     for name, row in results["terrains"].items():
         level = "" if row["level"] is None else f"{row['level']:.2f}".rstrip("0").rstrip(".")
         if "score" in row:
             low, high = row["interval"]
-            table.add_row(name, level, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), f"{low:.4f} to {high:.4f}")
+            table.add_row(
+                name, level, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), f"{low:.4f} to {high:.4f}"
+            )
         else:
             table.add_row(name, level, "", "", "", "")
     console.print(table)
@@ -157,6 +180,8 @@ def print_results(console: Console, results: Mapping[str, Any]) -> None:
         console.print(f"in {health['episodes']} quality episodes: {', '.join(troubles)}", highlight=False)
     if results["score"] is not None:
         low, high = results["score_interval"]
-        console.print(f"[bold]score {results['score']:.4f}[/bold]  (95 % interval {low:.4f} to {high:.4f})", highlight=False)
+        console.print(
+            f"[bold]score {results['score']:.4f}[/bold]  (95 % interval {low:.4f} to {high:.4f})", highlight=False
+        )
     elif results["level"] is not None:
         console.print(f"[bold]mean level {results['level']:.2f}[/bold]", highlight=False)

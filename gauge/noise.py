@@ -6,7 +6,6 @@ import random
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -23,7 +22,7 @@ class NoiseStream(ABC):
     def assign(self, slot: int, episode: Episode) -> None:
         """Start an episode's stream in a slot."""
 
-    def reserve(self, steps: int) -> None:
+    def reserve(self, steps: int) -> None:  # noqa: B027  (only tables need it)
         """Be ready for episodes of ``steps`` control steps."""
 
     @abstractmethod
@@ -195,5 +194,3 @@ def _shift(value: torch.Tensor, bits: int) -> torch.Tensor:
 def make_stream(noise: Noise, joints: int, slots: int, device: torch.device) -> ReferenceStream | CounterStream:
     """The stream that a suite asks for."""
     return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, slots, device)
-
-
