@@ -6,6 +6,8 @@ field), so that contact sensors can tell the three apart.
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -16,9 +18,9 @@ CONTACT_SLOTS = 12
 """Ground contacts reported one by one, the strongest first; a robot that lies flat has about this many."""
 FOOT_SLOTS = 3
 """Contacts reported one by one for each foot."""
-NOTHING = {"contype": 2, "conaffinity": 0}
+NOTHING: dict[str, Any] = {"contype": 2, "conaffinity": 0}
 """Meets nothing, yet counts as a collision geom, so that all models of a layout have bounding-volume trees of one size."""
-PARKED = {"size": [0.01, 0.01, 0.01], "pos": [0.0, 0.0, -1.0], **NOTHING}
+PARKED: dict[str, Any] = {"size": [0.01, 0.01, 0.01], "pos": [0.0, 0.0, -1.0], **NOTHING}
 """Unused boxes of a layout."""
 
 

@@ -100,7 +100,9 @@ class Record:
                 head: Mapping[str, Any] = json.loads(data["head"].tobytes())
                 arrays = {k: data[k] for k in ("samples", "goal_index", "part_index")}
         except (OSError, KeyError, ValueError, EOFError) as error:
-            raise ValueError(f"episode file {path} is damaged ({error}); delete it and run again with --resume") from error
+            raise ValueError(
+                f"episode file {path} is damaged ({error}); delete it and run again with --resume"
+            ) from error
         names = ("terrain", "level", "friction", "payload", "seed", "stage")
         episode = Episode(goals=tuple(head["goals"]), **{n: head[n] for n in names})
         record = cls(episode=episode, columns=tuple(head["columns"]), **arrays)

@@ -88,7 +88,9 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:
         if not 0.0 < friction <= 10.0:
-            raise SuiteError(f"friction {friction:g} is not possible; give a coefficient above 0 and at most 10 (--friction)")
+            raise SuiteError(
+                f"friction {friction:g} is not possible; give a coefficient above 0 and at most 10 (--friction)"
+            )
     for payload in request.payloads:
         if not -5.0 <= payload <= 50.0:
             raise SuiteError(f"payload {payload:g} kg is not possible; give -5 to 50 kg (--payload)")
@@ -98,7 +100,9 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
         payloads = payloads or (suite.matrix.nominal_payload,)
         seeds = seeds[:1]
         if len(terrains) * len(frictions) * len(payloads) != 1:
-            raise SuiteError("pipeline 'base' plays one environment; give one --terrain, --friction and --payload, or use multi")
+            raise SuiteError(
+                "pipeline 'base' plays one environment; give one --terrain, --friction and --payload, or use multi"
+            )
     environments = make_environments(
         suite, terrains=terrains, frictions=frictions or None, payloads=payloads or None, level=level
     )
@@ -124,7 +128,9 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
     if request.pipeline in ("base", "multi"):
         chosen = chosen or ["flat"]
         if request.level is None and any(t != "flat" for t in chosen):
-            raise SuiteError(f"pipeline '{request.pipeline}' plays one level of terrain '{chosen[-1]}'; say which with --level")
+            raise SuiteError(
+                f"pipeline '{request.pipeline}' plays one level of terrain '{chosen[-1]}'; say which with --level"
+            )
         return chosen
     chosen = chosen or order
     if request.pipeline == "level":
@@ -276,5 +282,3 @@ def _device_name(device: str) -> str:
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
     return device
-
-

@@ -29,7 +29,9 @@ class GoalTable:
         names = [g.name for g in suite.goals]
         unknown = [n for n in names if n not in _SUB_COMMANDS]
         if unknown:
-            raise SuiteError(f"suite '{suite.name}' has the unknown goal '{unknown[0]}'; choose from {', '.join(_SUB_COMMANDS)}")
+            raise SuiteError(
+                f"suite '{suite.name}' has the unknown goal '{unknown[0]}'; choose from {', '.join(_SUB_COMMANDS)}"
+            )
         self.names = tuple(names)
         self.period = suite.physics.control_period
         most = max(len(c) for c in _SUB_COMMANDS.values())
@@ -47,7 +49,9 @@ class GoalTable:
         self.parts = column([len(_SUB_COMMANDS[n]) for n in names], torch.int64)
         self.duration = column([sum(g.phases) or math.inf for g in suite.goals], double)
         self.total = self.duration * self.parts
-        self.steps = column([round(sum(g.phases) / self.period) if g.phases else 2**62 for g in suite.goals], torch.int64)
+        self.steps = column(
+            [round(sum(g.phases) / self.period) if g.phases else 2**62 for g in suite.goals], torch.int64
+        )
         self._first = column([g.phases[0] if g.phases else math.inf for g in suite.goals], double)
         self._second = column([_SECOND_PHASE[n] for n in names], dtype)
 
@@ -87,7 +91,9 @@ def target_offset(state: PhysicsState, target: torch.Tensor, frame: str) -> torc
     return torch.stack((cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]), dim=1)
 
 
-def target_command(offset: torch.Tensor, backward: torch.Tensor, speed: torch.Tensor, yaw_limit: torch.Tensor) -> torch.Tensor:
+def target_command(
+    offset: torch.Tensor, backward: torch.Tensor, speed: torch.Tensor, yaw_limit: torch.Tensor
+) -> torch.Tensor:
     """Command that leads to the target: proportional turning and side-stepping, full speed ahead once it is in sight.
 
     Args:

@@ -27,7 +27,9 @@ METRIC_NAMES = (
 )
 
 
-def linear_velocity(quaternion: torch.Tensor, velocity_w: torch.Tensor, command: torch.Tensor, scale: torch.Tensor, kind: str) -> torch.Tensor:
+def linear_velocity(
+    quaternion: torch.Tensor, velocity_w: torch.Tensor, command: torch.Tensor, scale: torch.Tensor, kind: str
+) -> torch.Tensor:
     """1 - ‖v - v*‖ / scale, with v in the body frame (Lin. Velocity Error).
 
     Args:
@@ -47,7 +49,9 @@ def linear_velocity(quaternion: torch.Tensor, velocity_w: torch.Tensor, command:
     return 1.0 - torch.linalg.vector_norm(error, dim=1) / scale
 
 
-def angular_velocity(quaternion: torch.Tensor, velocity_b: torch.Tensor, command: torch.Tensor, scale: torch.Tensor, kind: str) -> torch.Tensor:
+def angular_velocity(
+    quaternion: torch.Tensor, velocity_b: torch.Tensor, command: torch.Tensor, scale: torch.Tensor, kind: str
+) -> torch.Tensor:
     """1 - ‖ω - ω*‖ / scale (Ang. Velocity Error).
 
     Args:
@@ -161,7 +165,10 @@ class MetricEvaluator:
         watched = [j for j, n in enumerate(robot.joint_names) if any(p in n for p in metrics.soft_limit_joints)]
         ranges = torch.tensor(joint_ranges(robot)[watched], device=device, dtype=dtype)
         middle, self._full = ranges.mean(1), ranges[:, 1] - ranges[:, 0]
-        self._low, self._high = middle - 0.5 * metrics.soft_limit * self._full, middle + 0.5 * metrics.soft_limit * self._full
+        self._low, self._high = (
+            middle - 0.5 * metrics.soft_limit * self._full,
+            middle + 0.5 * metrics.soft_limit * self._full,
+        )
         self._watched = torch.tensor(watched, device=device)
         self._span = stance_span(robot) if metrics.zmp_span is None else metrics.zmp_span
 
@@ -188,7 +195,9 @@ class MetricEvaluator:
         for name in self.names:
             if name == "lin_vel_err":
                 scale = torch.hypot(limits[:, 0], limits[:, 1])
-                value = linear_velocity(state.base_quaternion_w, state.base_linear_velocity_w, command, scale, m.linear_velocity)
+                value = linear_velocity(
+                    state.base_quaternion_w, state.base_linear_velocity_w, command, scale, m.linear_velocity
+                )
             elif name == "ang_vel_err":
                 value = angular_velocity(
                     state.base_quaternion_w, state.base_angular_velocity_b, command, limits[:, 2], m.angular_velocity
@@ -210,7 +219,9 @@ class MetricEvaluator:
                 carried = state.foot_normal_force.sum(1) > m.contact_share * self._weight
                 value = torch.where(carried, value, torch.full_like(value, math.nan))
             else:
-                raise ValueError(f"unknown metric '{name}'; choose from {', '.join(METRIC_NAMES)} (suite, metrics.weights)")
+                raise ValueError(
+                    f"unknown metric '{name}'; choose from {', '.join(METRIC_NAMES)} (suite, metrics.weights)"
+                )
             columns.append(value)
         values = torch.stack(columns, dim=1)
         return torch.cat((values, quality(values, self._weights)[:, None]), dim=1)

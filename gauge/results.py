@@ -113,7 +113,9 @@ def _environment(
     }
     if environment.searched:
         row["search"] = {
-            str(level): bool(test.passed) for level, test in sorted(environment.tests.items()) if test.passed is not None
+            str(level): bool(test.passed)
+            for level, test in sorted(environment.tests.items())
+            if test.passed is not None
         }
     if environment.level == 0 and not flat:
         row["score"] = 0.0
@@ -137,9 +139,7 @@ def _environment(
     row["quality"] = {s: _number(v) for s, v in zip(STATISTICS, plain[columns[-1]], strict=True)}
     row["score"] = _number(statistics["score"][2])
     row["interval"] = _interval(replicates["score"])
-    row["metrics"] = {
-        c: {s: _number(v) for s, v in zip(STATISTICS, plain[c], strict=True)} for c in columns[:-1]
-    }
+    row["metrics"] = {c: {s: _number(v) for s, v in zip(STATISTICS, plain[c], strict=True)} for c in columns[:-1]}
     for name in ("falls",):
         row[name] = sum(getattr(r, name) for r in environment.records)
     for name in ("diverged", "overflowed", "restarted"):

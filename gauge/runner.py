@@ -148,7 +148,10 @@ class EpisodeRunner:
         suite, device = self.suite, self._device
         at = torch.tensor(slots, device=device)
         terrains = [self.backend.scene.terrains[self._terrain_index(e)] for e in episodes]
-        poses = [t.spawns["level_eval" if e.stage == "eval" else "level_search"] for t, e in zip(terrains, episodes, strict=True)]
+        poses = [
+            t.spawns["level_eval" if e.stage == "eval" else "level_search"]
+            for t, e in zip(terrains, episodes, strict=True)
+        ]
         stand = self._robot.stand_height
 
         def write(into: torch.Tensor, values: list) -> None:
@@ -226,9 +229,7 @@ class EpisodeRunner:
         """Put episodes back to their spawn; the robot hangs limp for one physics step, then settles."""
         if not bool(mask.any()):
             return
-        self.backend.reset(
-            mask, base_position=self._spawn, base_quaternion=self._heading, terrain_index=self._terrain
-        )
+        self.backend.reset(mask, base_position=self._spawn, base_quaternion=self._heading, terrain_index=self._terrain)
         self.backend.step(None, worlds=mask, substeps=1)
         self._builder.reset(mask)
         self._session.reset(mask)

@@ -58,7 +58,9 @@ class RunFolder:
                     "give another folder with --out"
                 )
             if not resume:
-                raise StoreError(f"{folder} already holds this run; go on with --resume, or give another folder with --out")
+                raise StoreError(
+                    f"{folder} already holds this run; go on with --resume, or give another folder with --out"
+                )
         elif folder.exists() and any(folder.iterdir()):
             raise StoreError(f"{folder} is not empty and holds no run; give another folder with --out")
         try:

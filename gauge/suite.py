@@ -208,7 +208,9 @@ def load_suite(name: str) -> Suite:
     if not path.is_file():
         close = get_close_matches(name, suite_names(), 1)
         hint = f"; did you mean '{close[0]}'" if close else ""
-        raise SuiteError(f"there is no suite '{name}'{hint}; choose one of {', '.join(suite_names())}, or give a .toml file")
+        raise SuiteError(
+            f"there is no suite '{name}'{hint}; choose one of {', '.join(suite_names())}, or give a .toml file"
+        )
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -220,9 +220,9 @@ class OnnxSession(PolicySession):
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         check_observation(observation, self._num_episodes, self._contract, self._runner._source)
-        rows = np.ascontiguousarray(observation.detach().cpu().numpy(), dtype=np.float32)
+        inputs = np.ascontiguousarray(observation.detach().cpu().numpy(), dtype=np.float32)
         if self.batched:
-            actions = self._runner.run(rows)
+            actions = self._runner.run(inputs)
         else:
-            actions = np.concatenate([self._runner.run(rows[i : i + 1]) for i in range(len(rows))])
+            actions = np.concatenate([self._runner.run(inputs[i : i + 1]) for i in range(len(inputs))])
         return torch.from_numpy(actions).to(self._device)

@@ -293,8 +293,8 @@ class CopiesSession(PolicySession):
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         check_observation(observation, len(self._modules), self._contract, self._source)
-        rows = zip(self._modules, observation.split(1), strict=True)
-        return torch.cat([_run(module, row, 1, self._contract, self._source) for module, row in rows])
+        pairs = zip(self._modules, observation.split(1), strict=True)
+        return torch.cat([_run(module, row, 1, self._contract, self._source) for module, row in pairs])
 
 
 def _run(module: Any, observation: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> torch.Tensor:
