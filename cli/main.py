@@ -19,7 +19,10 @@ app = typer.Typer(
 )
 
 PolicyArgument = Annotated[
-    str, typer.Argument(help="A policy file (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.", metavar="POLICY")
+    str,
+    typer.Argument(
+        help="A policy file (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.", metavar="POLICY"
+    ),
 ]
 
 
@@ -28,19 +31,38 @@ PolicyArgument = Annotated[
 def evaluate(
     policy: PolicyArgument,
     pipeline: Annotated[
-        str, typer.Option(help="base: one environment, one seed; multi: one level, all frictions and seeds; level: search the highest level; stress: everything.")
+        str,
+        typer.Option(
+            help="base: one environment and seed; multi: one level, all frictions and seeds; level: find the highest level; stress: all."
+        ),
     ] = "stress",
-    suite: Annotated[str, typer.Option(help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.")] = "gaitgauge-1",
+    suite: Annotated[
+        str, typer.Option(help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.")
+    ] = "gaitgauge-1",
     backend: Annotated[str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.")] = "mujoco",
     device: Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")] = None,
     robot: Annotated[str, typer.Option(help="Robot name, or a robot.toml.")] = "go2",
-    terrain: Annotated[list[str] | None, typer.Option(help="Terrain; give it several times for several. Default: the suite's.")] = None,
-    level: Annotated[int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")] = None,
-    friction: Annotated[list[float] | None, typer.Option(help="Friction coefficient; repeatable. Default: the suite's.")] = None,
-    payload: Annotated[list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")] = None,
-    seed: Annotated[list[int] | None, typer.Option(help="Seed of the quality episodes; repeatable. Default: the suite's.")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-<pipeline>.")] = None,
+    terrain: Annotated[
+        list[str] | None, typer.Option(help="Terrain; give it several times for several. Default: the suite's.")
+    ] = None,
+    level: Annotated[
+        int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")
+    ] = None,
+    friction: Annotated[
+        list[float] | None, typer.Option(help="Friction coefficient; repeatable. Default: the suite's.")
+    ] = None,
+    payload: Annotated[
+        list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")
+    ] = None,
+    seed: Annotated[
+        list[int] | None, typer.Option(help="Seed of the quality episodes; repeatable. Default: the suite's.")
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-<pipeline>.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the output folder.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print results.json instead of tables.")] = False,
 ) -> None:
@@ -66,10 +88,91 @@ def evaluate(
     )
 
 
+@app.command()
+@report_errors
+def train(
+    task: Annotated[str, typer.Argument(help="What to learn, see 'gaitgauge list tasks'.", metavar="TASK")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Settings of the task, such as environment.push.linear=0.6 or training.network.expert_count=4.",
+            metavar="key=value",
+        ),
+    ] = None,
+    backend: Annotated[
+        str | None, typer.Option(help="Physics engine, see 'gaitgauge list backends'. Default: mujoco-warp.")
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cpu, cuda or cuda:N; the default is what the engine is made for.")
+    ] = None,
+    num_envs: Annotated[
+        int | None, typer.Option(min=1, help="Parallel worlds, for each GPU. Default: the task's.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random. Default: the task's.")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="Updates of the whole run, resumed ones included. Default: the task's.")
+    ] = None,
+    time: Annotated[
+        str | None, typer.Option(help="Stop after this wall-clock time, building included: seconds, 9m, 2h or 1h30m.")
+    ] = None,
+    resume: Annotated[
+        str | None, typer.Option(help="Continue: latest, a run directory or a model_*.pt.", metavar="latest|PATH")
+    ] = None,
+    init_from: Annotated[
+        str | None, typer.Option(help="Begin a new run with the networks of this checkpoint.", metavar="PATH")
+    ] = None,
+    run_name: Annotated[str | None, typer.Option(help="Appended to the date in the run directory's name.")] = None,
+    log_root: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("logs/rsl_rl"),
+    capture: Annotated[
+        bool | None, typer.Option("--capture/--no-capture", help="CUDA graphs in the environment. Default: on a GPU.")
+    ] = None,
+    fuse: Annotated[
+        bool, typer.Option("--fuse/--no-fuse", help="Compile the environment's torch parts; faster, starts slower.")
+    ] = False,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads of an engine that runs on the CPU.")] = 1,
+    score: Annotated[
+        bool,
+        typer.Option("--score/--no-score", help="Gauge checkpoints in a side process; best.pt is the best of them."),
+    ] = True,
+    score_every: Annotated[
+        int | None, typer.Option(min=1, help="Iterations between two scores. Default: the task's.")
+    ] = None,
+    score_suite: Annotated[str, typer.Option(help="Suite of the scores, or a suite's .toml file.")] = "quick",
+    score_threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads of the side process. Default: half of the machine.")
+    ] = None,
+) -> None:
+    """Train a policy; Ctrl-C or SIGTERM writes a checkpoint and says how to go on."""
+    from .train import run_training
+
+    run_training(
+        task=task,
+        overrides=tuple(overrides or ()),
+        backend=backend,
+        device=device,
+        num_envs=num_envs,
+        seed=seed,
+        iterations=iterations,
+        time=time,
+        resume=resume,
+        init_from=init_from,
+        run_name=run_name,
+        log_root=log_root,
+        capture=capture,
+        fuse=fuse,
+        threads=threads,
+        score_suite=score_suite if score else None,
+        score_every=score_every,
+        score_threads=score_threads,
+    )
+
+
 @app.command("import")
 @report_errors
 def import_command(
-    source: Annotated[str, typer.Argument(help="TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint.")],
+    source: Annotated[
+        str, typer.Argument(help="TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint.")
+    ],
     destination: Annotated[Path, typer.Argument(help="File to write, by custom NAME.gauge.pt.")],
     force: Annotated[bool, typer.Option("--force", help="Replace the destination if it exists.")] = False,
 ) -> None:
@@ -111,3 +214,7 @@ def _kebab(argument: str) -> str:
         return argument
     name, equals, value = argument.partition("=")
     return name.replace("_", "-") + equals + value
+
+
+if __name__ == "__main__":
+    main()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
+from .configuration import ConfigurationError
 from .environment_configuration import CommandConfiguration
 from .schedules import RampTable
 
@@ -50,11 +51,11 @@ class CommandGenerator:
             device: where draws happen.
 
         Raises:
-            ValueError: the stages are not in order, or the first does not begin at 0.
+            ConfigurationError: the stages are not in order, or the first does not begin at 0.
         """
         begins = [stage.begin for stage in configuration.stages]
         if not begins or begins[0] != 0.0 or begins != sorted(begins):
-            raise ValueError(
+            raise ConfigurationError(
                 f"command stages begin at {begins} of the run; the first must begin at 0 and the others follow in order"
             )
         self._configuration = configuration

@@ -12,6 +12,7 @@ import torch
 
 from ..terrains.base import Terrain
 from ..terrains.training_tiles import LEVELLESS_KINDS, RANDOM_KINDS, make_tile
+from .configuration import ConfigurationError
 from .environment_configuration import TerrainConfiguration, TileConfiguration
 
 
@@ -59,10 +60,12 @@ def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
     share every kind.
 
     Raises:
-        ValueError: shares that are negative or all zero.
+        ConfigurationError: shares that are negative or all zero.
     """
     if min(shares, default=-1.0) < 0 or sum(shares) <= 0:
-        raise ValueError(f"shares of the terrain kinds are {list(shares)}; they must not be negative and not all zero")
+        raise ConfigurationError(
+            f"shares of the terrain kinds are {list(shares)}; they must not be negative and not all zero"
+        )
     total = sum(shares)
     bounds = torch.tensor([sum(shares[: i + 1]) / total for i in range(len(shares))], dtype=torch.float64)
     middle = (torch.arange(num_envs, dtype=torch.float64) + 0.5) / num_envs

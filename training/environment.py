@@ -21,6 +21,7 @@ from ..backends.registry import make_backend
 from ..policy.contract import PolicyContract, go2_contract
 from ..robots.base import JointParameters, Robot
 from ..robots.registry import load_robot
+from .configuration import ConfigurationError
 from .curriculum import TrainingPalette, assign_kinds, build_palette
 from .domain_randomization import BodyParameters, draw_bodies
 from .environment_configuration import EnvironmentConfiguration
@@ -75,15 +76,15 @@ class TrainingEnvironment(VecEnv):
             palette: the tiles; None builds them from the configuration.
 
         Raises:
-            ValueError: a setting that makes no sense, such as ``capture`` without a CUDA device.
+            ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device.
             BackendError: the engine cannot do what is asked.
         """
         if capture and torch.device(device).type != "cuda":
-            raise ValueError(
+            raise ConfigurationError(
                 f"capture=True needs a CUDA device, but the environment is on '{device}'; use capture=False there"
             )
         if configuration.num_envs < 1:
-            raise ValueError(f"num_envs is {configuration.num_envs}; an environment needs at least 1 world")
+            raise ConfigurationError(f"num_envs is {configuration.num_envs}; an environment needs at least 1 world")
         self.cfg = configuration
         self.configuration = configuration
         self.robot = load_robot(configuration.robot)
@@ -347,12 +348,12 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
     """The joint constants of the training physics.
 
     Raises:
-        ValueError: the robot has no such parameter set.
+        ConfigurationError: the robot has no such parameter set.
     """
     settings = configuration.joints
     if settings.parameters not in robot.parameters:
         known = ", ".join(robot.parameters)
-        raise ValueError(f"joints.parameters is '{settings.parameters}', but robot '{robot.name}' has: {known}")
+        raise ConfigurationError(f"joints.parameters is '{settings.parameters}', but robot '{robot.name}' has: {known}")
     changed = {
         name: (value,) * robot.num_joints
         for name in ("armature", "joint_damping", "friction_loss")

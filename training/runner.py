@@ -65,6 +65,7 @@ class TrainingRunner(OnPolicyRunner):
         device: str = "cpu",
         mirror: Mirror | None = None,
         scorer: Scorer | None = None,
+        settings: Mapping[str, Any] | None = None,
         progress: Callable[[Progress], None] | None = None,
         message: Callable[[str], None] | None = None,
     ) -> None:
@@ -79,6 +80,7 @@ class TrainingRunner(OnPolicyRunner):
             device: where to learn.
             mirror: left-right mirror maps, needed if the algorithm uses symmetry.
             scorer: gauges the student every ``run.gauge_interval`` iterations.
+            settings: plain data kept in every checkpoint, so that a resumed run can be built like this one.
             progress: called after every iteration.
             message: called with a sentence now and then.
 
@@ -92,6 +94,7 @@ class TrainingRunner(OnPolicyRunner):
         self.task = task
         self.log_dir = log_dir
         self.scorer = scorer
+        self.settings = dict(settings or {})
         self.logger = RunLogger(
             num_steps=configuration.run.steps_per_iteration,
             student_period=configuration.algorithm.student_period,
@@ -373,6 +376,7 @@ class TrainingRunner(OnPolicyRunner):
         training = local | {
             "version": TRAINING_VERSION,
             "task": self.task,
+            "settings": self.settings,
             "world_size": self.gpu_world_size,
             "best_score": self.best_score,
             "best_iteration": self.best_iteration,
@@ -431,6 +435,29 @@ class TrainingRunner(OnPolicyRunner):
             restore_random_state(local["random"], self.device)
         return entries.get("infos")
 
+    def load_weights(self, path: str | Path) -> None:
+        """Begin with the networks of another run's checkpoint; optimizers, counters and episodes start anew.
+
+        Raises:
+            CheckpointError: damaged, of other joints or another observation, or of other networks.
+        """
+        entries = read_checkpoint(path)
+        theirs = PolicyContract.from_json(entries["contract"])
+        for name in ("joint_names", "observation", "history", "action_scale", "default_joint_position"):
+            if getattr(theirs, name) != getattr(self.contract, name):
+                raise CheckpointError(
+                    f"Cannot start from '{path}': its {name} is {getattr(theirs, name)}, this run's is "
+                    f"{getattr(self.contract, name)}."
+                )
+        self._check_network(path, entries, "start")
+        try:
+            self.alg.load(entries, {"actor": True, "critic": True}, True)
+        except (RuntimeError, KeyError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise CheckpointError(
+                f"Cannot start from '{path}': its weights do not fit the networks of this run: {reason}"
+            ) from error
+
     def _load_environment(self, path: str, state: Any) -> bool:
         if state is None or not hasattr(self.env, "load_state_dict"):
             self._message(f"'{path}' holds no state of the environment: episodes start anew.")
@@ -453,18 +480,21 @@ class TrainingRunner(OnPolicyRunner):
         if lines := difference(PolicyContract.from_json(entries["contract"]), self.contract):
             first = lines.splitlines()[0]
             raise CheckpointError(f"Cannot resume from '{path}': its policy contract differs from this task's: {first}")
-        mine = checkpoint_entries(self.contract, self.stored_network(), {})["network"]
-        if entries["network"] != mine:
-            raise CheckpointError(
-                f"Cannot resume from '{path}': its network is {entries['network']['architecture']} "
-                f"{entries['network']['arguments']}, "
-                f"this run's is {mine['architecture']} {mine['arguments']}; give the same network.* settings."
-            )
+        self._check_network(path, entries, "resume")
         if training["num_envs"] != self.env.num_envs:
             raise CheckpointError(
                 f"Cannot resume from '{path}': it has {training['num_envs']} environments, this run "
                 f"{self.env.num_envs}; "
                 f"give --num-envs {training['num_envs']}."
+            )
+
+    def _check_network(self, path: str | Path, entries: Mapping[str, Any], verb: str) -> None:
+        mine = checkpoint_entries(self.contract, self.stored_network(), {})["network"]
+        if entries["network"] != mine:
+            raise CheckpointError(
+                f"Cannot {verb} from '{path}': its network is {entries['network']['architecture']} "
+                f"{entries['network']['arguments']}, "
+                f"this run's is {mine['architecture']} {mine['arguments']}; give the same training.network.* settings."
             )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
+from .configuration import ConfigurationError
 from .environment_configuration import Ramp
 
 
@@ -16,13 +17,13 @@ class RampTable:
         """Put the ramps on the device; a plain number is a ramp that never moves.
 
         Raises:
-            ValueError: a ramp ends before it begins.
+            ConfigurationError: a ramp ends before it begins.
         """
         rows = []
         for ramp in ramps:
             if isinstance(ramp, Ramp):
                 if ramp.until < ramp.begin:
-                    raise ValueError(
+                    raise ConfigurationError(
                         f"a ramp begins at {ramp.begin:g} and ends at {ramp.until:g} of the run; "
                         "'until' must not be before 'begin'"
                     )
