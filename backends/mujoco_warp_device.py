@@ -13,8 +13,12 @@ import warp as wp
 from .base import BackendError
 from .mujoco_warp_model import Capacity
 
-SCRATCH_FACTOR = 1.6
-"""Memory with the scratch arrays of a step and of its graph, in units of the engine's data."""
+_SCRATCH_FACTOR = 1.3
+"""Memory with the solver's scratch arrays, in units of the engine's data."""
+_CONVEX_BYTES = 6600
+"""Scratch memory of the convex solver for each contact that it has room for, with 35 iterations [bytes]."""
+_OWN_BYTES = 8000
+"""This engine's own buffers, and the model fields that every world has for itself [bytes]."""
 
 
 def find_device(name: str) -> torch.device:
@@ -45,6 +49,7 @@ class DeviceScope:
     """Runs Warp's launches on a torch device, in order with torch's own work there."""
 
     def __init__(self, device: torch.device) -> None:
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # one line for each of its kernels otherwise
         wp.init()
         self.on_gpu = device.type == "cuda"
         self.warp_device = wp.device_from_torch(device)
@@ -102,7 +107,8 @@ def bytes_per_world(model: mujoco.MjModel, capacity: Capacity, worlds: int) -> f
             )
         return sum(_array_bytes(part) for part in (data, data.contact, data.efc))
 
-    return SCRATCH_FACTOR * (size(3) - size(1)) / 2
+    data = (size(3) - size(1)) / 2
+    return _SCRATCH_FACTOR * data + _CONVEX_BYTES * capacity.convex / worlds + _OWN_BYTES
 
 
 def memory_advice(worlds: int, device: torch.device, free: int, per_world: float) -> str:

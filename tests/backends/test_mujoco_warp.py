@@ -159,7 +159,7 @@ def test_memory_advice_names_a_number_that_fits():
     doubled = bytes_per_world(
         shared.model, replace(capacity, contacts=2 * capacity.contacts, rows=2 * capacity.rows), 64
     )
-    assert 1.3 * per_world < doubled < 2.1 * per_world
+    assert 1.2 * per_world < doubled < 2.0 * per_world
     text = memory_advice(100_000, torch.device("cuda:0"), free=10**9, per_world=per_world)
     assert f"about {int(1e9 / per_world)} would" in text and "100000 worlds" in text
     assert is_memory_error(RuntimeError("Failed to allocate 12 bytes on device 'cuda:0'"))
