@@ -1,0 +1,284 @@
+"""``gaitgauge train``: one run on the fake engine, how it goes on, and one clear sentence for whatever is wrong."""
+
+import errno
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from gaitgauge.cli.errors import UserError
+from gaitgauge.cli.train import duration
+from gaitgauge.training import checkpoint as checkpoint_module
+from gaitgauge.training.gauging import gauge_scorer, scores_of
+from gaitgauge.training.launch import TrainRequest, prepare
+
+SMALL = (
+    "training.algorithm.minibatches=1",
+    "training.algorithm.epochs=1",
+    "training.run.steps_per_iteration=4",
+    "training.network.actor_hidden=8",
+    "training.network.critic_hidden=8",
+    "training.network.teacher_hidden=8",
+    "training.network.student_hidden=8",
+)
+FAKE = ("--backend", "fake", "--device", "cpu", "--num-envs", 8, "--no-score")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run directory of two iterations of go2-flat."""
+    from gaitgauge.cli.main import app
+    from typer.testing import CliRunner
+
+    root = tmp_path_factory.mktemp("logs")
+    arguments = ["train", "go2-flat", *FAKE, "--iterations", 2, "--seed", 5, "--log-root", root, *SMALL]
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    (run,) = (root / "go2_flat").iterdir()
+    assert str(run) in result.output.replace("\n", "")
+    return run
+
+
+# ---- runs -----------------------------------------------------------------------------------------------------------
+
+
+def test_run_directory_and_settings(trained):
+    assert (trained / "model_2.pt").is_file()
+    assert (trained / "params" / "env.yaml").read_text().count("seed: 5") == 1
+    description = json.loads((trained / "run.json").read_text())
+    assert (description["task"], description["backend"], description["num_envs"]) == ("go2-flat", "fake", 8)
+    settings = torch.load(trained / "model_2.pt", weights_only=True)["training"]["settings"]
+    assert settings["horizon_steps"] == 8
+    assert "training.network.actor_hidden=8" in settings["overrides"]
+
+
+def test_resume_keeps_settings_directory_and_horizon(run, trained):
+    result = run("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--iterations", 3)
+    assert result.exit_code == 0, result.output
+    entries = torch.load(trained / "model_3.pt", weights_only=True)
+    assert entries["iter"] == 3
+    assert entries["training"]["settings"]["horizon_steps"] == 8
+    assert entries["training"]["log"]["total_steps"] == 3 * 4 * 8
+    (trained / "model_3.pt").unlink()
+
+
+def test_carried_checkpoint_continues_in_a_new_directory(run, trained, tmp_path):
+    carried = tmp_path / "model_2.pt"
+    carried.write_bytes((trained / "model_2.pt").read_bytes())
+    result = run("train", "go2-flat", "--resume", carried, "--device", "cpu", "--no-score", "--iterations", 3)
+    assert result.exit_code == 0, result.output
+    (new,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    assert [f.name for f in new.glob("model_*.pt")] == ["model_3.pt"]
+    assert json.loads((new / "run.json").read_text())["begun_with"] == str(carried)
+
+
+def test_initial_weights_from_other_settings(run, trained, tmp_path):
+    command = ("train", "go2-flat", *FAKE[:4], "--num-envs", 12, "--no-score", "--iterations", 1, *SMALL)
+    slow = ("training.algorithm.learning_rate=1e-12", "training.algorithm.student_learning_rate=1e-12")
+    fixed = ("training.algorithm.desired_kl=none", "--init-from", trained / "model_2.pt")
+    result = run(*command, *slow, *fixed)
+    assert result.exit_code == 0, result.output
+    (new,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    ours = torch.load(new / "model_1.pt", weights_only=True)
+    theirs = torch.load(trained / "model_2.pt", weights_only=True)
+    assert ours["iter"] == 1
+    for name, value in theirs["state_dict"].items():
+        torch.testing.assert_close(ours["state_dict"][name], value, rtol=0, atol=1e-6)
+
+
+def test_signal_writes_a_checkpoint_and_says_how_to_go_on(run, tmp_path):
+    def stop_when_it_trains() -> None:
+        while not list(tmp_path.rglob("model_2.pt")):
+            if finished.wait(0.02):
+                return
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    finished = threading.Event()
+    watcher = threading.Thread(target=stop_when_it_trains)
+    watcher.start()
+    result = run("train", "go2-flat", *FAKE, *SMALL, "--iterations", 100_000, "training.run.save_interval=2")
+    finished.set()
+    watcher.join()
+    assert result.exit_code == 128 + signal.SIGTERM
+    assert "gaitgauge train go2-flat --resume" in result.output
+    last = max(int(f.stem.removeprefix("model_")) for f in tmp_path.rglob("model_*.pt"))
+    assert last >= 2
+    assert f"{last} iterations done" in result.output
+
+
+def test_time_limit_ends_with_success(run, tmp_path):
+    result = run("train", "go2-flat", *FAKE, *SMALL, "--iterations", 100_000, "--time", "0.5s")
+    assert result.exit_code == 0, result.output
+    assert "time is up" in result.output
+    assert list(tmp_path.rglob("model_*.pt"))
+
+
+# ---- bad input ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("go2-mo-cts",), ("'go2-mo-cts'", "go2-moe-cts")),
+        (("go2-flat", "environment.push.linaer=1"), ("'environment.push.linaer'", "environment.push.linear")),
+        (("go2-flat", "num_envs=3"), ("'num_envs'", "environment.num_envs")),
+        (("go2-flat", "training.run.iterations=many"), ("'many'", "whole number")),
+        (("go2-flat", "something"), ("'something'", "key=value")),
+        (("go2-flat", "--backend", "mujoco-wrap"), ("'mujoco-wrap'", "mujoco-warp")),
+        (("go2-flat", "--time", "soon"), ("'soon'", "1h30m")),
+        (("go2-flat", "--time", "0"), ("'0'", "longer")),
+        (("go2-flat", "--device", "cpu", "--backend", "fake", "--capture"), ("--capture", "cpu")),
+        (("go2-flat", "--score-suite", "quik", "--backend", "fake"), ("'quik'", "'quick'")),
+        (("go2-flat", "--resume", "latest", "--backend", "fake"), ("nothing to resume", "go2_flat")),
+        (("go2-flat", "--resume", "nowhere.pt"), ("'nowhere.pt'", "latest")),
+        (("go2-flat", "--init-from", "nowhere.pt"), ("'nowhere.pt'",)),
+        (("go2-flat", "--resume", "latest", "--init-from", "x.pt"), ("--resume", "--init-from")),
+        (("go2-flat", "--backend", "fake", "environment.joints.parameters=nope"), ("'nope'", "training")),
+        (("go2-flat", "--backend", "fake", "training.run.experiment=a/b"), ("a/b", "folder name")),
+    ],
+)
+def test_bad_request(refused, arguments, named):
+    message = refused("train", *arguments)
+    for text in named:
+        assert text in message
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_no_gpu(refused, tmp_path):
+    assert "--device cpu" in refused("train", "go2-flat")
+    assert "--device cpu" in refused("train", "go2-flat", "--backend", "fake", "--device", "cuda")
+    assert not (tmp_path / "logs").exists()
+
+
+def test_checkpoint_of_another_task(refused, trained, tmp_path):
+    message = refused("train", "go2-cts", "--resume", trained, "--device", "cpu")
+    assert "'go2-flat'" in message
+    assert "'go2-cts'" in message
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("option", ["--resume", "--init-from"])
+@pytest.mark.parametrize("damage", ["empty", "truncated", "text"])
+def test_damaged_checkpoint(refused, trained, tmp_path, damage, option):
+    whole = (trained / "model_2.pt").read_bytes()
+    content = {"empty": b"", "truncated": whole[: len(whole) // 2], "text": b"once upon a time\n"}[damage]
+    (tmp_path / "model_9.pt").write_bytes(content)
+    assert "model_9.pt" in refused("train", "go2-flat", "--backend", "fake", option, tmp_path / "model_9.pt")
+    assert not (tmp_path / "logs").exists()
+
+
+def test_policy_without_training_state(refused, policy):
+    assert "no training state" in refused("train", "go2-flat", "--backend", "fake", "--resume", policy)
+
+
+def test_initial_weights_of_other_networks(refused, trained):
+    bigger = [s.replace("student_hidden=8", "student_hidden=16") for s in SMALL]
+    message = refused("train", "go2-flat", *FAKE, "--init-from", trained / "model_2.pt", *bigger)
+    assert "training.network" in message
+
+
+def test_finished_run_says_what_to_give(refused, trained):
+    message = refused("train", "go2-flat", "--resume", trained / "model_2.pt", "--device", "cpu", "--no-score")
+    assert "2 of 2 iterations" in message
+    assert "--iterations" in message
+
+
+def test_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
+    real = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        if "model_2.pt" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(descriptor)
+
+    monkeypatch.setattr(checkpoint_module.os, "fsync", fsync)
+    result = run("train", "go2-flat", *FAKE, *SMALL, "--iterations", 3, "training.run.save_interval=1")
+    assert result.exit_code == 2
+    (sentence,) = result.stderr.splitlines()
+    assert "model_2.pt" in sentence
+    assert "No space left on device" in sentence
+    assert "--resume latest" in sentence
+    (run_directory,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    assert [f.name for f in run_directory.iterdir() if "model" in f.name] == ["model_1.pt"]
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    again = run("train", "go2-flat", "--resume", "latest", "--no-score")
+    assert again.exit_code == 0, again.output
+    assert (run_directory / "model_3.pt").is_file()
+
+
+# ---- pieces ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90", 90.0), ("1.5", 1.5), ("20s", 20.0), ("9m", 540.0), ("2h", 7200.0), ("1h30m", 5400.0)]
+)
+def test_durations(text, seconds):
+    assert duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "m", "-5", "9 m", "9d", "1e3", "0s"])
+def test_impossible_durations(text):
+    with pytest.raises(UserError, match="--time"):
+        duration(text)
+
+
+def test_options_are_overrides_and_settings_win():
+    request = TrainRequest(
+        task="go2-flat", backend="fake", num_envs=16, seed=7, overrides=("environment.num_envs=24",), score_every=50
+    )
+    task = prepare(request).task
+    assert task.environment.num_envs == 24
+    assert task.environment.seed == task.training.run.seed == 7
+    assert task.training.run.gauge_interval == 50
+
+
+def test_time_limit_waits_for_no_score_unless_asked():
+    def wait(*overrides: str, seconds: float | None) -> float:
+        request = TrainRequest(task="go2-flat", backend="fake", seconds=seconds, overrides=overrides)
+        return prepare(request).task.training.run.gauge_wait
+
+    assert wait(seconds=None) > 0.0
+    assert wait(seconds=60.0) == 0.0
+    assert wait("training.run.gauge_wait=30", seconds=60.0) == 30.0
+
+
+def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):
+    from gaitgauge.training import scoring
+
+    started = []
+
+    class Process:
+        def __init__(self, command, **options):
+            started.append((command, options["env"]))
+
+        def poll(self):
+            return None
+
+    monkeypatch.setattr(scoring.subprocess, "Popen", Process)
+    old = tmp_path / "gauge" / "quick" / "model_5" / "results.json"
+    old.parent.mkdir(parents=True)
+    old.write_text("{}")
+    scorer = gauge_scorer(tmp_path, suite="quick", threads=3)
+    for iteration in (5, 6, 7):
+        scorer.submit(tmp_path / f"model_{iteration}.pt", iteration)
+    ((command, environment),) = started
+    assert command[1:5] == ["-m", "gaitgauge.cli.main", "evaluate", str(tmp_path / "model_5.pt")]
+    assert command[command.index("--threads") + 1] == "3"
+    assert environment["CUDA_VISIBLE_DEVICES"] == ""
+    assert not old.exists(), "results of the same iteration before a resume would be refused"
+    (skipped,) = scorer.poll()
+    assert skipped.iteration == 6
+    assert "skipped" in skipped.failure
+
+
+def test_scores_taken_from_results():
+    terrains = {"flat": {"level": None, "mean": 0.5}, "wave": {"level": 3.0, "mean": 0.25}}
+    results = {"score": 0.375, "terrains": terrains, "groups": {"safety": 0.9}}
+    expected = {"score": 0.375, "terrain/flat": 0.5, "level/wave": 3.0, "terrain/wave": 0.25, "group/safety": 0.9}
+    assert scores_of(results) == expected
+    with pytest.raises(ValueError, match="no score"):
+        scores_of({"score": None})
