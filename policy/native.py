@@ -129,8 +129,15 @@ def save_policy(
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    torch.save({**entries, **(extra or {})}, partial)
-    os.replace(partial, target)
+    try:
+        # Given a path, torch would write its name, and with it the process id, into the file: equal policies, unequal bytes.
+        with partial.open("wb") as file:
+            torch.save({**entries, **(extra or {})}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:

@@ -23,6 +23,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from .trot import TrotController
+
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
     "elu": nn.ELU,
     "relu": nn.ReLU,
@@ -228,4 +230,5 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     "mlp": MlpNetwork,
     "cts": CtsNetwork,
     "moe_cts": MoeCtsNetwork,
+    "trot": TrotController,
 }
