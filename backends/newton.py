@@ -7,8 +7,10 @@ waits for the device.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from math import cos, pi
 from typing import Any, ClassVar
 
@@ -19,6 +21,7 @@ import warp as wp
 from . import newton_kernels as kernels
 from . import newton_readout_kernels as readout
 from .base import BackendError, Capability, PhysicsBackend, PhysicsState, Randomization, Scene
+from .mujoco_warp_device import is_memory_error, memory_advice
 from .newton_buffers import (
     MassTensors,
     MotorTensors,
@@ -28,6 +31,7 @@ from .newton_buffers import (
     layout_structure,
     palette_structure,
 )
+from .newton_description import describe_newton
 from .newton_model import BIRTH_HEIGHT, build_world_model
 from .newton_solvers import SOLVERS, SolverAdapter
 
@@ -77,9 +81,33 @@ class NewtonBackend(PhysicsBackend):
             self.device = torch.device("cuda", torch.cuda.current_device())
         self._warp_device = wp.device_from_torch(self.device)
         self._graphs: dict[tuple[int, bool, bool], Any] = {}
-        with self._on_device():
-            self._build()
-            self._warm_up()
+        try:
+            with self._on_device():
+                self._build()
+                self._warm_up()
+        except RuntimeError as error:  # torch's and Warp's out-of-memory errors are such
+            if isinstance(error, BackendError) or not is_memory_error(error):
+                raise
+            raise BackendError(self._memory_advice()) from error
+
+    def _memory_advice(self) -> str:
+        """The sentence for worlds that do not fit: how many would, measured on small copies."""
+        self.__dict__ = {name: self.__dict__[name] for name in ("scene", "device", "dtype", "_warp_device")}
+        gc.collect()
+
+        def free() -> int:
+            wp.synchronize_device(self._warp_device)
+            torch.cuda.empty_cache()
+            return int(torch.cuda.mem_get_info(self.device)[0])
+
+        start, used = free(), []
+        for count in (64, 512):
+            index = tuple(self.scene.terrain_index[i % self.num_worlds] for i in range(count))
+            copy = type(self)(replace(self.scene, terrain_index=index), device=str(self.device))
+            used.append(start - free())
+            del copy
+            gc.collect()
+        return memory_advice(self.num_worlds, self.device, start, max(1.0, (used[1] - used[0]) / 448))
 
     # ---- building -----------------------------------------------------------------------------------------------
 
@@ -255,6 +283,8 @@ class NewtonBackend(PhysicsBackend):
     def _graph(self, key: tuple[int, bool, bool]) -> Any:
         """The CUDA graph of a control period, captured at its first use."""
         if key not in self._graphs:
+            torch.cuda.synchronize(self.device)
+            # nothing runs while recording; recording in torch's default stream is impossible
             with wp.ScopedStream(wp.Stream(self._warp_device)), wp.ScopedCapture(force_module_load=False) as capture:
                 self._run_period(key[0], masked=key[1], sampled=key[2])
             self._graphs[key] = capture.graph
@@ -476,6 +506,10 @@ class NewtonBackend(PhysicsBackend):
             for state in (self._now, self._next):
                 wrenches = wp.to_torch(state.body_f).view(n, layout.bodies, 6)
                 wrenches[:, layout.base, :3] = force_w.to(self.device, torch.float32)
+
+    def describe(self) -> Mapping[str, list[float]]:
+        """See ``PhysicsBackend.describe``."""
+        return describe_newton(self.scene, self._world, self._motors)
 
     def close(self) -> None:
         """Free the graphs."""

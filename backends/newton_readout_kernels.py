@@ -143,7 +143,7 @@ def add_contacts(
 ):
     """Add each ground contact's force to its foot, body and world.
 
-    ``body_q`` are the poses in which the contacts were found. Moments and the centre are summed about the base's place in
+    ``body_q`` are the poses in which the contacts were found. Moments and the centre are summed about the base in
     these poses, near the contacts, to keep single precision; ``finish_contacts`` moves them.
     """
     c = wp.tid()

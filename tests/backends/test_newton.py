@@ -1,0 +1,202 @@
+"""The Newton engine beyond the conformance checks: its solvers, its import of the robot, its tables, and other engines' company."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from gaitgauge.backends import BackendError, PhysicsOptions, Randomization, Scene, Support
+from gaitgauge.backends.base import CAPABILITY_NAMES
+from gaitgauge.backends.mujoco_model import robot_spec
+from gaitgauge.backends.newton import NewtonBackend
+from gaitgauge.backends.newton_model import PARKED, _slot_tables, build_world_model, carriers, import_differences
+from gaitgauge.backends.newton_solvers import SOLVERS, dry_friction_slope
+from gaitgauge.backends.registry import make_backend
+from gaitgauge.robots import load_robot
+from gaitgauge.terrains.base import Box, HeightField, Terrain
+
+ROBOT = load_robot("go2")
+FLAT = Terrain(name="flat", family="flat")
+BLOCK = Box(center=(0.0, 0.0, 0.1), half_size=(2.0, 2.0, 0.1))
+WALL = Box(center=(3.0, 0.0, 0.5), half_size=(0.1, 2.0, 0.5), quaternion=(0.70710678, 0, 0, 0.70710678), wall=True)
+BOXES = Terrain(name="boxes", family="boxes", boxes=(BLOCK, WALL))
+
+
+def field(height):
+    heights = np.full((4, 5), height)
+    heights[0, 0] += 0.1
+    return Terrain(
+        name="field",
+        family="field",
+        height_field=HeightField(center=(0.5, 0.0), half_size=(2.0, 1.5), heights=heights),
+    )
+
+
+def scene(*terrains, index=None, **physics):
+    terrains = terrains or (FLAT,)
+    return Scene(
+        robot=ROBOT,
+        parameters=ROBOT.parameters["gauge"],
+        terrains=terrains,
+        terrain_index=tuple(range(len(terrains))) if index is None else index,
+        physics=PhysicsOptions(**physics),
+    )
+
+
+def compiled(change=lambda spec: None):
+    spec = robot_spec(scene())
+    change(spec)
+    return spec.compile()
+
+
+def test_solvers_declare_every_capability():
+    for name in SOLVERS:
+        capabilities = NewtonBackend.with_solver(name).capabilities()
+        assert set(capabilities) == set(CAPABILITY_NAMES)
+        # what is not exact says why
+        assert all(c.note for c in capabilities.values() if c.support is not Support.EXACT)
+
+
+def test_solver_names():
+    assert NewtonBackend.with_solver("mujoco") is NewtonBackend
+    steel = NewtonBackend.with_solver("steel")
+    assert steel.name == "newton:steel"
+    assert steel.capabilities() is not NewtonBackend.capabilities()
+    with pytest.raises(BackendError, match="unknown Newton solver 'bullet'; 'newton:NAME' runs mujoco and steel"):
+        make_backend("newton:bullet", scene())
+
+
+@pytest.mark.parametrize(
+    ("solver", "physics", "says"),
+    [
+        ("steel", {"foot_condim": 6}, "foot_condim_6"),
+        ("steel", {"cone": "pyramidal"}, "pyramidal"),
+        ("mujoco", {"contacts_per_world": 0}, "contacts_per_world is 0"),
+    ],
+)
+def test_refusals_say_what_to_change(solver, physics, says):
+    with pytest.raises(BackendError, match=says) as refused:
+        make_backend(f"newton:{solver}", scene(**physics))
+    assert "PhysicsOptions" in str(refused.value)
+
+
+def test_devices_that_do_not_exist():
+    with pytest.raises(BackendError, match="use 'cpu', 'cuda' or 'cuda:N'"):
+        make_backend("newton", scene(), device="tpu")
+
+
+def test_slots_of_a_palette():
+    slots = _slot_tables((FLAT, BOXES, field(0.2), field(0.3)))
+    assert slots.pose.shape == (4, 3, 7)
+    np.testing.assert_allclose(slots.pose[0, :, :3], np.tile(PARKED, (3, 1)))
+    np.testing.assert_allclose(slots.pose[1, 1], [3.0, 0.0, 0.5, 0.0, 0.0, 0.70710678, 0.70710678])  # xyzw
+    np.testing.assert_allclose(slots.scale[1, 0], BLOCK.half_size)
+    np.testing.assert_array_equal(slots.wall, [[0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(slots.pose[2, 2, :3], [0.5, 0.0, 0.0])
+    np.testing.assert_array_equal(slots.field, [0, 0, 0, 1])
+
+
+def test_import_differences_are_found():
+    order = np.arange(compiled().ngeom)
+    assert import_differences(compiled(), compiled(), order) == []
+
+    def heavier(spec):
+        spec.body("FL_calf").mass *= 1.01
+
+    def slippery(spec):
+        spec.geom("FL").condim = 3
+
+    def alone(spec):
+        spec.geom("base_trunk").contype = spec.geom("base_trunk").conaffinity = 0
+
+    assert "body_mass is off" in import_differences(compiled(heavier), compiled(), order)[0]
+    assert "geom_condim is off by 3" in import_differences(compiled(slippery), compiled(), order)[0]
+    assert any(
+        "'base_trunk'" in w and "do not collide" in w for w in import_differences(compiled(alone), compiled(), order)
+    )
+
+
+def test_dry_friction_slope_stops_a_joint_within_a_step_or_two():
+    reference = compiled()
+    dofs = np.array([int(reference.joint(name).dofadr[0]) for name in ROBOT.joint_names])
+    timestep = 0.002
+    slope = dry_friction_slope(reference, dofs, timestep)
+    # explicit damping with this slope is stable in all coupled directions: the largest eigenvalue of dt M⁻¹ K is below 2
+    data = mujoco.MjData(reference)
+    mujoco.mj_forward(reference, data)
+    inertia = np.zeros((reference.nv, reference.nv))
+    mujoco.mj_fullM(reference, data, inertia)
+    damping = np.zeros(reference.nv)
+    damping[dofs] = slope
+    largest = np.linalg.eigvals(timestep * np.linalg.inv(inertia) * damping).real.max()
+    assert 0.5 < largest < 2.0
+
+
+@pytest.mark.slow
+def test_every_field_of_the_palette_is_in_the_model():
+    for worlds in (1, 2, 5):
+        terrains = (field(0.1), FLAT, field(0.2), field(0.3))
+        world = build_world_model(scene(*terrains, index=(0,) * worlds), device="cpu", gap=0.0, skin=True)
+        found = [world.model.shape_source[s] for s in carriers(world.layout, world.slots, worlds)]
+        np.testing.assert_allclose([f.min_z for f in found], [0.1, 0.2, 0.3])
+        assert len(set(carriers(world.layout, world.slots, worlds))) == 3
+
+
+def stand(name, *, friction=0.6, periods=25, **physics):
+    """Two robots dropped on the floor and on a block, held at their default pose."""
+    engine = make_backend(name, scene(FLAT, BOXES, **physics))
+    kind = engine.dtype
+    engine.randomize(Randomization(friction=torch.full((2,), friction, dtype=kind)))
+    engine.reset(
+        base_position=torch.tensor([[0.0, 0.0, 0.36], [0.0, 0.0, 0.56]], dtype=kind),
+        base_quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=kind).repeat(2, 1),
+        held_target=torch.tensor(ROBOT.default_joint_position, dtype=kind).repeat(2, 1),
+    )
+    for _ in range(periods):
+        engine.step(None)
+    state = engine.state
+    return SimpleNamespace(
+        base=state.base_position_w.double().numpy(),
+        joints=state.joint_position.double().numpy(),
+        force=state.ground_force_w.double().numpy(),
+        feet=state.foot_normal_force.double().numpy(),
+        overflowed=bool(state.overflowed.any()),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "physics", [{}, {"timestep": 0.005, "substeps": 4, "cone": "pyramidal", "foot_condim": 3, "self_collision": False}]
+)
+def test_the_mujoco_solver_stands_as_mujoco_does(physics):
+    expected, found = stand("mujoco", **physics), stand("newton", **physics)
+    np.testing.assert_allclose(found.base, expected.base, atol=2e-4)
+    np.testing.assert_allclose(found.joints, expected.joints, atol=2e-3)
+    np.testing.assert_allclose(found.feet, expected.feet, rtol=0.02, atol=0.5)
+    assert not found.overflowed
+
+
+@pytest.mark.slow
+def test_steel_stands_nearly_as_mujoco_does():
+    expected, found = stand("mujoco"), stand("newton:steel")
+    np.testing.assert_allclose(found.base[:, 2], expected.base[:, 2], atol=0.015)
+    np.testing.assert_allclose(found.joints, expected.joints, atol=0.15)
+    np.testing.assert_allclose(found.base[1] - found.base[0], [0.0, 0.0, 0.2], atol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_small_buffer_overflows_and_says_so():
+    assert stand("newton", contacts_per_world=2, periods=5).overflowed
+    assert stand("newton:steel", contacts_per_world=2, periods=5).overflowed
+
+
+@pytest.mark.slow
+def test_randomizing_some_worlds_takes_a_row_for_each():
+    engine = make_backend("newton:steel", scene(index=(0, 0, 0)))
+    mask = torch.tensor([True, False, True])
+    engine.randomize(Randomization(motor_offset=torch.ones(2, 12), friction=torch.tensor([0.3, 0.7])), mask)
+    assert engine._motors.offset[:, 0].tolist() == [1.0, 0.0, 1.0]
+    np.testing.assert_allclose(engine._masses.friction[:, 5], [0.3, 0.4, 0.7])
+    with pytest.raises(BackendError, match="friction has 3 rows for 2 worlds"):
+        engine.randomize(Randomization(friction=torch.ones(3)), mask)
