@@ -167,6 +167,26 @@ def train(
     )
 
 
+@app.command()
+@report_errors
+def export(
+    policy: Annotated[
+        str,
+        typer.Argument(
+            help="A checkpoint of the project's own, a run directory, or latest, best, pretrained.", metavar="POLICY"
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder. Default: 'exported' in the run directory, or here.")
+    ] = None,
+    form: Annotated[str, typer.Option("--format", help="torchscript, onnx, deploy or all.")] = "all",
+) -> None:
+    """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it."""
+    from .export import run_export
+
+    run_export(policy, out=out, form=form)
+
+
 @app.command("import")
 @report_errors
 def import_command(

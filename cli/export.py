@@ -1,0 +1,73 @@
+"""``gaitgauge export``: a policy as the files that robots and other programs run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from difflib import get_close_matches
+from pathlib import Path
+
+from rich.console import Console
+
+from ..policy.base import Policy
+from ..policy.export import ExportError, export_deploy, export_onnx, export_policy, export_torchscript
+from ..policy.loading import load_policy
+from ..robots import Robot, load_robot
+from .errors import UserError
+from .policies import policy_file
+
+
+def _torchscript(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
+    path = folder / "policy.pt"
+    return {path: export_torchscript(policy, path)}
+
+
+def _onnx(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
+    path = folder / "policy.onnx"
+    return {path: export_onnx(policy, path)}
+
+
+def _deploy(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
+    path = folder / "deploy.yaml"
+    export_deploy(policy, path, robot)
+    return {path: 0.0}
+
+
+FORMATS: dict[str, Callable[[Policy, Path, Robot], dict[Path, float]]] = {
+    "all": export_policy,
+    "torchscript": _torchscript,
+    "onnx": _onnx,
+    "deploy": _deploy,
+}
+_ABOUT = {
+    ".pt": "TorchScript: one observation in, history inside, reset()",
+    ".onnx": "ONNX: stacked observations in, the contract in its metadata",
+    ".yaml": "settings of the robot's C++ runtime for policy.onnx",
+}
+
+
+def run_export(choice: str, *, out: Path | None, form: str) -> None:
+    """Export, and print each file with its check against the policy.
+
+    Raises:
+        UserError: no such format.
+        PolicyError, ContractError: no such policy, or it cannot be exported.
+    """
+    if form not in FORMATS:
+        close = get_close_matches(form, FORMATS, 1)
+        hint = f"did you mean '{close[0]}'? " if close else ""
+        raise UserError(f"there is no format '{form}'; {hint}choose one of: {', '.join(FORMATS)} (--format)")
+    path = policy_file(choice)
+    policy = load_policy(path)
+    robot = load_robot(policy.contract.robot)
+    # Beside the checkpoint of a run, where users of Isaac Lab look for it.
+    folder = out or (path.parent if (path.parent / "run.json").is_file() else Path()) / "exported"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExportError(f"cannot create folder '{folder}': {error.strerror}; choose another --out") from error
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"policy {path}, contract {policy.contract.hash[:12]}")
+    for written, largest in FORMATS[form](policy, folder, robot).items():
+        actions = f"actions differ by at most {largest:.1e}" if largest else "actions are the same"
+        check = "reads back the same" if written.suffix == ".yaml" else actions
+        console.print(f"{written}  {written.stat().st_size / 1e6:.2f} MB  {_ABOUT[written.suffix]}; {check}")

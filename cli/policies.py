@@ -1,0 +1,28 @@
+"""Which policy file the user means."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..policy.loading import find_policy
+from ..training.run_directory import latest_checkpoint
+from .errors import UserError
+
+
+def policy_file(choice: str) -> Path:
+    """The file of a policy, of a name such as ``latest``, or of a run directory: its best checkpoint, else its last.
+
+    Raises:
+        PolicyError: there is no such policy.
+        UserError: the run directory holds no checkpoint.
+    """
+    folder = Path(choice)
+    if not folder.is_dir():
+        return find_policy(choice)
+    best = folder / "best.pt"
+    found = best if best.is_file() else latest_checkpoint(folder)
+    if found is None:
+        raise UserError(
+            f"'{choice}' is a folder without a best.pt or model_<iteration>.pt; give a run directory or a policy file"
+        )
+    return found

@@ -1,0 +1,48 @@
+"""``gaitgauge export``: files, their check, and one sentence for what cannot be exported."""
+
+from pathlib import Path
+
+import pytest
+from gaitgauge.policy.loading import load_policy
+
+
+def test_all_formats(run, policy, tmp_path):
+    result = run("export", policy, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert sorted(f.name for f in (tmp_path / "out").iterdir()) == ["deploy.yaml", "policy.onnx", "policy.pt"]
+    assert result.output.count("; actions ") == 2
+    assert "reads back the same" in result.output
+    ours = load_policy(policy).contract
+    assert load_policy(tmp_path / "out" / "policy.pt").contract.joint_names == ours.joint_names
+
+
+def test_run_directory_gives_its_best_and_holds_the_files(run, policy, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "run.json").write_text("{}")
+    (folder / "model_9.pt").write_bytes(b"not this one")
+    (folder / "best.pt").write_bytes(policy.read_bytes())
+    result = run("export", folder, "--format", "torchscript")
+    assert result.exit_code == 0, result.output
+    assert [f.name for f in (folder / "exported").iterdir()] == ["policy.pt"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("nowhere.pt",), ("'nowhere.pt'", "pretrained")),
+        (("standing.gauge.pt", "--format", "onxx"), ("'onxx'", "'onnx'", "--format")),
+        (("standing.gauge.pt", "--out", "standing.gauge.pt"), ("standing.gauge.pt", "--out")),
+        (("empty",), ("'empty'", "best.pt")),
+    ],
+)
+def test_bad_request(refused, policy, tmp_path, arguments, named):
+    (tmp_path / "empty").mkdir()
+    message = refused("export", *arguments)
+    for text in named:
+        assert text in message
+
+
+def test_exported_file_is_not_exported_again(run, refused, policy, tmp_path):
+    assert run("export", policy, "--format", "torchscript", "--out", tmp_path).exit_code == 0
+    assert "exported file already" in refused("export", Path(tmp_path) / "policy.pt", "--out", tmp_path / "again")
