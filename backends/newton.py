@@ -173,7 +173,7 @@ class NewtonBackend(PhysicsBackend):
     def _launch(self, kernel: Any, dim: int | tuple[int, ...], *inputs: Any) -> None:
         wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._warp_device)
 
-    def _coordinates(self, state: newton.State) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+    def _coordinates(self, state: Any) -> tuple[Any, Any, Any, Any]:
         return state.joint_q, state.joint_qd, state.body_q, state.body_qd
 
     def _run_period(self, substeps: int, *, masked: bool, sampled: bool) -> None:
@@ -250,9 +250,7 @@ class NewtonBackend(PhysicsBackend):
         if masked:
             self._launch(kernels.keep_inactive, (n, width), self._layout, active, 1, *keep)
 
-    def _read(
-        self, select: wp.array, value: int, state: newton.State, out: Any, *, contacts_of: newton.State | None
-    ) -> None:
+    def _read(self, select: Any, value: int, state: Any, out: Any, *, contacts_of: Any) -> None:
         """Write the state of the worlds whose ``select`` equals ``value``; without ``contacts_of`` forces are zero."""
         n, (joints, feet, bodies) = self.num_worlds, self._sizes
         live = self._state_arrays
@@ -268,7 +266,7 @@ class NewtonBackend(PhysicsBackend):
         )
         self._launch(readout.finish_contacts, n, select, value, self._layout, poses, out)
 
-    def _read_motion(self, select: wp.array, value: int, state: newton.State, out: Any) -> None:
+    def _read_motion(self, select: Any, value: int, state: Any, out: Any) -> None:
         """Write poses, velocities and flags."""
         n, (joints, feet, _) = self.num_worlds, self._sizes
         live, com = self._state_arrays, self._model.body_com
@@ -315,7 +313,7 @@ class NewtonBackend(PhysicsBackend):
         self._active.copy_(worlds)
         self._mask[:-1].copy_(worlds)
 
-    def _rows(self, name: str, value: torch.Tensor | None, width: int, default: float | torch.Tensor = 0.0) -> wp.array:
+    def _rows(self, name: str, value: torch.Tensor | None, width: int, default: float | torch.Tensor = 0.0) -> Any:
         """An argument with one row per world as a Warp array."""
         if value is None:
             rows = torch.zeros((self.num_worlds, width), dtype=torch.float32, device=self.device) + default
@@ -374,7 +372,7 @@ class NewtonBackend(PhysicsBackend):
             newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
             self._read(active, 1, self._now, self._state_arrays, contacts_of=None)
 
-    def _place_terrain(self, active: wp.array) -> None:
+    def _place_terrain(self, active: Any) -> None:
         """Give the active worlds the terrains in ``_requested_terrain``."""
         self._launch(
             kernels.place_terrain,

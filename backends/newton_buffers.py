@@ -70,7 +70,7 @@ def palette_structure(slots: SlotTables, device: wp.Device) -> Any:
     )
 
 
-def contact_structure(contacts: newton.Contacts, force: wp.array, shape_body: wp.array) -> Any:
+def contact_structure(contacts: newton.Contacts, force: Any, shape_body: Any) -> Any:
     """Newton's contacts, as the kernels see them."""
     return structure(
         kernels.ContactArrays,

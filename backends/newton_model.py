@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import newton
@@ -83,7 +84,8 @@ class SlotTables:
 class WorldModel:
     """The Newton model of all worlds and what is known about it."""
 
-    model: newton.Model
+    model: Any
+    """A ``newton.Model``; Newton declares every one of its arrays as optional."""
     layout: WorldLayout
     slots: SlotTables
     reference: mujoco.MjModel
@@ -251,7 +253,7 @@ def _add_ground(
         world.add_shape_box(-1, xform=parked, hx=PARKED_SIZE, hy=PARKED_SIZE, hz=PARKED_SIZE, cfg=material)
         for _ in range(boxes)
     ]
-    spare = []
+    spare: list[int] = []
     if slots.fields:
         for i in range(-(-len(slots.fields) // scene.num_worlds)):
             field = _newton_field(slots.fields[0])
@@ -284,7 +286,7 @@ def _distribute_fields(everything: newton.ModelBuilder, layout: WorldLayout, slo
     if not slots.fields:
         return
     tiny = _newton_field(HeightField(center=(0.0, 0.0), half_size=(0.01, 0.01), heights=np.zeros((2, 2))))
-    base = everything.custom_attributes["mujoco:hfield_base"].values
+    base: Any = everything.custom_attributes["mujoco:hfield_base"].values
     for shape in (int(layout.slot_shape[-1]), *map(int, layout.spare_fields)):
         for world in range(scene.num_worlds):
             everything.shape_source[world * layout.shapes + shape] = tiny
@@ -367,7 +369,7 @@ def import_differences(found: mujoco.MjModel, expected: mujoco.MjModel, order: N
     Returns:
         One sentence for each field that differs; empty where all is well.
     """
-    wrong = []
+    wrong: list[str] = []
     for name in BODY_AND_JOINT_FIELDS:
         _compare(name, getattr(found, name), getattr(expected, name), wrong)
     for name in GEOM_FIELDS:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import mujoco_warp
@@ -79,15 +79,15 @@ class SolverAdapter(ABC):
         """One physics step. ``observe``: the contact forces are wanted."""
 
     @abstractmethod
-    def collect_overflow(self, active: wp.array, overflowed: wp.array) -> None:
+    def collect_overflow(self, active: Any, overflowed: Any) -> None:
         """Set the flags of the active worlds in which the last step dropped contacts or constraints."""
 
     @abstractmethod
-    def reset(self, state: newton.State, mask: wp.array) -> None:
+    def reset(self, state: newton.State, mask: Any) -> None:
         """Forget the past of the masked worlds; ``mask`` is (N + 1,) bool."""
 
     @abstractmethod
-    def shapes_changed(self, terrain: wp.array) -> None:
+    def shapes_changed(self, terrain: Any) -> None:
         """Take over poses, sizes and friction of the model's shapes; ``terrain`` is each world's, (N,)."""
 
     @abstractmethod
@@ -124,7 +124,7 @@ class MujocoAdapter(SolverAdapter):
         contacts = _contacts_per_world(scene, world)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the margins that it complains about are repaired below
-            self.solver = newton.solvers.SolverMuJoCo(
+            self.solver: Any = newton.solvers.SolverMuJoCo(
                 model,
                 nconmax=contacts,
                 njmax=_constraint_rows(scene, world, contacts),
@@ -145,13 +145,13 @@ class MujocoAdapter(SolverAdapter):
             self._model.opt.deterministic = int(mujoco_warp.DeterminismType.ATOMICS)
         self._model.opt.warn_overflow = 0  # alarms are reported per world, not printed by the device
         self._check_import(world, scene)
-        geoms = self.solver.mjc_geom_to_newton_shape.numpy()
+        geoms = _geom_shapes(self.solver)
         margin = np.zeros(geoms.shape, dtype=np.float32)
         local = geoms[0] % world.layout.shapes
         for geom, shape in enumerate(local):
             if world.layout.shape_ground[shape] == 0:
                 margin[:, geom] = model.shape_margin.numpy()[shape]
-        self._margin = wp.array(margin, dtype=float, device=model.device)
+        self._margin: wp.array = wp.array(margin, dtype=float, device=model.device)
         self._fields = _FieldGeom(self.solver, world, scene) if world.slots.fields else None
         self.warm_start = self._data.qacc_warmstart
         self.contacts = newton.Contacts(self.solver.get_max_contact_count(), 0, device=model.device)
@@ -162,7 +162,7 @@ class MujocoAdapter(SolverAdapter):
 
     def _check_import(self, world: WorldModel, scene: Scene) -> None:
         """Refuse a robot of which Newton's importer made something else than MuJoCo's compiler."""
-        shape_geom = {int(s): g for g, s in enumerate(self.solver.mjc_geom_to_newton_shape.numpy()[0])}
+        shape_geom = {int(s): g for g, s in enumerate(_geom_shapes(self.solver)[0])}
         order = np.array([shape_geom[s] for s in range(world.reference.ngeom)])
         wrong = import_differences(self.solver.mj_model, world.reference, order)
         if wrong:
@@ -177,7 +177,7 @@ class MujocoAdapter(SolverAdapter):
             before, after, control, self.contacts, self._timestep, observables=self.observables if observe else None
         )
 
-    def collect_overflow(self, active: wp.array, overflowed: wp.array) -> None:
+    def collect_overflow(self, active: Any, overflowed: Any) -> None:
         """See ``SolverAdapter.collect_overflow``."""
         wp.launch(
             kernels.collect_overflow_bits,
@@ -186,11 +186,11 @@ class MujocoAdapter(SolverAdapter):
             device=active.device,
         )
 
-    def reset(self, state: newton.State, mask: wp.array) -> None:
+    def reset(self, state: newton.State, mask: Any) -> None:
         """See ``SolverAdapter.reset``."""
         self.solver.reset(state, mask, flags=0)
 
-    def shapes_changed(self, terrain: wp.array) -> None:
+    def shapes_changed(self, terrain: Any) -> None:
         """See ``SolverAdapter.shapes_changed``."""
         self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
         # Newton zeroes margins for fear of an old limit of mujoco_warp
@@ -201,6 +201,11 @@ class MujocoAdapter(SolverAdapter):
     def inertia_changed(self) -> None:
         """See ``SolverAdapter.inertia_changed``."""
         self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+
+
+def _geom_shapes(solver: Any) -> np.ndarray:
+    """Newton's shape of each MuJoCo geom in every world, (N, G)."""
+    return solver.mjc_geom_to_newton_shape.numpy()
 
 
 def _constraint_rows(scene: Scene, world: WorldModel, contacts: int) -> int:
@@ -218,10 +223,10 @@ def _constraint_rows(scene: Scene, world: WorldModel, contacts: int) -> int:
 class _FieldGeom:
     """The height-field geom of Newton's MuJoCo solver, whose field differs between worlds."""
 
-    def __init__(self, solver: newton.solvers.SolverMuJoCo, world: WorldModel, scene: Scene) -> None:
+    def __init__(self, solver: Any, world: WorldModel, scene: Scene) -> None:
         self._solver, slots, layout = solver, world.slots, world.layout
         device, count = world.model.device, len(slots.fields)
-        shape_geom = {int(s): g for g, s in enumerate(solver.mjc_geom_to_newton_shape.numpy()[0])}
+        shape_geom = {int(s): g for g, s in enumerate(_geom_shapes(solver)[0])}
         self._geom = shape_geom[int(layout.slot_shape[-1])]
         ids = solver.mjw_model.geom_dataid.numpy()
         asset = np.zeros(count, dtype=np.int32)
@@ -239,12 +244,12 @@ class _FieldGeom:
             [np.c_[np.zeros((len(present), 2)), 0.5 * (top - base)], np.c_[half, 0.5 * (top + base)]], axis=1
         )
         radius = np.sqrt((half**2).sum(1) + np.maximum(top, base) ** 2)
-        self._asset = wp.array(asset[slots.field], dtype=int, device=device)
-        self._position = wp.array(position, dtype=wp.vec3, device=device)
-        self._box = wp.array(box, dtype=wp.vec3, device=device)
-        self._radius = wp.array(radius, dtype=float, device=device)
+        self._asset: wp.array = wp.array(asset[slots.field], dtype=int, device=device)
+        self._position: wp.array = wp.array(position, dtype=wp.vec3, device=device)
+        self._box: wp.array = wp.array(box, dtype=wp.vec3, device=device)
+        self._radius: wp.array = wp.array(radius, dtype=float, device=device)
 
-    def place(self, terrain: wp.array) -> None:
+    def place(self, terrain: Any) -> None:
         """Give every world the field of its terrain."""
         model, data = self._solver.mjw_model, self._solver.mjw_data
         wp.launch(
@@ -271,7 +276,7 @@ class _FieldShape:
         lower, upper = np.c_[-half, low], np.c_[half, top]
         radius = np.linalg.norm(np.maximum(np.abs(lower), np.abs(upper)), axis=1)
         device = model.device
-        self._tables = (
+        self._tables: tuple[wp.array, ...] = (
             wp.array(model.shape_heightfield_index.numpy()[shapes], dtype=int, device=device),
             wp.array(model.shape_source_ptr.numpy()[shapes], dtype=wp.uint64, device=device),
             wp.array(lower, dtype=wp.vec3, device=device),
@@ -286,7 +291,7 @@ class _FieldShape:
             model.shape_collision_radius,
         )
 
-    def place(self, terrain: wp.array) -> None:
+    def place(self, terrain: Any) -> None:
         """Give every world the field of its terrain."""
         wp.launch(
             solver_kernels.place_newton_field,
@@ -344,7 +349,7 @@ class SteelAdapter(SolverAdapter):
         model.shape_material_mu.fill_(feet)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            self.solver = newton.solvers.SolverSteel(
+            self.solver: Any = newton.solvers.SolverSteel(
                 model,
                 iterations=physics.iterations,
                 enable_joint_limits=True,
@@ -373,7 +378,7 @@ class SteelAdapter(SolverAdapter):
             before, after, control, self.contacts, self._timestep, observables=self.observables if observe else None
         )
 
-    def collect_overflow(self, active: wp.array, overflowed: wp.array) -> None:
+    def collect_overflow(self, active: Any, overflowed: Any) -> None:
         """See ``SolverAdapter.collect_overflow``."""
         wp.launch(
             kernels.collect_overflow_flags,
@@ -382,11 +387,11 @@ class SteelAdapter(SolverAdapter):
             device=active.device,
         )
 
-    def reset(self, state: newton.State, mask: wp.array) -> None:
+    def reset(self, state: newton.State, mask: Any) -> None:
         """See ``SolverAdapter.reset``."""
         self.solver.reset(state, mask, flags=0)
 
-    def shapes_changed(self, terrain: wp.array) -> None:
+    def shapes_changed(self, terrain: Any) -> None:
         """See ``SolverAdapter.shapes_changed``."""
         self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
         if self._fields is not None:
