@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
@@ -78,7 +79,7 @@ def check_python() -> Iterator[Finding]:
     """The interpreter's version."""
     found = f"{platform.python_version()} in {sys.prefix}"
     try:
-        wanted = SpecifierSet(metadata("gaitgauge").get("Requires-Python", ""))
+        wanted = SpecifierSet(metadata("gaitgauge")["Requires-Python"])
     except PackageNotFoundError:
         wanted = SpecifierSet()
     if wanted.contains(platform.python_version(), prereleases=True):
@@ -130,10 +131,10 @@ print(json.dumps([torch.version.cuda, gpus]))
 
 def check_gpu() -> Iterator[Finding]:
     """Whether torch can use a GPU, which training needs."""
-    answer = _ask(_TORCH_PROBE)
-    if isinstance(answer, str):
+    answer, trouble = _ask(_TORCH_PROBE)
+    if trouble:
         yield Finding(
-            what="GPU (torch)", status=PROBLEM, found=f"torch fails: {answer}", advice="reinstall torch: make install"
+            what="GPU (torch)", status=PROBLEM, found=f"torch fails: {trouble}", advice="reinstall torch: make install"
         )
         return
     built, gpus = answer
@@ -180,12 +181,12 @@ print(json.dumps([str(d) for d in warp.get_devices()]))
 
 def check_warp() -> Iterator[Finding]:
     """The devices of Warp, on which the training engines run."""
-    answer = _ask(_WARP_PROBE)
-    if isinstance(answer, str):
+    answer, trouble = _ask(_WARP_PROBE)
+    if trouble:
         yield Finding(
             what="Warp devices",
             status=PROBLEM,
-            found=f"Warp fails: {answer}",
+            found=f"Warp fails: {trouble}",
             advice="reinstall warp-lang: make install",
         )
     elif any(d.startswith("cuda") for d in answer):
@@ -203,10 +204,10 @@ print(json.dumps([mujoco.__version__, mujoco.mj_versionString()]))
 
 def check_mujoco() -> Iterator[Finding]:
     """Whether MuJoCo loads, with the batched stepping that the gauge runs on."""
-    answer = _ask(_MUJOCO_PROBE)
-    if isinstance(answer, str):
+    answer, trouble = _ask(_MUJOCO_PROBE)
+    if trouble:
         advice = "reinstall it: make install"
-        yield Finding(what="MuJoCo engine", status=PROBLEM, found=f"fails: {answer}", advice=advice)
+        yield Finding(what="MuJoCo engine", status=PROBLEM, found=f"fails: {trouble}", advice=advice)
         return
     package, library = answer
     if package == library:
@@ -237,8 +238,8 @@ def check_rendering() -> Iterator[Finding]:
     """Which of MuJoCo's ways to render without a window work; one is enough for videos."""
     works: dict[str, bool] = {}
     for backend in ("egl", "osmesa"):
-        answer = _ask(_RENDER_PROBE, MUJOCO_GL=backend)
-        works[backend] = isinstance(answer, int) and answer > 0
+        brightest, trouble = _ask(_RENDER_PROBE, MUJOCO_GL=backend)
+        works[backend] = not trouble and brightest > 0
     for backend, good in works.items():
         what = f"rendering ({backend})"
         if good:
@@ -327,11 +328,11 @@ def _writable(folder: Path) -> Finding:
     return Finding(what=what, status=OK, found=found)
 
 
-def _ask(program: str, **environment: str) -> object:
+def _ask(program: str, **environment: str) -> tuple[Any, str]:
     """Run a Python program in a child process.
 
     Returns:
-        What it prints as JSON on its last line; if it fails, the last line of its error output.
+        What it prints as JSON on its last line, and an empty text; or None, and what went wrong.
     """
     try:
         done = subprocess.run(
@@ -342,11 +343,14 @@ def _ask(program: str, **environment: str) -> object:
             env={**os.environ, **environment},
         )
     except subprocess.TimeoutExpired:
-        return f"no answer within {_PATIENCE:g} s"
+        return None, f"no answer within {_PATIENCE:g} s"
     lines = [line for line in (done.stdout if done.returncode == 0 else done.stderr).splitlines() if line.strip()]
     if done.returncode != 0:
-        return lines[-1] if lines else f"ended with exit code {done.returncode}"
-    return json.loads(lines[-1])
+        return None, lines[-1] if lines else f"ended with exit code {done.returncode}"
+    try:
+        return json.loads(lines[-1] if lines else ""), ""
+    except json.JSONDecodeError:
+        return None, f"answered {lines[-1:]}"
 
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
