@@ -126,7 +126,7 @@ def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> W
     _distribute_fields(everything, layout, slots, scene)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model = everything.finalize(device=device)
+        model = everything.finalize(device=device, skip_all_validations=True)
     return WorldModel(model=model, layout=layout, slots=slots, reference=reference)
 
 
