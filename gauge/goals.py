@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 
@@ -25,6 +26,9 @@ TARGET = "target_pos_velocity"
 class GoalTable:
     """The goals of a suite as tensors, indexed by goal number (the position in ``suite.goals``)."""
 
+    PARTS: Mapping[str, int] = {name: len(commands) for name, commands in _SUB_COMMANDS.items()}
+    """Number of sub-commands by name of the goal."""
+
     def __init__(self, suite: Suite, device: torch.device, dtype: torch.dtype) -> None:
         names = [g.name for g in suite.goals]
         unknown = [n for n in names if n not in _SUB_COMMANDS]
@@ -32,6 +36,13 @@ class GoalTable:
             raise SuiteError(
                 f"suite '{suite.name}' has the unknown goal '{unknown[0]}'; choose from {', '.join(_SUB_COMMANDS)}"
             )
+        for g in suite.goals:
+            wanted = 0 if g.name == TARGET else 2
+            if len(g.phases) != wanted or any(phase <= 0.0 for phase in g.phases):
+                raise SuiteError(
+                    f"goal '{g.name}' of suite '{suite.name}' has the phases {list(g.phases)}; "
+                    f"give {wanted} lengths above zero"
+                )
         self.names = tuple(names)
         self.period = suite.physics.control_period
         most = max(len(c) for c in _SUB_COMMANDS.values())

@@ -15,6 +15,10 @@ from .episodes import Episode
 from .suite import Noise
 
 
+TABLE_STEPS = 2000
+"""Control steps that are drawn in advance at a time."""
+
+
 class NoiseStream(ABC):
     """Draws for K episodes at work: half widths times uniform numbers in [-1, 1), and delays."""
 
@@ -66,7 +70,7 @@ class ReferenceStream(NoiseStream):
             length, self._length = self._length, 0
             self._uniform = self._uniform.new_zeros(len(self._seeds), 0, self._widths)
             self._delays = self._delays.new_zeros(len(self._seeds), 0)
-            self._extend(max(length, 2000))
+            self._extend(max(length, TABLE_STEPS))
         self._row[slot] = self._seeds.index(episode.seed)
 
     def _extend(self, length: int) -> None:
@@ -83,7 +87,7 @@ class ReferenceStream(NoiseStream):
     def reserve(self, steps: int) -> None:
         """See ``NoiseStream.reserve``."""
         while self._length < steps:
-            self._extend(self._length + 2000)
+            self._extend(self._length + TABLE_STEPS)
 
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """See ``NoiseStream.draw``. Call ``reserve`` before an episode can get beyond the table."""

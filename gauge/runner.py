@@ -6,6 +6,7 @@ happens in an episode depends on that episode alone: not on its slot, its neighb
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -24,8 +25,6 @@ from .noise import make_stream
 from .suite import Suite
 
 GRAVITY = 9.81
-_SAMPLES = 4096
-"""Samples that an episode can hold: 400 s at ten a second, twice what the longest one takes."""
 
 
 class Agenda(Protocol):
@@ -93,15 +92,16 @@ class EpisodeRunner:
         self._sampled = zeros(kind=truth)
         # how far it is
         self._goal_at, self._goal_time = zeros(kind=whole), zeros(kind=torch.float64)
-        self._part_steps, self._settling = zeros(kind=whole), zeros(kind=truth)
+        self._part, self._part_steps, self._settling = zeros(kind=whole), zeros(kind=whole), zeros(kind=truth)
         self._tick, self._draws, self._steps = zeros(kind=whole), zeros(kind=whole), zeros(kind=whole)
         self._done, self._reached, self._restarted = zeros(kind=truth), zeros(kind=truth), zeros(kind=truth)
         self._falls, self._diverged, self._overflowed = zeros(kind=whole), zeros(kind=truth), zeros(kind=truth)
         self._last_action = zeros(joints, kind=torch.float32)
         self._torque, self._torque_known = zeros(joints), zeros(kind=truth)
         # what was seen of it
-        self._values = zeros(_SAMPLES, len(self.columns), kind=torch.float32)
-        self._where = zeros(_SAMPLES, 2, kind=torch.int16)
+        self.capacity = _most_samples(suite)
+        self._values = zeros(self.capacity, len(self.columns), kind=torch.float32)
+        self._where = zeros(self.capacity, 2, kind=torch.int16)
         self._count = zeros(kind=whole)
         self.control_steps = 0
         self.physics_steps = 0
@@ -109,6 +109,7 @@ class EpisodeRunner:
         self._cheap_checks = device.type == "cpu"
         self._few_rows_suffice = self._cheap_checks and _rows_are_stable(policy, k)
         self._nobody = zeros(kind=truth)
+        self._last_ran = zeros(kind=whole)
 
     # ---- episodes come and go -------------------------------------------------------------------------------------
 
@@ -171,7 +172,7 @@ class EpisodeRunner:
         write(self._sequence, [o + [0] * (len(names) - len(o)) for o in order])
         write(self._num_goals, [len(o) for o in order])
         write(self._sampled, [e.stage == "eval" for e in episodes])
-        for counter in (self._goal_at, self._goal_time, self._part_steps, self._tick, self._draws, self._steps):
+        for counter in (self._goal_at, self._goal_time, self._part, self._tick, self._draws, self._steps):
             counter[at] = 0
         for counter in (self._done, self._reached, self._restarted, self._falls, self._diverged, self._overflowed):
             counter[at] = 0
@@ -268,11 +269,12 @@ class EpisodeRunner:
         )
         self.control_steps += 1
         fall, penetration, ran = self._events(active)
+        self._last_ran = ran
         self._tick += ran
         self._steps += ran
         due &= sample_at <= ran
         if not self._cheap_checks or bool(due.any()):
-            self._take_samples(due, command, commanded, goal)
+            self._take_samples(due, command, commanded)
         if self.suite.metrics.smoothness == "control-steps":
             self._torque.copy_(self.backend.state.joint_torque)
             self._torque_known |= active
@@ -320,8 +322,14 @@ class EpisodeRunner:
         """Go on to the next goal; an episode without one ends."""
         self._goal_at += mask
         self._goal_time.masked_fill_(mask, 0.0)
+        self._part.masked_fill_(mask, 0)
         self._done &= ~mask
         self._ended |= mask & (self._goal_at >= self._num_goals)
+
+    def _end_part(self, mask: torch.Tensor, goal: torch.Tensor) -> None:
+        """Go on to the next sub-command of a velocity goal; a goal without one closes."""
+        self._part += mask
+        self._close_goal(mask & (self._part >= self._goals.parts[goal]))
 
     def _command(self, state: PhysicsState, goal: torch.Tensor, commanded: torch.Tensor) -> torch.Tensor:
         """What the goals command, (K, 3); zero while settling."""
@@ -356,7 +364,8 @@ class EpisodeRunner:
                 return self._nobody, self._nobody, active * last
         never = torch.full_like(state.tilt_substep, last + 1)
         fell_at = torch.where(state.tilt_substep > 0, state.tilt_substep, never)
-        fell_at = torch.where(state.diverged, torch.clamp(fell_at, max=last), fell_at)
+        # at which substep the state became invalid is not known: nothing of this control step counts
+        fell_at = torch.where(state.diverged, torch.zeros_like(fell_at), fell_at)
         self._diverged |= state.diverged & active
         self._overflowed |= state.overflowed & active
         deep_at = never
@@ -368,9 +377,7 @@ class EpisodeRunner:
         ran = torch.minimum(torch.minimum(fell_at, deep_at), never - 1) * active
         return fall, penetration, ran
 
-    def _take_samples(
-        self, due: torch.Tensor, command: torch.Tensor, commanded: torch.Tensor, goal: torch.Tensor
-    ) -> None:
+    def _take_samples(self, due: torch.Tensor, command: torch.Tensor, commanded: torch.Tensor) -> None:
         """Write one row for every slot whose sample is due."""
         sample = self.backend.sample
         values = self._metrics.evaluate(sample, command, self._limits, self._friction, self._torque, self._torque_known)
@@ -378,11 +385,10 @@ class EpisodeRunner:
             self._torque = torch.where(due[:, None], sample.joint_torque, self._torque)
             self._torque_known |= due
         keep = due if self.suite.settling.sampled else due & commanded
-        at = torch.clamp(self._count, max=_SAMPLES - 1)
+        at = torch.clamp(self._count, max=self.capacity - 1)
         old = self._values[self._rows, at]
         self._values[self._rows, at] = torch.where(keep[:, None], values.to(torch.float32), old)
-        part = torch.clamp(self._goals.part(goal, self._goal_time), min=0)
-        where = torch.stack((self._goal_at, part), dim=1).to(torch.int16)
+        where = torch.stack((self._goal_at, self._part), dim=1).to(torch.int16)
         self._where[self._rows, at] = torch.where(keep[:, None], where, self._where[self._rows, at])
         self._count += keep
 
@@ -399,6 +405,7 @@ class EpisodeRunner:
         going = commanded & ~fall & ~penetration
         aims = self._goals.is_target[goal]
         back = going & ~aims & (self._part_steps >= self._goals.steps[goal])
+        self._end_part(back, goal)
         if not self._cheap_checks or bool(aims.any()):
             offset = target_offset(self.backend.state, self._target, commands.target_distance)
             near = torch.hypot(offset[:, 0], offset[:, 1]) < commands.target_radius
@@ -406,19 +413,25 @@ class EpisodeRunner:
             late = self._part_steps * self._goals.period >= self._time_limit
             over = reached | (going & aims & late)
             self._reached |= reached
-            self._done |= over
+            if self.suite.events.penetration is None:
+                self._close_goal(over)
+            else:
+                self._done |= over  # a penetration while the robot settles can still undo it
             back = back | over
         self._settling &= ~leaving
         if fall is not self._nobody and bool((fall | penetration).any()):
-            self._interrupt(fall, penetration, goal)
+            self._interrupt(fall, penetration, commanded, goal)
             back = back | fall | penetration
         self._reset(back & ~self._ended)
 
-    def _interrupt(self, fall: torch.Tensor, penetration: torch.Tensor, goal: torch.Tensor) -> None:
+    def _interrupt(
+        self, fall: torch.Tensor, penetration: torch.Tensor, commanded: torch.Tensor, goal: torch.Tensor
+    ) -> None:
         """Falls close the goal or cost the rest of the sub-command; a penetration starts the goal again."""
         self._falls += fall
         self._restarted |= penetration
         self._goal_time.masked_fill_(penetration, 0.0)
+        self._part.masked_fill_(penetration, 0)
         again = penetration & self._goals.is_target[goal]
         self._done &= ~again
         self._reached &= ~again
@@ -428,17 +441,35 @@ class EpisodeRunner:
         aims = self._goals.is_target[goal]
         self._close_goal(fall & aims)
         fall = fall & ~aims
-        duration = torch.where(aims, torch.ones_like(self._goal_time), self._goals.duration[goal])
-        part = torch.floor(self._goal_time / duration + 1e-6)
-        rest = (part + 1.0) * duration - self._goal_time
-        grid = self.suite.metrics.interval * self.suite.physics.timestep
-        lost = torch.round(rest / grid).to(torch.int64) * fall * self._sampled
-        row = torch.arange(_SAMPLES, device=self._device)
+        # as many zeros as there would have been samples; a fall while settling costs the whole sub-command that follows
+        steps = torch.where(aims, torch.zeros_like(goal), self._goals.steps[goal])
+        begun = torch.where(commanded, self._part_steps - 1, torch.zeros_like(steps))
+        step_began = torch.where(commanded, self._tick - self._last_ran, self._tick)
+        part_ends = step_began + (steps - begun) * self._substeps
+        interval = self.suite.metrics.interval
+        lost = (part_ends // interval - self._tick // interval) * fall * self._sampled
+        row = torch.arange(self.capacity, device=self._device)
         blank = (row >= self._count[:, None]) & (row < (self._count + lost)[:, None])
-        where = torch.stack((self._goal_at, part.to(torch.int64)), dim=1).to(torch.int16)
+        where = torch.stack((self._goal_at, self._part), dim=1).to(torch.int16)
         self._where = torch.where(blank[..., None], where[:, None], self._where)
         self._count += lost
-        self._goal_time = torch.where(fall, (part + 1.0) * duration, self._goal_time)
+        next_part = (self._part + 1) * torch.where(aims, torch.ones_like(self._goal_time), self._goals.duration[goal])
+        self._goal_time = torch.where(fall, next_part, self._goal_time)
+        self._end_part(fall, goal)
+
+
+def _most_samples(suite: Suite) -> int:
+    """Number of samples that no episode exceeds: every goal with the longest settling before each sub-command, twice over
+    where a penetration may start a goal again.
+    """
+    seconds = max(suite.commands.target_time.values(), default=0.0) + 3.0 * suite.settling.longest
+    parts = 1
+    for goal in suite.goals:
+        count = GoalTable.PARTS[goal.name] if goal.phases else 0
+        parts += count
+        seconds += count * (sum(goal.phases) + suite.settling.longest + 2.0 * suite.physics.control_period)
+    repeats = 1 if suite.events.penetration is None else 2
+    return repeats * (math.ceil(seconds / (suite.metrics.interval * suite.physics.timestep)) + 2 * parts)
 
 
 def _rows_are_stable(policy: Policy, slots: int) -> bool:
