@@ -175,6 +175,9 @@ class TrotController(nn.Module):
         dt = self.control_period
         gravity = frame[:, 3:6]
         wanted = torch.clamp(frame[:, 6:9] / frame.new_tensor((2.0, 2.0, 0.25)), -self.limits, self.limits)
+        # what it can do in a diagonal direction lies on an ellipse
+        beyond = torch.clamp((wanted / self.limits)[:, :2].norm(dim=1, keepdim=True), min=1.0)
+        wanted = torch.cat((wanted[:, :2] / beyond, wanted[:, 2:]), -1)
         joints = frame[:, 9:21] + self.default
         fresh = state[:, _STARTED : _STARTED + 1] < 0.5
         before = torch.where(fresh, gravity, state[:, _GRAVITY])
