@@ -90,6 +90,78 @@ def evaluate(
 
 @app.command()
 @report_errors
+def consistency(
+    policies: Annotated[
+        list[str],
+        typer.Argument(
+            help="One or more policy files (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
+            metavar="POLICY...",
+        ),
+    ],
+    backends: Annotated[
+        str,
+        typer.Option(
+            help="Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005)."
+        ),
+    ] = "mujoco,mujoco-warp,newton",
+    reference: Annotated[
+        str | None, typer.Option(help="Engine that the others are compared with. Default: the first.")
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cpu or cuda, for the engines that can use a GPU. Default: a GPU.")
+    ] = None,
+    suite: Annotated[
+        str, typer.Option(help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.")
+    ] = "robogauge-1.1",
+    robot: Annotated[str, typer.Option(help="Robot name, or a robot.toml.")] = "go2",
+    terrain: Annotated[list[str] | None, typer.Option(help="Terrain; repeatable. Default: the suite's.")] = None,
+    friction: Annotated[
+        list[float] | None,
+        typer.Option(help="Friction coefficient; repeatable. Default: the nominal one; on a GPU the suite's."),
+    ] = None,
+    level: Annotated[
+        list[int] | None, typer.Option(help="Level (1-10) of the terrains that have levels; repeatable. Default: 3.")
+    ] = None,
+    seeds: Annotated[int | None, typer.Option(help="Number of seeds, at least 2. Default: 3; on a GPU 10.")] = None,
+    factor: Annotated[
+        list[str] | None,
+        typer.Option(help="Factor that the attribution switches; repeatable. Default: all (docs/consistency.md)."),
+    ] = None,
+    attribution: Annotated[bool, typer.Option(help="Switch one factor at a time and see what it does.")] = True,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-consistency.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the output folder.")] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Print consistency.json instead of tables.")] = False,
+) -> None:
+    """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why."""
+    from .consistency import run_consistency
+
+    run_consistency(
+        policies=policies,
+        backends=backends,
+        reference=reference,
+        device=device,
+        suite=suite,
+        robot=robot,
+        terrains=tuple(terrain or ()),
+        frictions=tuple(friction or ()),
+        levels=tuple(level or ()),
+        seeds=seeds,
+        factors=tuple(factor or ()),
+        attribution=attribution,
+        threads=threads,
+        out=out,
+        resume=resume,
+        json_output=json_output,
+    )
+
+
+@app.command()
+@report_errors
 def train(
     task: Annotated[str, typer.Argument(help="What to learn, see 'gaitgauge list tasks'.", metavar="TASK")],
     overrides: Annotated[
@@ -185,6 +257,52 @@ def export(
     from .export import run_export
 
     run_export(policy, out=out, form=form)
+
+
+@app.command()
+@report_errors
+def play(
+    policy: Annotated[
+        str, typer.Argument(help="A policy file, a run directory, or latest, best, pretrained.", metavar="POLICY")
+    ],
+    terrain: Annotated[str, typer.Option(help="Terrain, see 'gaitgauge list terrains'.")] = "flat",
+    level: Annotated[int | None, typer.Option(help="Level of the terrain, 1 to 10. Default: 5.")] = None,
+    viewer: Annotated[
+        str | None,
+        typer.Option(help="native: a window; viser: in a browser; video. Default: a window where there is a display."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write a video (.mp4); needs no display.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="How long [s]. Default: 10 for a video, else no end.")] = None,
+    command: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="Forward, sideways [m/s] and turning [rad/s] speed. Default: to the target, or a tour.",
+            metavar="VX VY YAW",
+        ),
+    ] = None,
+    friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.6,
+    seed: Annotated[int, typer.Option(help="Of the heading at each start.")] = 0,
+    backend: Annotated[str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.")] = "mujoco",
+    device: Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,
+) -> None:
+    """Watch a policy walk: in MuJoCo's viewer, in a browser, or in a video file without a display."""
+    from .play import run_play
+
+    run_play(
+        policy,
+        terrain=terrain,
+        level=level,
+        backend=backend,
+        device=device,
+        viewer=viewer,
+        out=out,
+        seconds=seconds,
+        command=command,
+        friction=friction,
+        seed=seed,
+        port=port,
+    )
 
 
 @app.command("import")

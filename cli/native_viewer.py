@@ -1,0 +1,106 @@
+"""MuJoCo's own viewer, steered with the keyboard."""
+
+from __future__ import annotations
+
+import time
+
+import mujoco
+import mujoco.viewer
+from rich.console import Console
+
+from .errors import UserError
+from .play_session import Command, PlaySession
+from .scenery import COLLISION_GROUP, show, visual_model
+
+# GLFW's numbers of keys that the viewer does not use itself.
+_UP, _DOWN, _LEFT, _RIGHT = 265, 264, 263, 262
+_HOME, _END, _ENTER, _INSERT, _DELETE = 268, 269, 257, 260, 261
+KEYS = (
+    "up/down: faster forward/backward; left/right: turn; home/end: step to the left/right; enter: stand; "
+    "delete: to the target or on tour; insert: back to the start"
+)
+_FORWARD_STEP, _LATERAL_STEP, _YAW_STEP = 0.1, 0.1, 0.25
+"""What one press adds to a command [m/s, m/s, rad/s]."""
+
+
+class Keyboard:
+    """What the keys have asked for: None while the robot finds its own way."""
+
+    def __init__(self, limits: Command, command: Command | None) -> None:
+        """Begin with a command.
+
+        Args:
+            limits: largest values.
+            command: at the start, None for the robot's own way.
+        """
+        self.command = command
+        self.restart = False
+        self._limits = limits
+
+    def press(self, key: int) -> None:
+        """Take a key by its GLFW number; others than ``KEYS`` mean nothing."""
+        steps = {
+            _UP: (_FORWARD_STEP, 0.0, 0.0),
+            _DOWN: (-_FORWARD_STEP, 0.0, 0.0),
+            _LEFT: (0.0, 0.0, _YAW_STEP),
+            _RIGHT: (0.0, 0.0, -_YAW_STEP),
+            _HOME: (0.0, _LATERAL_STEP, 0.0),
+            _END: (0.0, -_LATERAL_STEP, 0.0),
+        }
+        if key == _INSERT:
+            self.restart = True
+        elif key == _DELETE:
+            self.command = None
+        elif key == _ENTER:
+            self.command = (0.0, 0.0, 0.0)
+        elif key in steps:
+            now = self.command or (0.0, 0.0, 0.0)
+            forward, lateral, yaw = (
+                max(-limit, min(limit, round(value + change, 3)))
+                for value, change, limit in zip(now, steps[key], self._limits, strict=True)
+            )
+            self.command = (forward, lateral, yaw)
+
+
+def watch(session: PlaySession, command: Command | None, seconds: float | None) -> None:
+    """Open the window; returns when it is closed or the time is over.
+
+    Raises:
+        UserError: the window cannot be opened.
+    """
+    keyboard = Keyboard(session.limits, command)
+    model = visual_model(session.robot, session.terrain)
+    data = mujoco.MjData(model)
+    show(model, data, session.position())
+    try:
+        viewer = mujoco.viewer.launch_passive(
+            model, data, key_callback=keyboard.press, show_left_ui=False, show_right_ui=False
+        )
+    except (RuntimeError, mujoco.FatalError) as error:
+        raise UserError(f"the window cannot be opened: {error}; use --viewer viser, or --out FILE.mp4") from error
+    console = Console(highlight=False)
+    console.print(KEYS, soft_wrap=True)
+    with viewer:
+        viewer.opt.geomgroup[COLLISION_GROUP] = 0
+        viewer.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        viewer.cam.trackbodyid = model.body(session.robot.base_body).id
+        viewer.cam.distance, viewer.cam.elevation, viewer.cam.azimuth = 2.2, -18.0, 55.0
+        due, told = time.monotonic(), keyboard.command
+        while viewer.is_running() and (seconds is None or session.time < seconds):
+            if keyboard.restart:
+                keyboard.restart = False
+                session.reset()
+            session.step(keyboard.command or session.autopilot())
+            with viewer.lock():
+                show(model, data, session.position())
+            viewer.sync()
+            if keyboard.command != told:
+                told = keyboard.command
+                words = (
+                    "own way"
+                    if told is None
+                    else "forward {:+.1f} m/s, left {:+.1f} m/s, turn {:+.2f} rad/s".format(*told)
+                )
+                console.print(words, soft_wrap=True)
+            due = max(due + session.period, time.monotonic() - session.period)
+            time.sleep(max(0.0, due - time.monotonic()))

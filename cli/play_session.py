@@ -1,0 +1,194 @@
+"""One robot with a policy on one terrain, step by step, with commands from outside: what every way to watch shares."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..backends.base import PhysicsState, Randomization, Scene
+from ..backends.registry import make_backend
+from ..gauge.goals import target_command, target_offset
+from ..gauge.suite import Suite
+from ..policy.base import Policy
+from ..policy.observation import ObservationBuilder
+from ..robots import Robot
+from ..robots.rotation import from_yaw
+from ..terrains.base import Terrain
+from .errors import UserError
+
+Command = tuple[float, float, float]
+"""Forward, lateral [m/s] and yaw [rad/s] speed."""
+
+_SETTLE = 0.4
+"""Time after a reset in which the robot is told to stand [s]."""
+_FALLEN_TILT = 1.4
+"""Tilt of the base at which the robot starts again [rad]."""
+_LONG_DOWN = 1.0
+"""How long a fallen robot is shown [s]."""
+
+# A walk that shows every direction: share of the command limits and time [s].
+_TOUR: tuple[tuple[Command, float], ...] = (
+    ((0.5, 0.0, 0.0), 3.0),
+    ((0.5, 0.0, 0.6), 3.0),
+    ((0.0, 0.6, 0.0), 2.0),
+    ((0.0, 0.0, -0.6), 2.5),
+    ((0.75, 0.0, 0.0), 2.5),
+    ((-0.4, 0.0, 0.0), 2.0),
+    ((0.0, 0.0, 0.0), 1.5),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaySettings:
+    """Where and how a policy is played."""
+
+    backend: str
+    device: str
+    friction: float
+    seed: int
+    suite: Suite
+    """Gives the physics, the robot's joint constants and the command limits."""
+
+
+class PlaySession:
+    """The loop: observation, action, physics; starts again after a fall and at the target."""
+
+    def __init__(self, policy: Policy, robot: Robot, terrain: Terrain, settings: PlaySettings) -> None:
+        """Build the world and put the robot at the start.
+
+        Raises:
+            BackendError: the engine cannot do this.
+            ContractError: the policy is not for this robot.
+            UserError: the policy's control period is no multiple of the physics step.
+        """
+        suite = settings.suite
+        physics = suite.physics
+        period = policy.contract.control_period
+        self.substeps = round(period / physics.timestep)
+        if abs(self.substeps * physics.timestep - period) > 1e-9:
+            raise UserError(
+                f"the policy's control period is {period:g} s, no multiple of the physics step of {physics.timestep:g} s"
+            )
+        self.policy, self.robot, self.terrain, self.period = policy, robot, terrain, period
+        self.limits = suite.command_limits(terrain.family)
+        self._speed = suite.commands.target_speed.get(terrain.family, 0.5 * self.limits[0])
+        scene = Scene(
+            robot=robot,
+            parameters=robot.parameters[suite.parameters],
+            terrains=(terrain,),
+            terrain_index=(0,),
+            physics=physics,
+        )
+        self.backend = make_backend(settings.backend, scene, device=settings.device)
+        device, dtype = self.backend.device, self.backend.dtype
+        self.backend.randomize(Randomization(friction=torch.tensor([settings.friction], device=device, dtype=dtype)))
+        self._builder = ObservationBuilder(policy.contract, robot, 1, device)
+        self._network = policy.session(1, device=str(device))
+        self._random = np.random.default_rng(settings.seed)
+        self._action = torch.zeros(1, robot.num_joints, device=device)
+        self.time = 0.0
+        """Simulated time in all [s]."""
+        self.falls = 0
+        self.arrivals = 0
+        self.reset()
+
+    @property
+    def state(self) -> PhysicsState:
+        """State of the one world."""
+        return self.backend.state
+
+    def reset(self) -> None:
+        """Put the robot back to the start, turned a little at random."""
+        pose = self.terrain.spawns["level_search"]
+        device, dtype = self.backend.device, self.backend.dtype
+        x, y, z = pose.position
+        yaw = torch.tensor([pose.yaw + self._random.uniform(-0.05, 0.05)], device=device, dtype=dtype)
+        held = torch.tensor([self.robot.default_joint_position], device=device, dtype=dtype)
+        self.backend.reset(
+            base_position=torch.tensor([[x, y, z + self.robot.stand_height]], device=device, dtype=dtype),
+            base_quaternion=from_yaw(yaw),
+            held_target=held,
+        )
+        self._builder.reset()
+        self._network.reset()
+        self._action.zero_()
+        self.since_reset = 0.0
+        """Simulated time since the robot was put to the start [s]."""
+        self._down = 0.0
+
+    def step(self, command: Command) -> None:
+        """Advance one control period; a command beyond the limits of the terrain is clipped."""
+        if self.since_reset < _SETTLE:
+            command = (0.0, 0.0, 0.0)
+        limited = [max(-limit, min(limit, value)) for value, limit in zip(command, self.limits, strict=True)]
+        device, dtype = self.backend.device, self.backend.dtype
+        observation = self._builder.build(self.state, torch.tensor([limited], device=device, dtype=dtype), self._action)
+        self._action = self._network.act(observation)
+        if not bool(torch.isfinite(self._action).all()):
+            raise UserError(f"the policy '{self.policy.path}' gave an action that is not finite")
+        self.backend.step(self._builder.targets(self._action).to(dtype), substeps=self.substeps)
+        self.time += self.period
+        self.since_reset += self.period
+        self._start_again()
+
+    def _start_again(self) -> None:
+        """Back to the start once the robot has lain on the ground for a while, or has reached the target."""
+        if self.tilt > _FALLEN_TILT or bool(self.state.diverged[0]):
+            self._down += self.period
+            if self._down >= _LONG_DOWN or bool(self.state.diverged[0]):
+                self.falls += 1
+                self.reset()
+            return
+        self._down = 0.0
+        if self.terrain.target is not None and self.target_distance < 0.15:
+            self.arrivals += 1
+            self.reset()
+
+    @property
+    def tilt(self) -> float:
+        """Angle between the base's z axis and the world's [rad]."""
+        _, x, y, _ = self.state.base_quaternion_w[0].tolist()
+        return math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
+
+    @property
+    def target_distance(self) -> float:
+        """Horizontal distance from the base to the terrain's target [m]; infinite without one."""
+        if self.terrain.target is None:
+            return math.inf
+        x, y, _ = self.state.base_position_w[0].tolist()
+        return math.hypot(self.terrain.target[0] - x, self.terrain.target[1] - y)
+
+    def position(self) -> NDArray[np.float64]:
+        """Position of the free joint and of the robot's joints, as MuJoCo orders them: (7 + J,)."""
+        state = self.state
+        parts = (state.base_position_w[0], state.base_quaternion_w[0], state.joint_position[0])
+        return torch.cat([p.double() for p in parts]).cpu().numpy()
+
+    def autopilot(self) -> Command:
+        """To the target where there is one, else a tour that shows every direction."""
+        if self.terrain.target is not None:
+            state = self.state
+            target = torch.tensor([self.terrain.target], device=self.backend.device, dtype=self.backend.dtype)
+            offset = target_offset(state, target, "horizontal")
+            command = target_command(
+                offset,
+                torch.tensor([self.terrain.backward], device=offset.device),
+                torch.full_like(offset[:, 0], self._speed),
+                torch.full_like(offset[:, 0], self.limits[2]),
+            )
+            forward, lateral, yaw = command[0].tolist()
+            return forward, lateral, yaw
+        at = (self.since_reset - _SETTLE) % sum(seconds for _, seconds in _TOUR)
+        for shares, seconds in _TOUR:
+            if at < seconds:
+                return shares[0] * self.limits[0], shares[1] * self.limits[1], shares[2] * self.limits[2]
+            at -= seconds
+        return 0.0, 0.0, 0.0
+
+    def close(self) -> None:
+        """Free the physics."""
+        self.backend.close()

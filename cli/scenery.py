@@ -1,0 +1,155 @@
+"""The robot and its ground as a MuJoCo model made to be looked at; the physics runs elsewhere and only poses are copied."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from ..robots import Robot
+from ..terrains.base import Terrain
+
+VISUAL_GROUP = 2
+"""Geom group of what is seen of a robot."""
+COLLISION_GROUP = 3
+GROUND_COLOR = (0.78, 0.80, 0.82, 1.0)
+FIELD_COLOR = (0.72, 0.76, 0.74, 1.0)
+BOX_COLORS = ((0.66, 0.70, 0.76, 1.0), (0.58, 0.62, 0.69, 1.0))
+"""Neighbouring boxes differ a little, so that steps can be told apart."""
+_FLOOR_REACH = 40.0
+"""Half extent of the drawn floor [m]."""
+_EXTENT = 3.0
+"""Size of what is looked at [m]."""
+
+
+def visual_model(robot: Robot, terrain: Terrain, *, width: int = 1280, height: int = 720) -> mujoco.MjModel:
+    """A model of robot, terrain, sky and light.
+
+    Args:
+        robot: whose ``qpos`` the model takes.
+        terrain: walls are left out, they would hide the robot.
+        width: largest picture [pixels].
+        height: largest picture [pixels].
+    """
+    spec = mujoco.MjSpec.from_file(str(robot.mjcf))
+    _set_light(spec, width, height)
+    _add_floor(spec)
+    steps = [box for box in terrain.boxes if not box.wall]
+    for i, box in enumerate(steps):
+        spec.worldbody.add_geom(
+            name=f"step_{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=box.half_size,
+            pos=box.center,
+            quat=box.quaternion,
+            rgba=BOX_COLORS[i % 2],
+            contype=0,
+            conaffinity=0,
+        )
+    if terrain.height_field is not None:
+        _add_field(spec, terrain)
+    if terrain.target is not None:
+        spec.worldbody.add_geom(
+            name="target",
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=[0.12, 0.004, 0.0],
+            pos=[*terrain.target[:2], _ground(terrain, *terrain.target[:2]) + 0.006],
+            rgba=[0.95, 0.45, 0.15, 1.0],
+            contype=0,
+            conaffinity=0,
+        )
+    shown = any(geom.group == VISUAL_GROUP for geom in spec.geoms)
+    for geom in list(spec.geoms):
+        if geom.group == COLLISION_GROUP and shown:
+            spec.delete(geom)
+    return spec.compile()
+
+
+def _ground(terrain: Terrain, x: float, y: float) -> float:
+    return float(terrain.height(x, y))
+
+
+def _set_light(spec: mujoco.MjSpec, width: int, height: int) -> None:
+    visual = spec.visual
+    visual.global_.offwidth, visual.global_.offheight = width, height
+    visual.quality.shadowsize = 4096
+    visual.quality.offsamples = 4
+    visual.headlight.ambient = [0.38, 0.38, 0.40]
+    visual.headlight.diffuse = [0.30, 0.30, 0.30]
+    visual.headlight.specular = [0.05, 0.05, 0.05]
+    visual.rgba.haze = [0.86, 0.90, 0.95, 1.0]
+    visual.map.haze = 0.35
+    visual.map.znear = 0.01
+    # Shadows are sharp where they fall within this distance of the sun's axis, and absent beyond it.
+    spec.stat.extent = _EXTENT
+    visual.map.shadowclip = 1.0
+    # The sun follows the robot: a shadow map that covers the whole ground would be too coarse.
+    sun = spec.worldbody.add_light(
+        name="sun",
+        pos=[0.0, 0.0, 4.0],
+        dir=[0.35, 0.45, -1.0],
+        diffuse=[0.62, 0.60, 0.56],
+        specular=[0.15, 0.15, 0.15],
+        castshadow=True,
+    )
+    sun.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.45, 0.62, 0.82],
+        rgb2=[0.90, 0.94, 0.98],
+        width=512,
+        height=3072,
+    )
+
+
+def _add_floor(spec: mujoco.MjSpec) -> None:
+    texture = spec.add_texture(
+        name="checker",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.74, 0.77, 0.80],
+        rgb2=[0.66, 0.69, 0.73],
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        markrgb=[0.80, 0.83, 0.86],
+        width=512,
+        height=512,
+    )
+    material = spec.add_material(name="floor", texrepeat=[1.0, 1.0], texuniform=True, reflectance=0.04)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[_FLOOR_REACH, _FLOOR_REACH, 1.0],
+        material="floor",
+        contype=0,
+        conaffinity=0,
+    )
+
+
+def _add_field(spec: mujoco.MjSpec, terrain: Terrain) -> None:
+    field = terrain.height_field
+    assert field is not None
+    top = max(float(field.heights.max()), 1e-6)
+    hfield = spec.add_hfield(name="ground", nrow=field.heights.shape[0], ncol=field.heights.shape[1])
+    hfield.size = np.array([*field.half_size, top, field.base])
+    hfield.userdata = (field.heights / top).astype(np.float32).ravel()
+    spec.worldbody.add_geom(
+        name="ground",
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname="ground",
+        pos=[*field.center, 0.0],
+        rgba=FIELD_COLOR,
+        contype=0,
+        conaffinity=0,
+    )
+
+
+def show(model: mujoco.MjModel, data: mujoco.MjData, position: np.ndarray) -> None:
+    """Put the model into a pose, (7 + J,), and move the sun along."""
+    data.qpos[: len(position)] = position
+    sun = model.light("sun").id
+    model.light_pos[sun] = (*position[:2] - np.array([1.4, 1.8]), position[2] + 4.0)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
