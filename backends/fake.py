@@ -336,7 +336,7 @@ class FakeBackend(PhysicsBackend):
             linear_b, angular_b = script.motion(self)
             linear_w, angular_b = rotate(state.base_quaternion_w, linear_b), angular_b.clone()
         self._substeps_since_reset += mask.long()
-        state.time.copy_(self._substeps_since_reset * h)
+        state.time.copy_(self._substeps_since_reset.to(self.dtype) * h)
         if script.fall_time is not None:
             fallen = self._since(script.fall_time)
             lying = self._since(script.fall_time + FALL_DURATION)

@@ -86,7 +86,7 @@ class EpisodeRunner:
         # what does not change during an episode
         self._spawn, self._heading = zeros(3), zeros(4)
         self._target, self._backward = zeros(3), zeros(kind=truth)
-        self._limits, self._speed, self._time_limit = zeros(3) + 1.0, zeros(), zeros()
+        self._limits, self._speed, self._most_steps = zeros(3) + 1.0, zeros(), zeros(kind=whole)
         self._friction, self._terrain = zeros() + 1.0, zeros(kind=whole)
         self._sequence, self._num_goals = zeros(len(suite.goals), kind=whole), zeros(kind=whole)
         self._sampled = zeros(kind=truth)
@@ -153,7 +153,7 @@ class EpisodeRunner:
             t.spawns["level_eval" if e.stage == "eval" else "level_search"]
             for t, e in zip(terrains, episodes, strict=True)
         ]
-        stand = self._robot.stand_height
+        stand, times = self._robot.stand_height, suite.commands.target_time
 
         def write(into: torch.Tensor, values: list) -> None:
             into[at] = torch.tensor(values, device=device, dtype=into.dtype)
@@ -164,7 +164,7 @@ class EpisodeRunner:
         write(self._backward, [t.backward for t in terrains])
         write(self._limits, [suite.command_limits(t.family) for t in terrains])
         write(self._speed, [suite.commands.target_speed.get(t.family, 0.0) for t in terrains])
-        write(self._time_limit, [suite.commands.target_time.get(t.family, 0.0) for t in terrains])
+        write(self._most_steps, [round(times.get(t.family, 0.0) / self._goals.period) for t in terrains])
         write(self._friction, [e.friction for e in episodes])
         write(self._terrain, [self._terrain_index(e) for e in episodes])
         names = self._goals.names
@@ -294,7 +294,7 @@ class EpisodeRunner:
             still = (speed < settle.speed) & (state.time > settle.shortest)
             leaving = settling & (still | (state.time > settle.longest))
         commanded = self._active & ~settling
-        self._goal_time += commanded * self._goals.period
+        self._goal_time += commanded.to(torch.float64) * self._goals.period
         goal = self._present_goal()
         over = commanded & torch.where(self._goals.is_target[goal], self._done, self._goals.over(goal, self._goal_time))
         if bool(over.any()):
@@ -410,7 +410,7 @@ class EpisodeRunner:
             offset = target_offset(self.backend.state, self._target, commands.target_distance)
             near = torch.hypot(offset[:, 0], offset[:, 1]) < commands.target_radius
             reached = going & aims & near
-            late = self._part_steps * self._goals.period >= self._time_limit
+            late = self._part_steps >= self._most_steps
             over = reached | (going & aims & late)
             self._reached |= reached
             if self.suite.events.penetration is None:

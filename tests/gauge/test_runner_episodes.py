@@ -1,0 +1,322 @@
+"""The loop of episodes on an engine without physics: settling, the grid of samples, and everything that ends something."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gaitgauge.backends.fake import FakeScript
+from gaitgauge.gauge import noise
+from gaitgauge.gauge.runner import EpisodeRunner
+from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.base import PolicyError
+from scripted_gauge import (
+    DIAGONAL,
+    GO2,
+    MAXIMUM,
+    TARGET,
+    Agenda,
+    ScriptedPolicy,
+    at,
+    beginning,
+    episode,
+    fake,
+    ground,
+    moving,
+    play,
+    run,
+    short_suite,
+    tipping,
+)
+
+REFERENCE, OWN = "robogauge-1.1", "gaitgauge-1"
+CYCLE = 12  # control steps of a sub-command, two of settling included
+
+
+def column(record, name):
+    return record.samples[:, record.columns.index(name)]
+
+
+# ---- settling -----------------------------------------------------------------------------------------------------
+
+
+def first_command(script=None, **settling):
+    suite = short_suite()
+    commands = beginning(replace(suite, settling=replace(suite.settling, **settling)), script, steps=30)
+    return int((commands.abs().sum(1) > 0).nonzero()[0])
+
+
+def test_a_robot_that_stands_is_commanded_after_a_tenth_of_a_second():
+    """0.01 s limp and five steps are the first time after more than 0.1 s; that step still has a zero command."""
+    assert first_command(shortest=0.1, longest=3.0) == 6
+
+
+@pytest.mark.parametrize(("velocity", "settled"), [((0.049, 0, 0), 2), ((0.051, 0, 0), 26), ((0, 0, -0.2), 26)])
+def test_a_robot_that_moves_in_any_direction_is_commanded_when_patience_ends(velocity, settled):
+    assert first_command(FakeScript(motion=moving(velocity)), shortest=0.02, longest=0.5) == settled
+
+
+def test_the_last_action_is_forgotten_at_every_reset():
+    policy = ScriptedPolicy(lambda o: torch.ones(len(o), 12))
+    play(short_suite(), [episode(MAXIMUM)], policy=policy)
+    last = torch.stack([o[0, 33:] for o in policy.seen])
+    assert (last[::CYCLE] == 0).all()
+    assert (last[1:CYCLE] == 1).all()
+
+
+# ---- samples --------------------------------------------------------------------------------------------------------
+
+
+def test_the_reference_samples_on_a_grid_that_runs_through_resets():
+    suite = short_suite(REFERENCE)
+    backend, agenda = fake(suite), Agenda([episode(MAXIMUM)])
+    run(suite, backend, agenda)
+    record = agenda.records[0]
+    # every sub-command takes 12 control steps of two substeps and a limp substep, which is offered to nobody
+    length = 2 * CYCLE + 1
+    numbers = [(resets - 1) * length + since for _, resets, since in backend.sampled]
+    # the goal's clock ends the last sub-command one step early
+    assert record.physics_steps == 6 * length - 2
+    assert numbers == [n for n in range(5, record.physics_steps + 1, 5) if n % length != 1]
+    assert len(record.samples) == len(numbers)
+    assert record.part_index.tolist() == [(n - 1) // length for n in numbers]
+
+
+def test_the_own_suite_samples_on_a_grid_that_starts_at_every_reset_and_leaves_settling_out():
+    suite = short_suite(OWN)
+    suite = replace(suite, settling=replace(suite.settling, shortest=0.1))
+    backend, agenda = fake(suite), Agenda([episode(MAXIMUM)])
+    run(suite, backend, agenda)
+    record = agenda.records[0]
+    # counted after the limp substep: 2 x 6 of settling, 2 x 10 of the sub-command
+    assert backend.sampled == [(0, reset, tick + 1) for reset in range(1, 7) for tick in (5, 10, 15, 20, 25, 30)]
+    assert len(record.samples) == 6 * 4
+    assert record.part_index.tolist() == [p for p in range(6) for _ in range(4)]
+    assert record.control_steps == 6 * 16
+
+
+def test_samples_of_a_search_are_not_kept():
+    records = play(short_suite(), [episode(TARGET, stage="search")], terrain=ground((9.0, 0.0, 0.4)))
+    assert len(records[0].samples) == 0
+    assert records[0].columns == ()
+
+
+@pytest.mark.parametrize("name", [REFERENCE, OWN])
+def test_a_dense_grid_loses_no_sample(name):
+    suite = short_suite(name)
+    suite = replace(suite, metrics=replace(suite.metrics, interval=2))
+    backend, agenda = fake(suite, FakeScript(penetration_time=at(0.2))), Agenda([episode(MAXIMUM)])
+    run(suite, backend, agenda)
+    record = agenda.records[0]
+    assert len(record.samples) == (len(backend.sampled) if suite.settling.sampled else 6 * 10)
+    assert (column(record, "dof_limits") > 0.9).all()
+
+
+def test_room_for_samples_grows_with_the_suite():
+    """A short period between samples, long goals: more samples than any fixed table would hold."""
+    suite = load_suite(REFERENCE)
+    dense = replace(suite, metrics=replace(suite.metrics, interval=10))
+    runner = EpisodeRunner(dense, ScriptedPolicy(), fake(dense), lambda e: 0)
+    # 90 s of commands and 14 times 3 s of settling, at 50 a second, all of it twice
+    assert runner.capacity >= 2 * 50 * (90 + 14 * 3)
+
+
+# ---- falls ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_fall_closes_the_goal_in_the_reference():
+    record = play(short_suite(REFERENCE), [episode(DIAGONAL, MAXIMUM)], FakeScript(motion=tipping(16)))[0]
+    assert record.falls == 2
+    # the limp substep and 15 more make 8 control steps, the last of them cut short
+    assert record.control_steps == 2 * 8
+    assert record.physics_steps == 2 * 16
+    assert record.goal_index.tolist() == [0] * 3 + [1] * 3
+    assert (column(record, "dof_limits") > 0.9).all()
+
+
+@pytest.mark.parametrize("substep", [2, 5, 6, 8, 11, 12, 16, 24, 25])
+def test_a_fall_costs_exactly_the_rest_of_the_sub_command_in_the_own_suite(substep):
+    """Substeps since the reset: 1 limp, then 2 x 2 of settling, then 2 x 10 of the sub-command; samples at 6, 11, … 21."""
+    record = play(short_suite(OWN), [episode(MAXIMUM)], FakeScript(motion=tipping(substep)))[0]
+    earned = sum(sampled <= substep for sampled in (6, 11, 16, 21)) if substep > 5 else 0
+    assert record.falls == 6
+    assert record.part_index.tolist() == [p for p in range(6) for _ in range(4)]
+    scored = column(record, "dof_limits").reshape(6, 4) > 0
+    assert (scored == (np.arange(4) < earned)).all()
+    assert (record.samples[~scored.ravel()] == 0).all()
+
+
+@pytest.mark.parametrize(("suite", "falls"), [(REFERENCE, 2), (OWN, 14)])
+def test_a_robot_that_falls_whenever_it_settles_ends_its_episode(suite, falls):
+    record = play(short_suite(suite), [episode(DIAGONAL, MAXIMUM)], FakeScript(motion=tipping(3)))[0]
+    assert record.falls == falls
+    if suite == OWN:
+        assert len(record.samples) == 8 * 4 + 6 * 4
+        assert not record.samples.any()
+
+
+@pytest.mark.parametrize("suite", [REFERENCE, OWN])
+def test_a_fall_on_the_way_to_the_target_is_no_success(suite):
+    search = [episode(TARGET, stage="search")]
+    record = play(short_suite(suite), search, FakeScript(motion=tipping(20)), terrain=ground((5.0, 0.0, 0.4)))[0]
+    assert record.success is False
+    assert record.falls == 1
+
+
+# ---- invalid physics --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("suite", "falls"), [(REFERENCE, 1), (OWN, 6)])
+def test_a_diverged_world_is_a_fall_and_costs_the_step_in_which_it_happened(suite, falls):
+    """Invalid from substep 16 on, on which a sample falls; steps end at 15 and 17."""
+    record = play(short_suite(suite), [episode(MAXIMUM)], FakeScript(diverge_time=at(0.16)))[0]
+    assert record.diverged
+    assert record.falls == falls
+    if suite == OWN:
+        assert ((column(record, "dof_limits").reshape(6, 4) > 0) == (np.arange(4) < 2)).all()
+    else:
+        assert len(record.samples) == 3  # of substeps 5, 10 and 15; that of the step that went wrong is none
+    assert np.isfinite(column(record, "quality")).all()
+
+
+def test_an_overflow_is_recorded_and_interrupts_nothing():
+    quiet = play(short_suite(OWN), [episode(MAXIMUM)])[0]
+    record = play(short_suite(OWN), [episode(MAXIMUM)], FakeScript(overflow_time=at(0.2)))[0]
+    assert record.overflowed
+    assert record.falls == 0
+    assert np.array_equal(record.samples, quiet.samples, equal_nan=True)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_policy_that_answers_with_no_number_is_an_error(value):
+    def act(observation):
+        action = torch.zeros(len(observation), 12)
+        action[:, 3] = torch.where(observation[:, 6].abs() > 0, value, 0.0)
+        return action
+
+    with pytest.raises(PolicyError, match=rf"returned {value} for a finite observation at control step 2 of"):
+        play(short_suite(), [episode(DIAGONAL)], policy=ScriptedPolicy(act))
+
+
+def test_what_a_policy_answers_for_empty_slots_does_not_matter():
+    def act(observation):
+        action = torch.zeros(len(observation), 12)
+        action[1:] = math.nan
+        return action
+
+    assert len(play(short_suite(), [episode(MAXIMUM)], slots=3, policy=ScriptedPolicy(act))) == 1
+
+
+# ---- penetration ------------------------------------------------------------------------------------------------------
+
+
+def test_a_penetration_starts_the_goal_again_once_and_keeps_the_samples():
+    """0.2 s after a reset, in the eighth control step; and again, without effect, in every later sub-command."""
+    suite, policy = short_suite(REFERENCE), ScriptedPolicy()
+    record = play(suite, [episode(MAXIMUM)], FakeScript(penetration_time=at(0.2)), policy=policy)[0]
+    quiet = play(suite, [episode(MAXIMUM)])[0]
+    assert record.restarted
+    assert record.falls == 0
+    again = record.control_steps - quiet.control_steps
+    assert again == 10
+    assert torch.equal(policy.commands()[:again], policy.commands()[again : 2 * again])
+    assert (record.part_index == 0).sum() == 4 + (quiet.part_index == 0).sum()
+
+
+def test_a_penetration_after_the_target_was_reached_takes_the_success_back():
+    """The robot walks after the first reset alone, and reaches the target then."""
+    suite, spot = short_suite(REFERENCE), ground((0.2, 0.0, GO2.stand_height))
+
+    def motion(backend):
+        linear = torch.zeros(backend.num_worlds, 3, dtype=torch.float64)
+        linear[:, 0] = backend.resets.le(1) * backend.state.time.ge(0.05)
+        return linear, torch.zeros_like(linear)
+
+    script = FakeScript(motion=motion)
+    search = [episode(TARGET, stage="search")]
+    assert play(suite, search, script, terrain=spot)[0].success is True
+    backend, agenda = fake(suite, script, terrain=spot), Agenda(search)
+
+    def watch(progress):
+        if int(backend.resets[0]) == 2:
+            backend.script = replace(script, penetration_time=at(0.02))
+
+    EpisodeRunner(suite, ScriptedPolicy(), backend, lambda e: 0).run(agenda, watch)
+    assert agenda.records[0].restarted
+    assert agenda.records[0].success is False
+
+
+def test_the_own_suite_knows_no_penetration():
+    record = play(short_suite(OWN), [episode(MAXIMUM)], FakeScript(penetration_time=at(0.2)))[0]
+    assert not record.restarted
+
+
+# ---- the target -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("suite", "steps"), [(REFERENCE, 2 + 20 + 2), (OWN, 2 + 20)])
+def test_time_runs_out_after_its_steps(suite, steps):
+    """0.4 s are 20 steps; the reference settles once more before it closes the goal."""
+    record = play(short_suite(suite), [episode(TARGET, stage="search")], terrain=ground((5.0, 0.0, 0.4)))[0]
+    assert record.success is False
+    assert record.control_steps == steps
+
+
+@pytest.mark.parametrize("name", [REFERENCE, OWN])
+def test_the_target_is_reached_within_a_tenth_of_a_metre(name):
+    """At 1 m/s from 0.05 s on, 0.2501 m to go but for 0.1: within reach after 16 substeps, which is 8 control steps."""
+    suite = short_suite(name)
+    search, spot = [episode(TARGET, stage="search")], ground((0.2501, 0.0, GO2.stand_height))
+    record = play(suite, search, FakeScript(motion=moving((1.0, 0, 0), since=0.05)), terrain=spot)[0]
+    assert record.success is True
+    assert record.control_steps == 2 + 8 + (2 if name == REFERENCE else 0)
+
+
+def test_velocity_goals_alone_have_no_success():
+    assert play(short_suite(), [episode(MAXIMUM)])[0].success is None
+
+
+# ---- slots --------------------------------------------------------------------------------------------------------------
+
+
+def swaying(backend):
+    """A motion that depends on the episode's friction and time alone; the slippery one falls."""
+    friction, time = backend.randomized.friction, backend.state.time
+    linear = torch.stack((torch.sin(9.0 * friction * time), 0.1 * time, 0.0 * time), dim=1)
+    angular = torch.stack((40.0 * (friction < 0.3) * time.ge(0.06), 0.0 * time, friction), dim=1)
+    return linear * time.ge(0.05)[:, None], angular
+
+
+@pytest.mark.parametrize("name", [REFERENCE, OWN])
+def test_an_episode_does_not_depend_on_slots_order_or_neighbours(name):
+    suite = short_suite(name, maximum=(0.06, 0.04))
+    episodes = [
+        episode(MAXIMUM, seed=seed, friction=friction) for seed, friction in [(0, 0.6), (1, 0.2), (0, 0.9), (2, 0.4)]
+    ]
+
+    def outcome(order, slots):
+        policy = ScriptedPolicy(lambda o: torch.tanh(o[:, 9:21] + 0.5 * o[:, 21:33] + 0.1 * o[:, 33:45]))
+        script = FakeScript(motion=swaying)
+        return {r.episode: r for r in play(suite, [episodes[i] for i in order], script, slots=slots, policy=policy)}
+
+    alone = outcome([0, 1, 2, 3], 1)
+    assert len({r.samples.tobytes() for r in alone.values()}) == 4
+    assert alone[episodes[1]].falls > 0
+    for order, slots in (([2, 0, 3, 1], 3), ([3, 2, 1, 0], 8)):
+        other = outcome(order, slots)
+        for e, record in alone.items():
+            assert record.summary() == other[e].summary()
+            for name in ("samples", "goal_index", "part_index"):
+                assert getattr(record, name).tobytes() == getattr(other[e], name).tobytes()
+
+
+def test_an_episode_may_be_longer_than_the_table_of_noise(monkeypatch):
+    suite = short_suite()
+    policy = ScriptedPolicy()
+    play(suite, [episode(MAXIMUM)] * 2, policy=policy)
+    monkeypatch.setattr(noise, "TABLE_STEPS", 16)
+    short = ScriptedPolicy()
+    play(suite, [episode(MAXIMUM)] * 2, policy=short)
+    assert len(policy.seen) > 2 * 60
+    assert torch.equal(torch.stack(policy.seen), torch.stack(short.seen))
