@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import time as clock
@@ -34,7 +35,8 @@ def run_training(*, task: str, time: str | None, **choices: Any) -> None:
     began = clock.monotonic()
     seconds = None if time is None else duration(time)
     plan = prepare(TrainRequest(task=task, seconds=seconds, **choices))
-    console = Console(highlight=False)
+    # Of several processes, one for each GPU, the first speaks.
+    console = Console(highlight=False, quiet=os.environ.get("RANK", "0") != "0")
     steps = plan.task.training.run.steps_per_iteration * plan.task.environment.num_envs
     display = _Display(console, title=task, deadline=None if seconds is None else began + seconds)
 

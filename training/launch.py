@@ -107,7 +107,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
     own = _own_overrides(request)
     task = find_task(request.task, own)
     stored: Mapping[str, Any] = {}
-    checkpoint, run = None, None
+    checkpoint, run, training = None, None, None
     if request.resume is not None:
         checkpoint = find_checkpoint(
             request.resume, experiment=task.training.run.experiment, root=request.log_root
@@ -137,6 +137,11 @@ def prepare(request: TrainRequest) -> TrainPlan:
         task = find_task(request.task, [f"{_WAIT}=0", *own])
     else:
         task = find_task(request.task, own)
+    if training is not None and task.environment.num_envs != training["num_envs"]:
+        raise CheckpointError(
+            f"Cannot resume from '{checkpoint}': it has {training['num_envs']} environments, this run "
+            f"{task.environment.num_envs}; leave --num-envs out, or begin a new run with --init-from."
+        )
     if request.score_suite is None:
         task = replace(task, training=replace(task.training, run=replace(task.training.run, gauge_interval=0)))
     else:

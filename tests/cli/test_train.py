@@ -170,6 +170,13 @@ def test_damaged_checkpoint(refused, trained, tmp_path, damage, option):
     assert not (tmp_path / "logs").exists()
 
 
+def test_resume_with_another_number_of_environments(refused, trained):
+    message = refused("train", "go2-flat", "--resume", trained, "--device", "cpu", "--num-envs", 16)
+    assert "8 environments" in message
+    assert "16" in message
+    assert "--init-from" in message
+
+
 def test_policy_without_training_state(refused, policy):
     assert "no training state" in refused("train", "go2-flat", "--backend", "fake", "--resume", policy)
 
