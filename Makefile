@@ -16,6 +16,7 @@ $(READY): pyproject.toml constraints.txt
 	touch $(READY)
 
 demo: install
+	rm -rf results/demo
 	$(BIN)/gaitgauge evaluate pretrained --suite demo --out results/demo
 
 test: install

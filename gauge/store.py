@@ -48,16 +48,20 @@ class RunFolder:
         if marker.exists():
             try:
                 present = json.loads(marker.read_text(encoding="utf-8"))
+                if not isinstance(present, dict):
+                    raise ValueError("it holds no table")
             except (OSError, ValueError) as error:
                 raise StoreError(f"{marker} is damaged ({error}); give another folder with --out") from error
             different = sorted(k for k in wanted.keys() | present.keys() if wanted.get(k) != present.get(k))
-            if different:
+            if different and not any(self._episodes.glob("*.npz")):
+                marker.unlink()  # the other run ended before its first episode did: there is nothing to lose
+            elif different:
                 key = different[0]
                 raise StoreError(
                     f"{folder} belongs to another run ({_difference(key, present.get(key), wanted.get(key))}); "
                     "give another folder with --out"
                 )
-            if not resume:
+            elif not resume:
                 raise StoreError(
                     f"{folder} already holds this run; go on with --resume, or give another folder with --out"
                 )
