@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
+import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,10 @@ from numpy.typing import NDArray
 
 QUALITY = "quality"
 """Column of the sample table that holds the quality of each sample."""
+
+
+class RecordError(ValueError):
+    """An episode's file is damaged."""
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
@@ -35,7 +41,9 @@ class Episode:
     def key(self) -> str:
         """Name of the episode, unique within a suite; also its file's name."""
         goals = "+".join(g.split("_")[0] for g in self.goals)
-        return f"{self.stage}-{self.terrain}-L{self.level}-f{self.friction:g}-m{self.payload:g}-s{self.seed}-{goals}"
+        return (
+            f"{self.stage}-{self.terrain}-L{self.level}-f{self.friction:.12g}-m{self.payload:.12g}-s{self.seed}-{goals}"
+        )
 
 
 @dataclass(kw_only=True)
@@ -93,18 +101,20 @@ class Record:
         """Read a record.
 
         Raises:
-            ValueError: the file is damaged.
+            RecordError: the file is damaged.
         """
         try:
             with np.load(path, allow_pickle=False) as data:
                 head: Mapping[str, Any] = json.loads(data["head"].tobytes())
                 arrays = {k: data[k] for k in ("samples", "goal_index", "part_index")}
-        except (OSError, KeyError, ValueError, EOFError) as error:
-            raise ValueError(
-                f"episode file {path} is damaged ({error}); delete it and run again with --resume"
+            names = ("terrain", "level", "friction", "payload", "seed", "stage")
+            episode = Episode(goals=tuple(head["goals"]), **{n: head[n] for n in names})
+            if episode.key != path.stem:
+                raise ValueError(f"it holds episode {episode.key}")
+            rest = ("success", "falls", "diverged", "overflowed", "restarted", "control_steps", "physics_steps")
+            return cls(episode=episode, columns=tuple(head["columns"]), **arrays, **{n: head[n] for n in rest})
+        except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise RecordError(
+                f"episode file {path} is damaged ({reason}); delete it and run again with --resume"
             ) from error
-        names = ("terrain", "level", "friction", "payload", "seed", "stage")
-        episode = Episode(goals=tuple(head["goals"]), **{n: head[n] for n in names})
-        record = cls(episode=episode, columns=tuple(head["columns"]), **arrays)
-        rest = ("success", "falls", "diverged", "overflowed", "restarted", "control_steps", "physics_steps")
-        return replace(record, **{n: head[n] for n in rest})

@@ -24,6 +24,7 @@ from ..policy.loading import find_policy, load_policy
 from ..robots import Robot, RobotError, load_robot
 from ..terrains.registry import make_terrain, terrain_names
 from .episodes import Episode
+from .goals import check_terrain
 from .pipelines import PIPELINES, Environment, Plan, make_environments
 from .results import fold, health, rows_csv
 from .runner import EpisodeRunner, Progress
@@ -106,6 +107,9 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
     environments = make_environments(
         suite, terrains=terrains, frictions=frictions or None, payloads=payloads or None, level=level
     )
+    for name, environment in {e.terrain: e for e in environments}.items():
+        level = suite.scoring.levels if environment.searched else environment.level
+        check_terrain(suite, make_terrain(name, level), searched=environment.searched)
     policy = load_policy(request.policy, robot)
     check_robot(policy.contract, robot)
     if abs(policy.contract.control_period - suite.physics.control_period) > 1e-9:
@@ -113,7 +117,7 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
             f"the policy was made for a control period of {policy.contract.control_period:g} s, suite '{suite.name}' runs "
             f"{suite.physics.control_period:g} s; use a policy of that period"
         )
-    return suite, robot, policy, environments, list(seeds)
+    return suite, robot, policy, environments, list(dict.fromkeys(seeds))
 
 
 def _terrains(request: Request, suite: Suite) -> list[str]:
@@ -144,6 +148,7 @@ def identity(request: Request, suite: Suite, policy: Policy, environments: list[
     """What decides about the results: a folder that holds another run is refused."""
     return {
         "suite": f"{suite.name} {suite.version}",
+        "suite_digest": suite.digest,
         "policy": policy.contract.hash,
         "policy_file": policy_digest(request.policy),
         "pipeline": request.pipeline,
@@ -198,7 +203,7 @@ def evaluate(
         runner.run(plan, _watcher(plan, watch, began))
         physics_steps += runner.physics_steps
         backend.close()
-    results = fold(suite, environments, columns)
+    results = fold(suite, environments, columns, evaluated=evaluated)
     results["policy"] = {
         "path": policy.path,
         "contract_hash": policy.contract.hash,
@@ -210,7 +215,7 @@ def evaluate(
     results["robot"] = robot.name
     results["health"] = dict(health(environments))
     results["provenance"] = _provenance(request, command, time.perf_counter() - began, physics_steps)
-    write_atomically(folder / "episodes.csv", rows_csv([r for e in environments for r in e.records]))
+    write_atomically(folder / "episodes.csv", rows_csv([r for e in environments for r in (*e.trials, *e.records)]))
     write_atomically(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     return results
 

@@ -9,6 +9,7 @@ import torch
 
 from ..backends.base import PhysicsState
 from ..robots.rotation import rotate_inverse, yaw_of
+from ..terrains.base import Terrain
 from .suite import Suite, SuiteError
 
 # Sub-commands as multiples of the limits (forward, lateral, yaw), in the order in which they run.
@@ -90,6 +91,34 @@ class GoalTable:
         within = time - self._early - torch.where(torch.isinf(duration), torch.zeros_like(time), part * duration)
         factor = torch.where(within < self._first[goal], torch.ones_like(self._second[goal]), self._second[goal])
         return self._table[goal, part] * limits * factor[:, None]
+
+
+def check_terrain(suite: Suite, terrain: Terrain, *, searched: bool) -> None:
+    """Check that a terrain, a plug-in's for example, has what the goals need.
+
+    Args:
+        suite: the rules.
+        terrain: any level of it.
+        searched: whether its target is to be reached.
+
+    Raises:
+        SuiteError: a start, the target, or the suite's speed and time for its family is missing.
+    """
+    for spawn in ("level_eval", *(["level_search"] if searched else [])):
+        if spawn not in terrain.spawns:
+            raise SuiteError(f"terrain '{terrain.name}' has no spawn '{spawn}'; add it, or choose another terrain")
+    if not searched:
+        return
+    if terrain.target is None:
+        raise SuiteError(
+            f"terrain '{terrain.name}' has no target, so no level can be searched on it; give one with --level"
+        )
+    for name, table in (("target_speed", suite.commands.target_speed), ("target_time", suite.commands.target_time)):
+        if terrain.family not in table:
+            raise SuiteError(
+                f"suite '{suite.name}' has no commands.{name} for terrain family '{terrain.family}'; "
+                f"it has {', '.join(sorted(table))}"
+            )
 
 
 def target_offset(state: PhysicsState, target: torch.Tensor, frame: str) -> torch.Tensor:

@@ -13,7 +13,7 @@ from ..backends.base import PhysicsState
 from ..robots.base import Robot
 from ..robots.geometry import joint_ranges, stance_span
 from ..robots.rotation import projected_gravity, rotate_inverse
-from .suite import Metrics
+from .suite import Metrics, SuiteError
 
 METRIC_NAMES = (
     "lin_vel_err",
@@ -219,7 +219,7 @@ class MetricEvaluator:
                 carried = state.foot_normal_force.sum(1) > m.contact_share * self._weight
                 value = torch.where(carried, value, torch.full_like(value, math.nan))
             else:
-                raise ValueError(
+                raise SuiteError(
                     f"unknown metric '{name}'; choose from {', '.join(METRIC_NAMES)} (suite, metrics.weights)"
                 )
             columns.append(value)

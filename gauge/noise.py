@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from .episodes import Episode
 from .suite import Noise
 
-
 TABLE_STEPS = 2000
 """Control steps that are drawn in advance at a time."""
 

@@ -87,13 +87,15 @@ class Environment:
     tests: dict[int, LevelTest] = field(default_factory=dict)
     records: list[Record] = field(default_factory=list)
     """Quality episodes, in the order of the seeds once complete."""
+    trials: list[Record] = field(default_factory=list)
+    """Episodes of the level tests."""
     low: int = 0
     high: int = 0
 
     @property
     def key(self) -> str:
         """Unique name."""
-        return f"{self.terrain}-f{self.friction:g}-m{self.payload:g}"
+        return f"{self.terrain}-f{self.friction:.12g}-m{self.payload:.12g}"
 
 
 class Plan:
@@ -173,6 +175,7 @@ class Plan:
             environment.records.append(record)
             environment.records.sort(key=lambda r: self.seeds.index(r.episode.seed))
             return
+        environment.trials.append(record)
         environment.tests[record.episode.level].record(bool(record.success))
         self._search(environment)
 
@@ -247,7 +250,9 @@ def make_environments(
     if level is not None and not 1 <= level <= suite.scoring.levels:
         raise SuiteError(f"level {level} does not exist; choose 1 to {suite.scoring.levels}")
     crossed = matrix.crossed or frictions is not None or payloads is not None
-    pairs = [(f, p) for p in (payloads or matrix.payloads) for f in (frictions or matrix.frictions)]
+    pairs = [
+        (f, p) for p in dict.fromkeys(payloads or matrix.payloads) for f in dict.fromkeys(frictions or matrix.frictions)
+    ]
     if payloads is None and frictions is not None and not matrix.crossed:
         pairs = [(f, p) for f, p in pairs if p == matrix.nominal_payload]
     if not crossed:

@@ -27,13 +27,17 @@ from .suite import Suite
 SCHEMA = 1
 
 
-def fold(suite: Suite, environments: Sequence[Environment], columns: Sequence[str]) -> dict[str, Any]:
+def fold(
+    suite: Suite, environments: Sequence[Environment], columns: Sequence[str], *, evaluated: bool | None = None
+) -> dict[str, Any]:
     """Everything of ``results.json`` but the policy and the provenance.
 
     Args:
         suite: the rules.
         environments: all of them with their level, and their quality episodes where these were played.
         columns: the metrics, then ``quality``.
+        evaluated: whether quality was asked for, and not the level alone; None: if any environment has quality episodes. Where
+            it was and no level is passed anywhere, the score is 0 and not absent.
 
     Returns:
         Plain data. Scores rest on mean@50: an environment's is its quality's (``scoring.level_score``), a terrain's the mean over
@@ -49,7 +53,8 @@ def fold(suite: Suite, environments: Sequence[Environment], columns: Sequence[st
         rows.append(row)
         values[environment.key] = statistics
         draws[environment.key] = replicates
-    evaluated = any(e.records for e in environments)
+    if evaluated is None:
+        evaluated = any(e.records for e in environments)
     searched = [e for e in environments if e.terrain != "flat"]
     result: dict[str, Any] = {
         "schema": SCHEMA,
@@ -122,20 +127,20 @@ def _environment(
     if not environment.records:
         return row, statistics, replicates
     plain: dict[str, Array] = {}
+    draws = bootstrap_environment(
+        [bootstrap_run(r, range(len(columns)), scoring.bootstrap) for r in environment.records],
+        scoring.bootstrap,
+        name=environment.key,
+    )
     for index, column in enumerate(columns):
         runs = [rounded(run_statistics(r, index), scoring) for r in environment.records]
         mean = rounded(np.mean(runs, axis=0), scoring)
-        draws = bootstrap_environment(
-            [bootstrap_run(r, index, scoring.bootstrap, name=column) for r in environment.records],
-            scoring.bootstrap,
-            name=f"{environment.key}/{column}",
-        )
         plain[column] = mean
         name = column if index < len(columns) - 1 else "score"
         # the reference rounds every run's score before it averages
         weighted = [rounded(np.asarray(level_score(v, level, scoring, flat=flat)), scoring) for v in runs]
         statistics[name] = rounded(np.mean(weighted, axis=0), scoring)
-        replicates[name] = np.asarray(level_score(draws, level, scoring, flat=flat))
+        replicates[name] = np.asarray(level_score(draws[index], level, scoring, flat=flat))
     row["quality"] = {s: _number(v) for s, v in zip(STATISTICS, plain[columns[-1]], strict=True)}
     row["score"] = _number(statistics["score"][2])
     row["interval"] = _interval(replicates["score"])

@@ -67,39 +67,72 @@ class Interval:
         return cls(float(low), float(high))
 
 
-def bootstrap_run(record: Record, column: int, resamples: int, *, name: str) -> Array:
-    """Bootstrap replicates of an episode's mean@50 of one column: the sub-commands of every goal are drawn with replacement.
+def bootstrap_run(record: Record, columns: Sequence[int], resamples: int) -> Array:
+    """Bootstrap replicates of an episode's mean@50: the sub-commands of every goal are drawn with replacement.
 
-    Each resample gives every sub-command a multiplicity; the lowest half of the multiset follows from cumulated counts over the
-    samples sorted once. Returns (B, ). The generator is seeded by the episode's name, so results are reproducible.
+    A resample gives every sub-command a multiplicity, the same for all columns, so that what columns have in common stays in
+    their averages. The lowest half of the multiset follows from sums over the sorted samples, one for each sub-command.
+    Samples that are not defined are left out; what has none counts zero, as in ``run_statistics``.
+
+    Args:
+        record: the episode; its name seeds the generator, so that results are reproducible.
+        columns: columns of the sample table.
+        resamples: number of replicates B.
+
+    Returns:
+        (columns, B).
     """
-    replicates = np.zeros((len(record.episode.goals), resamples))
-    generator = np.random.default_rng(zlib.crc32(f"{name}/{record.episode.key}".encode()))
-    for goal in range(len(record.episode.goals)):
+    goals = range(len(record.episode.goals))
+    replicates = np.zeros((len(columns), len(goals), resamples))
+    generator = np.random.default_rng(zlib.crc32(record.episode.key.encode()))
+    for goal in goals:
         mine = record.goal_index == goal
-        values = record.samples[mine, column].astype(np.float64) if len(record.samples) else np.zeros(0)
-        parts = record.part_index[mine]
-        defined = ~np.isnan(values)
-        values, parts = np.clip(values[defined], 0.0, 1.0), parts[defined]
-        if len(values) == 0:
+        labels, codes = np.unique(record.part_index[mine], return_inverse=True)
+        if len(labels) == 0:
             continue
-        labels, codes = np.unique(parts, return_inverse=True)
-        order = np.argsort(values, kind="stable")
         draws = generator.multinomial(len(labels), np.full(len(labels), 1.0 / len(labels)), size=resamples)
-        count = draws[:, codes[order]].astype(np.float64)
-        total = count.sum(1)
-        half = np.maximum(1.0, np.floor(0.5 * total))
-        used = np.clip(half[:, None] - (np.cumsum(count, axis=1) - count), 0.0, count)
-        replicates[goal] = used @ values[order] / half
-    return replicates.mean(0)
+        for at, column in enumerate(columns):
+            values = record.samples[mine, column].astype(np.float64)
+            defined = ~np.isnan(values)
+            replicates[at, goal] = _lower_halves(np.clip(values[defined], 0.0, 1.0), codes[defined], draws)
+    return replicates.mean(1)
+
+
+def _lower_halves(values: Array, codes: NDArray[np.intp], draws: NDArray[np.int64]) -> Array:
+    """Mean of the lowest half of multisets in which value i occurs ``draws[:, codes[i]]`` times; 0 for an empty one.
+
+    ``values`` and ``codes`` (N,), ``draws`` (B, labels); returns (B,).
+    """
+    order = np.argsort(values, kind="stable")
+    values, codes = values[order], codes[order]
+    one_hot = codes[:, None] == np.arange(draws.shape[1])
+    start = np.zeros((1, draws.shape[1]))
+    counts = np.concatenate((start, np.cumsum(one_hot, axis=0)))
+    sums = np.concatenate((start, np.cumsum(one_hot * values[:, None], axis=0)))
+    total = draws @ counts[-1]
+    half = np.maximum(1.0, np.floor(0.5 * total))
+    # smallest number of sorted values whose copies make up the half, by bisection for all resamples at once
+    low, high = np.ones(len(draws), dtype=np.int64), np.full(len(draws), len(values), dtype=np.int64)
+    while (low < high).any():
+        middle = (low + high) // 2
+        enough = (draws * counts[middle]).sum(1) >= half
+        low, high = np.where(enough, low, middle + 1), np.where(enough, middle, high)
+    last = high - 1
+    before = (draws * counts[last]).sum(1)
+    lower = (draws * sums[last]).sum(1) + (half - before) * (values[last] if len(values) else 0.0)
+    return np.where(total > 0, lower / half, 0.0)
 
 
 def bootstrap_environment(runs: Sequence[Array], resamples: int, *, name: str) -> Array:
-    """Replicates of an environment's value: seeds drawn with replacement, each with a replicate of its own. (B,)."""
+    """Replicates of an environment's values: seeds drawn with replacement, each with a replicate of its own.
+
+    ``runs`` holds one array (columns, B) for each seed; the same seeds are drawn for all columns. Returns (columns, B).
+    """
     table = np.stack(runs)
     generator = np.random.default_rng(zlib.crc32(name.encode()))
     seeds = generator.integers(len(table), size=(len(table), resamples))
-    return table[seeds, np.arange(resamples)[None, :]].mean(0)
+    drawn: Array = table[seeds, :, np.arange(resamples)[None, :]].mean(0).T
+    return drawn
 
 
 def group_values(weighted: Mapping[str, float], scoring: Scoring) -> dict[str, float]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, get_type_hints
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from ..backends.base import PhysicsOptions
 
@@ -184,6 +187,11 @@ class Suite:
     metrics: Metrics
     scoring: Scoring
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 over every rule, hexadecimal: two suites of one name and different rules differ in it."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
     def goal(self, name: str) -> Goal:
         """The goal of that name."""
         return next(g for g in self.goals if g.name == name)
@@ -204,38 +212,115 @@ def load_suite(name: str) -> Suite:
     Raises:
         SuiteError: no such suite, or a malformed file.
     """
-    path = Path(name) if name.endswith(".toml") else SUITE_FOLDER / f"{name}.toml"
+    return _load(name, ())
+
+
+def _load(name: str, behind: tuple[Path, ...]) -> Suite:
+    """Load a suite that the files ``behind`` extend, one after the other."""
+    own = name.endswith(".toml")
+    path = Path(name) if own else SUITE_FOLDER / f"{name}.toml"
+    if own and behind:
+        path = behind[-1].parent / path
     if not path.is_file():
         close = get_close_matches(name, suite_names(), 1)
         hint = f"; did you mean '{close[0]}'" if close else ""
         raise SuiteError(
             f"there is no suite '{name}'{hint}; choose one of {', '.join(suite_names())}, or give a .toml file"
         )
+    if path.resolve() in behind:
+        raise SuiteError(f"suite file {path} extends itself; let 'extends' name another suite")
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SuiteError(f"suite file {path} is not valid TOML: {error}") from error
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SuiteError(f"suite file {path} cannot be read: {error}") from error
     base = data.pop("extends", None)
-    if base is not None:
-        suite = _apply(load_suite(base), data, path)
-        assert isinstance(suite, Suite)
-        return suite
-    suite = _build(Suite, data, str(path))
+    if base is None:
+        suite = _build(Suite, data, str(path))
+    else:
+        suite = _apply(_load(str(base), (*behind, path.resolve())), data, str(path))
     assert isinstance(suite, Suite)
+    foreign = own and path.resolve().parent != SUITE_FOLDER.resolve()
+    if foreign and ((base is not None and "name" not in data) or suite.name in suite_names()):
+        raise SuiteError(
+            f"suite file {path} is called '{suite.name}' as a suite that ships with the project or that it extends; "
+            "give it a 'name' of its own, so that results are not taken for that suite's"
+        )
+    _check(suite, str(path))
     return suite
 
 
-def _apply(item: Any, data: Mapping[str, Any], path: Path) -> Any:
+# What may stand in fields that name a rule.
+_CHOICES: Mapping[str, tuple[str, ...]] = {
+    "commands.target_distance": ("body", "horizontal"),
+    "commands.heading_frame": ("body", "horizontal"),
+    "noise.stream": ("reference", "counter"),
+    "events.fall": ("close-goal", "zero-rest"),
+    "metrics.clock": ("run", "reset"),
+    "metrics.angular_velocity": ("twice-rotated", "body", "commanded"),
+    "metrics.linear_velocity": ("body", "commanded"),
+    "metrics.smoothness": ("samples", "control-steps"),
+}
+
+
+def _check(suite: Suite, where: str) -> None:
+    """Refuse values that would be ignored or cannot work."""
+    for field, allowed in _CHOICES.items():
+        section, _, key = field.partition(".")
+        value = getattr(getattr(suite, section), key)
+        if value not in allowed:
+            raise SuiteError(f"{where}: {field} is '{value}'; choose one of {', '.join(allowed)}")
+    physics, events, metrics, scoring = suite.physics, suite.events, suite.metrics, suite.scoring
+    rules = {
+        f"events.fall_tilt ({events.fall_tilt}) and physics.watch_tilt ({physics.watch_tilt}) must be the same": (
+            events.fall_tilt == physics.watch_tilt
+        ),
+        f"events.penetration ({events.penetration}) and physics.watch_penetration ({physics.watch_penetration}) must be "
+        "the same": events.penetration == physics.watch_penetration,
+        f"metrics.interval is {metrics.interval} substeps; at least physics.substeps ({physics.substeps}) are needed": (
+            metrics.interval >= physics.substeps
+        ),
+        f"noise.latency is {suite.noise.latency} substeps; 0 to physics.substeps ({physics.substeps}) are possible": (
+            0 <= suite.noise.latency <= physics.substeps
+        ),
+        "metrics.weights must be above zero, at least one of them": (
+            len(metrics.weights) > 0 and all(w > 0 for w in metrics.weights.values())
+        ),
+        f"scoring.pass_rate is {scoring.pass_rate}; it must lie above 0 and not above 1": 0 < scoring.pass_rate <= 1,
+        f"scoring.levels is {scoring.levels}; at least 1 is needed": scoring.levels >= 1,
+        f"scoring.bootstrap is {scoring.bootstrap}; at least 1 resample is needed": scoring.bootstrap >= 1,
+        "matrix needs at least one terrain, friction, payload, seed and search seed": all(
+            (
+                suite.matrix.terrains,
+                suite.matrix.frictions,
+                suite.matrix.payloads,
+                suite.matrix.seeds,
+                suite.matrix.search_seeds,
+            )
+        ),
+    }
+    for rule, kept in rules.items():
+        if not kept:
+            raise SuiteError(f"{where}: {rule}")
+    for group, names in scoring.groups.items():
+        missing = [n for n in names if n not in metrics.weights]
+        if missing:
+            raise SuiteError(
+                f"{where}: scoring.groups.{group} names '{missing[0]}', which has no weight; "
+                f"choose from {', '.join(metrics.weights)}"
+            )
+
+
+def _apply(item: Any, data: Mapping[str, Any], where: str) -> Any:
     """A copy of a dataclass with the given (nested) fields replaced."""
     known = {f.name for f in fields(item)}
     changes: dict[str, Any] = {}
     hints = get_type_hints(type(item))
     for key, value in data.items():
         if key not in known:
-            raise SuiteError(f"suite file {path} has the unknown key '{key}'; allowed here: {', '.join(sorted(known))}")
-        present = getattr(item, key)
+            raise SuiteError(f"{where} has the unknown key '{key}'; allowed here: {', '.join(sorted(known))}")
+        present, inside = getattr(item, key), f"{where}: {key}"
         nested = is_dataclass(present) and isinstance(value, dict)
-        changes[key] = _apply(present, value, path) if nested else _value(hints[key], value, f"{path}: {key}")
+        changes[key] = _apply(present, value, inside) if nested else _value(hints[key], value, inside)
     return replace(item, **changes)
 
 
@@ -249,20 +334,31 @@ def _build(kind: type, data: Mapping[str, Any], where: str) -> Any:
     try:
         return kind(**values)
     except TypeError as error:
-        raise SuiteError(f"{where} is incomplete: {error}") from error
+        missing = [f.name for f in fields(kind) if f.name not in values and f.default is MISSING]
+        raise SuiteError(f"{where} is incomplete; it lacks {', '.join(missing)}") from error
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
     """Plain TOML data as the annotated type: nested dataclasses, tuples for lists, and None for ``false`` where allowed."""
-    if value is False and type(None) in getattr(hint, "__args__", ()):
-        return None  # TOML has no null
-    if isinstance(value, dict) and is_dataclass(hint):
+    inner = get_args(hint)
+    if get_origin(hint) in (Union, UnionType):
+        if value is False:
+            return None  # TOML has no null
+        return _value(next(i for i in inner if i is not type(None)), value, where)
+    if is_dataclass(hint) and isinstance(value, dict):
         return _build(hint, value, where)  # type: ignore[arg-type]
-    if isinstance(value, list):
-        inner = getattr(hint, "__args__", (Any,))[0]
-        if is_dataclass(inner):
-            return tuple(_build(inner, v, where) for v in value)  # type: ignore[arg-type]
-        return tuple(value)
-    if isinstance(value, dict):
-        return {k: tuple(v) if isinstance(v, list) else v for k, v in value.items()}
-    return value
+    if get_origin(hint) is tuple and isinstance(value, list):
+        kinds = inner[:1] * len(value) if inner[-1] is Ellipsis else inner
+        if len(kinds) == len(value):
+            return tuple(_value(k, v, where) for k, v in zip(kinds, value, strict=True))
+    elif get_origin(hint) is Mapping and isinstance(value, dict):
+        return {k: _value(inner[1], v, f"{where}.{k}") for k, v in value.items()}
+    elif hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    elif hint in (int, str, bool) and type(value) is hint:
+        return value
+    shape = f" with {len(inner)} entries" if get_origin(hint) is tuple and inner[-1] is not Ellipsis else ""
+    raise SuiteError(f"{where} is {value!r}; a {_KINDS.get(get_origin(hint) or hint, 'table')}{shape} is needed")
+
+
+_KINDS = {float: "number", int: "whole number", str: "text", bool: "true or false", tuple: "list"}
