@@ -1,0 +1,378 @@
+"""From samples to scores: tail means, level scores, the paper's own tables, and the bootstrap."""
+
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gaitgauge.gauge.episodes import Episode, Record
+from gaitgauge.gauge.pipelines import Environment
+from gaitgauge.gauge.results import fold
+from gaitgauge.gauge.scoring import (
+    Interval,
+    bootstrap_environment,
+    bootstrap_run,
+    group_values,
+    level_score,
+    rounded,
+    run_statistics,
+    tail_means,
+)
+from gaitgauge.gauge.suite import load_suite
+from gaitgauge.gauge.validation import ValidationError, aggregate_errors
+
+REFERENCE, OWN = load_suite("robogauge-1.1"), load_suite("gaitgauge-1")
+METRICS = ("lin_vel_err", "ang_vel_err", "dof_limits", "dof_power", "orientation_stability", "torque_smoothness")
+
+
+def record(
+    samples, goals=None, parts=None, *, names=("diagonal_velocity", "max_velocity"), seed=0, terrain="flat", level=0
+):
+    samples = np.asarray(samples, dtype=np.float32)
+    samples = samples.reshape(len(samples), -1) if samples.ndim == 1 else samples
+    count = len(samples)
+    return Record(
+        episode=Episode(
+            terrain=terrain, level=level, friction=0.6, payload=0.0, seed=seed, stage="eval", goals=tuple(names)
+        ),
+        columns=tuple(f"c{i}" for i in range(samples.shape[1])),
+        samples=samples,
+        goal_index=np.asarray(np.zeros(count) if goals is None else goals, dtype=np.int16),
+        part_index=np.asarray(np.zeros(count) if parts is None else parts, dtype=np.int16),
+    )
+
+
+# ---- tail means -----------------------------------------------------------------------------------------------------
+
+
+def test_tail_means_are_those_of_the_lowest_values():
+    # ten values: the lowest quarter are two, the lowest half five
+    assert tail_means(np.arange(10.0)[::-1] / 10) == pytest.approx([0.45, 0.05, 0.2])
+
+
+def test_tail_means_clamp_each_sample_before_they_average():
+    assert tail_means(np.array([-3.0, 2.0, 0.5, 0.5])) == pytest.approx([0.5, 0.0, 0.25])
+
+
+@pytest.mark.parametrize(("values", "expected"), [([0.3], [0.3] * 3), ([0.2, 0.8], [0.5, 0.2, 0.2]), ([], [0.0] * 3)])
+def test_tail_means_of_few_values_take_at_least_one(values, expected):
+    assert tail_means(np.array(values)) == pytest.approx(expected)
+
+
+def test_tail_means_leave_out_what_is_not_defined():
+    assert tail_means(np.array([np.nan, 0.4, np.nan, 0.6])) == pytest.approx([0.5, 0.4, 0.4])
+    assert tail_means(np.full(3, np.nan)) == pytest.approx([0.0] * 3)
+
+
+def test_goals_weigh_the_same_however_many_samples_they_have():
+    run = record([1.0] * 30 + [0.5] * 2, [0] * 30 + [1] * 2)
+    assert run_statistics(run, 0) == pytest.approx([0.75] * 3)
+
+
+def test_a_goal_without_samples_counts_zero():
+    assert run_statistics(record([0.8] * 4), 0) == pytest.approx([0.4] * 3)
+    assert run_statistics(record(np.zeros((0, 1))), 0) == pytest.approx([0.0] * 3)
+
+
+# ---- levels ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("quality", "level", "flat", "expected"),
+    [(0.7, 0, True, 0.7), (1.0, 10, False, 1.0), (0.0, 1, False, 0.0), (0.5, 6, False, 0.545), (0.9, 0, False, 0.0)],
+)
+def test_level_score(quality, level, flat, expected):
+    assert level_score(quality, level, REFERENCE.scoring, flat=flat) == pytest.approx(expected)
+    assert level_score(np.full(3, quality), level, REFERENCE.scoring, flat=flat) == pytest.approx([expected] * 3)
+
+
+def test_level_scores_overlap_as_the_reference_measured_them():
+    """Reference run of the CTS policy: slope_fd at level 6 and stairs_fd at level 9, Q and terrain quality in three tails."""
+    slope = level_score(np.array([0.5906, 0.1478, 0.3709]), 6, REFERENCE.scoring, flat=False)
+    assert slope == pytest.approx([0.5622, 0.4781, 0.5205], abs=1e-4)
+    stairs = level_score(np.array([0.4014, 0.0027, 0.1143]), 9, REFERENCE.scoring, flat=False)
+    assert stairs == pytest.approx([0.7963, 0.7205, 0.7417], abs=1e-4)
+
+
+def test_rounding_is_the_suites():
+    assert rounded(np.array([0.123456]), REFERENCE.scoring).tolist() == [0.1235]
+    assert rounded(np.array([0.123456]), OWN.scoring).tolist() == [0.123456]
+
+
+# ---- the paper's tables -----------------------------------------------------------------------------------------------
+
+# Level-weighted mean@50 of the eight metrics, in this order, then the published Tracking, Safety and Quality.
+COLUMNS = (
+    "ang_vel_err",
+    "lin_vel_err",
+    "dof_limits",
+    "dof_power",
+    "orientation_stability",
+    "torque_smoothness",
+    "zmp_margin",
+    "friction_margin",
+)
+BASELINES = {
+    "Ours": ((0.6431, 0.6908, 0.8073, 0.7642, 0.8040, 0.7535, 0.7653, 0.6340), (0.6669, 0.7857, 0.7392)),
+    "CTS": ((0.5632, 0.5878, 0.7275, 0.6856, 0.7232, 0.6744, 0.6900, 0.5622), (0.5755, 0.7066, 0.6624)),
+    "HIM": ((0.5025, 0.5881, 0.6699, 0.6253, 0.6643, 0.6201, 0.6344, 0.5014), (0.5453, 0.6476, 0.6050)),
+    "DreamWaQ": ((0.4698, 0.5512, 0.6360, 0.5939, 0.6312, 0.5853, 0.6049, 0.4706), (0.5105, 0.6149, 0.5730)),
+}
+
+
+@pytest.mark.parametrize("model", BASELINES)
+def test_groups_are_the_papers(model):
+    weighted, published = BASELINES[model]
+    groups = group_values(dict(zip(COLUMNS, weighted, strict=True)), OWN.scoring)
+    assert list(groups) == ["tracking", "safety", "quality"]
+    assert list(groups.values()) == pytest.approx(published, abs=0.51e-4 + 1e-9)
+
+
+# Terrain scores mean@50: flat, wave, slope_fd, slope_bd, stairs_fd, stairs_bd, obstacle; the score and the mean level as the
+# sum of the levels of 54 environments.
+TERRAINS = ("flat", "wave", "slope_fd", "slope_bd", "stairs_fd", "stairs_bd", "obstacle")
+TERRAIN_SCORES = {
+    "Ours": ((0.663, 0.579, 0.551, 0.553, 0.775, 0.744, 0.835), 0.6713, 424, 7.85),
+    "CTS": ((0.592, 0.561, 0.521, 0.491, 0.746, 0.617, 0.521), 0.5786, 369, 6.83),
+    "HIM": ((0.621, 0.525, 0.457, 0.537, 0.514, 0.693, 0.418), 0.5379, 334, 6.19),
+    "DreamWaQ": ((0.620, 0.491, 0.373, 0.564, 0.542, 0.633, 0.315), 0.5054, 310, 5.74),
+}
+
+
+@pytest.mark.parametrize("model", TERRAIN_SCORES)
+def test_benchmark_and_level_fold_as_in_the_papers_tables(model):
+    """Levels and qualities of 63 environments that fit the published terrain scores and level sum give the published score."""
+    scores, published, level_sum, level_mean = TERRAIN_SCORES[model]
+    common = (np.mean(scores[1:]) - 0.09 * (level_sum / 54 - 1)) / 0.19
+    assert common == pytest.approx({"Ours": 0.296, "CTS": 0.271, "HIM": 0.299, "DreamWaQ": 0.314}[model], abs=3e-3)
+    # whole level sums of each terrain that add up to the published one; quality takes up the rest
+    wanted = np.array([9 * ((score - 0.19 * common) / 0.09 + 1) for score in scores[1:]])
+    sums = np.floor(wanted).astype(int)
+    sums[np.argsort(sums - wanted)[: level_sum - sums.sum()]] += 1
+    suite = replace(REFERENCE, scoring=replace(REFERENCE.scoring, decimals=None, bootstrap=4))
+    environments = [flat_environment([scores[0]], 0.1 * n) for n in range(2, 11)]
+    for terrain, score, levels in zip(TERRAINS[1:], scores[1:], sums.tolist(), strict=True):
+        quality = (score - 0.09 * (levels / 9 - 1)) / 0.19
+        assert 0.0 < quality < 1.0
+        for n in range(9):
+            level = levels // 9 + (n < levels % 9)
+            environments.append(flat_environment([quality], 0.1 * (n + 2), terrain, level, True))
+    result = fold(suite, environments, (*METRICS, "quality"))
+    assert [result["terrains"][t]["mean50"] for t in TERRAINS] == pytest.approx(scores, abs=1e-6)
+    assert result["level"] == pytest.approx(level_sum / 54)
+    assert round(result["level"], 2) == level_mean
+    assert result["score"] == pytest.approx(published, abs=3e-4)
+
+
+def flat_environment(qualities, friction=0.6, terrain="flat", level=0, searched=False):
+    environment = Environment(terrain=terrain, friction=friction, payload=0.0, level=level, searched=searched)
+    for seed, quality in enumerate(qualities):
+        samples = np.full((4, 7), quality)
+        environment.records.append(record(samples, [0, 0, 1, 1], [0, 1, 0, 1], seed=seed, terrain=terrain, level=level))
+    return environment
+
+
+def test_fold_weighs_terrains_the_same_and_counts_unpassed_environments_zero():
+    suite = replace(REFERENCE, scoring=replace(REFERENCE.scoring, bootstrap=10))
+    environments = [
+        flat_environment([0.6, 0.7, 0.8]),
+        flat_environment([0.5], 0.2, "wave", 3, True),
+        flat_environment([], 0.3, "wave", 0, True),
+    ]
+    result = fold(suite, environments, (*METRICS, "quality"))
+    wave = (0.09 * 2 + 0.19 * 0.5) / 2
+    assert result["terrains"]["flat"]["score"] == pytest.approx(0.7)
+    assert result["terrains"]["wave"]["score"] == pytest.approx(wave)
+    assert result["score"] == pytest.approx((0.7 + wave) / 2)
+    assert result["level"] == 1.5
+    # metrics are weighted by level like quality, over environments and not over terrains
+    assert result["metrics"]["dof_limits"]["mean50"] == pytest.approx((0.7 + 2 * wave) / 3, abs=1e-4)
+    assert [row["score"] for row in result["environments"]] == pytest.approx([0.7, 2 * wave, 0.0])
+
+
+def test_fold_rounds_a_run_before_it_averages_as_the_reference_does():
+    suite = replace(REFERENCE, scoring=replace(REFERENCE.scoring, bootstrap=2))
+    result = fold(suite, [flat_environment([0.12344, 0.12344, 0.12346])], (*METRICS, "quality"))
+    assert result["score"] == pytest.approx(0.1234)  # (0.1234 + 0.1234 + 0.1235) / 3 = 0.12343
+    own = replace(OWN, scoring=replace(OWN.scoring, bootstrap=2))
+    names = [*own.metrics.weights, "quality"]
+    environment = flat_environment([0.12344, 0.12344, 0.12346])
+    for item in environment.records:
+        item.samples = np.repeat(item.samples[:, :1], len(names), axis=1)
+    assert fold(own, [environment], names)["score"] == pytest.approx(0.123447, abs=1e-6)
+
+
+def test_a_policy_that_passes_no_level_anywhere_scores_zero():
+    suite = replace(REFERENCE, scoring=replace(REFERENCE.scoring, bootstrap=5))
+    environments = [flat_environment([], 0.6, name, 0, True) for name in ("wave", "obstacle")]
+    result = fold(suite, environments, (*METRICS, "quality"), evaluated=True)
+    assert result["score"] == 0.0
+    assert result["score_interval"] == [0.0, 0.0]
+    assert result["groups"] == {"tracking": 0.0, "safety": 0.0, "quality": 0.0}
+    assert result["level"] == 0.0
+    assert fold(suite, environments, (*METRICS, "quality"), evaluated=False)["score"] is None
+
+
+# ---- real and predicted -------------------------------------------------------------------------------------------------
+
+# Lin, Ang, Power, Limits, Orient, Smooth of the paper's appendix.
+ORDER = ("lin_vel_err", "ang_vel_err", "dof_power", "dof_limits", "orientation_stability", "torque_smoothness")
+MEASURED = {
+    "real": {
+        "linear": (0.9185, 0.5808, 0.8527, 0.9159, 0.9675, 0.7739),
+        "lateral": (0.9552, 0.7037, 0.9696, 0.9384, 0.9661, 0.8985),
+        "angular": (0.9552, 0.8010, 0.9659, 0.9439, 0.9614, 0.9020),
+        "stairs": (0.8554, 0.2732, 0.6721, 0.8395, 0.8749, 0.5944),
+    },
+    "RoboGauge": {
+        "linear": (0.8217, 0.5669, 0.8330, 0.9386, 0.9592, 0.7853),
+        "lateral": (0.8685, 0.6822, 0.9704, 0.9293, 0.9627, 0.8861),
+        "angular": (0.8763, 0.7679, 0.9734, 0.9414, 0.9647, 0.8983),
+        "stairs": (0.7596, 0.2507, 0.6211, 0.8472, 0.8625, 0.6606),
+    },
+    "IsaacGym": {
+        "linear": (0.8977, 0.7826, 0.9155, 0.9361, 0.9737, 0.8289),
+        "lateral": (0.9694, 0.8039, 0.9598, 0.9378, 0.9707, 0.8781),
+        "angular": (0.9853, 0.9134, 0.9751, 0.9325, 0.9798, 0.9510),
+        "stairs": (0.8786, 0.5732, 0.8635, 0.9027, 0.9339, 0.7454),
+    },
+}
+PUBLISHED_GROUPS = {
+    "RoboGauge": {
+        "longitudinal": (0.0573, 0.0253, 0.0246),
+        "lateral": (0.0541, 0.0049, 0.0079),
+        "angular": (0.0560, 0.0050, 0.0035),
+        "average": (0.0558, 0.0117, 0.0120),
+    },
+    "IsaacGym": {
+        "longitudinal": (0.1365, 0.0844, 0.0678),
+        "lateral": (0.0572, 0.0052, 0.0125),
+        "angular": (0.0713, 0.0103, 0.0337),
+        "average": (0.0883, 0.0333, 0.0380),
+    },
+}
+PUBLISHED_AVERAGES = {
+    "RoboGauge": (0.0873, 0.02427, 0.01455, 0.00893, 0.00568, 0.0183),
+    "IsaacGym": (0.0221, 0.1545, 0.0487, 0.0179, 0.01853, 0.05747),
+}
+
+
+def table(source):
+    return {motion: dict(zip(ORDER, row, strict=True)) for motion, row in MEASURED[source].items()}
+
+
+@pytest.mark.parametrize("source", PUBLISHED_GROUPS)
+def test_errors_against_reality_are_the_papers(source):
+    errors = aggregate_errors(table("real"), table(source))
+    for row, published in PUBLISHED_GROUPS[source].items():
+        assert list(errors.groups[row].values()) == pytest.approx(published, abs=1e-4), row
+    assert [errors.metrics["average"][m] for m in ORDER] == pytest.approx(PUBLISHED_AVERAGES[source], abs=1e-4)
+
+
+def test_errors_need_every_motion_and_metric():
+    real = table("real")
+    incomplete = {m: dict(row) for m, row in real.items()}
+    del incomplete["stairs"]["dof_power"]
+    with pytest.raises(ValidationError, match="the predicted values lack dof_power of motion 'stairs'"):
+        aggregate_errors(real, incomplete)
+    with pytest.raises(ValidationError, match="the measured values lack lin_vel_err of motion 'angular'"):
+        aggregate_errors({k: v for k, v in real.items() if k != "angular"}, real)
+
+
+# ---- the bootstrap ------------------------------------------------------------------------------------------------------
+
+
+def brute_force(run, column, resamples):
+    """The same resamples, each written out as a list of samples."""
+    generator = np.random.default_rng(zlib.crc32(run.episode.key.encode()))
+    goals = range(len(run.episode.goals))
+    out = np.zeros((len(goals), resamples))
+    for goal in goals:
+        mine = run.goal_index == goal
+        labels = np.unique(run.part_index[mine])
+        draws = generator.multinomial(len(labels), np.full(len(labels), 1 / len(labels)), size=resamples)
+        for b, times in enumerate(draws):
+            chosen = [
+                run.samples[mine & (run.part_index == label), column]
+                for label, n in zip(labels, times, strict=True)
+                for _ in range(n)
+            ]
+            out[goal, b] = tail_means(np.concatenate(chosen).astype(np.float64))[2]
+    return out.mean(0)
+
+
+def noisy(seed=0, parts=(5, 4), size=60):
+    generator = np.random.default_rng(7)
+    goals = np.repeat([0, 1], size)
+    part = np.concatenate([generator.integers(0, n, size) for n in parts])
+    # sub-commands differ, samples wander beyond [0, 1], some are not defined
+    samples = 0.2 * part[:, None] + 0.3 * generator.standard_normal((2 * size, 3))
+    samples[generator.random((2 * size, 3)) < 0.1] = np.nan
+    return record(samples, goals, part, seed=seed)
+
+
+def test_the_bootstrap_equals_resampling_written_out():
+    run = noisy()
+    fast = bootstrap_run(run, (0, 2), 300)
+    assert fast[0] == pytest.approx(brute_force(run, 0, 300), abs=1e-12)
+    assert fast[1] == pytest.approx(brute_force(run, 2, 300), abs=1e-12)
+
+
+def test_the_bootstrap_survives_sub_commands_without_defined_samples():
+    samples = np.array([[0.5], [np.nan], [0.7], [np.nan]])
+    run = record(samples, [0, 0, 1, 1], [0, 1, 0, 1])
+    replicates = bootstrap_run(run, (0,), 200)[0]
+    # each goal draws its defined sub-command in three of four resamples, and has nothing otherwise
+    assert set(np.round(replicates, 6)) == {0.0, 0.25, 0.35, 0.6}
+    assert replicates == pytest.approx(brute_force(run, 0, 200))
+
+
+def test_columns_share_their_resamples():
+    run = noisy()
+    run.samples[:, 1] = run.samples[:, 0]
+    first, second = bootstrap_run(run, (0, 1), 50)
+    assert np.array_equal(first, second)
+    both = bootstrap_environment([bootstrap_run(run, (0, 1), 50)], 50, name="e")
+    assert np.array_equal(both[0], both[1])
+
+
+def test_the_bootstrap_is_reproducible_and_differs_between_episodes():
+    assert np.array_equal(bootstrap_run(noisy(), (0,), 50), bootstrap_run(noisy(), (0,), 50))
+    assert not np.array_equal(bootstrap_run(noisy(0), (0,), 50), bootstrap_run(noisy(1), (0,), 50))
+
+
+def test_constant_samples_have_an_interval_of_no_width():
+    runs = [
+        bootstrap_run(record([[0.4]] * 6, [0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 1, 2], seed=s), (0,), 100) for s in (0, 1)
+    ]
+    interval = Interval.of(bootstrap_environment(runs, 100, name="e")[0])
+    assert (interval.low, interval.high) == (pytest.approx(0.4), pytest.approx(0.4))
+
+
+def test_seeds_are_resampled_too():
+    """Two seeds without spread of their own: means of two draws are 0.2, 0.3 or 0.4."""
+    runs = [np.full((1, 500), 0.2), np.full((1, 500), 0.4)]
+    replicates = bootstrap_environment(runs, 500, name="e")[0]
+    values, counts = np.unique(np.round(replicates, 9), return_counts=True)
+    assert values.tolist() == [0.2, 0.3, 0.4]
+    assert counts / 500 == pytest.approx([0.25, 0.5, 0.25], abs=0.08)
+
+
+def test_the_interval_covers_the_truth_about_as_often_as_it_says():
+    """Episodes whose sub-commands have effects of their own; 30 of them, so that percentile intervals are not far too narrow.
+
+    The truth is the mean@50 of a very long episode.
+    """
+    generator = np.random.default_rng(3)
+
+    def run(seed, parts):
+        effect = 0.5 + 0.1 * generator.standard_normal(parts)
+        samples = np.repeat(effect, 20) + 0.05 * generator.standard_normal(20 * parts)
+        return record(samples[:, None], np.zeros(20 * parts), np.repeat(np.arange(parts), 20), names=("g",), seed=seed)
+
+    truth = run_statistics(run(10**6, 4000), 0)[2]
+    hits = 0
+    for seed in range(200):
+        interval = Interval.of(bootstrap_run(run(seed, 30), (0,), 300)[0])
+        hits += interval.low <= truth <= interval.high
+    assert 0.88 <= hits / 200 <= 0.99
