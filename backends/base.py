@@ -206,6 +206,22 @@ CAPABILITY_NAMES: tuple[str, ...] = (
 )
 
 
+# What ``PhysicsBackend.describe`` may say, in the order in which reports list it.
+DESCRIPTION_KEYS: tuple[str, ...] = (
+    "total_mass",
+    "body_mass",
+    "body_inertia",
+    "joint_range",
+    "joint_armature",
+    "joint_damping",
+    "joint_friction_loss",
+    "stiffness",
+    "damping",
+    "torque_limit",
+    "contact_friction",
+)
+
+
 class PhysicsBackend(ABC):
     """N worlds of one robot. See the module docstring for frames and units."""
 
@@ -311,6 +327,18 @@ class PhysicsBackend(ABC):
     @abstractmethod
     def apply_force(self, force_w: torch.Tensor) -> None:
         """External force on the base's centre of mass [N], (N, 3), that acts until changed or the world is reset."""
+
+    def describe(self) -> Mapping[str, list[float]] | None:
+        """The first world's model as the engine holds it at present, randomization included; None where it cannot say.
+
+        Returns:
+            Some of ``DESCRIPTION_KEYS``: ``total_mass`` [kg] (1); ``body_mass`` [kg] (B) and ``body_inertia``, the principal
+            moments of each body in rising order [kg·m²] (3 B); ``joint_range`` [rad], lower and upper limit of each joint
+            (2 J); ``joint_armature`` [kg·m²], ``joint_damping`` [N·m·s/rad], ``joint_friction_loss`` [N·m], ``stiffness``
+            [N·m/rad], ``damping`` [N·m·s/rad] and ``torque_limit`` [N·m], infinity for none (J each);
+            ``contact_friction``, the sliding coefficient that acts between each foot and the floor (F).
+        """
+        return None
 
     def close(self) -> None:  # noqa: B027  (an engine may have nothing to free)
         """Free what the engine holds. A closed backend must not be used again."""

@@ -394,6 +394,11 @@ class MujocoWarpBackend(PhysicsBackend):
             with self._scope():
                 mujoco_warp.set_const(self._model, self._data, restore=False)
 
+    def describe(self) -> Mapping[str, list[float]]:
+        """See ``PhysicsBackend.describe``."""
+        with self._scope():
+            return self._parameters.describe(self._model, self._shared)
+
     def close(self) -> None:
         """Drop the recorded graphs and the memory that they hold."""
         self._graphs.clear()

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import fields
 
 import mujoco_warp
+import numpy as np
 import torch
 import warp as wp
 
 from .base import BackendError, Randomization, Scene
+from .description import ModelFields
 from .mujoco_warp_arrays import Motors, shared_array, to_warp
 from .mujoco_warp_model import SharedModel
 
@@ -115,6 +117,34 @@ class WorldParameters:
         if "base_com_offset" in rows:
             write(self._com[:, base], self._nominal_com[:, base] + rows["base_com_offset"])
         return bool({"link_mass_scale", "base_mass_offset", "base_com_offset"} & set(rows))
+
+    def describe(self, model: mujoco_warp.Model, shared: SharedModel) -> dict[str, list[float]]:
+        """The first world as ``PhysicsBackend.describe`` says, read from the engine's own arrays."""
+
+        def first(name: str) -> np.ndarray:
+            return getattr(model, name).numpy()[0]  # an array of all worlds, or of one that stands for all
+
+        bodies, dofs = shared.bodies, shared.joint_v
+        joints = [int(shared.model.dof_jntid[d]) for d in dofs]
+        limited = shared.model.jnt_limited[joints, None].astype(bool)
+        feet = [int(np.flatnonzero(shared.geom_foot == f)[0]) for f in range(int(shared.geom_foot.max()) + 1)]
+        floor, priority = shared.model.geom("floor").id, model.geom_priority.numpy()
+        friction, strength = first("geom_friction"), self._strength[0].cpu().numpy()
+        return ModelFields(
+            total_mass=float(first("body_mass").sum()),
+            body_mass=first("body_mass")[bodies],
+            body_inertia=first("body_inertia")[bodies],
+            joint_range=np.where(limited, first("jnt_range")[joints], [-np.inf, np.inf]),
+            joint_armature=first("dof_armature")[dofs],
+            joint_damping=first("dof_damping")[dofs],
+            joint_friction_loss=first("dof_frictionloss")[dofs],
+            stiffness=self._stiffness[0].cpu().numpy() * strength,
+            damping=self._damping[0].cpu().numpy() * strength,
+            torque_limit=self.motors.limit.numpy() * strength,
+            foot_friction=friction[feet, 0],
+            floor_friction=float(friction[floor, 0]),
+            foot_priority=priority[feet] - priority[floor],
+        ).describe()
 
     def _spread(self, name: str, value: torch.Tensor, mask: torch.Tensor, whole: bool) -> torch.Tensor:
         """Spread the masked worlds' rows over all worlds, without asking the device how many are masked."""

@@ -1,0 +1,89 @@
+"""The models compared field by field, as the engines hold them after import and randomization."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...backends.base import DESCRIPTION_KEYS
+from ...robots import Robot
+
+Description = Mapping[str, Sequence[float]]
+
+TOLERANCE = 1e-5
+"""Relative difference up to which single precision explains it; 84 roundings of float32."""
+
+
+def entry_names(key: str, robot: Robot) -> list[str]:
+    """What each entry of a description's field belongs to."""
+    if key.startswith("body_"):
+        bodies = list(robot.collision_bodies)
+        return bodies if key == "body_mass" else [f"{b} {axis}" for b in bodies for axis in ("I1", "I2", "I3")]
+    if key == "joint_range":
+        return [f"{j} {end}" for j in robot.joint_names for end in ("low", "high")]
+    if key == "contact_friction":
+        return list(robot.foot_names)
+    return [robot.name] if key == "total_mass" else list(robot.joint_names)
+
+
+def compare_models(robot: Robot, descriptions: Mapping[str, Description | None], reference: str) -> dict[str, Any]:
+    """Compare what the engines say of themselves with what the reference says.
+
+    Args:
+        robot: names the entries.
+        descriptions: by variant label; None for an engine that does not describe itself.
+        reference: label of the reference.
+
+    Returns:
+        Plain data: ``fields`` by name with ``reference`` (mean of the entries' magnitudes, None for no limit) and, by variant,
+        ``largest`` absolute and ``relative`` difference, the ``entry`` where it is and whether it ``agrees`` to single
+        precision; ``not_described`` names the silent engines.
+    """
+    silent = [label for label, found in descriptions.items() if found is None]
+    fields: dict[str, Any] = {}
+    base = descriptions.get(reference)
+    for key in DESCRIPTION_KEYS if base is not None else ():
+        assert base is not None
+        if key not in base:
+            continue
+        expected = np.asarray(base[key], dtype=np.float64)
+        row: dict[str, Any] = {"reference": _finite(np.abs(expected).mean()), "variants": {}}
+        for label, found in descriptions.items():
+            if label == reference or found is None:
+                continue
+            row["variants"][label] = _difference(key, found.get(key), expected, robot)
+        fields[key] = row
+    return {"reference": reference, "fields": fields, "not_described": silent}
+
+
+def _difference(key: str, values: Sequence[float] | None, expected: np.ndarray, robot: Robot) -> dict[str, Any] | None:
+    """Largest difference of a field; None where the engine does not say it."""
+    if values is None:
+        return None
+    found = np.asarray(values, dtype=np.float64)
+    if found.shape != expected.shape:
+        return {
+            "largest": None,
+            "relative": None,
+            "entry": f"{len(found)} entries instead of {len(expected)}",
+            "agrees": False,
+        }
+    with np.errstate(invalid="ignore"):  # a limit that only one of them has is an infinite difference
+        absolute = np.where(found == expected, 0.0, np.abs(found - expected))
+        scale = np.maximum(np.maximum(np.abs(found), np.abs(expected)), 1e-12)
+        relative = np.where(absolute == 0.0, 0.0, np.where(np.isinf(absolute), np.inf, absolute / scale))
+    worst = int(np.argmax(relative))
+    names = entry_names(key, robot)
+    return {
+        "largest": _finite(absolute.max()),
+        "relative": _finite(relative[worst]),
+        "entry": names[worst] if worst < len(names) else str(worst),
+        "agrees": bool((relative <= TOLERANCE).all()),
+    }
+
+
+def _finite(value: float) -> float | None:
+    """A number for JSON, which knows no infinity."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,217 @@
+"""Paired comparisons of two engines, or two settings of one: means with intervals, effect sizes, agreement of outcomes.
+
+Pure functions of arrays; formulas and assumptions are in ``docs/consistency.md``.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+CONFIDENCE = 0.95
+_TINY = 1e-12
+"""Spread below which differences count as all the same."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A mean with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def contains_zero(self) -> bool:
+        """Whether the interval holds zero."""
+        return self.low <= 0.0 <= self.high
+
+    def plain(self) -> dict[str, float | list[float]]:
+        """As plain data."""
+        return {"value": self.value, "interval": [self.low, self.high]}
+
+
+def terrain_weights(terrains: Sequence[str]) -> Array:
+    """Weight of each environment in the overall mean: every terrain counts the same, and so does every environment of it.
+
+    Args:
+        terrains: terrain of each environment.
+
+    Returns:
+        Weights that add up to one, (E,).
+    """
+    names, counts = np.unique(np.asarray(terrains), return_counts=True)
+    share = {str(n): 1.0 / (len(names) * c) for n, c in zip(names, counts, strict=True)}
+    return np.array([share[t] for t in terrains])
+
+
+def spread_of_mean(values: Array, weights: Array, *, shared: bool) -> tuple[float, float]:
+    """Standard error of the weighted mean, and its degrees of freedom.
+
+    Args:
+        values: (E, S).
+        weights: (E,).
+        shared: whether the environments share the seeds' draws. Then the weighted sums of the seeds are the sample, with
+            S - 1 degrees of freedom; else every environment is one, and Welch and Satterthwaite say how many they amount to.
+    """
+    seeds = values.shape[1]
+    if shared:
+        return float((weights @ values).std(ddof=1) / math.sqrt(seeds)), float(seeds - 1)
+    parts = weights**2 * values.var(axis=1, ddof=1) / seeds
+    total = float(parts.sum())
+    freedom = total**2 / float((parts**2).sum() / (seeds - 1)) if total > 0.0 else float(seeds - 1)
+    return math.sqrt(total), freedom
+
+
+def tail_probability(seeds: int, freedom: float) -> float:
+    """Probability left out on either side of a bootstrap distribution so that its quantiles bound a 95 % interval.
+
+    A bootstrap of n units is too narrow by sqrt((n - 1) / n) and knows nothing of Student's t. Reading it at
+    Φ(-sqrt(n / (n - 1)) t) instead of 2.5 % makes up for both (Hesterberg 2015, "What teachers should know about the
+    bootstrap": the expanded percentile interval).
+
+    Args:
+        seeds: number of seeds n, at least 2.
+        freedom: degrees of freedom of t.
+    """
+    quantile = stats.t.ppf(0.5 + 0.5 * CONFIDENCE, freedom)
+    return float(stats.norm.cdf(-math.sqrt(seeds / (seeds - 1)) * quantile))
+
+
+def replicates(values: Array, weights: Array, *, shared: bool, resamples: int, name: str) -> Array:
+    """Bootstrap replicates of the weighted mean over environments of the mean over seeds.
+
+    The unit that is drawn with replacement is the seed, with all that an episode holds: its goals and sub-commands stay
+    together. Values are paired already (each is the difference, or its magnitude, between two engines in one episode).
+
+    Args:
+        values: one number for each environment and seed, (E, S).
+        weights: of the environments, adding up to one, (E,).
+        shared: draw the same seeds for all environments (their episodes share random numbers), or anew for each.
+        resamples: number of replicates B.
+        name: seeds the generator, so that the same question has the same answer.
+
+    Returns:
+        (B,).
+    """
+    environments, seeds = values.shape
+    generator = np.random.default_rng(zlib.crc32(name.encode()))
+    if shared:
+        per_seed = weights @ values
+        return per_seed[generator.integers(seeds, size=(resamples, seeds))].mean(1)
+    total = np.zeros(resamples)
+    for environment in range(environments):
+        drawn = generator.integers(seeds, size=(resamples, seeds))
+        total += weights[environment] * values[environment][drawn].mean(1)
+    return total
+
+
+def paired_mean(
+    values: Array, terrains: Sequence[str], *, shared: bool, resamples: int, name: str, magnitude: bool = False
+) -> Estimate:
+    """Mean of paired values over terrains, their environments and the seeds, with its 95 % interval.
+
+    The interval is the expanded percentile interval of the bootstrap, widened to Student's where that is wider: resamples of a
+    handful of seeds never leave the range of what was seen.
+
+    Args:
+        values: (E, S).
+        terrains: terrain of each environment.
+        shared: see ``replicates``.
+        resamples: see ``replicates``.
+        name: see ``replicates``.
+        magnitude: the values are magnitudes, so that the interval ends at zero.
+
+    Raises:
+        ValueError: fewer than two seeds, from which no spread can be seen.
+    """
+    if values.shape[1] < 2:
+        raise ValueError(f"an interval needs at least 2 seeds, not {values.shape[1]}")
+    weights = terrain_weights(terrains)
+    mean = float(weights @ values.mean(1))
+    error, freedom = spread_of_mean(values, weights, shared=shared)
+    draws = replicates(values, weights, shared=shared, resamples=resamples, name=name)
+    tail = tail_probability(values.shape[1], freedom)
+    low, high = (float(q) for q in np.quantile(draws, [tail, 1.0 - tail]))
+    reach = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, freedom)) * error
+    low, high = min(low, mean - reach), max(high, mean + reach)
+    return Estimate(value=mean, low=max(low, 0.0) if magnitude else low, high=high)
+
+
+def effect_size(differences: Array) -> float | None:
+    """Cohen's d of paired differences: their mean over their standard deviation (N - 1), all episodes weighing the same.
+
+    Returns:
+        0 where all differences vanish; None where they are all the same and not zero, so that d has no bound, or where
+        there are fewer than two.
+    """
+    flat = np.asarray(differences, dtype=np.float64).ravel()
+    if len(flat) < 2:
+        return None
+    spread = float(flat.std(ddof=1))
+    if spread < _TINY:
+        return 0.0 if abs(float(flat.mean())) < _TINY else None
+    return float(flat.mean()) / spread
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutcomeAgreement:
+    """How often a yes-or-no outcome was the same in both engines."""
+
+    episodes: int
+    both: int
+    only_reference: int
+    only_compared: int
+    neither: int
+
+    @property
+    def share(self) -> float:
+        """Share of episodes with the same outcome."""
+        return (self.both + self.neither) / self.episodes
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the share."""
+        found = stats.binomtest(self.both + self.neither, self.episodes).proportion_ci(CONFIDENCE, method="wilson")
+        return float(found.low), float(found.high)
+
+    @property
+    def p_value(self) -> float:
+        """Exact McNemar test: how likely so lopsided a count of disagreements is if either engine may be the one."""
+        lone = self.only_reference + self.only_compared
+        return float(stats.binomtest(self.only_compared, lone).pvalue) if lone else 1.0
+
+    def plain(self) -> dict[str, float | int | list[float]]:
+        """As plain data."""
+        return {
+            "episodes": self.episodes,
+            "same": self.share,
+            "interval": list(self.interval),
+            "both": self.both,
+            "only_reference": self.only_reference,
+            "only_compared": self.only_compared,
+            "neither": self.neither,
+            "p_value": self.p_value,
+        }
+
+
+def outcome_agreement(reference: Sequence[bool], compared: Sequence[bool]) -> OutcomeAgreement | None:
+    """Count the agreement of an outcome over paired episodes; None where there are none."""
+    first, second = np.asarray(reference, dtype=bool), np.asarray(compared, dtype=bool)
+    if len(first) == 0:
+        return None
+    return OutcomeAgreement(
+        episodes=len(first),
+        both=int((first & second).sum()),
+        only_reference=int((first & ~second).sum()),
+        only_compared=int((~first & second).sum()),
+        neither=int((~first & ~second).sum()),
+    )

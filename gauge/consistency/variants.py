@@ -1,0 +1,164 @@
+"""A variant is an engine with some of the suite's physics options changed: what a study compares."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, get_type_hints
+
+from ...backends.base import BackendError, PhysicsBackend, PhysicsOptions, Scene, Support
+from ...backends.registry import find_backend, make_backend
+from .errors import ConsistencyError
+from .wrapping import PerturbedBackend, RetimedBackend
+
+MakeBackend = Callable[..., PhysicsBackend]
+"""Called as ``make_backend`` is."""
+
+Value = bool | int | float | str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """An engine as it is to be run."""
+
+    backend: str
+    """Registry name, with the solver after a colon."""
+    device: str = "cpu"
+    overrides: tuple[tuple[str, Value], ...] = ()
+    """Fields of ``PhysicsOptions`` that differ from the suite's, sorted by name."""
+    perturbation: float = 0.0
+    """Largest relative change of the state at each reset."""
+    draw: int = 0
+    """Number of the perturbation."""
+
+    @property
+    def label(self) -> str:
+        """Name for people, and the text that ``parse_variant`` reads back but for perturbations."""
+        changed = "".join(f"@{name}={_shown(value)}" for name, value in self.overrides)
+        return self.backend + changed + (f"~{self.perturbation:g}#{self.draw}" if self.perturbation else "")
+
+    @property
+    def folder(self) -> str:
+        """Name of the variant's folder."""
+        return re.sub(r"[^A-Za-z0-9._=@~#-]", "-", self.label)
+
+    def switched(self, name: str, value: Value) -> Variant:
+        """The same engine with one option changed."""
+        return replace(self, overrides=tuple(sorted({**dict(self.overrides), name: value}.items())))
+
+    def physics(self, suite: PhysicsOptions) -> PhysicsOptions:
+        """The suite's options with the changes; another timestep brings another number of substeps.
+
+        Raises:
+            ConsistencyError: the timestep does not divide the control period.
+        """
+        changed = replace(suite, **dict(self.overrides))
+        if changed.timestep == suite.timestep:
+            return changed
+        count = suite.control_period / changed.timestep if changed.timestep > 0.0 else 0.0
+        if round(count) < 1 or abs(count - round(count)) > 1e-6:
+            raise ConsistencyError(
+                f"timestep {changed.timestep:g} s does not divide the control period of {suite.control_period:g} s; "
+                f"use for example {suite.control_period / 4:g} in '{self.label}'"
+            )
+        return replace(changed, substeps=round(count))
+
+    def check(self, suite: PhysicsOptions) -> None:
+        """Say at once what would go wrong later.
+
+        Raises:
+            ConsistencyError: an impossible option.
+            BackendError: the engine is not there or cannot run on the device.
+        """
+        self.physics(suite)
+        find_backend(self.backend, self.device)
+
+    def worlds(self, scene: Scene, *, threads: int, make: MakeBackend = make_backend) -> PhysicsBackend:
+        """Build the worlds of a scene, whose physics options are the suite's.
+
+        Args:
+            scene: what to build.
+            threads: CPU threads.
+            make: builds engines by name.
+
+        Raises:
+            BackendError: the engine cannot do what the scene or the variant asks for.
+        """
+        physics = self.physics(scene.physics)
+        backend = make(self.backend, replace(scene, physics=physics), device=self.device, threads=threads)
+        if physics.timestep != scene.physics.timestep:
+            backend = RetimedBackend(backend, scene)
+        if self.perturbation:
+            backend = PerturbedBackend(backend, self.perturbation, draw=self.draw)
+        return backend
+
+
+def parse_variant(text: str) -> Variant:
+    """Read ``NAME``, ``NAME:SOLVER`` or ``NAME@option=value@option=value``; the device is left to ``place``.
+
+    Raises:
+        ConsistencyError: a malformed text, an unknown option or a value of another type.
+    """
+    backend, *changes = text.strip().split("@")
+    if not backend:
+        raise ConsistencyError(
+            f"'{text}' names no engine; write for example mujoco or mujoco@timestep=0.005 (--backends)"
+        )
+    hints = get_type_hints(PhysicsOptions)
+    free = [f.name for f in fields(PhysicsOptions) if f.name not in ("substeps", "watch_tilt", "watch_penetration")]
+    overrides: dict[str, Value] = {}
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if not equals or name not in free:
+            raise ConsistencyError(
+                f"'@{change}' in '{text}' is no physics option; write @option=value with one of {', '.join(free)}"
+            )
+        overrides[name] = _read(hints[name], value, change, text)
+    return Variant(backend=backend, overrides=tuple(sorted(overrides.items())))
+
+
+def place(variant: Variant, device: str | None) -> Variant:
+    """Choose the device: the one asked for, or a GPU for the engines that are made for it.
+
+    Raises:
+        BackendError: the engine is not there, or wants a GPU and there is none.
+    """
+    if device is not None and device != "cpu":
+        engine = find_backend(variant.backend, "cpu")
+        on_gpu = engine.capabilities()["gpu"].support is not Support.NONE
+        wanted = device if on_gpu else "cpu"
+    elif device == "cpu" or find_backend(variant.backend, "cpu").capabilities()["gpu"].support is Support.NONE:
+        wanted = "cpu"
+    else:
+        import torch
+
+        if not torch.cuda.is_available():
+            raise BackendError(
+                f"backend '{variant.backend}' wants a GPU and this machine has none; add --device cpu (slow)"
+            )
+        wanted = "cuda"
+    find_backend(variant.backend, wanted)
+    return replace(variant, device=wanted)
+
+
+def _read(hint: Any, value: str, change: str, text: str) -> Value:
+    """A value as the option's type."""
+    kinds = getattr(hint, "__args__", (hint,))
+    if value == "none" and type(None) in kinds:
+        return None
+    kind = next(k for k in kinds if k is not type(None))
+    if kind is bool:
+        if value not in ("true", "false"):
+            raise ConsistencyError(f"'@{change}' in '{text}' must be true or false")
+        return value == "true"
+    try:
+        return kind(value)
+    except ValueError as error:
+        raise ConsistencyError(f"'@{change}' in '{text}' needs a {kind.__name__}, not '{value}'") from error
+
+
+def _shown(value: Value) -> str:
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)

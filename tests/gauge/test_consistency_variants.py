@@ -1,0 +1,166 @@
+"""Variants of engines, and the backends that stand before them."""
+
+import pytest
+import torch
+from gaitgauge.backends import Scene
+from gaitgauge.backends.base import BackendError, PhysicsOptions
+from gaitgauge.backends.fake import FakeBackend, FakeScript
+from gaitgauge.gauge.consistency.errors import ConsistencyError
+from gaitgauge.gauge.consistency.variants import Variant, parse_variant, place
+from gaitgauge.gauge.consistency.wrapping import PerturbedBackend, RetimedBackend
+from gaitgauge.robots import load_robot
+from gaitgauge.terrains.registry import make_terrain
+
+GO2 = load_robot("go2")
+
+
+def scene(worlds=2, **physics):
+    return Scene(
+        robot=GO2,
+        parameters=GO2.parameters["gauge"],
+        terrains=(make_terrain("flat"),),
+        terrain_index=(0,) * worlds,
+        physics=PhysicsOptions(**physics),
+    )
+
+
+def standing(backend):
+    n = backend.num_worlds
+    position = torch.tensor([0.0, 0.0, 0.4], dtype=backend.dtype).repeat(n, 1)
+    upright = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=backend.dtype).repeat(n, 1)
+    return {"base_position": position, "base_quaternion": upright}
+
+
+def test_variants_are_read_and_named():
+    variant = parse_variant("newton:steel@timestep=0.005@cone=pyramidal@self_collision=false@contacts_per_world=20")
+    assert variant.backend == "newton:steel"
+    changed = {"timestep": 0.005, "cone": "pyramidal", "self_collision": False, "contacts_per_world": 20}
+    assert dict(variant.overrides) == changed
+    assert parse_variant(variant.label) == variant
+    assert parse_variant("mujoco@cone=pyramidal@timestep=0.001") == parse_variant(
+        "mujoco@timestep=0.001@cone=pyramidal"
+    )
+    assert dict(parse_variant("mujoco@contacts_per_world=none").overrides) == {"contacts_per_world": None}
+    assert ":" not in variant.folder and "/" not in variant.folder
+    physics = variant.physics(PhysicsOptions())
+    assert (physics.timestep, physics.substeps, physics.cone) == (0.005, 4, "pyramidal")
+    assert physics.control_period == pytest.approx(0.02)
+    assert parse_variant("mujoco").physics(PhysicsOptions()) == PhysicsOptions()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("@timestep=0.005", "names no engine"),
+        ("mujoco@speed=3", "timestep"),
+        ("mujoco@timestep", "option=value"),
+        ("mujoco@substeps=3", "no physics option"),
+        ("mujoco@timestep=fast", "needs a float"),
+        ("mujoco@iterations=1.5", "needs a int"),
+        ("mujoco@self_collision=no", "true or false"),
+    ],
+)
+def test_malformed_variants_are_refused(text, words):
+    with pytest.raises(ConsistencyError, match=words):
+        parse_variant(text)
+
+
+@pytest.mark.parametrize("timestep", [0.003, 0.05, 0.0, -0.005])
+def test_timestep_that_does_not_divide_the_control_period_is_refused(timestep):
+    with pytest.raises(ConsistencyError, match="does not divide"):
+        parse_variant(f"mujoco@timestep={timestep}").physics(PhysicsOptions())
+
+
+def test_place_chooses_devices(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert place(Variant(backend="mujoco"), None).device == "cpu"
+    assert place(Variant(backend="mujoco"), "cuda").device == "cpu"  # it has no use for a GPU, whatever the others get
+    assert place(Variant(backend="fake"), "cpu").device == "cpu"
+    with pytest.raises(BackendError, match="--device cpu"):
+        place(Variant(backend="fake"), None)
+    with pytest.raises(BackendError, match="no GPU"):
+        place(Variant(backend="fake"), "cuda")
+    with pytest.raises(BackendError, match="unknown backend"):
+        place(Variant(backend="nonsense"), None)
+
+
+class Spy(FakeBackend):
+    """Notes what it is asked."""
+
+    def __init__(self, scene, **options):
+        super().__init__(scene, **options)
+        self.asked = []
+
+    def step(self, joint_targets, **arguments):
+        self.asked.append(arguments)
+        super().step(joint_targets, **arguments)
+
+    def reset(self, worlds=None, **arguments):
+        self.given = arguments
+        super().reset(worlds, **arguments)
+
+
+def test_retimed_backend_rounds_to_the_engines_own_grid():
+    outer = scene(10)
+    backend = RetimedBackend(Spy(scene(10, timestep=0.005, substeps=4)), outer)
+    assert backend.scene is outer
+    backend.reset(**standing(backend))
+    target = torch.zeros(10, 12, dtype=backend.dtype)
+    backend.step(target, delay=torch.arange(10), sample_at=torch.arange(10) + torch.tensor([0] * 9 + [1]))
+    asked = backend.inner.asked[0]
+    # delays of 0, 2 … 18 ms on a grid of 5 ms: their mean of 9 ms stays
+    assert asked["delay"].tolist() == [0, 0, 1, 1, 2, 2, 2, 3, 3, 4]
+    assert asked["sample_at"].tolist() == [0, 1, 1, 1, 2, 2, 2, 3, 3, 4]
+    assert asked["substeps"] == 4
+    assert backend.state.time[0] == pytest.approx(0.02)
+    backend.step(None, substeps=1)
+    assert backend.inner.asked[1]["substeps"] == 1
+
+
+def test_retimed_backend_counts_watches_in_outer_substeps():
+    inner = FakeBackend(
+        scene(4, timestep=0.005, substeps=4, watch_tilt=0.5, watch_penetration=0.01),
+        script=FakeScript(penetration_time=torch.tensor([0.005, 0.01, 0.02, 9.0])),
+    )
+    backend = RetimedBackend(inner, scene(4))
+    backend.reset(**standing(backend))
+    backend.step(torch.zeros(4, 12, dtype=backend.dtype))
+    # after 5, 10 and 20 ms: the third, fifth and tenth substep of 2 ms
+    assert backend.state.penetration_substep.tolist() == [3, 5, 10, 0]
+    assert backend.state.clone().penetration_substep.tolist() == [3, 5, 10, 0]
+    assert backend.state.tilt_substep.tolist() == [0, 0, 0, 0]
+    assert torch.equal(backend.state.base_position_w, inner.state.base_position_w)
+
+
+def test_retimed_backend_keeps_the_control_period():
+    with pytest.raises(BackendError, match="control period"):
+        RetimedBackend(FakeBackend(scene(timestep=0.005, substeps=3)), scene())
+
+
+def test_perturbation_is_small_the_same_for_all_worlds_and_differs_between_draws():
+    first, second = (PerturbedBackend(Spy(scene(3)), 1e-7, draw=d) for d in (1, 2))
+    for backend in (first, second):
+        backend.reset(**standing(backend))
+    pose = torch.tensor(GO2.default_joint_position, dtype=first.dtype)
+    off = first.inner.given["joint_position"] / pose - 1.0
+    assert 0.0 < off.abs().max() <= 1e-7
+    assert torch.equal(off[0], off[2])
+    assert not torch.equal(first.inner.given["joint_position"], second.inner.given["joint_position"])
+    height = first.inner.given["base_position"][:, 2]
+    assert 0.0 < (height - 0.4).abs().max() <= 1e-7
+
+
+def test_variant_builds_what_it_says():
+    made = []
+
+    def make(name, asked, *, device, threads):
+        made.append((name, asked.physics, device, threads))
+        return FakeBackend(asked)
+
+    plain = Variant(backend="fake").worlds(scene(), threads=2, make=make)
+    assert isinstance(plain, FakeBackend)
+    variant = parse_variant("fake@timestep=0.004")
+    assert isinstance(variant.worlds(scene(), threads=1, make=make), RetimedBackend)
+    assert made[1][1].substeps == 5
+    wobbly = Variant(backend="fake", perturbation=1e-7)
+    assert isinstance(wobbly.worlds(scene(), threads=1, make=make), PerturbedBackend)
