@@ -1,6 +1,6 @@
 """Finds engines by name: the project's own, and any installed under the entry-point group ``gaitgauge.backends``.
 
-A name may carry a variant after a colon (``newton:kamino``); the variant is handed to the engine as ``solver``.
+A name may carry a variant after a colon (``newton:steel``); the variant is handed to the engine as ``solver``.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def find_backend(name: str, device: str) -> type[PhysicsBackend]:
 
 
 def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int = 1) -> PhysicsBackend:
-    """Build the worlds of ``scene`` in the engine ``name`` (``mujoco``, ``newton:kamino`` …).
+    """Build the worlds of ``scene`` in the engine ``name`` (``mujoco``, ``newton:steel`` …).
 
     Raises:
         BackendError: unknown engine, missing package, or something the engine cannot do.

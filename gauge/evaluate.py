@@ -24,6 +24,7 @@ from ..policy.loading import find_policy, load_policy
 from ..robots import Robot, RobotError, load_robot
 from ..terrains.registry import make_terrain, terrain_names
 from .episodes import Episode
+from .goals import SUB_COMMANDS
 from .goals import check_terrain
 from .pipelines import PIPELINES, Environment, Plan, make_environments
 from .results import fold, health, rows_csv
@@ -36,6 +37,8 @@ _SLOTS = 24
 """Worlds on the CPU: enough to keep the threads busy, few enough for the policy's batch to cost little."""
 _MANY_SLOTS = 64
 """Worlds on the CPU for runs of many environments."""
+_GPU_SLOTS = 4096
+"""Largest number of worlds on a GPU."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +98,9 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
     for payload in request.payloads:
         if not -5.0 <= payload <= 50.0:
             raise SuiteError(f"payload {payload:g} kg is not possible; give -5 to 50 kg (--payload)")
+    for seed in request.seeds:
+        if seed < 0:
+            raise SuiteError(f"seed {seed} is not possible; give a whole number of at least 0 (--seed)")
     frictions, payloads, seeds = request.frictions, request.payloads, request.seeds or suite.matrix.seeds
     if request.pipeline == "base":
         frictions = frictions or (suite.matrix.nominal_friction,)
@@ -128,9 +134,12 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
         if name not in terrain_names():
             make_terrain(name)  # raises with the nearest names
     order = list(suite.matrix.terrains)
-    chosen = sorted(set(request.terrains), key=lambda t: order.index(t) if t in order else len(order))
+    chosen = sorted(set(request.terrains), key=lambda t: (order.index(t) if t in order else len(order), t))
     if request.pipeline in ("base", "multi"):
         chosen = chosen or ["flat"]
+    if request.level is not None and chosen and all(t == "flat" for t in chosen):
+        raise SuiteError(f"terrain 'flat' has no levels, so --level {request.level} means nothing; leave it out")
+    if request.pipeline in ("base", "multi"):
         if request.level is None and any(t != "flat" for t in chosen):
             raise SuiteError(
                 f"pipeline '{request.pipeline}' plays one level of terrain '{chosen[-1]}'; say which with --level"
@@ -138,6 +147,8 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
         return chosen
     chosen = chosen or order
     if request.pipeline == "level":
+        if request.level is not None:
+            raise SuiteError("pipeline 'level' searches the level; leave --level out, or use pipeline 'multi'")
         chosen = [t for t in chosen if t != "flat"]
         if not chosen:
             raise SuiteError("terrain 'flat' has no levels to search; choose another --terrain, or pipeline 'multi'")
@@ -196,13 +207,16 @@ def evaluate(
     if on_cpu:
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
     evaluated = request.pipeline != "level"
-    plan = Plan(suite, environments, seeds, store, evaluate=evaluated, speculative=not on_cpu)
     columns: tuple[str, ...] = (*suite.metrics.weights, "quality")
     physics_steps = 0
-    for backend, runner in _runners(request, suite, robot, policy, plan):
+    # A GPU plays every level of every search at once, then all quality episodes: few long batches instead of many short ones.
+    stages = [evaluated] if on_cpu or all(e.level is not None for e in environments) else [False, evaluated]
+    for stage in dict.fromkeys(stages):
+        plan = Plan(suite, environments, seeds, store, evaluate=stage, speculative=not on_cpu)
+        runner = _runner(request, suite, robot, policy, plan)
         runner.run(plan, _watcher(plan, watch, began))
         physics_steps += runner.physics_steps
-        backend.close()
+        runner.backend.close()
     results = fold(suite, environments, columns, evaluated=evaluated)
     results["policy"] = {
         "path": policy.path,
@@ -220,15 +234,20 @@ def evaluate(
     return results
 
 
-def _runners(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: Plan) -> Any:
-    """The backend and runner of each layout of terrain; one on the CPU, where all terrains share a layout."""
+def _runner(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: Plan) -> EpisodeRunner:
+    """Worlds for a plan, all terrains in one layout, and the runner that plays in them."""
     keys = [
         (e.terrain, level)
-        for e in {e.terrain: e for e in plan.environments}.values()
-        for level in ([e.level or 0] if not e.searched else range(1, suite.scoring.levels + 1))
+        for e in plan.environments
+        for level in ([e.level] if e.level is not None else range(1, suite.scoring.levels + 1))
+        if level > 0 or e.terrain == "flat"
     ]
-    most = len(plan.environments) * max(len(plan.seeds), 2)
-    slots = min(most, _MANY_SLOTS if most > 2 * _SLOTS else _SLOTS)
+    keys = list(dict.fromkeys(keys)) or [("flat", 0)]
+    if torch.device(request.device).type == "cpu":
+        most = len(plan.environments) * max(len(plan.seeds), 2)
+        slots = min(most, _MANY_SLOTS if most > 2 * _SLOTS else _SLOTS)
+    else:
+        slots = min(max(plan.total_known, 1), _GPU_SLOTS)
     scene = Scene(
         robot=robot,
         parameters=robot.parameters[suite.parameters],
@@ -238,16 +257,24 @@ def _runners(request: Request, suite: Suite, robot: Robot, policy: Policy, plan:
     )
     backend = make_backend(request.backend, scene, device=request.device, threads=request.threads)
     index = {key: i for i, key in enumerate(keys)}
-    yield backend, EpisodeRunner(suite, policy, backend, lambda e: index[e.terrain, e.level])
+    return EpisodeRunner(suite, policy, backend, lambda e: index[e.terrain, e.level])
 
 
 def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -> Callable[[Progress], None] | None:
     if watch is None:
         return None
+    suite, goals = plan.suite, {g.name: g for g in plan.suite.goals}
+    seconds = {
+        name: sum(goal.phases) * len(SUB_COMMANDS[name]) or 0.4 * max(suite.commands.target_time.values(), default=25.0)
+        for name, goal in goals.items()
+    }
 
     def on_step(progress: Progress) -> None:
         left = plan.expected_left()
         total = plan.done + left
+        for episode, age in zip(progress.active, progress.ages, strict=True):
+            usual = sum(seconds[g] for g in episode.goals) / suite.physics.control_period
+            left -= min(age / usual, 0.95)
         watch(
             Status(
                 done=plan.done,
@@ -255,7 +282,7 @@ def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -
                 active=progress.active,
                 physics_steps=progress.physics_steps,
                 seconds=time.perf_counter() - began,
-                remaining_work=left / total if total else 0.0,
+                remaining_work=max(left, 0.0) / total if total else 0.0,
             )
         )
 

@@ -13,7 +13,7 @@ from ..terrains.base import Terrain
 from .suite import Suite, SuiteError
 
 # Sub-commands as multiples of the limits (forward, lateral, yaw), in the order in which they run.
-_SUB_COMMANDS: dict[str, list[tuple[int, int, int]]] = {
+SUB_COMMANDS: dict[str, list[tuple[int, int, int]]] = {
     "diagonal_velocity": [(-1, -1, 0), (-1, 1, 0), (-1, 0, 0), (1, -1, 0), (1, 1, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0)],
     "max_velocity": [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)],
     "target_pos_velocity": [(0, 0, 0)],
@@ -27,15 +27,15 @@ TARGET = "target_pos_velocity"
 class GoalTable:
     """The goals of a suite as tensors, indexed by goal number (the position in ``suite.goals``)."""
 
-    PARTS: Mapping[str, int] = {name: len(commands) for name, commands in _SUB_COMMANDS.items()}
+    PARTS: Mapping[str, int] = {name: len(commands) for name, commands in SUB_COMMANDS.items()}
     """Number of sub-commands by name of the goal."""
 
     def __init__(self, suite: Suite, device: torch.device, dtype: torch.dtype) -> None:
         names = [g.name for g in suite.goals]
-        unknown = [n for n in names if n not in _SUB_COMMANDS]
+        unknown = [n for n in names if n not in SUB_COMMANDS]
         if unknown:
             raise SuiteError(
-                f"suite '{suite.name}' has the unknown goal '{unknown[0]}'; choose from {', '.join(_SUB_COMMANDS)}"
+                f"suite '{suite.name}' has the unknown goal '{unknown[0]}'; choose from {', '.join(SUB_COMMANDS)}"
             )
         for g in suite.goals:
             wanted = 0 if g.name == TARGET else 2
@@ -46,10 +46,10 @@ class GoalTable:
                 )
         self.names = tuple(names)
         self.period = suite.physics.control_period
-        most = max(len(c) for c in _SUB_COMMANDS.values())
+        most = max(len(c) for c in SUB_COMMANDS.values())
         table = torch.zeros(len(names), most, 3, device=device, dtype=dtype)
         for i, name in enumerate(names):
-            table[i, : len(_SUB_COMMANDS[name])] = torch.tensor(_SUB_COMMANDS[name], device=device, dtype=dtype)
+            table[i, : len(SUB_COMMANDS[name])] = torch.tensor(SUB_COMMANDS[name], device=device, dtype=dtype)
         self._table = table
 
         def column(values: list[float], kind: torch.dtype) -> torch.Tensor:
@@ -58,7 +58,7 @@ class GoalTable:
         self._early = suite.commands.clock_offset * self.period
         double = torch.float64  # goal time is added up in double precision, as the reference does
         self.is_target = column([n == TARGET for n in names], torch.bool)
-        self.parts = column([len(_SUB_COMMANDS[n]) for n in names], torch.int64)
+        self.parts = column([len(SUB_COMMANDS[n]) for n in names], torch.int64)
         self.duration = column([sum(g.phases) or math.inf for g in suite.goals], double)
         self.total = self.duration * self.parts
         self.steps = column(

@@ -128,10 +128,10 @@ class Plan:
         self.total_known = 0
         self.done = 0
         for environment in self.environments:
-            if environment.searched:
+            if environment.level is None:
                 environment.low, environment.high = 0, suite.scoring.levels
                 self._search(environment)
-            elif evaluate:
+            elif evaluate and (environment.level > 0 or environment.terrain == "flat"):
                 self._queue_quality(environment)
 
     # ---- the runner's side ----------------------------------------------------------------------------------------
@@ -239,8 +239,9 @@ def make_environments(
     Args:
         suite: the rules.
         terrains: terrain names.
-        frictions: None for the suite's.
-        payloads: None for the suite's.
+        frictions: None for the suite's. Without payloads they are played at the nominal one where the suite does not cross both.
+        payloads: None for the suite's. Without frictions they are played as the suite does: a payload other than the nominal one
+            at the nominal friction only, unless it crosses both.
         level: the level to play at; None to search for it.
 
     Raises:
@@ -249,14 +250,13 @@ def make_environments(
     matrix = suite.matrix
     if level is not None and not 1 <= level <= suite.scoring.levels:
         raise SuiteError(f"level {level} does not exist; choose 1 to {suite.scoring.levels}")
-    crossed = matrix.crossed or frictions is not None or payloads is not None
     pairs = [
         (f, p) for p in dict.fromkeys(payloads or matrix.payloads) for f in dict.fromkeys(frictions or matrix.frictions)
     ]
-    if payloads is None and frictions is not None and not matrix.crossed:
-        pairs = [(f, p) for f, p in pairs if p == matrix.nominal_payload]
-    if not crossed:
+    if not matrix.crossed and frictions is None:
         pairs = [(f, p) for f, p in pairs if p == matrix.nominal_payload or f == matrix.nominal_friction]
+    elif not matrix.crossed and payloads is None:
+        pairs = [(f, p) for f, p in pairs if p == matrix.nominal_payload]
     found = []
     for terrain in terrains:
         flat = terrain == "flat"

@@ -42,6 +42,8 @@ class Progress:
     """How far the runner is; handed to the ``watch`` callback after every control step."""
 
     active: tuple[Episode, ...]
+    ages: tuple[int, ...]
+    """Control steps that each active episode has behind it."""
     control_steps: int
     physics_steps: int
 
@@ -136,7 +138,8 @@ class EpisodeRunner:
                 agenda.finished(record)
             if watch is not None:
                 active = tuple(e for e in self._episode if e is not None)
-                watch(Progress(active, self.control_steps, self.physics_steps))
+                ages = tuple(self.control_steps - begun for begun in self._begun())
+                watch(Progress(active, ages, self.control_steps, self.physics_steps))
 
     def _begun(self) -> list[int]:
         """The runner's control step at which each present episode began."""

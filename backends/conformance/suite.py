@@ -111,7 +111,7 @@ def make_bench(backend: str | type[PhysicsBackend], device: str = "cpu", *, robo
     """The test bench of an engine, for ``run_check``.
 
     Args:
-        backend: registry name (``mujoco``, ``newton:kamino``, a plug-in's name), or a class.
+        backend: registry name (``mujoco``, ``newton:steel``, a plug-in's name), or a class.
         device: where its worlds live, ``cpu`` or ``cuda``.
         robot: the robot in the scenes, four-legged with spherical feet; None for the Go2.
 
