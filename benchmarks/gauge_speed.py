@@ -14,7 +14,9 @@ import platform
 import statistics
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from gaitgauge.backends.mujoco import MujocoBackend
 from gaitgauge.gauge import evaluate as module
@@ -22,23 +24,26 @@ from gaitgauge.gauge.evaluate import Request, evaluate
 
 
 class StepClock:
-    """Adds up the wall time spent inside ``mujoco.batch.Batch.step``."""
+    """Adds up the wall time spent inside MuJoCo: ``rollout``, ``step`` and ``forward`` of ``mujoco.batch.Batch``."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
         self.calls = 0
 
     def watch(self, backend: MujocoBackend) -> None:
-        """Measure this backend's steps."""
-        step = backend._batch.step
+        """Measure this backend's calls."""
+        for name in ("rollout", "step", "forward"):
+            setattr(backend._batch, name, self._timed(getattr(backend._batch, name)))
 
-        def timed(*arguments: object) -> None:
+    def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any, **options: Any) -> Any:
             began = time.perf_counter()
-            step(*arguments)
+            result = call(*arguments, **options)
             self.seconds += time.perf_counter() - began
             self.calls += 1
+            return result
 
-        backend._batch.step = timed
+        return timed
 
 
 def run(arguments: argparse.Namespace, threads: int) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Control steps a second and memory of the mujoco-warp engine, with everything that training does to it.
+"""Control steps a second and memory of the Warp engines, with everything that training does to it.
 
 Each control step is 4 substeps of 5 ms (pyramidal cone, 10 solver iterations, feet with sliding friction only, no
 self-collision) of a standing and stepping Go2: new joint targets and latencies, physics, reading the whole state,
@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from time import perf_counter
 
@@ -55,11 +56,11 @@ def make_palette(ground: str) -> tuple:
     return tuple(terrains)
 
 
-def measure(ground: str, worlds: int, device: str, steps: int) -> dict:
+def measure(name: str, ground: str, worlds: int, device: str, steps: int) -> dict:
     """Build, warm up and time one configuration."""
     import torch
+    from gaitgauge.backends import make_backend
     from gaitgauge.backends.base import PhysicsOptions, Randomization, Scene
-    from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
     from gaitgauge.robots import load_robot
 
     gpu = device.startswith("cuda")
@@ -97,7 +98,7 @@ def measure(ground: str, worlds: int, device: str, steps: int) -> dict:
         physics=physics,
     )
     free_before, start = free(), perf_counter()
-    backend = MujocoWarpBackend(scene, device=device)
+    backend = make_backend(name, scene, device=device)
     synchronize()
     build_seconds = perf_counter() - start
     pose = torch.tensor(robot.default_joint_position, device=device)
@@ -151,7 +152,8 @@ def measure(ground: str, worlds: int, device: str, steps: int) -> dict:
         flags["diverged"] |= state.diverged
         mask = (torch.rand(worlds, device=device) < RESET_SHARE) | state.diverged
         reset(mask)
-        random_parameters(mask)
+        # mujoco-warp takes a row for every world with a mask, without asking the GPU how many it selects
+        random_parameters(mask if name == "mujoco-warp" else None)
         return observation.abs().mean()
 
     reset(None)
@@ -178,6 +180,7 @@ def measure(ground: str, worlds: int, device: str, steps: int) -> dict:
     synchronize()
     physics_seconds = perf_counter() - start
     return {
+        "backend": name,
         "ground": ground,
         "worlds": worlds,
         "steps": steps,
@@ -192,25 +195,26 @@ def measure(ground: str, worlds: int, device: str, steps: int) -> dict:
     }
 
 
-def in_own_process(ground: str, worlds: int, device: str, steps: int) -> dict:
+def in_own_process(name: str, ground: str, worlds: int, device: str, steps: int) -> dict:
     """Run ``measure`` in a fresh interpreter; a configuration that fails is a row with its error."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "row.json"
         command = [sys.executable, __file__, "--single", ground, str(worlds), "--device", device, "--steps", str(steps)]
+        command += ["--backend", name]
         done = subprocess.run(
             [*command, "--out", str(out)], capture_output=True, text=True, env=os.environ, check=False
         )
         if out.exists():
             return json.loads(out.read_text())
         reason = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()[-1]
-        return {"ground": ground, "worlds": worlds, "error": reason}
+        return {"backend": name, "ground": ground, "worlds": worlds, "error": reason}
 
 
 def hardware(device: str) -> dict:
     """What the numbers were measured on."""
     import torch
 
-    packages = ("torch", "warp-lang", "mujoco", "mujoco-warp")
+    packages = ("torch", "warp-lang", "mujoco", "mujoco-warp", "newton")
     entry = {"python": platform.python_version(), "versions": {p: version(p) for p in packages}}
     entry["device"] = torch.cuda.get_device_name(device) if device.startswith("cuda") else platform.processor()
     return entry
@@ -219,6 +223,7 @@ def hardware(device: str) -> dict:
 def main() -> None:
     """Measure all configurations asked for, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backend", nargs="+", default=["mujoco-warp"], help="engines")
     parser.add_argument("--worlds", type=int, nargs="+", default=list(SIZES), help="numbers of worlds")
     parser.add_argument("--ground", nargs="+", choices=GROUNDS, default=["boxes", "field"], help="kinds of ground")
     parser.add_argument("--steps", type=int, default=200, help="control steps to time")
@@ -229,7 +234,8 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     if arguments.single:
-        row = measure(arguments.single[0], int(arguments.single[1]), arguments.device, arguments.steps)
+        ground, worlds = arguments.single[0], int(arguments.single[1])
+        row = measure(arguments.backend[0], ground, worlds, arguments.device, arguments.steps)
         text = json.dumps(row)
         if arguments.out is None:
             print(text)
@@ -237,22 +243,21 @@ def main() -> None:
             arguments.out.write_text(text)
         return
     print(
-        f"{'ground':8} {'worlds':>7} {'M control steps/s':>18} {'physics alone':>15} {'kB/world':>9} {'overflowed':>11}"
+        f"{'backend':12} {'ground':8} {'worlds':>7} {'M control steps/s':>18} {'physics alone':>15} {'kB/world':>9} {'overflowed':>11}"
     )
     rows = []
-    for ground in arguments.ground:
-        for worlds in arguments.worlds:
-            row = in_own_process(ground, worlds, arguments.device, arguments.steps)
-            rows.append(row)
-            if "error" in row:
-                print(f"{ground:8} {worlds:7} {row['error']}", flush=True)
-                continue
-            rate, alone = row["control_steps_per_second"] / 1e6, row["control_steps_per_second_without_resets"] / 1e6
-            memory = row["bytes_per_world"] / 1e3
-            share = row["overflowed_share"]
-            print(f"{ground:8} {worlds:7} {rate:18.3f} {alone:15.3f} {memory:9.1f} {share:11.2%}", flush=True)
-            if arguments.out is not None:
-                arguments.out.write_text(json.dumps({"hardware": hardware(arguments.device), "rows": rows}, indent=2))
+    for name, ground, worlds in product(arguments.backend, arguments.ground, arguments.worlds):
+        row = in_own_process(name, ground, worlds, arguments.device, arguments.steps)
+        rows.append(row)
+        if "error" in row:
+            print(f"{name:12} {ground:8} {worlds:7} {row['error']}", flush=True)
+            continue
+        rate, alone = row["control_steps_per_second"] / 1e6, row["control_steps_per_second_without_resets"] / 1e6
+        memory = row["bytes_per_world"] / 1e3
+        share = row["overflowed_share"]
+        print(f"{name:12} {ground:8} {worlds:7} {rate:18.3f} {alone:15.3f} {memory:9.1f} {share:11.2%}", flush=True)
+        if arguments.out is not None:
+            arguments.out.write_text(json.dumps({"hardware": hardware(arguments.device), "rows": rows}, indent=2))
 
 
 if __name__ == "__main__":
