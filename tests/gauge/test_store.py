@@ -1,0 +1,173 @@
+"""Records on disk: they come back as they were, and what is not a run's folder is left alone."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from gaitgauge.gauge.episodes import Record, RecordError
+from gaitgauge.gauge.store import MemoryStore, RunFolder, StoreError, write_atomically
+from scripted_gauge import DIAGONAL, MAXIMUM, episode
+
+REQUEST = {"suite": "s 1", "seeds": [0, 1], "level": None}
+
+
+def full_record(**changes):
+    values = np.array([[0.5, math.nan], [-1e9, 0.1], [math.inf, 1.0]], dtype=np.float32)
+    options = {
+        "episode": episode(DIAGONAL, MAXIMUM, friction=0.1 + 0.2, terrain="wave", level=3),
+        "falls": 2,
+        "diverged": True,
+        "control_steps": 12,
+        "physics_steps": 125,
+        "columns": ("dof_power", "quality"),
+        "samples": values,
+        "goal_index": np.array([0, 0, 1], dtype=np.int16),
+        "part_index": np.array([0, 7, 2], dtype=np.int16),
+    }
+    return Record(**{**options, **changes})
+
+
+def same(one, other):
+    assert one.summary() == other.summary()
+    assert one.episode == other.episode
+    assert one.columns == other.columns
+    for name in ("samples", "goal_index", "part_index"):
+        assert getattr(one, name).dtype == getattr(other, name).dtype
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+
+
+@pytest.mark.parametrize("success", [None, True, False])
+def test_a_record_comes_back_bit_by_bit(tmp_path, success):
+    folder = RunFolder(tmp_path / "run", REQUEST, resume=False)
+    record = full_record(success=success)
+    folder.put(record)
+    again = RunFolder(tmp_path / "run", REQUEST, resume=True).get(record.episode)
+    same(again, record)
+    assert again.success is success
+    assert again.diverged is True
+
+
+def test_a_record_without_samples_comes_back(tmp_path):
+    folder = RunFolder(tmp_path, REQUEST, resume=False)
+    record = Record(episode=episode("target_pos_velocity", stage="search"), success=True)
+    folder.put(record)
+    same(RunFolder(tmp_path, REQUEST, resume=True).get(record.episode), record)
+
+
+def test_an_episode_that_never_ran_is_unknown(tmp_path):
+    folder = RunFolder(tmp_path, REQUEST, resume=False)
+    folder.put(full_record())
+    resumed = RunFolder(tmp_path, REQUEST, resume=True)
+    assert resumed.get(episode(DIAGONAL)) is None
+    memory = MemoryStore()
+    memory.put(full_record())
+    assert memory.get(episode(DIAGONAL)) is None
+
+
+def test_what_a_killed_process_left_half_written_is_no_record(tmp_path):
+    folder = RunFolder(tmp_path, REQUEST, resume=False)
+    record = full_record()
+    (tmp_path / "episodes" / f"{record.episode.key}.tmp").write_bytes(b"half")
+    assert RunFolder(tmp_path, REQUEST, resume=True).get(record.episode) is None
+    folder.put(record)
+    same(RunFolder(tmp_path, REQUEST, resume=True).get(record.episode), record)
+
+
+def damaged(kind, data):
+    return {
+        "truncated": data[: len(data) // 2],
+        "empty": b"",
+        "text": b"not an archive",
+        "flipped": data[:300] + bytes(b ^ 0xFF for b in data[300:340]) + data[340:],
+        "array": b"\x93NUMPY" + data[6:],
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["truncated", "empty", "text", "flipped", "array"])
+def test_a_damaged_record_is_one_sentence(tmp_path, kind):
+    record = full_record()
+    RunFolder(tmp_path, REQUEST, resume=False).put(record)
+    file = tmp_path / "episodes" / f"{record.episode.key}.npz"
+    file.write_bytes(damaged(kind, file.read_bytes()))
+    with pytest.raises(RecordError, match=r"is damaged .*; delete it and run again with --resume") as caught:
+        RunFolder(tmp_path, REQUEST, resume=True).get(record.episode)
+    assert "\n" not in str(caught.value)
+    assert str(file) in str(caught.value)
+
+
+def test_a_record_under_another_episodes_name_is_damaged(tmp_path):
+    record = full_record()
+    RunFolder(tmp_path, REQUEST, resume=False).put(record)
+    other = episode(DIAGONAL)
+    (tmp_path / "episodes" / f"{record.episode.key}.npz").rename(tmp_path / "episodes" / f"{other.key}.npz")
+    with pytest.raises(RecordError, match=re.escape(f"it holds episode {record.episode.key}")):
+        RunFolder(tmp_path, REQUEST, resume=True).get(other)
+
+
+def test_a_record_runs_no_code_when_it_is_read(tmp_path):
+    record = full_record()
+    RunFolder(tmp_path, REQUEST, resume=False).put(record)
+    file = tmp_path / "episodes" / f"{record.episode.key}.npz"
+    np.savez(file, head=np.array([{"a": 1}], dtype=object), samples=[], goal_index=[], part_index=[])
+    with pytest.raises(RecordError, match="damaged"):
+        Record.load(file)
+
+
+# ---- folders ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_is_taken_up_again_only_when_asked(tmp_path):
+    RunFolder(tmp_path / "run", REQUEST, resume=False)
+    with pytest.raises(StoreError, match="already holds this run; go on with --resume"):
+        RunFolder(tmp_path / "run", REQUEST, resume=False)
+    RunFolder(tmp_path / "run", REQUEST, resume=True)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_folder_of_another_run_is_refused_and_left_as_it_is(tmp_path, resume):
+    RunFolder(tmp_path, REQUEST, resume=False).put(full_record())
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    with pytest.raises(StoreError, match=r"belongs to another run \(seeds was \[0, 1\], now \[2\]\)"):
+        RunFolder(tmp_path, {**REQUEST, "seeds": [2]}, resume=resume)
+    with pytest.raises(StoreError, match=r"belongs to another run \(policy was null, now \"x\"\)"):
+        RunFolder(tmp_path, {**REQUEST, "policy": "x"}, resume=resume)
+    assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
+
+
+def test_a_folder_with_something_else_in_it_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(StoreError, match="is not empty and holds no run"):
+        RunFolder(tmp_path, REQUEST, resume=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+    with pytest.raises(StoreError, match="is a file"):
+        RunFolder(tmp_path / "notes.txt", REQUEST, resume=False)
+
+
+@pytest.mark.parametrize("content", ["{", "[1, 2]", ""])
+def test_a_damaged_request_is_refused(tmp_path, content):
+    RunFolder(tmp_path, REQUEST, resume=False)
+    (tmp_path / "request.json").write_text(content)
+    with pytest.raises(StoreError, match=r"request\.json is damaged"):
+        RunFolder(tmp_path, REQUEST, resume=True)
+
+
+def test_an_empty_folder_and_one_that_is_not_there_will_do(tmp_path):
+    (tmp_path / "empty").mkdir()
+    RunFolder(tmp_path / "empty", REQUEST, resume=True)
+    RunFolder(tmp_path / "a" / "b", REQUEST, resume=False)
+    assert json.loads((tmp_path / "a" / "b" / "request.json").read_text()) == REQUEST
+
+
+def test_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "results.json"
+    write_atomically(path, "first")
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, "second")
+    assert path.read_text() == "first"
