@@ -278,7 +278,7 @@ def compare_trajectories(
     return result
 
 
-def _first(time: Array, over: NDArray[np.bool_]) -> float | None:
+def _first(time: NDArray[np.floating], over: NDArray[np.bool_]) -> float | None:
     """First time at which a condition holds."""
     return float(time[int(over.argmax())]) if over.any() else None
 

@@ -170,7 +170,7 @@ def prepare_study(request: Request) -> _Prepared:
                 device=reference.device,
                 robot=request.robot,
                 terrains=tuple(terrains),
-                level=levels[0],
+                level=levels[0] if request.levels or any(t != "flat" for t in terrains) else None,
                 frictions=frictions,
             )
         )
@@ -402,7 +402,7 @@ class _Policy:
         near = [v.label for v in prepared.engines if v.label != variant.label]
         if variant.label != prepared.reference.label:
             near = [prepared.reference.label]
-        others = {label: dict(self._records[label]) for label in near}
+        others = {label: self._records[label] for label in near}
         name = f"{self._name}/{switched.label}"
         return entry | effect_of_switch(prepared.design, self._records[variant.label], records, others, name=name)
 

@@ -54,9 +54,17 @@ class WrappedBackend(PhysicsBackend):
         """See ``PhysicsBackend.reset``."""
         self.inner.reset(worlds, **arguments)
 
-    def step(self, joint_targets: torch.Tensor | None, **arguments: Any) -> None:
+    def step(
+        self,
+        joint_targets: torch.Tensor | None,
+        *,
+        delay: torch.Tensor | None = None,
+        sample_at: torch.Tensor | None = None,
+        worlds: torch.Tensor | None = None,
+        substeps: int | None = None,
+    ) -> None:
         """See ``PhysicsBackend.step``."""
-        self.inner.step(joint_targets, **arguments)
+        self.inner.step(joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=substeps)
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``."""

@@ -26,19 +26,21 @@ SUITE = """
 extends = "robogauge-1.1"
 name = "tiny"
 title = "a second"
-goals = [{ name = "max_velocity", phases = [0.3, 0.1] }, { name = "target_pos_velocity", phases = [] }]
+goals = [{ name = "max_velocity", phases = [0.1, 0.04] }, { name = "target_pos_velocity", phases = [] }]
 [commands]
-target_time = { slope = 0.2, wave = 0.2, stairs = 0.2, obstacle = 0.2 }
+target_time = { slope = 0.1, wave = 0.1, stairs = 0.1, obstacle = 0.1 }
 [settling]
-longest = 0.12
+longest = 0.04
+speed = 10.0
+shortest = 0.0
 [physics]
 timestep = 0.01
 substeps = 2
-watch_tilt = 1.0
+watch_tilt = 0.4
 [noise]
 latency = 1
 [events]
-fall_tilt = 1.0
+fall_tilt = 0.4
 [metrics]
 interval = 5
 [scoring]
@@ -46,7 +48,8 @@ bootstrap = 400
 """
 FAST = 0.5
 """Speed at which the shifted engine lifts every robot [m/s]: an error of its velocity, whatever is commanded."""
-DURATION = 0.4
+BOTH = ("flat", "slope_fd")
+DURATION = 0.3
 """Length of the open-loop tests here [s]."""
 
 
@@ -69,7 +72,7 @@ def request_of(tmp_path):
         backends=("fake", "fake@ls_iterations=7"),
         device="cpu",
         suite=str(suite),
-        terrains=("flat", "slope_fd"),
+        terrains=("flat",),
         attribution=False,
     )
 
@@ -106,7 +109,7 @@ def zero(estimate):
 
 
 def test_identical_engines_have_no_gap(request_of, tmp_path):
-    results = study(request_of(), tmp_path / "out", make=engine())
+    results = study(request_of(terrains=BOTH), tmp_path / "out", make=engine())
     pair = only_pair(results)
     for block in (pair["overall"], *pair["terrains"].values()):
         assert zero(block["gap"]) and zero(block["difference"])
@@ -134,21 +137,21 @@ def test_shifted_engine_is_found_out(request_of, tmp_path):
     # 1 - ‖v - v*‖ / limit of a robot that stands, or drifts: only velocity tracking can tell
     assert overall["metrics"]["lin_vel_err"]["difference"]["interval"][1] < 0.0
     assert overall["difference"]["interval"][1] < 0.0
-    assert overall["effect_size"] < -1.0
+    assert overall["effect_size"] is None  # no noise reaches a scripted engine: every seed differs by the same
     walk = results["policies"][0]["open_loop"]["differences"]["fake@ls_iterations=7"]["walk"]
     assert walk["end"]["position"] == pytest.approx(FAST * DURATION, rel=1e-3)
     assert walk["apart"]["0.1"] == pytest.approx(0.2, abs=0.021)
 
 
 def test_falls_in_one_engine_are_counted(request_of, tmp_path):
-    make = engine(fall_time=torch.full((), 0.1))
-    overall = only_pair(study(request_of(terrains=("flat",)), tmp_path / "out", make=make))["overall"]
+    make = engine(fall_time=torch.full((), 0.04))
+    overall = only_pair(study(request_of(), tmp_path / "out", make=make))["overall"]
     fell = overall["outcomes"]["fell"]
     assert (fell["only_reference"], fell["only_compared"], fell["same"]) == (0, 3, 0.0)
 
 
 def test_gap_is_the_mean_magnitude_of_the_rows(request_of, tmp_path):
-    pair = only_pair(study(request_of(), tmp_path / "out", make=engine(motion=drifting)))
+    pair = only_pair(study(request_of(terrains=BOTH), tmp_path / "out", make=engine(motion=drifting)))
     by_terrain = {}
     for row in pair["episodes"]:
         if row["stage"] == "eval":
@@ -189,7 +192,7 @@ def test_attribution_switches_one_factor_and_finds_the_one_that_matters(request_
 
 
 def test_a_study_goes_on_where_it_stopped(request_of, tmp_path):
-    request, folder = request_of(), tmp_path / "out"
+    request, folder = request_of(terrains=BOTH), tmp_path / "out"
     first = study(request, folder, make=engine(motion=drifting))
     with pytest.raises(StoreError, match="--resume"):
         study(request, folder, make=engine())
@@ -201,18 +204,18 @@ def test_a_study_goes_on_where_it_stopped(request_of, tmp_path):
     assert {p: p.stat().st_mtime_ns for p in files[1:]} == before
     assert again["policies"] == first["policies"]
     with pytest.raises(StoreError, match="another run"):
-        study(request_of(seeds=4), folder, resume=True, make=engine())
+        study(request_of(terrains=BOTH, seeds=4), folder, resume=True, make=engine())
 
 
 def test_engines_that_cannot_run_are_left_out_until_one_is_left(request_of, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    request = request_of(backends=("mujoco", "mujoco@cone=pyramidal", "mujoco-warp"), device=None, terrains=("flat",))
+    request = request_of(backends=("mujoco", "mujoco@cone=pyramidal", "mujoco-warp"), device=None)
     results = study(request, tmp_path / "out", make=engine())
     assert results["compared"] == ["mujoco@cone=pyramidal"]
     assert [s["backend"] for s in results["skipped"]] == ["mujoco-warp"]
     assert "--device cpu" in results["skipped"][0]["reason"]
     with pytest.raises(ConsistencyError, match=r"only 'mujoco' is left.*--device cpu"):
-        study(request_of(backends=("mujoco", "mujoco-warp", "newton"), device=None), tmp_path / "two")
+        study(request_of(backends=("mujoco", "mujoco-warp"), device=None), tmp_path / "two")
     assert not (tmp_path / "two").exists()
 
 
@@ -253,7 +256,7 @@ def test_impossible_requests_are_refused_before_anything_is_written(request_of, 
 
 
 def test_the_reference_can_be_any_engine(request_of, tmp_path):
-    request = request_of(reference="fake@ls_iterations=7", terrains=("flat",))
+    request = request_of(reference="fake@ls_iterations=7")
     results = study(request, tmp_path / "out", make=engine(motion=drifting))
     assert results["reference"] == "fake@ls_iterations=7"
     assert results["compared"] == ["fake"]
@@ -297,7 +300,7 @@ def test_page_is_self_contained_and_escapes_names(request_of, tmp_path):
 
 def test_several_policies_have_folders_of_their_own(request_of, tmp_path):
     name = request_of().policies[0]
-    results = study(request_of(policies=(name, name), terrains=("flat",)), tmp_path / "out", make=engine())
+    results = study(request_of(policies=(name, name)), tmp_path / "out", make=engine())
     assert len(results["policies"]) == 2
     folders = sorted(p.name for p in (tmp_path / "out").iterdir() if p.is_dir())
     assert [f[0] for f in folders] == ["1", "2"]

@@ -1,0 +1,67 @@
+"""``gaitgauge consistency`` as a user runs it."""
+
+import json
+
+import pytest
+
+SUITE = """
+extends = "robogauge-1.1"
+name = "tiny"
+title = "a second"
+goals = [{ name = "max_velocity", phases = [0.2, 0.1] }, { name = "target_pos_velocity", phases = [] }]
+[settling]
+longest = 0.2
+[scoring]
+bootstrap = 200
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    path = tmp_path / "tiny.toml"
+    path.write_text(SUITE)
+    return path
+
+
+def test_two_settings_of_the_c_engine(run, refused, tmp_path, policy, tiny):
+    out = tmp_path / "study"
+    command = (
+        "consistency",
+        policy,
+        "--backends",
+        "mujoco,mujoco@timestep=0.005",
+        "--suite",
+        tiny,
+        "--terrain",
+        "flat",
+    )
+    command += ("--seeds", 2, "--factor", "timestep-5ms", "--out", out)
+    done = run(*command, "--json")
+    assert done.exit_code == 0, done.output
+    printed = json.loads(done.stdout)
+    assert printed == json.loads((out / "consistency.json").read_text())
+    assert printed["reference"] == "mujoco"
+    row = printed["policies"][0]["attribution"][0]
+    # the reference with the compared engine's timestep is the compared engine
+    assert row["to"]["mujoco@timestep=0.005"]["gap_after"] == 0.0
+    assert "<html" in (out / "consistency.html").read_text()
+
+    assert "--resume" in refused(*command)
+    again = run(*command, "--resume")
+    assert again.exit_code == 0, again.output
+    for words in ("models: largest relative difference", "open loop", "closed loop", "attribution", "gap"):
+        assert words in again.stdout
+    assert "mujoco – mujoco@timestep=0.005" in again.stdout
+    assert str(out / "consistency.html") in again.stdout.replace("\n", "")
+
+
+def test_bad_input_is_one_sentence(refused, policy, tmp_path):
+    out = ("--out", tmp_path / "none")
+    assert "two engines" in refused("consistency", policy, "--backends", "mujoco", *out)
+    assert "unknown backend 'nonsense'" in refused("consistency", policy, "--backends", "mujoco,nonsense", *out)
+    assert "@option=value" in refused("consistency", policy, "--backends", "mujoco,mujoco@speed=1", *out)
+    assert "--seeds" in refused("consistency", policy, "--backends", "mujoco,mujoco@cone=pyramidal", "--seeds", 1, *out)
+    flat = ("--backends", "mujoco,mujoco@cone=pyramidal", "--terrain", "flat")
+    assert "no levels" in refused("consistency", policy, *flat, "--level", 2, *out)
+    assert "missing.pt" in refused("consistency", "missing.pt", "--backends", "mujoco,mujoco@cone=pyramidal", *out)
+    assert not (tmp_path / "none").exists()
