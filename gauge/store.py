@@ -65,7 +65,7 @@ class RunFolder:
                 raise StoreError(
                     f"{folder} already holds this run; go on with --resume, or give another folder with --out"
                 )
-        elif folder.exists() and any(folder.iterdir()):
+        elif folder.exists() and any(not _left_by_a_kill(p) for p in folder.iterdir()):
             raise StoreError(f"{folder} is not empty and holds no run; give another folder with --out")
         try:
             self._episodes.mkdir(parents=True, exist_ok=True)
@@ -84,6 +84,13 @@ class RunFolder:
     def put(self, record: Record) -> None:
         """Keep a record."""
         record.save(self._episodes)
+
+
+def _left_by_a_kill(path: Path) -> bool:
+    """Whether something in a folder is all that a run leaves that was killed while it began."""
+    if path.is_dir():
+        return path.name == "episodes" and not any(path.iterdir())
+    return path.name == "request.json.tmp"
 
 
 class MemoryStore:

@@ -153,6 +153,16 @@ def test_a_damaged_request_is_refused(tmp_path, content):
         RunFolder(tmp_path, REQUEST, resume=True)
 
 
+def test_a_folder_of_a_run_that_was_killed_while_it_began_will_do(tmp_path):
+    (tmp_path / "episodes").mkdir()
+    (tmp_path / "request.json.tmp").write_text('{"sui')
+    RunFolder(tmp_path, REQUEST, resume=True)
+    (tmp_path / "other" / "episodes").mkdir(parents=True)
+    (tmp_path / "other" / "episodes" / "x.npz").write_bytes(b"")
+    with pytest.raises(StoreError, match="holds no run"):
+        RunFolder(tmp_path / "other", REQUEST, resume=True)
+
+
 def test_an_empty_folder_and_one_that_is_not_there_will_do(tmp_path):
     (tmp_path / "empty").mkdir()
     RunFolder(tmp_path / "empty", REQUEST, resume=True)

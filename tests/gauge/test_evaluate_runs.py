@@ -1,0 +1,351 @@
+"""From a request to results: what is refused, what a killed run leaves, and that it ends with the very same results."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from gaitgauge.backends.fake import FakeScript
+from gaitgauge.gauge import evaluate as evaluation
+from gaitgauge.gauge.evaluate import Request, evaluate, prepare
+from gaitgauge.gauge.store import RunFolder, StoreError
+from gaitgauge.gauge.suite import SuiteError
+from gaitgauge.policy.base import PolicyError
+from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.native import StoredNetwork, save_policy
+from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.terrains.registry import TerrainError
+from scripted_gauge import GO2, Puppet
+
+TINY = """
+extends = "{base}"
+name = "tiny"
+version = "1.0.0"
+goals = [
+  {{ name = "diagonal_velocity", phases = [0.04, 0.02] }},
+  {{ name = "max_velocity", phases = [0.04, 0.02] }},
+  {{ name = "target_pos_velocity", phases = [] }},
+]
+
+[physics]
+timestep = 0.01
+substeps = 2
+
+[matrix]
+terrains = ["flat", "slope_fd"]
+frictions = [0.6]
+payloads = [0.0]
+seeds = [0, 1]
+search_seeds = [100, 101, 102]
+
+[commands]
+target_radius = 0.5
+target_time = {{ slope = 0.3 }}
+target_speed = {{ slope = 1.0 }}
+
+[noise]
+latency = 1
+
+[settling]
+shortest = 0.02
+longest = 0.2
+
+[metrics]
+interval = 2
+
+[scoring]
+levels = 3
+pass_rate = 0.6
+bootstrap = 20
+"""
+
+
+def gliding(backend):
+    """Robots rush up gentle slopes once they have settled, and never move on level 3."""
+    level = torch.tensor([t.level for t in backend.scene.terrains])[backend.terrain_index]
+    linear = torch.zeros(backend.num_worlds, 3, dtype=torch.float64)
+    linear[:, 0] = 20.0 * (backend.state.time.ge(0.045) & level.ge(1) & level.le(2))
+    return linear, torch.zeros_like(linear)
+
+
+def puppets(name, scene, *, device="cpu", threads=1):
+    return Puppet(scene, script=FakeScript(motion=gliding))
+
+
+@pytest.fixture
+def request_for(tmp_path, monkeypatch):
+    """Makes requests for a tiny suite on an engine without physics."""
+    torch.manual_seed(0)
+    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
+    network = MlpNetwork(**arguments)
+    policy = tmp_path / "policy.gauge.pt"
+    stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
+    save_policy(policy, go2_contract(GO2), stored)
+    monkeypatch.setattr(evaluation, "make_backend", puppets)
+
+    def make(base="gaitgauge-1", **choices):
+        suite = tmp_path / f"{base}.toml"
+        suite.write_text(TINY.format(base=base))
+        return Request(**{"policy": str(policy), "suite": str(suite), "backend": "fake", **choices})
+
+    return make
+
+
+def without_provenance(folder):
+    results = json.loads((folder / "results.json").read_text())
+    del results["provenance"]
+    return json.dumps(results)
+
+
+class Killed(BaseException):
+    pass
+
+
+# ---- results --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("base", ["robogauge-1.1", "gaitgauge-1"])
+def test_a_whole_run(request_for, tmp_path, base):
+    folder = tmp_path / "run"
+    returned = evaluate(request_for(base), folder)
+    results = json.loads((folder / "results.json").read_text())
+    assert results == json.loads(json.dumps(returned))
+    flat, slope = results["environments"]
+    assert (flat["terrain"], flat["level"]) == ("flat", None)
+    assert (slope["terrain"], slope["level"]) == ("slope_fd", 2)
+    assert slope["search"] == {"2": True, "3": False}
+    assert results["level"] == 2.0
+    assert results["score"] == pytest.approx((flat["score"] + slope["score"]) / 2, abs=1e-6)
+    assert results["score_interval"][0] <= results["score"] <= results["score_interval"][1]
+    assert set(results["groups"]) == set(results["groups_interval"]) == {"tracking", "safety", "quality"}
+    assert results["terrains"]["slope_fd"]["score"] == pytest.approx(0.09 + 0.19 * slope["quality"]["mean50"], abs=2e-4)
+    assert results["health"] == {"episodes": 4, "falls": 0, "diverged": 0, "overflowed": 0}
+    # every episode that was played is a row, those of the level tests too
+    rows = list(csv.DictReader((folder / "episodes.csv").open()))
+    files = {p.stem for p in (folder / "episodes").iterdir()}
+    assert len(rows) == len(files) == 4 + 2 + 2
+    assert [r["success"] for r in rows if r["stage"] == "search" and r["level"] == "3"] == ["False", "False"]
+    assert sum(int(r["physics_steps"]) for r in rows) > 0
+
+
+def test_the_same_request_gives_the_same_results(request_for, tmp_path):
+    evaluate(request_for(), tmp_path / "a")
+    evaluate(request_for(threads=2), tmp_path / "b")
+    assert without_provenance(tmp_path / "a") == without_provenance(tmp_path / "b")
+    assert (tmp_path / "a" / "episodes.csv").read_bytes() == (tmp_path / "b" / "episodes.csv").read_bytes()
+
+
+def test_a_level_run_has_levels_and_no_score(request_for, tmp_path):
+    results = evaluate(request_for(pipeline="level"), tmp_path / "run")
+    assert results["score"] is None
+    assert results["terrains"] == {"slope_fd": {"level": 2.0}}
+
+
+def test_a_policy_that_passes_nothing_scores_zero(request_for, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "make_backend", lambda name, scene, **options: Puppet(scene))
+    results = evaluate(request_for(terrains=("slope_fd",)), tmp_path / "run")
+    assert results["score"] == 0.0
+    assert results["level"] == 0.0
+    assert results["metrics"]["dof_power"]["mean50"] == 0.0
+
+
+def test_seeds_and_frictions_given_twice_count_once(request_for, tmp_path):
+    request = request_for(pipeline="multi", frictions=(0.5, 0.5), seeds=(1, 1))
+    results = evaluate(request, tmp_path / "run")
+    assert len(results["environments"]) == 1
+    assert results["health"]["episodes"] == 1
+
+
+# ---- interruption ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("counts", [(0, 3, 7), pytest.param(range(9), marks=pytest.mark.slow)])
+def test_a_run_killed_after_any_episode_ends_with_the_very_same_results(request_for, tmp_path, monkeypatch, counts):
+    request, puts = request_for("robogauge-1.1"), []
+    put = RunFolder.put
+    monkeypatch.setattr(RunFolder, "put", lambda self, record: (puts.append(record.episode.key), put(self, record)))
+    evaluate(request, tmp_path / "whole")
+    episodes = sorted(puts)
+    assert len(set(episodes)) == len(episodes) == 8
+    for count in counts:
+        folder = tmp_path / f"killed-{count}"
+        puts.clear()
+
+        def watch(status, count=count):
+            if status.done >= count:
+                raise Killed
+
+        with pytest.raises(Killed):
+            evaluate(request, folder, watch=watch)
+        assert not (folder / "results.json").exists()
+        assert len(puts) >= count
+        evaluate(request, folder, resume=True)
+        assert sorted(puts) == episodes, "an episode was played twice or never"
+        assert without_provenance(folder) == without_provenance(tmp_path / "whole")
+        assert (folder / "episodes.csv").read_bytes() == (tmp_path / "whole" / "episodes.csv").read_bytes()
+
+
+def test_a_finished_run_resumes_to_itself_without_playing(request_for, tmp_path, monkeypatch):
+    evaluate(request_for(), tmp_path / "run")
+    before = without_provenance(tmp_path / "run")
+    monkeypatch.setattr(Puppet, "step", lambda *_, **__: pytest.fail("an episode was played again"))
+    evaluate(request_for(), tmp_path / "run", resume=True)
+    assert without_provenance(tmp_path / "run") == before
+
+
+def test_a_damaged_episode_is_one_sentence_and_costs_nothing_else(request_for, tmp_path):
+    evaluate(request_for(), tmp_path / "run")
+    before = (tmp_path / "run" / "results.json").read_bytes()
+    file = next((tmp_path / "run" / "episodes").glob("eval-flat*s1*"))
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ValueError, match=f"episode file .*{file.name[:12]}.* is damaged .*; delete it and run again"):
+        evaluate(request_for(), tmp_path / "run", resume=True)
+    assert (tmp_path / "run" / "results.json").read_bytes() == before
+    file.unlink()
+    evaluate(request_for(), tmp_path / "run", resume=True)
+    assert json.loads(before)["score"] == json.loads((tmp_path / "run" / "results.json").read_text())["score"]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"seeds": (0,)}, {"frictions": (0.5,)}, {"pipeline": "level"}, {"base": "robogauge-1.1"}]
+)
+def test_the_folder_of_another_request_is_refused(request_for, tmp_path, changes):
+    evaluate(request_for(), tmp_path / "run")
+    before = (tmp_path / "run" / "results.json").read_bytes()
+    with pytest.raises(StoreError, match="belongs to another run"):
+        evaluate(request_for(**changes), tmp_path / "run", resume=True)
+    assert (tmp_path / "run" / "results.json").read_bytes() == before
+
+
+def test_a_suite_that_changed_under_its_name_is_another_run(request_for, tmp_path):
+    request = request_for()
+    evaluate(request, tmp_path / "run")
+    suite = Path(request.suite)
+    suite.write_text(suite.read_text().replace("interval = 2", "interval = 4"))
+    with pytest.raises(StoreError, match="belongs to another run"):
+        evaluate(request, tmp_path / "run", resume=True)
+
+
+def test_a_policy_that_answers_nonsense_leaves_what_was_finished(request_for, tmp_path):
+    request = request_for(pipeline="multi")
+    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
+    broken = {k: torch.full_like(v, torch.nan) for k, v in MlpNetwork(**arguments).state_dict().items()}
+    save_policy(
+        request.policy, go2_contract(GO2), StoredNetwork(architecture="mlp", arguments=arguments, state_dict=broken)
+    )
+    with pytest.raises(
+        PolicyError, match="returned nan for a finite observation at control step 0 of episode eval-flat"
+    ):
+        evaluate(request, tmp_path / "run")
+    assert not (tmp_path / "run" / "results.json").exists()
+
+
+# ---- requests -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("choices", "error", "message"),
+    [
+        (
+            {"pipeline": "base", "terrains": ("slope_fd",)},
+            SuiteError,
+            "plays one level of terrain 'slope_fd'; say which",
+        ),
+        ({"pipeline": "everything"}, SuiteError, "there is no pipeline 'everything'; choose one of base, multi"),
+        ({"pipeline": "level", "terrains": ("flat",)}, SuiteError, "'flat' has no levels to search"),
+        ({"pipeline": "level", "level": 3}, SuiteError, "pipeline 'level' searches the level; leave --level out"),
+        ({"pipeline": "multi", "level": 3}, SuiteError, "terrain 'flat' has no levels, so --level 3 means nothing"),
+        ({"pipeline": "base", "frictions": (0.5, 0.6)}, SuiteError, "plays one environment"),
+        ({"level": 0}, SuiteError, "level 0 does not exist; choose 1 to 3"),
+        ({"level": 11}, SuiteError, "level 11 does not exist"),
+        ({"frictions": (-0.2,)}, SuiteError, "friction -0.2 is not possible"),
+        ({"frictions": (float("nan"),)}, SuiteError, "friction nan is not possible"),
+        ({"payloads": (-9.0,)}, SuiteError, "payload -9 kg is not possible"),
+        ({"seeds": (-1,)}, SuiteError, "seed -1 is not possible"),
+        ({"terrains": ("slop_fd",)}, TerrainError, "did you mean 'slope_fd'"),
+        ({"terrains": ("wave",)}, SuiteError, r"has no commands\.target_speed for terrain family 'wave'"),
+        ({"suite": "gaitgauge-2"}, SuiteError, "there is no suite 'gaitgauge-2'"),
+        ({"policy": "nowhere.pt"}, PolicyError, "nowhere.pt"),
+    ],
+)
+def test_impossible_requests_are_refused_before_anything_is_written(request_for, tmp_path, choices, error, message):
+    with pytest.raises(error, match=message) as caught:
+        evaluate(request_for(**choices), tmp_path / "run")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_terrains_keep_the_suites_order(request_for):
+    environments = prepare(request_for(terrains=("slope_fd", "flat")))[3]
+    assert [e.terrain for e in environments] == ["flat", "slope_fd"]
+
+
+def test_a_base_run_is_one_episode(request_for, tmp_path):
+    results = evaluate(request_for(pipeline="base", terrains=("slope_fd",), level=2), tmp_path / "run")
+    assert results["health"]["episodes"] == 1
+    assert results["environments"][0]["level"] == 2
+    assert "search" not in results["environments"][0]
+
+
+# ---- real kills and real physics --------------------------------------------------------------------------------------------
+
+CHILD = """
+import sys
+sys.path.insert(0, {tests!r})
+import test_evaluate_runs as runs
+from gaitgauge.gauge import evaluate as evaluation
+from pathlib import Path
+evaluation.make_backend = runs.puppets
+evaluation.evaluate(evaluation.Request(policy={policy!r}, suite={suite!r}, backend="fake"), Path({folder!r}), resume=True)
+"""
+
+
+@pytest.mark.slow
+def test_a_process_killed_by_the_system_resumes(request_for, tmp_path):
+    request = request_for()
+    evaluate(request, tmp_path / "whole")
+    for wanted in (0, 1, 3, 5):
+        folder = tmp_path / f"killed-{wanted}"
+        child = CHILD.format(
+            tests=str(Path(__file__).parent), policy=request.policy, suite=request.suite, folder=str(folder)
+        )
+        process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(child)])
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and process.poll() is None:
+            if (folder / "episodes").exists() and len(list((folder / "episodes").glob("*.npz"))) >= wanted:
+                break
+            time.sleep(0.002)
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        assert process.returncode in (0, -signal.SIGKILL)
+        evaluate(request, folder, resume=True)
+        assert without_provenance(folder) == without_provenance(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_threads_change_no_bit_of_the_results_in_mujoco(request_for, tmp_path, monkeypatch):
+    """Real terrains and contacts, a random policy that stumbles and falls, short goals."""
+    monkeypatch.undo()
+    request = request_for()
+    text = Path(request.suite).read_text()
+    text = text.replace("timestep = 0.01\nsubsteps = 2", "").replace("interval = 2", "interval = 10")
+    text = text.replace("[0.04, 0.02]", "[0.4, 0.2]").replace("slope = 0.3", "slope = 2.0").replace("latency = 1", "")
+    Path(request.suite).write_text(text)
+    for threads in (1, 2):
+        evaluate(
+            Request(policy=request.policy, suite=request.suite, backend="mujoco", threads=threads),
+            tmp_path / f"threads-{threads}",
+        )
+    one, two = (without_provenance(tmp_path / f"threads-{n}") for n in (1, 2))
+    assert one == two
+    assert 0.0 < json.loads(one)["score"] < 1.0
+    for file in sorted((tmp_path / "threads-1" / "episodes").iterdir()):
+        assert file.read_bytes() == (tmp_path / "threads-2" / "episodes" / file.name).read_bytes()
