@@ -52,10 +52,9 @@ class ReferenceStream(NoiseStream):
         self._noise, self._joints, self._device = noise, joints, device
         self._seeds: list[int] = []
         self._generators: list[_PythonGenerator] = []
-        self._length = 0
-        self._widths = 2 * joints + 12
-        self._uniform = torch.zeros(0, 0, self._widths, device=device)
-        self._delays = torch.zeros(0, 0, dtype=torch.int64, device=device)
+        self._length = TABLE_STEPS
+        self._uniform = torch.zeros(0, self._length, 2 * joints + 12, device=device)
+        self._delays = torch.zeros(0, self._length, dtype=torch.int64, device=device)
         self._row = torch.zeros(slots, dtype=torch.int64, device=device)
         half = [noise.joint_position] * joints + [noise.joint_velocity] * joints + [0.05] * 3
         half += [noise.base_angular_velocity] * 3 + [0.05] * 3 + [noise.base_angular_velocity] * 3
@@ -64,29 +63,31 @@ class ReferenceStream(NoiseStream):
     def assign(self, slot: int, episode: Episode) -> None:
         """See ``NoiseStream.assign``."""
         if episode.seed not in self._seeds:
+            generator = _PythonGenerator(episode.seed)
+            uniform, delays = self._tables([generator], self._length)
             self._seeds.append(episode.seed)
-            self._generators = [_PythonGenerator(s) for s in self._seeds]
-            length, self._length = self._length, 0
-            self._uniform = self._uniform.new_zeros(len(self._seeds), 0, self._widths)
-            self._delays = self._delays.new_zeros(len(self._seeds), 0)
-            self._extend(max(length, TABLE_STEPS))
+            self._generators.append(generator)
+            self._uniform = torch.cat((self._uniform, uniform))
+            self._delays = torch.cat((self._delays, delays))
         self._row[slot] = self._seeds.index(episode.seed)
 
-    def _extend(self, length: int) -> None:
-        """Draw further control steps of every seed, until there are ``length``."""
-        count = length - self._length
-        tables = [g.draw(count, len(self._half), self._noise.latency) for g in self._generators]
-        uniform = np.stack([low_to_high(u, self._half) for u, _ in tables])
-        delays = np.stack([d for _, d in tables])
-        new = torch.tensor(uniform, dtype=torch.float32, device=self._device)
-        self._uniform = torch.cat((self._uniform, new), dim=1)
-        self._delays = torch.cat((self._delays, torch.tensor(delays, device=self._device)), dim=1)
-        self._length = length
+    def _tables(self, generators: Sequence[_PythonGenerator], count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """The next ``count`` control steps of some generators: (G, count, W) in physical units, and delays (G, count)."""
+        drawn = [g.draw(count, len(self._half), self._noise.latency) for g in generators]
+        uniform = np.stack([low_to_high(u, self._half) for u, _ in drawn])
+        delays = np.stack([d for _, d in drawn])
+        return (
+            torch.tensor(uniform, dtype=torch.float32, device=self._device),
+            torch.tensor(delays, device=self._device),
+        )
 
     def reserve(self, steps: int) -> None:
         """See ``NoiseStream.reserve``."""
         while self._length < steps:
-            self._extend(self._length + TABLE_STEPS)
+            uniform, delays = self._tables(self._generators, TABLE_STEPS)
+            self._uniform = torch.cat((self._uniform, uniform), dim=1)
+            self._delays = torch.cat((self._delays, delays), dim=1)
+            self._length += TABLE_STEPS
 
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """See ``NoiseStream.draw``. Call ``reserve`` before an episode can get beyond the table."""

@@ -117,9 +117,27 @@ class Puppet(FakeBackend):
     def __init__(self, *arguments, **options) -> None:
         self.sampled: list[tuple[int, int, int]] = []
         super().__init__(*arguments, **options)
+        self.resting = FakeScript()
+        if options.get("script") is None:
+            self.script = self.resting
 
     def _place_feet(self, mask: torch.Tensor) -> None:
         pass
+
+    def _advance(self, mask: torch.Tensor) -> None:
+        if self.script is not self.resting or not bool(mask.all()):
+            super()._advance(mask)
+            return
+        state, step = self._state, self.scene.physics.timestep  # the base rests, the joints follow their motors
+        state.joint_torque.copy_(self._torque())
+        state.joint_velocity.add_(step * state.joint_torque)
+        state.joint_position.add_(step * state.joint_velocity)
+        self._substeps_since_reset += 1
+        state.time.copy_(self._substeps_since_reset.to(self.dtype) * step)
+
+    def _watch(self, mask: torch.Tensor, substep: int) -> None:
+        if self.script is not self.resting:
+            super()._watch(mask, substep)
 
     def step(self, joint_targets, *, delay=None, sample_at=None, worlds=None, substeps=None) -> None:
         mask, state = self._mask(worlds), self._state
