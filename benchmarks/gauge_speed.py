@@ -2,8 +2,9 @@
 
     python benchmarks/gauge_speed.py POLICY [--friction 0.6] [--threads 1 2] [--repeat 1] [--out FILE.json]
 
-For each number of threads it plays the suite's stress pipeline at the given frictions into a temporary folder and prints: wall time, physics
-steps, time per physics step and core, the share of the wall time spent inside MuJoCo's own stepping, and the score.
+For each number of threads it plays the suite's stress pipeline at the given frictions into a temporary folder and
+prints: wall time, physics steps, time per physics step and core, the share of the wall time spent inside MuJoCo's own
+stepping, and the score.
 """
 
 from __future__ import annotations

@@ -24,8 +24,7 @@ from ..policy.loading import find_policy, load_policy
 from ..robots import Robot, RobotError, load_robot
 from ..terrains.registry import make_terrain, terrain_names
 from .episodes import Episode
-from .goals import SUB_COMMANDS
-from .goals import check_terrain
+from .goals import SUB_COMMANDS, check_terrain
 from .pipelines import PIPELINES, Environment, Plan, make_environments
 from .results import fold, health, rows_csv
 from .runner import EpisodeRunner, Progress
