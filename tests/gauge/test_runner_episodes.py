@@ -180,6 +180,19 @@ def test_a_diverged_world_is_a_fall_and_costs_the_step_in_which_it_happened(suit
     assert np.isfinite(column(record, "quality")).all()
 
 
+@pytest.mark.parametrize("name", [REFERENCE, OWN])
+def test_worlds_that_are_invalid_from_the_start_end_as_results(name):
+    """Their observations are no numbers: what a policy makes of them is no error of the policy's."""
+    policy = ScriptedPolicy(lambda observation: observation[:, 9:21])
+    script = FakeScript(diverge_time=at(0.0))
+    episodes = [episode(DIAGONAL, MAXIMUM), episode(TARGET, stage="search")]
+    records = play(short_suite(name), episodes, script, terrain=ground((5.0, 0.0, 0.4)), policy=policy)
+    assert [r.diverged for r in records] == [True, True]
+    assert records[1].success is False
+    assert not records[0].samples.any()
+    assert len(records[0].samples) == (14 * 4 if name == OWN else 0)
+
+
 def test_an_overflow_is_recorded_and_interrupts_nothing():
     quiet = play(short_suite(OWN), [episode(MAXIMUM)])[0]
     record = play(short_suite(OWN), [episode(MAXIMUM)], FakeScript(overflow_time=at(0.2)))[0]
