@@ -336,8 +336,11 @@ class EpisodeRunner:
 
     def _command(self, state: PhysicsState, goal: torch.Tensor, commanded: torch.Tensor) -> torch.Tensor:
         """What the goals command, (K, 3); zero while settling."""
-        command = self._goals.velocity_command(goal, self._goal_time, self._limits)
-        aims = self._goals.is_target[goal]
+        aims = self._goals.is_target[goal] & commanded
+        if self._cheap_checks and torch.equal(aims, commanded):
+            command = torch.zeros_like(self._limits)
+        else:
+            command = self._goals.velocity_command(goal, self._goal_time, self._limits)
         if not self._cheap_checks or bool(aims.any()):
             offset = target_offset(state, self._target, self.suite.commands.heading_frame)
             towards = target_command(offset, self._backward, self._speed, self._limits[:, 2])
@@ -346,7 +349,10 @@ class EpisodeRunner:
 
     def _check_action(self, observation: torch.Tensor, action: torch.Tensor, active: torch.Tensor) -> None:
         """A policy must answer finite observations with finite actions."""
-        bad = active & ~torch.isfinite(action).all(1)
+        finite = torch.isfinite(action)
+        if bool(finite.all()):
+            return
+        bad = active & ~finite.all(1)
         if bool(bad.any()):
             bad &= torch.isfinite(observation).all(1)
             if bool(bad.any()):
@@ -408,8 +414,9 @@ class EpisodeRunner:
         going = commanded & ~fall & ~penetration
         aims = self._goals.is_target[goal]
         back = going & ~aims & (self._part_steps >= self._goals.steps[goal])
-        self._end_part(back, goal)
-        if not self._cheap_checks or bool(aims.any()):
+        if not self._cheap_checks or bool(back.any()):
+            self._end_part(back, goal)
+        if not self._cheap_checks or bool((going & aims).any()):
             offset = target_offset(self.backend.state, self._target, commands.target_distance)
             near = torch.hypot(offset[:, 0], offset[:, 1]) < commands.target_radius
             reached = going & aims & near
