@@ -20,7 +20,7 @@ demo: install
 	$(BIN)/gaitgauge evaluate pretrained --suite demo --out results/demo
 
 test: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: install
 	$(BIN)/python -m pytest -m slow
