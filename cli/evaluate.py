@@ -58,7 +58,11 @@ def run_evaluation(
             results = evaluate(request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=watch)
     except KeyboardInterrupt:
         again = shlex.join(["gaitgauge", *[a for a in sys.argv[1:] if a != "--resume"], "--resume"])
-        console.print(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}", highlight=False)
+        console.print(
+            f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}",
+            highlight=False,
+            soft_wrap=True,
+        )
         raise typer.Exit(130) from None
     report = write_report(folder)
     if json_output:
@@ -119,11 +123,7 @@ class _display:  # noqa: N801  (reads as a verb where it is used)
         self._last = now
         done = 1.0 - status.remaining_work
         left = status.seconds * status.remaining_work / done if done > 0.02 else None
-        text = (
-            f"{status.done} of about {round(status.done / max(done, 1e-6))} episodes"
-            if done > 0.02
-            else f"{status.done} episodes"
-        )
+        text = f"{status.done} of about {status.expected} episodes"
         places = sorted({f"{e.terrain} L{e.level}" if e.level else e.terrain for e in status.active})
         running = ", ".join(places[:5]) + (f" and {len(places) - 5} more" if len(places) > 5 else "")
         remaining = f"about {_duration(left)} left" if left is not None else "estimating time"

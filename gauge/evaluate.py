@@ -67,6 +67,8 @@ class Status:
     """Episodes that have ended, those of an earlier run included."""
     known: int
     """Episodes known to be needed so far; level searches add more."""
+    expected: int
+    """Episodes expected in all, searches that are still open estimated."""
     active: tuple[Episode, ...]
     physics_steps: int
     seconds: float
@@ -271,6 +273,7 @@ def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -
     def on_step(progress: Progress) -> None:
         left = plan.expected_left()
         total = plan.done + left
+        expected = round(total)
         for episode, age in zip(progress.active, progress.ages, strict=True):
             usual = sum(seconds[g] for g in episode.goals) / suite.physics.control_period
             left -= min(age / usual, 0.95)
@@ -278,6 +281,7 @@ def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -
             Status(
                 done=plan.done,
                 known=plan.total_known,
+                expected=expected,
                 active=progress.active,
                 physics_steps=progress.physics_steps,
                 seconds=time.perf_counter() - began,
