@@ -344,6 +344,6 @@ class PhysicsBackend(ABC):
         """Free what the engine holds. A closed backend must not be used again."""
 
 
-def unsupported(backend: str, needed: Sequence[str], capabilities: Mapping[str, Capability]) -> list[str]:
+def unsupported(needed: Sequence[str], capabilities: Mapping[str, Capability]) -> list[str]:
     """Those names of ``needed`` that the engine does not support at all."""
     return [n for n in needed if capabilities[n].support is Support.NONE]

@@ -92,7 +92,7 @@ def all_checks() -> tuple[Check, ...]:
 def run_check(check: Check, bench: Bench) -> CheckResult:
     """Run one check; an error in the engine is a failed check."""
     start = perf_counter()
-    missing = unsupported("", check.needs, bench.capabilities)
+    missing = unsupported(check.needs, bench.capabilities)
     if missing:
         outcome, detail = (
             Outcome.NOT_SUPPORTED,
