@@ -191,7 +191,10 @@ def train(
         str | None, typer.Option(help="Continue: latest, a run directory or a model_*.pt.", metavar="latest|PATH")
     ] = None,
     init_from: Annotated[
-        str | None, typer.Option(help="Begin a new run with the networks of this checkpoint.", metavar="PATH")
+        str | None,
+        typer.Option(
+            help="Begin a new run with these networks: a checkpoint or a policy file.", metavar="PATH|pretrained"
+        ),
     ] = None,
     run_name: Annotated[str | None, typer.Option(help="Appended to the date in the run directory's name.")] = None,
     log_root: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("logs/rsl_rl"),

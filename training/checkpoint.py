@@ -135,11 +135,15 @@ def copy_checkpoint(source: Path, target: Path) -> None:
         raise CheckpointError(_write_failure(target, source.stat().st_size if source.exists() else 0, error)) from error
 
 
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
+def read_checkpoint(path: str | Path, *, training_state: bool = True) -> dict[str, Any]:
     """Read a training checkpoint onto the CPU.
 
+    Args:
+        path: the file.
+        training_state: whether it must hold what training needs to continue; otherwise a policy file will do.
+
     Raises:
-        CheckpointError: no such file, damaged, or a policy without what training needs to continue.
+        CheckpointError: no such file, damaged, no policy of this project, or a policy without what training needs.
     """
     file = Path(path)
     try:
@@ -151,6 +155,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     except PolicyError as error:
         raise CheckpointError(f"Cannot resume: {error}.") from error
     training = entries.get("training")
+    if not training_state and training is None and entries.get("format") == FORMAT and "state_dict" in entries:
+        return entries
     if entries.get("format") != FORMAT or not isinstance(training, Mapping):
         raise CheckpointError(
             f"Cannot resume from '{path}': it holds no training state; give a model_<iteration>.pt of a training run."

@@ -156,12 +156,20 @@ class RunConfiguration:
     """Longest wait for pending scores at the end of a run [s]."""
     random_episode_start: bool = True
     """Whether the first episodes start at random ages, so that resets spread over time."""
+    keep_episodes: bool = True
+    """Whether checkpoints hold the running episodes, so that resuming equals never having stopped. They are most of a
+    checkpoint with thousands of environments; without them a resumed run begins new episodes on the levels reached."""
+    bootstrap_iterations: int = 60
+    """Iterations at the start of a run from a bare policy (``--init-from``) in which only a teacher and a critic for
+    it are learned."""
     nonfinite_limit: float = 0.01
     """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run
     stops."""
 
     def __post_init__(self) -> None:
         _positive(self, "steps_per_iteration", "iterations", "save_interval", "nonfinite_limit")
+        if self.bootstrap_iterations < 1:
+            raise ConfigurationError(f"bootstrap_iterations is {self.bootstrap_iterations}; it must be at least 1.")
         if self.gauge_interval < 0:
             raise ConfigurationError(f"gauge_interval is {self.gauge_interval}; it must be 0 (never) or positive.")
         if not self.experiment or PurePath(self.experiment).name != self.experiment:

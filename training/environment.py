@@ -127,6 +127,10 @@ class TrainingEnvironment(VecEnv):
             configuration.randomization, self.num_envs, len(self.robot.collision_bodies), self._generator
         )
         self._bodies.apply(self.backend)
+        schedule = configuration.schedule
+        if not 0.0 <= schedule.begin <= 1.0:
+            raise ConfigurationError(f"schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1")
+        self.program.memory.step.fill_(round(schedule.begin * schedule.horizon_steps))
         self._begin(level.to(self.device))
         self._after_physics: Callable[[], Verdict] = self.program.after_physics
         self._observe: Callable[[], Observations] = self.program.observe
@@ -153,9 +157,10 @@ class TrainingEnvironment(VecEnv):
         return of_kind / of_kind.sum(dim=1, keepdim=True).clamp_min(1.0)
 
     def _begin(self, level: torch.Tensor) -> None:
-        """Begin the first episode of every world."""
+        """Begin an episode in every world, on the given levels, (N,)."""
         memory = self.program.memory
         memory.level.copy_(level)
+        memory.moves_level.zero_()  # what an earlier episode came to moves nothing
         if self.program.push_steps > 0:
             memory.push_phase.random_(self.program.push_steps, generator=self._generator)
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -289,6 +294,18 @@ class TrainingEnvironment(VecEnv):
 
     # --- resuming ---------------------------------------------------------------------------------------------------
 
+    def progress_dict(self) -> dict[str, Any]:
+        """What a run has reached, without its running episodes: step counter, levels, and the bodies that were drawn,
+        for which the levels were found.
+        """
+        return {
+            "version": STATE_VERSION,
+            "step": self.program.memory.step.clone(),
+            "level": self.program.memory.level.to(torch.int16),
+            "bodies": {f.name: getattr(self._bodies, f.name).clone() for f in fields(self._bodies)},
+            "common_step_counter": self.common_step_counter,
+        }
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that continuing needs: memory, random state, randomization, observations, and poses and
         velocities of the physics.
@@ -310,7 +327,8 @@ class TrainingEnvironment(VecEnv):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``. The environment must have been built with the same configuration.
+        """Continue from ``state_dict``, or begin new episodes from ``progress_dict``. The environment must have been
+        built with the same configuration.
 
         Raises:
             ValueError: the state is of another version or of another environment.
@@ -319,6 +337,9 @@ class TrainingEnvironment(VecEnv):
             raise ValueError(
                 f"the saved environment has version {state.get('version')}, this program reads {STATE_VERSION}"
             )
+        if "memory" not in state:
+            self._begin_from(state)
+            return
         program = self.program
         program.memory.restore({name: value.to(self.device) for name, value in state["memory"].items()})
         for name, value in state["motors"].items():
@@ -342,6 +363,19 @@ class TrainingEnvironment(VecEnv):
             terrain_index=program.memory.terrain_index,
         )
         self._read(AFTER_RESET)
+
+    def _begin_from(self, progress: dict[str, Any]) -> None:
+        """Begin new episodes where ``progress_dict`` says that the run is."""
+        level = progress["level"]
+        if level.shape != (self.num_envs,):
+            raise ValueError(
+                f"the saved environment does not fit: it has {len(level)} worlds, this environment {self.num_envs}"
+            )
+        self.program.memory.step.copy_(progress["step"])
+        self.common_step_counter = progress["common_step_counter"]
+        self._bodies = BodyParameters(**{name: value.to(self.device) for name, value in progress["bodies"].items()})
+        self._bodies.apply(self.backend)
+        self._begin(level.to(self.device, torch.int64))
 
 
 def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:

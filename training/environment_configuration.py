@@ -35,6 +35,9 @@ class ScheduleConfiguration:
     horizon_steps: int = 240_000
     """Environment steps, per environment, of the whole run: 24 steps times 10,000 iterations. Every ramp and stage is
     a fraction of it."""
+    begin: float = 0.0
+    """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin
+    with the commands of a robot that cannot walk yet."""
 
 
 @dataclass(frozen=True, kw_only=True)

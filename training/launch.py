@@ -14,6 +14,7 @@ import torch
 
 from ..backends.registry import find_backend, list_backends
 from ..gauge.suite import load_suite
+from ..policy.loading import find_policy
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, read_checkpoint
 from .configuration import ConfigurationError
@@ -63,7 +64,7 @@ class TrainRequest:
     resume: str | None = None
     """``latest``, a run directory or a checkpoint to continue."""
     init_from: str | None = None
-    """Checkpoint whose networks a new run begins with."""
+    """Checkpoint or policy whose networks a new run begins with."""
     run_name: str | None = None
     log_root: Path = LOG_ROOT
     capture: bool | None = None
@@ -129,9 +130,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         ]
         own = _last_of_each(own)
     elif request.init_from is not None:
-        read_checkpoint(
-            find_checkpoint(request.init_from, experiment=task.training.run.experiment, root=request.log_root)
-        )
+        read_checkpoint(_first_weights(request, task), training_state=False)
     if request.seconds is not None:
         # The limit is for the whole command: by default nothing is waited for beyond it.
         task = find_task(request.task, [f"{_WAIT}=0", *own])
@@ -159,6 +158,19 @@ def prepare(request: TrainRequest) -> TrainPlan:
     return TrainPlan(
         request=request, task=task, backend=backend, device=device, checkpoint=checkpoint, run=run, settings=settings
     )
+
+
+def _first_weights(request: TrainRequest, task: Task) -> Path:
+    """The file whose networks a new run begins with: what ``--resume`` takes, or the policy that ships with the
+    project.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    assert request.init_from is not None
+    if request.init_from == "pretrained":
+        return find_policy(request.init_from)
+    return find_checkpoint(request.init_from, experiment=task.training.run.experiment, root=request.log_root)
 
 
 def _own_overrides(request: TrainRequest) -> list[str]:
@@ -271,8 +283,7 @@ def train(
         if plan.checkpoint is not None:
             runner.load(str(plan.checkpoint))
         elif request.init_from is not None:
-            source = find_checkpoint(request.init_from, experiment=run_settings.experiment, root=request.log_root)
-            runner.load_weights(source)
+            runner.load_weights(_first_weights(request, task))
         left = run_settings.iterations - runner.current_learning_iteration
         if left <= 0:
             raise ConfigurationError(

@@ -358,9 +358,10 @@ class TrainingRunner(OnPolicyRunner):
             TrainingDivergedError: a weight is not finite.
             CheckpointError: the file cannot be written.
         """
+        kept = "state_dict" if self.configuration.run.keep_episodes else "progress_dict"
         local = {
             "random": random_state(self.device),
-            "environment": self.env.state_dict() if hasattr(self.env, "state_dict") else None,
+            "environment": getattr(self.env, kept)() if hasattr(self.env, kept) else None,
             "num_envs": self.env.num_envs,
             "log": self.logger.state_dict(),
         }
@@ -431,17 +432,21 @@ class TrainingRunner(OnPolicyRunner):
             local = torch.load(_rank_file(path, self.gpu_global_rank), map_location="cpu", weights_only=True)
         self.logger.load_state_dict((local or training)["log"])
         if local is not None:
-            self._fresh = not self._load_environment(path, local["environment"])
+            loaded = self._load_environment(path, local["environment"])
+            self._fresh = not loaded or not self.configuration.run.keep_episodes
             restore_random_state(local["random"], self.device)
         return entries.get("infos")
 
     def load_weights(self, path: str | Path) -> None:
         """Begin with the networks of another run's checkpoint; optimizers, counters and episodes start anew.
 
+        A policy file without training state gives the student alone; the first ``run.bootstrap_iterations`` then find
+        a teacher and a critic for it.
+
         Raises:
             CheckpointError: damaged, of other joints or another observation, or of other networks.
         """
-        entries = read_checkpoint(path)
+        entries = read_checkpoint(path, training_state=False)
         theirs = PolicyContract.from_json(entries["contract"])
         for name in ("joint_names", "observation", "history", "action_scale", "default_joint_position"):
             if getattr(theirs, name) != getattr(self.contract, name):
@@ -451,7 +456,11 @@ class TrainingRunner(OnPolicyRunner):
                 )
         self._check_network(path, entries, "start")
         try:
-            self.alg.load(entries, {"actor": True, "critic": True}, True)
+            if "training" in entries:
+                self.alg.load(entries, {"actor": True, "critic": True}, True)
+            else:
+                self.alg.actor.student.load_state_dict(entries["state_dict"])
+                self.alg.follow_student(self.configuration.run.bootstrap_iterations)
         except (RuntimeError, KeyError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise CheckpointError(

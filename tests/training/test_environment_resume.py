@@ -3,6 +3,7 @@
 import pytest
 import torch
 from gaitgauge.backends.fake import FakeScript
+from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment_configuration import (
     CommandConfiguration,
     CommandStage,
@@ -95,3 +96,40 @@ def test_states_of_other_environments_are_refused():
         environment.load_state_dict({**state, "version": 7})
     with pytest.raises(ValueError, match=r"'episode_length' has shape \(12,\), this environment needs \(8,\)"):
         make(8, **BUSY).load_state_dict(state)
+
+
+def test_progress_without_episodes(tmp_path):
+    """Levels, schedules and bodies survive; episodes begin anew on those levels, and move none of them by beginning."""
+    reached = busy()
+    run(reached, 17, 1)
+    level = torch.arange(12) % 3
+    reached.program.memory.level.copy_(level)
+    torch.save(reached.progress_dict(), tmp_path / "progress.pt")
+
+    resumed = busy(seed=99)
+    run(resumed, 3, 5)
+    resumed.load_state_dict(torch.load(tmp_path / "progress.pt", weights_only=True))
+    memory = resumed.program.memory
+    assert torch.equal(memory.level, level) and resumed.common_step_counter == 17
+    assert torch.equal(resumed.program.progress(), reached.program.progress())
+    assert int(memory.episode_length.abs().sum()) == 0 and float(memory.history[:, :-1].abs().sum()) == 0.0
+    kinds, variants = resumed.program._tile_index, memory.terrain_index
+    assert all(int(variants[i]) in kinds[resumed.kind[i], level[i]].tolist() for i in range(12))
+    for name, value in reached.progress_dict()["bodies"].items():
+        assert torch.equal(resumed.progress_dict()["bodies"][name], value), name
+    run(resumed, 5, 2)
+
+
+def test_progress_of_other_worlds_is_refused():
+    progress = busy().progress_dict()
+    with pytest.raises(ValueError, match="12 worlds, this environment 8"):
+        make(8, **BUSY).load_state_dict(progress)
+
+
+def test_a_run_can_begin_in_the_middle_of_its_schedule():
+    environment = make(12, **{**BUSY, "schedule": ScheduleConfiguration(horizon_steps=40, begin=0.5)})
+    assert float(environment.program.progress()) == 0.5
+    run(environment, 4, 1)
+    assert float(environment.program.progress()) == pytest.approx(0.6)
+    with pytest.raises(ConfigurationError, match=r"schedule\.begin is 2"):
+        make(12, **{**BUSY, "schedule": ScheduleConfiguration(begin=2.0)})

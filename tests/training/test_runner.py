@@ -6,11 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.training.checkpoint import CheckpointError, read_checkpoint
+from gaitgauge.robots import load_robot
+from gaitgauge.training.algorithms.symmetry import build_mirror
+from gaitgauge.training.checkpoint import CheckpointError, checkpoint_entries, read_checkpoint, write_checkpoint
 from gaitgauge.training.runner import TrainingDivergedError, TrainingRunner
 from gaitgauge.training.scoring import FunctionScorer
 from gaitgauge.training.seeding import seed_everything
-from toy_training import ToyEnv, toy_configuration, toy_contract
+from toy_training import HISTORY, ToyEnv, toy_configuration, toy_contract
 
 
 def make(
@@ -214,3 +216,62 @@ def test_resume_refuses_what_does_not_fit(tmp_path):
         make().load(str(damaged))
     with pytest.raises(CheckpointError, match="Cannot read"):
         make().load(str(tmp_path / "none.pt"))
+
+
+@pytest.mark.parametrize("symmetry", ["none", "augment"])
+def test_beginning_with_a_bare_policy(tmp_path, symmetry):
+    """First a teacher and a critic for the student, which stands still and acts everywhere; then both go on."""
+    settings = toy_configuration(
+        algorithm={"symmetry": symmetry, "epochs": 20}, run={"bootstrap_iterations": 6, "nonfinite_limit": 0.5}
+    )
+    mirror = build_mirror(toy_contract(), load_robot("go2"), history_length=HISTORY) if symmetry != "none" else None
+    trained = make(configuration=settings, mirror=mirror)
+    trained.learn(2)
+    network = trained.stored_network()
+    write_checkpoint(tmp_path / "policy.pt", checkpoint_entries(toy_contract(), network, {}))
+
+    runner = make(seed=5, configuration=settings, mirror=mirror)
+    runner.load_weights(tmp_path / "policy.pt")
+    for name, value in network.state_dict.items():
+        assert torch.equal(runner.stored_network().state_dict[name], value)
+    observations = runner.env.get_observations()
+    alg, order = runner.alg, runner.alg.storage.split.order
+    with torch.inference_mode():
+        alg.act(observations)
+        mean = alg.transition.distribution_params[0]
+        history, frame = observations["history"][order], observations["policy"][order]
+        assert torch.allclose(mean, alg.actor.action_mean(alg.actor.student_latent(history)[0], frame), atol=1e-6)
+
+    def error():
+        with torch.no_grad():
+            seen = runner.env.get_observations()
+            latent = alg.actor.teacher_latent(seen["privileged"]) - alg.actor.student_latent(seen["history"])[0]
+            return float(latent.square().mean())
+
+    before = error()
+    for _ in range(6):
+        assert runner.alg.bootstrap is not None
+        std = runner.alg.actor.output_std.clone()
+        runner.learn(1)
+        assert {"Loss/teacher_latent", "Loss/value"} <= runner.logger.scalars.keys()
+        for name, value in network.state_dict.items():
+            assert torch.equal(runner.stored_network().state_dict[name], value)
+        assert torch.equal(runner.alg.actor.output_std, std)
+    assert runner.alg.bootstrap is None and error() < 0.5 * before
+    runner.learn(1)
+    assert "Loss/surrogate" in runner.logger.scalars
+    changed = runner.stored_network().state_dict
+    assert not torch.equal(changed["actor.0.weight"], network.state_dict["actor.0.weight"])
+
+
+def test_slim_checkpoints_keep_weights_and_progress(tmp_path):
+    configuration = toy_configuration(run={"keep_episodes": False})
+    make(tmp_path, configuration=configuration).learn(1)
+    entries = read_checkpoint(tmp_path / "model_1.pt")
+    assert entries["training"]["environment"] is None  # the toy has no progress of its own
+    said = []
+    resumed = make(seed=7, configuration=configuration, message=said.append)
+    resumed.load(str(tmp_path / "model_1.pt"))
+    assert "episodes start anew" in said[0] and resumed.current_learning_iteration == 1
+    assert_same(resumed.alg.save(), {k: entries[k] for k in resumed.alg.save()})
+    resumed.learn(1)

@@ -27,6 +27,7 @@ from torch import nn
 
 from ..configuration import AlgorithmConfiguration, ConfigurationError, NetworkConfiguration
 from ..networks import CtsActor, CtsCritic, student_architecture
+from .bootstrap import Bootstrap
 from .graphs import GraphedStep
 from .storage import EnvironmentSplit, StratifiedStorage
 from .symmetry import Mirror
@@ -89,6 +90,7 @@ class CTS(PPO):
         self.configuration = configuration
         self.mirror = mirror.to(device) if mirror is not None and configuration.symmetry != "none" else None
         self.transition = StratifiedStorage.Transition()
+        self.bootstrap: Bootstrap | None = None
         self._policy_parameters = [*actor.policy_parameters(), *critic.parameters()]
         self.optimizer = torch.optim.Adam(self._policy_parameters, lr=self._rate, fused=on_gpu, capturable=on_gpu)
         self.student_optimizer = torch.optim.Adam(
@@ -173,6 +175,10 @@ class CTS(PPO):
             self._rate = torch.zeros((), device=self.device)
         self._rate.fill_(float(value))
 
+    def follow_student(self, iterations: int) -> None:
+        """Spend the next iterations on a teacher and a critic for the present student (see ``bootstrap``)."""
+        self.bootstrap = Bootstrap(self, iterations) if iterations > 0 else None
+
     # Rollout
 
     def act(self, obs: TensorDict) -> torch.Tensor:
@@ -185,7 +191,12 @@ class CTS(PPO):
         history = obs["history"][split.order[split.num_teacher :]]
         with self._autocast():
             student_latent = self.actor.student_latent(history)[0]
-            latent = torch.cat((self.actor.teacher_latent(privileged[: split.num_teacher]), student_latent))
+            if self.bootstrap is None:
+                teacher_latent = self.actor.teacher_latent(privileged[: split.num_teacher])
+            else:
+                others = obs["history"][split.order[: split.num_teacher]]
+                teacher_latent = self.actor.student_latent(others)[0]
+            latent = torch.cat((teacher_latent, student_latent))
             mean = self.actor.action_mean(latent, policy).float()
             values = self.critic.value(latent, privileged).float()
         self.actor.distribution.update(mean)
@@ -229,6 +240,11 @@ class CTS(PPO):
             Means over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
             and were dropped.
         """
+        if self.bootstrap is not None:
+            losses = self.bootstrap.update()
+            if self.bootstrap.over:
+                self.bootstrap = None
+            return losses
         storage, settings, mirror = self.storage, self.configuration, self.mirror
         self._policy_metrics.zero_()
         self._student_metrics.zero_()
