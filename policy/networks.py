@@ -21,7 +21,6 @@ from itertools import pairwise
 
 import torch
 from torch import nn
-from torch.nn import functional
 
 from .trot import TrotController
 
@@ -37,9 +36,19 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
 }
 
 
+class Perceptron(nn.Sequential):
+    """Layers one after another, called without hooks: on the CPU a call through them costs as much as a small layer."""
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        """Outputs (N, last width) for inputs (N, first width)."""
+        for layer in self:
+            input = layer.forward(input)
+        return input
+
+
 def multilayer_perceptron(
     widths: Sequence[int], *, activation: str = "elu", activate_output: bool = False
-) -> nn.Sequential:
+) -> Perceptron:
     """Linear layers of the given widths (input first, output last) with an activation between them.
 
     The linear layers are numbered 0, 2, 4 … in the state dict, as rsl_rl numbers them.
@@ -49,7 +58,12 @@ def multilayer_perceptron(
     layers: list[nn.Module] = []
     for width_in, width_out in pairwise(widths):
         layers += [nn.Linear(width_in, width_out), ACTIVATIONS[activation]()]
-    return nn.Sequential(*layers) if activate_output else nn.Sequential(*layers[:-1])
+    return Perceptron(*layers) if activate_output else Perceptron(*layers[:-1])
+
+
+def unit(latent: torch.Tensor) -> torch.Tensor:
+    """Vectors of unit length, those that are zero left zero, (…, L). To the last bit what ``functional.normalize`` gives."""
+    return latent / torch.linalg.vector_norm(latent, dim=-1, keepdim=True).clamp_min(1e-12)
 
 
 class MlpNetwork(nn.Module):
@@ -119,7 +133,7 @@ class CtsNetwork(nn.Module):
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for ``history`` (N, H, F)."""
-        latent = functional.normalize(self.encoder(history.flatten(1)), dim=-1)
+        latent = unit(self.encoder(history.flatten(1)))
         return self.actor(torch.cat((latent, history[:, -1]), dim=-1))
 
 
@@ -173,8 +187,9 @@ class ExpertMixture(nn.Module):
         seen = history if self.sees_all else history[:, :, self.seen]
         features = self.trunk(seen.flatten(1)).unflatten(1, (self.num_experts, self.expert_width))
         head_weight = self.head_weight.expand(self.num_experts, -1, -1)
-        experts = torch.einsum("nke,kle->nkl", features, head_weight) + self.head_bias
-        return (weights.unsqueeze(-1) * experts).sum(dim=1), weights
+        head_bias = self.head_bias.expand(self.num_experts, -1)
+        experts = torch.bmm(features.transpose(0, 1), head_weight.transpose(1, 2)) + head_bias[:, None]
+        return (weights.t()[..., None] * experts).sum(dim=0), weights
 
 
 class MoeCtsNetwork(nn.Module):
@@ -222,7 +237,7 @@ class MoeCtsNetwork(nn.Module):
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for ``history`` (N, H, F)."""
-        latent = functional.normalize(self.encoder(history)[0], dim=-1)
+        latent = unit(self.encoder(history)[0])
         return self.actor(torch.cat((latent, history[:, -1]), dim=-1))
 
 
