@@ -43,9 +43,12 @@ from .mujoco_warp_arrays import (
     to_warp,
 )
 from .mujoco_warp_device import DeviceScope, bytes_per_world, find_device, is_memory_error, memory_advice
+from .mujoco_warp_fields import repair_height_fields
 from .mujoco_warp_model import Capacity, SharedModel, buffer_capacity, build_shared_model
 from .mujoco_warp_order import CanonicalOrder
 from .mujoco_warp_parameters import BATCHED_FIELDS, WorldParameters
+
+repair_height_fields()
 
 _ALARMS = mujoco_warp.OverflowType
 _DROPPED = int(
@@ -127,14 +130,11 @@ class MujocoWarpBackend(PhysicsBackend):
         self._palette, self._links = palette_arrays(shared.palette), link_arrays(shared.chains)
         self._roles, self._slot_geom = role_arrays(shared), to_warp(shared.slot_geom, int)
         self._contacts = contact_arrays(self._data, pyramidal=scene.physics.cone == "pyramidal")
-        self._field = -1
-        if shared.has_field and model.geom_margin.any():
-            self._field = int(shared.slot_geom[-1])
-        self._order = CanonicalOrder(self._model, self._data) if scene.physics.deterministic else None
-        if self._field >= 0 or self._order is not None:
-            self._model.callback.contactfilter = self._after_collision
-        if self._order is not None:
-            self._model.callback.control = self._before_solver
+        if scene.physics.deterministic:
+            self._order = CanonicalOrder(self._model, self._data)
+            # called between collision detection and constraints, and between constraints and solver
+            self._model.callback.contactfilter = lambda _, data: self._order.sort_contacts(data)
+            self._model.callback.control = lambda _, data: self._order.sort_rows(data)
         self._active, self._sample_at = self._integers(n), self._integers(n)
         self._has_request = self._integers(1)
         self._terrain, self._new_terrain = self._integers(n), self._integers(n)
@@ -163,18 +163,6 @@ class MujocoWarpBackend(PhysicsBackend):
 
     def _integers(self, *shape: int) -> torch.Tensor:
         return torch.zeros(shape, dtype=torch.int32, device=self.device)
-
-    def _after_collision(self, _: mujoco_warp.Model, data: mujoco_warp.Data) -> None:
-        """Called by mujoco_warp between collision detection and constraints."""
-        if self._field >= 0:
-            wp.launch(kernels.correct_field_contacts, dim=data.naconmax, inputs=[self._contacts, self._field])
-        if self._order is not None:
-            self._order.sort_contacts(data)
-
-    def _before_solver(self, _: mujoco_warp.Model, data: mujoco_warp.Data) -> None:
-        """Called by mujoco_warp between constraints and solver."""
-        if self._order is not None:
-            self._order.sort_rows(data)
 
     def _reset_to_default(self) -> None:
         """Every world at its first terrain's origin in the default pose."""

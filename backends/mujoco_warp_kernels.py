@@ -152,27 +152,6 @@ def watch_penetration(
 
 
 @wp.kernel
-def correct_field_contacts(contacts: ContactArrays, field: int) -> None:
-    """Take the contact margin out of the distances of height-field contacts.
-
-    mujoco_warp 3.17 lifts the field's surface by the margin and inflates the other geom by half of it, but reports the
-    distance between these: contacts would begin with a jolt, and feet would stand that much too high. (Its other shapes
-    are right.)
-    """
-    contact = wp.tid()
-    if contact >= contacts.count[0]:
-        return
-    if contacts.geom[contact][0] != field:
-        return
-    frame = contacts.frame[contact]
-    normal = wp.vec3(frame[0, 0], frame[0, 1], frame[0, 2])
-    lift = contacts.margin[contact] * normal[2]
-    inflation = 0.5 * contacts.margin[contact]
-    contacts.distance[contact] = contacts.distance[contact] + lift + inflation
-    contacts.position[contact] = contacts.position[contact] - normal * (0.5 * (lift - inflation))
-
-
-@wp.kernel
 def reset_worlds(
     active: wp.array[int],
     has_held: wp.array[int],

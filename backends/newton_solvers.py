@@ -20,7 +20,10 @@ import warp as wp
 from . import newton_kernels as kernels
 from . import newton_solver_kernels as solver_kernels
 from .base import CAPABILITY_NAMES, BackendError, Capability, Scene, Support
+from .mujoco_warp_fields import repair_height_fields
 from .newton_model import WorldModel, carriers, import_differences
+
+repair_height_fields()
 
 DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
 """Contacts per world for which room is made, by the palette's hardest shape; a robot that lies flat needs about 30."""

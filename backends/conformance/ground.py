@@ -142,6 +142,55 @@ def height_field(bench: Bench) -> str:
     return f"heights {', '.join(f'{h:.2f}' for h in heights)} m{fluctuation}"
 
 
+def waves() -> Terrain:
+    """A height field of waves 0.12 m high, 1 m long along x and 1.4 m along y, with nodes every 0.08 m."""
+    x, y = np.meshgrid(np.linspace(-3.0, 3.0, 76), np.linspace(-2.0, 2.0, 51))
+    heights = 0.06 + 0.03 * (np.sin(2.0 * np.pi * x) + np.cos(2.0 * np.pi * y / 1.4))
+    field = HeightField(center=(0.0, 0.0), half_size=(3.0, 2.0), heights=heights - heights.min())
+    return Terrain(name="conformance_waves", family="field", height_field=field)
+
+
+def clearance(terrain: Terrain, points: np.ndarray, reach: float) -> np.ndarray:
+    """Distance of points from the ground [m], found on a grid of ``reach`` [m] around each; (M,) for points (M, 3)."""
+    span = np.linspace(-reach, reach, 61)
+    dx, dy = (grid.ravel() for grid in np.meshgrid(span, span))
+    x, y = points[:, 0, None] + dx, points[:, 1, None] + dy
+    apart = np.stack([x, y, terrain.height(x, y)], axis=-1) - points[:, None]
+    return np.linalg.norm(apart, axis=-1).min(axis=1)
+
+
+@check("ground/waves", "height_field", "friction")
+def sliding_on_waves(bench: Bench) -> str:
+    """Feet that slide over the edges of a height field meet its surface only: no false depth, no pull."""
+    terrain, watch = waves(), 0.02
+    physics = {"watch_penetration": watch} if bench.supports("penetration") else {}
+    with bench.worlds(bench.stiff(), terrains=(terrain,), **physics) as worlds:
+        worlds.randomize(friction=np.full(worlds.count, 0.1))
+        reference = Reference(bench.robot, bench.stiff())
+        turns = np.linspace(0.0, 2.0 * np.pi, worlds.count, endpoint=False) + 0.3
+        velocity = 0.6 * np.stack([np.cos(turns), np.sin(turns), np.zeros(worlds.count)], axis=1)
+        top = float(terrain.height_field.heights.max()) if terrain.height_field is not None else 0.0
+        # a first tenth of a second for the fall onto the ground
+        stand_still(bench, worlds, seconds=0.1, ground=np.full(worlds.count, top), base_linear_velocity=velocity)
+        nearest, lowest = np.inf, np.inf
+        for _ in range(25):
+            worlds.step()
+            state = worlds.read()
+            feet = state.foot_position_w.reshape(-1, 3)
+            nearest = min(nearest, float(clearance(terrain, feet, 1.5 * reference.foot_radius).min()))
+            if bench.supports("contact_forces"):
+                lowest = min(lowest, float(state.foot_contact_force_w[..., 2].min()))
+            expect(
+                not state.penetration_substep.any(),
+                f"penetration_substep says that a foot is {watch} m deep in the waves, while its centre was never nearer "
+                f"to them than {nearest:.4f} m and its radius is {reference.foot_radius:.4f} m",
+            )
+        weight = reference.mass * GRAVITY
+        expect(nearest > reference.foot_radius - 0.01, f"the centre of a foot is only {nearest:.4f} m above the waves")
+        expect(lowest > -0.02 * weight, f"the ground pulls a foot down with {-lowest:.3g} N")
+    return f"feet sink {1e3 * (reference.foot_radius - nearest):.2f} mm"
+
+
 @check("ground/walls", "boxes")
 def walls(bench: Bench) -> str:
     """A wall stops a sliding robot."""

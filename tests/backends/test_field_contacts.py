@@ -1,0 +1,52 @@
+"""Contacts of single shapes with a height field: those of mujoco_warp, as repaired here, against MuJoCo's."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gaitgauge.backends.mujoco_warp_fields import repair_height_fields
+from gaitgauge.terrains.registry import make_terrain
+
+ROOT = Path(__file__).parents[2]
+TERRAIN = make_terrain("wave", 5)
+COUNT = 200
+
+
+def _load():
+    spec = importlib.util.spec_from_file_location("field_contacts", ROOT / "benchmarks" / "field_contacts.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+BENCH = _load()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BENCH.SHAPES)
+def test_the_deepest_contact_with_a_wave_is_mujocos(name):
+    repair_height_fields()
+    model, qpos = BENCH.model_of(name, TERRAIN), BENCH.poses(name, TERRAIN, COUNT)
+    seen = BENCH.compare(BENCH.contacts_of_mujoco(model, qpos), BENCH.contacts_of_mujoco_warp(model, qpos))
+    assert len(seen["depth"]) > 0.5 * COUNT
+    assert np.all(np.abs(seen["only"]) < 2e-5), "only what just touches may be a contact in one engine alone"
+    # Where a shape's axis is below the ground two ways out are nearly as short, and the engines may choose unlike.
+    depth = np.abs(seen["depth"])
+    assert np.quantile(depth, 0.95) < 2e-4
+    assert depth.max() < 1.5e-3
+    assert np.median(seen["angle"]) < 0.5
+    assert np.mean(seen["angle"] > 10.0) < 0.1
+    assert np.median(seen["apart"]) < 1e-3
+
+
+@pytest.mark.slow
+def test_a_spheres_contacts_lie_between_it_and_the_ground():
+    repair_height_fields()
+    model, qpos = BENCH.model_of("foot", TERRAIN), BENCH.poses("foot", TERRAIN, COUNT)
+    radius = float(BENCH.SHAPES["foot"][1])
+    for row, found in zip(qpos, BENCH.contacts_of_mujoco_warp(model, qpos), strict=True):
+        for distance, normal, position in found:
+            assert normal[2] > -0.01
+            # on the line along the normal through the centre, halfway between the surfaces
+            assert np.allclose(row[:3] - position, (radius + 0.5 * distance) * normal, atol=2e-5)
