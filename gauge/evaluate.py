@@ -24,7 +24,7 @@ from ..policy.loading import find_policy, load_policy
 from ..robots import Robot, RobotError, load_robot
 from ..terrains.registry import make_terrain, terrain_names
 from .episodes import Episode
-from .goals import SUB_COMMANDS, check_terrain
+from .goals import SUB_COMMANDS, TARGET, check_terrain
 from .pipelines import PIPELINES, Environment, Plan, make_environments
 from .results import fold, health, rows_csv
 from .runner import EpisodeRunner, Progress
@@ -244,11 +244,13 @@ def _runner(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: 
         if level > 0 or e.terrain == "flat"
     ]
     keys = list(dict.fromkeys(keys)) or [("flat", 0)]
+    parts = sum(len(SUB_COMMANDS[g.name]) for g in suite.goals if g.name != TARGET)
     if torch.device(request.device).type == "cpu":
-        most = len(plan.environments) * max(len(plan.seeds), 2)
-        slots = min(most, _MANY_SLOTS if most > 2 * _SLOTS else _SLOTS)
+        at_once = max(len(plan.seeds) * parts, len(suite.matrix.search_seeds))
+        slots = min(len(plan.environments) * at_once, _SLOTS)
     else:
-        slots = min(max(plan.total_known, 1), _GPU_SLOTS)
+        tests, quality = plan.waiting
+        slots = min(max(tests + quality * parts, 1), _GPU_SLOTS)
     scene = Scene(
         robot=robot,
         parameters=robot.parameters[suite.parameters],
@@ -274,7 +276,8 @@ def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -
         left = plan.expected_left()
         total = plan.done + left
         expected = round(total)
-        for episode, age in zip(progress.active, progress.ages, strict=True):
+        active = progress.active()
+        for episode, age in active.items():
             usual = sum(seconds[g] for g in episode.goals) / suite.physics.control_period
             left -= min(age / usual, 0.95)
         watch(
@@ -282,7 +285,7 @@ def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -
                 done=plan.done,
                 known=plan.total_known,
                 expected=expected,
-                active=progress.active,
+                active=tuple(active),
                 physics_steps=progress.physics_steps,
                 seconds=time.perf_counter() - began,
                 remaining_work=max(left, 0.0) / total if total else 0.0,

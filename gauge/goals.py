@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import torch
 
@@ -19,18 +18,27 @@ SUB_COMMANDS: dict[str, list[tuple[int, int, int]]] = {
     "target_pos_velocity": [(0, 0, 0)],
 }
 # What the second phase of a sub-command does with the first one's command.
-_SECOND_PHASE = {"diagonal_velocity": -1.0, "max_velocity": 0.0, "target_pos_velocity": 0.0}
+_SECOND_PHASE = {"diagonal_velocity": -1.0, "max_velocity": 0.0}
 
 TARGET = "target_pos_velocity"
 
+Command = tuple[float, float, float]
 
-class GoalTable:
-    """The goals of a suite as tensors, indexed by goal number (the position in ``suite.goals``)."""
 
-    PARTS: Mapping[str, int] = {name: len(commands) for name, commands in SUB_COMMANDS.items()}
-    """Number of sub-commands by name of the goal."""
+class Schedule:
+    """What every goal of a suite commands at every control step, worked out in advance.
+
+    A part is one sub-command of a goal, from one reset to the next. A goal's clock runs through its parts, starts with one
+    control period at the first commanded step, stands still while the robot settles, and adds up rounding errors in double
+    precision, as the reference's does.
+    """
 
     def __init__(self, suite: Suite, device: torch.device, dtype: torch.dtype) -> None:
+        """Work out the commands.
+
+        Raises:
+            SuiteError: a goal that is not known, or phases that do not suit it.
+        """
         names = [g.name for g in suite.goals]
         unknown = [n for n in names if n not in SUB_COMMANDS]
         if unknown:
@@ -45,52 +53,70 @@ class GoalTable:
                     f"give {wanted} lengths above zero"
                 )
         self.names = tuple(names)
-        self.period = suite.physics.control_period
-        most = max(len(c) for c in SUB_COMMANDS.values())
-        table = torch.zeros(len(names), most, 3, device=device, dtype=dtype)
-        for i, name in enumerate(names):
-            table[i, : len(SUB_COMMANDS[name])] = torch.tensor(SUB_COMMANDS[name], device=device, dtype=dtype)
-        self._table = table
+        """Goals in the order in which an episode runs them."""
+        period = suite.physics.control_period
+        self.target_steps = {family: round(t / period) for family, t in suite.commands.target_time.items()}
+        """Control steps that the target goal may take, by terrain family."""
+        early = suite.commands.clock_offset * period
+        self.parts: dict[str, tuple[tuple[Command, ...], ...]] = {
+            g.name: ((),) if g.name == TARGET else _velocity_parts(g.name, g.phases, period, early) for g in suite.goals
+        }
+        """Commands of each part of each goal, one for each step, as multiples of the limits; none for the target goal."""
+        # One long table: zeros for the target goal, whose commands follow from the state, then every part, each after a row of
+        # zeros for the time in which the robot settles.
+        zero = (0.0, 0.0, 0.0)
+        rows: list[Command] = [zero] * (1 + max(self.target_steps.values(), default=0))
+        self._first: dict[tuple[str, int], int] = {}
+        for name, parts in self.parts.items():
+            for part, commands in enumerate(parts):
+                self._first[name, part] = 0 if name == TARGET else len(rows)
+                rows += [] if name == TARGET else [zero, *commands]
+        self._rows = torch.tensor(rows, device=device, dtype=dtype)
 
-        def column(values: list[float], kind: torch.dtype) -> torch.Tensor:
-            return torch.tensor(values, device=device, dtype=kind)
+    def first_row(self, goal: str, part: int) -> int:
+        """Where a part begins in the table that ``commands`` reads."""
+        return self._first[goal, part]
 
-        self._early = suite.commands.clock_offset * self.period
-        double = torch.float64  # goal time is added up in double precision, as the reference does
-        self.is_target = column([n == TARGET for n in names], torch.bool)
-        self.parts = column([len(SUB_COMMANDS[n]) for n in names], torch.int64)
-        self.duration = column([sum(g.phases) or math.inf for g in suite.goals], double)
-        self.total = self.duration * self.parts
-        self.steps = column(
-            [round(sum(g.phases) / self.period) if g.phases else 2**62 for g in suite.goals], torch.int64
-        )
-        self._first = column([g.phases[0] if g.phases else math.inf for g in suite.goals], double)
-        self._second = column([_SECOND_PHASE[n] for n in names], dtype)
-
-    def over(self, goal: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
-        """Whether a velocity goal has run its time [s], (N,) bool; never true for the target goal."""
-        return time - self._early >= self.total[goal]
-
-    def part(self, goal: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
-        """Sub-command at a goal time [s], (N,) int64; 0 in the target goal."""
-        return torch.floor((time - self._early) / self.duration[goal]).to(torch.int64)
-
-    def velocity_command(self, goal: torch.Tensor, time: torch.Tensor, limits: torch.Tensor) -> torch.Tensor:
-        """Command of the velocity goals.
+    def commands(self, row: torch.Tensor, limits: torch.Tensor) -> torch.Tensor:
+        """Commands of the velocity goals, zero for the target goal.
 
         Args:
-            goal: goal number, (N,) int64.
-            time: goal time, which starts with one control period at the first command [s], (N,) float64.
+            row: ``first_row`` of each part, plus the number of the commanded step from 1 on, or 0 while settling, (N,) int64.
             limits: command limits, (N, 3).
 
         Returns:
             Forward, lateral [m/s] and yaw [rad/s], (N, 3).
         """
-        duration = self.duration[goal]
-        part = torch.clamp(self.part(goal, time), max=self._table.shape[1] - 1)
-        within = time - self._early - torch.where(torch.isinf(duration), torch.zeros_like(time), part * duration)
-        factor = torch.where(within < self._first[goal], torch.ones_like(self._second[goal]), self._second[goal])
-        return self._table[goal, part] * limits * factor[:, None]
+        return self._rows.index_select(0, row) * limits
+
+
+def _velocity_parts(
+    name: str, phases: tuple[float, ...], period: float, early: float
+) -> tuple[tuple[Command, ...], ...]:
+    """Commands of the parts of a velocity goal. The clock ends the last one, which may be a step short.
+
+    Args:
+        name: the goal.
+        phases: length of both phases of a sub-command [s].
+        period: control period [s].
+        early: how much the clock is read early [s].
+    """
+    signs, duration, second = SUB_COMMANDS[name], sum(phases), _SECOND_PHASE[name]
+    total, steps = duration * len(signs), round(duration / period)
+    parts: list[tuple[Command, ...]] = []
+    time = 0.0
+    for _ in signs:
+        commands: list[Command] = []
+        for _ in range(steps):
+            time += period
+            if time - early >= total:
+                return (*parts, tuple(commands))
+            at = math.floor((time - early) / duration)
+            factor = 1.0 if time - early - at * duration < phases[0] else second
+            x, y, yaw = signs[at] if at < len(signs) else (0, 0, 0)
+            commands.append((factor * x + 0.0, factor * y + 0.0, factor * yaw + 0.0))  # no negative zeros
+        parts.append(tuple(commands))
+    return tuple(parts)
 
 
 def check_terrain(suite: Suite, terrain: Terrain, *, searched: bool) -> None:
@@ -145,13 +171,12 @@ def target_command(
     Returns:
         Forward, lateral [m/s] and yaw [rad/s], (N, 3).
     """
-    bearing = torch.atan2(offset[:, 1], offset[:, 0])
+    sideways = offset[:, 1]
+    bearing = torch.atan2(sideways, offset[:, 0])
     wide = bearing.abs()
     turn = torch.where(backward, math.pi - wide, wide)
     yaw = torch.sign(bearing) * torch.minimum(2.0 * turn, yaw_limit)
-    yaw = torch.where(backward, -yaw, yaw)
     facing = torch.where(backward, wide > 0.75 * math.pi, wide < 0.25 * math.pi)
-    forward = torch.where(facing, torch.where(backward, -speed, speed), torch.zeros_like(speed))
-    lateral = torch.sign(offset[:, 1]) * torch.clamp(offset[:, 1].abs(), max=1.0)
-    lateral = torch.where(wide >= 0.25 * math.pi, lateral, torch.zeros_like(lateral))
-    return torch.stack((forward, lateral, yaw), dim=1)
+    lateral = torch.clamp(sideways, -1.0, 1.0) * (wide >= 0.25 * math.pi)
+    direction = 1.0 - 2.0 * backward
+    return torch.stack((direction * speed * facing, lateral, direction * yaw), dim=1)

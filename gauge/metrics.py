@@ -6,10 +6,10 @@ Paper table ``Metrics for the RoboGauge Framework`` and its appendix ``Stability
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import torch
 
-from ..backends.base import PhysicsState
 from ..robots.base import Robot
 from ..robots.geometry import joint_ranges, stance_span
 from ..robots.rotation import projected_gravity, rotate_inverse
@@ -145,8 +145,33 @@ def quality(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     return torch.exp((logs * weights).sum(1) / (defined * weights).sum(1))
 
 
+class MotionState(Protocol):
+    """What the metrics need of a state; ``PhysicsState`` has it, with the same frames and units."""
+
+    @property
+    def base_quaternion_w(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def base_linear_velocity_w(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def base_angular_velocity_b(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def joint_position(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def joint_velocity(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def joint_torque(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def ground_moment_w(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def ground_force_w(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def foot_normal_force(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def foot_tangential_force(self) -> torch.Tensor: ...  # noqa: D102
+
+
 class MetricEvaluator:
-    """All metrics of a suite for N episodes at once."""
+    """All metrics of a suite for N instants at once."""
 
     def __init__(self, metrics: Metrics, robot: Robot, weight: float, device: torch.device, dtype: torch.dtype) -> None:
         """Prepare the constants.
@@ -159,6 +184,7 @@ class MetricEvaluator:
             dtype: floating-point type of the states.
         """
         self.names = tuple(metrics.weights)
+        self.needs_contacts = not {"zmp_margin", "friction_margin"}.isdisjoint(self.names)
         self._metrics = metrics
         self._weight = weight
         self._weights = torch.tensor([metrics.weights[n] for n in self.names], device=device, dtype=dtype)
@@ -174,7 +200,7 @@ class MetricEvaluator:
 
     def evaluate(
         self,
-        state: PhysicsState,
+        state: MotionState,
         command: torch.Tensor,
         limits: torch.Tensor,
         friction: torch.Tensor,
@@ -184,7 +210,7 @@ class MetricEvaluator:
         """Metrics and quality of one instant, (N, M + 1), NaN where a metric is not defined.
 
         Args:
-            state: N episodes.
+            state: N instants; contacts are looked at only if ``needs_contacts``.
             command: commanded velocities, (N, 3).
             limits: command limits, (N, 3): their norm and the yaw limit scale the tracking errors.
             friction: friction coefficient, (N,).

@@ -15,28 +15,27 @@ from .episodes import Episode
 from .suite import Noise
 
 TABLE_STEPS = 2000
-"""Control steps that are drawn in advance at a time."""
+"""Control steps of a seed that are drawn in advance at a time."""
+BLOCK_STEPS = 32
+"""Control steps that are looked up for all slots at a time."""
 
 
 class NoiseStream(ABC):
-    """Draws for K episodes at work: half widths times uniform numbers in [-1, 1), and delays."""
+    """Draws for K slots: half widths times uniform numbers in [-1, 1), and delays. Every episode has a stream of its own."""
 
     @abstractmethod
-    def assign(self, slot: int, episode: Episode) -> None:
-        """Start an episode's stream in a slot."""
-
-    def reserve(self, steps: int) -> None:  # noqa: B027  (only tables need it)
-        """Be ready for episodes of ``steps`` control steps."""
+    def assign(self, slot: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
+        """Read an episode's stream in a slot, up to ``steps`` control steps from its start."""
 
     @abstractmethod
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Noise by observation term and delay [substeps] of every slot.
 
         Args:
-            step: number of control steps that each episode has behind it, (K,) int64.
+            step: place in each slot's stream, in control steps, (…, K) int64.
 
         Returns:
-            ``{term: (K, width)}`` in physical units, and (K,) int64.
+            ``{term: (…, K, width)}`` in physical units, and (…, K) int64.
         """
 
 
@@ -45,60 +44,60 @@ class ReferenceStream(NoiseStream):
 
     A control step draws uniform numbers for joint positions, joint velocities, base and imu linear velocity and base and
     imu angular velocity (all in that order), then one whole number for the delay, whatever the episode does. Episodes of
-    one seed therefore share one table.
+    one seed therefore share one table. What no observation contains is drawn and forgotten.
     """
 
     def __init__(self, noise: Noise, joints: int, slots: int, device: torch.device) -> None:
         self._noise, self._joints, self._device = noise, joints, device
-        self._seeds: list[int] = []
+        self._seeds: dict[int, int] = {}
         self._generators: list[_PythonGenerator] = []
-        self._length = TABLE_STEPS
-        self._uniform = torch.zeros(0, self._length, 2 * joints + 12, device=device)
-        self._delays = torch.zeros(0, self._length, dtype=torch.int64, device=device)
+        self._length = 0
+        self._uniform = torch.zeros(0, 0, 2 * joints + 3, device=device)
+        self._delays = torch.zeros(0, 0, dtype=torch.int64, device=device)
         self._row = torch.zeros(slots, dtype=torch.int64, device=device)
         half = [noise.joint_position] * joints + [noise.joint_velocity] * joints + [0.05] * 3
         half += [noise.base_angular_velocity] * 3 + [0.05] * 3 + [noise.base_angular_velocity] * 3
         self._half = half
+        self._observed = [*range(2 * joints), *range(len(half) - 3, len(half))]
 
-    def assign(self, slot: int, episode: Episode) -> None:
+    def assign(self, slot: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
         """See ``NoiseStream.assign``."""
+        if steps > self._length:
+            more = -(-(steps - self._length) // TABLE_STEPS) * TABLE_STEPS
+            uniform, delays = self._tables(self._generators, more)
+            self._uniform = torch.cat((self._uniform, uniform), dim=1)
+            self._delays = torch.cat((self._delays, delays), dim=1)
+            self._length += more
         if episode.seed not in self._seeds:
             generator = _PythonGenerator(episode.seed)
             uniform, delays = self._tables([generator], self._length)
-            self._seeds.append(episode.seed)
+            self._seeds[episode.seed] = len(self._seeds)
             self._generators.append(generator)
             self._uniform = torch.cat((self._uniform, uniform))
             self._delays = torch.cat((self._delays, delays))
-        self._row[slot] = self._seeds.index(episode.seed)
+        self._row[slot] = self._seeds[episode.seed]
 
     def _tables(self, generators: Sequence[_PythonGenerator], count: int) -> tuple[torch.Tensor, torch.Tensor]:
         """The next ``count`` control steps of some generators: (G, count, W) in physical units, and delays (G, count)."""
-        drawn = [g.draw(count, len(self._half), self._noise.latency) for g in generators]
-        uniform = np.stack([low_to_high(u, self._half) for u, _ in drawn])
-        delays = np.stack([d for _, d in drawn])
-        return (
-            torch.tensor(uniform, dtype=torch.float32, device=self._device),
-            torch.tensor(delays, device=self._device),
-        )
-
-    def reserve(self, steps: int) -> None:
-        """See ``NoiseStream.reserve``."""
-        while self._length < steps:
-            uniform, delays = self._tables(self._generators, TABLE_STEPS)
-            self._uniform = torch.cat((self._uniform, uniform), dim=1)
-            self._delays = torch.cat((self._delays, delays), dim=1)
-            self._length += TABLE_STEPS
+        uniform = np.zeros((len(generators), count, len(self._observed)), dtype=np.float32)
+        delays = np.zeros((len(generators), count), dtype=np.int64)
+        half = [self._half[column] for column in self._observed]
+        for row, generator in enumerate(generators):
+            unit, delays[row] = generator.draw(count, len(self._half), self._noise.latency, self._observed)
+            uniform[row] = low_to_high(unit, half)
+        return torch.tensor(uniform, device=self._device), torch.tensor(delays, device=self._device)
 
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """See ``NoiseStream.draw``. Call ``reserve`` before an episode can get beyond the table."""
-        values = self._uniform[self._row, step]
+        """See ``NoiseStream.draw``. A place beyond what was asked for with ``assign`` gives some other numbers."""
+        at = torch.clamp(self._row * self._length + step, max=len(self._seeds) * self._length - 1)
+        values = self._uniform.flatten(0, 1).index_select(0, at.flatten()).view(*step.shape, -1)
         j = self._joints
         terms = {
-            "joint_position": values[:, :j],
-            "joint_velocity": values[:, j : 2 * j],
-            "base_angular_velocity_b": values[:, -3:],
+            "joint_position": values[..., :j],
+            "joint_velocity": values[..., j : 2 * j],
+            "base_angular_velocity_b": values[..., -3:],
         }
-        return terms, self._delays[self._row, step]
+        return terms, self._delays.flatten()[at]
 
 
 class _PythonGenerator:
@@ -113,33 +112,50 @@ class _PythonGenerator:
         }
         self._words = np.zeros(0, dtype=np.uint64)
 
-    def draw(self, count: int, width: int, most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def draw(
+        self, count: int, width: int, most: int, wanted: Sequence[int] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """``count`` times ``width`` calls of ``random()`` followed by one of ``randint(0, most)``.
 
+        Args:
+            count: number of rows.
+            width: calls of ``random()`` in a row.
+            most: largest whole number.
+            wanted: columns of the ``width`` to return, None for all.
+
         Returns:
-            (count, width) in [0, 1), and (count,).
+            (count, columns) in [0, 1), and (count,).
         """
         bits = (most + 1).bit_length()
-        uniform, whole = np.zeros((count, width)), np.zeros(count, dtype=np.int64)
+        begins: list[int] = []
+        ends: list[int] = []
         at = 0
-        for row in range(count):
-            self._need(at + 2 * width + 64)
-            pairs = self._words[at : at + 2 * width]
-            uniform[row] = ((pairs[0::2] >> 5) * 67108864.0 + (pairs[1::2] >> 6)) / 9007199254740992.0
-            at += 2 * width
-            while True:  # randint draws again until the number is small enough
-                self._need(at + 1)
-                number = int(self._words[at]) >> (32 - bits)
-                at += 1
-                if number <= most:
+        # ``randint`` draws again until the number is small enough, so a row's length shows when its last word is read
+        self._need(count * (2 * width + 4))
+        numbers = self._words >> np.uint64(32 - bits)
+        while len(begins) < count:
+            last = at + 2 * width
+            while True:
+                if last >= len(numbers):
+                    self._need(len(self._words) + 1)
+                    numbers = self._words >> np.uint64(32 - bits)
+                if numbers[last] <= most:
                     break
-            whole[row] = number
+                last += 1
+            begins.append(at)
+            ends.append(last)
+            at = last + 1
+        columns = np.arange(width) if wanted is None else np.asarray(wanted)
+        first = np.asarray(begins, dtype=np.int64)[:, None] + 2 * columns
+        high, low = self._words[first] >> np.uint64(5), self._words[first + 1] >> np.uint64(6)
+        whole = numbers[np.asarray(ends, dtype=np.int64)].astype(np.int64)
         self._words = self._words[at:]
-        return uniform, whole
+        return (high * 67108864.0 + low) / 9007199254740992.0, whole
 
     def _need(self, words: int) -> None:
+        """Have at least so many words at hand."""
         if len(self._words) < words:
-            more = self._twister.random_raw(max(words, 1 << 16))
+            more = self._twister.random_raw(max(words - len(self._words), 1 << 12))
             self._words = np.concatenate((self._words, more))
 
 
@@ -159,21 +175,21 @@ class CounterStream(NoiseStream):
         self._half = torch.tensor(half, device=device)
         self._index = torch.arange(2 * joints + 4, dtype=torch.int64, device=device)
 
-    def assign(self, slot: int, episode: Episode) -> None:
+    def assign(self, slot: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
         """See ``NoiseStream.assign``."""
         low, high = zlib.crc32(episode.key.encode()), zlib.crc32(episode.key[::-1].encode())
         self._key[slot] = (high << 31) ^ low
 
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """See ``NoiseStream.draw``."""
-        unit = uniform_hash(self._key[:, None], step[:, None], self._index)
-        delay = (unit[:, -1] * (self._noise.latency + 1)).to(torch.int64)
-        values = (2.0 * unit[:, :-1] - 1.0) * self._half
+        unit = uniform_hash(self._key[:, None], step[..., None], self._index)
+        delay = (unit[..., -1] * (self._noise.latency + 1)).to(torch.int64)
+        values = (2.0 * unit[..., :-1] - 1.0) * self._half
         j = self._joints
         terms = {
-            "joint_position": values[:, :j],
-            "joint_velocity": values[:, j : 2 * j],
-            "base_angular_velocity_b": values[:, -3:],
+            "joint_position": values[..., :j],
+            "joint_velocity": values[..., j : 2 * j],
+            "base_angular_velocity_b": values[..., -3:],
         }
         return terms, delay
 
@@ -198,3 +214,42 @@ def _shift(value: torch.Tensor, bits: int) -> torch.Tensor:
 def make_stream(noise: Noise, joints: int, slots: int, device: torch.device) -> ReferenceStream | CounterStream:
     """The stream that a suite asks for."""
     return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, slots, device)
+
+
+class NoiseReader:
+    """Reads K streams step by step, many steps at a time."""
+
+    def __init__(self, stream: NoiseStream, slots: int, device: torch.device) -> None:
+        self._stream = stream
+        self._device = device
+        self._offset = torch.zeros(slots, dtype=torch.int64, device=device)
+        self._ahead = torch.arange(BLOCK_STEPS, device=device)[:, None]
+        self._block: list[tuple[dict[str, torch.Tensor], torch.Tensor]] = []
+        self._now = 0
+
+    def begin(self, slots: Sequence[int], episodes: Sequence[Episode], starts: Sequence[int], steps: int) -> None:
+        """Let some slots read other streams from the next step on.
+
+        Args:
+            slots: which.
+            episodes: whose streams.
+            starts: the places in them at which to begin, in control steps.
+            steps: none of them reads more than this number of control steps.
+        """
+        for slot, episode, start in zip(slots, episodes, starts, strict=True):
+            self._stream.assign(slot, episode, start + steps)
+        at = torch.tensor(slots, device=self._device)
+        self._offset[at] = torch.tensor(starts, device=self._device) - self._now
+        self._block = []
+
+    def next(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Noise by observation term, (K, width), and delays, (K,), of the next control step."""
+        if not self._block:
+            terms, delays = self._stream.draw(self._now + self._ahead + self._offset)
+            columns = [value.unbind(0) for value in terms.values()]
+            self._block = [
+                (dict(zip(terms, values, strict=True)), delay)
+                for *values, delay in reversed(list(zip(*columns, delays.unbind(0), strict=True)))
+            ]
+        self._now += 1
+        return self._block.pop()

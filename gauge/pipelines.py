@@ -7,6 +7,7 @@ then its quality episodes run, unless only the level was asked for.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -123,7 +124,8 @@ class Plan:
         """
         self.suite, self.environments, self.seeds = suite, list(environments), list(seeds)
         self._store, self._evaluate, self._speculative = store, evaluate, speculative
-        self._queue: list[Episode] = []
+        self._tests: deque[Episode] = deque()
+        self._quality: deque[Episode] = deque()
         self._of: dict[str, Environment] = {}
         self.total_known = 0
         self.done = 0
@@ -136,12 +138,16 @@ class Plan:
 
     # ---- the runner's side ----------------------------------------------------------------------------------------
 
-    def take(self, most: int) -> list[Episode]:
-        """Episodes that can start now, quality first: they are the longest."""
+    def take(self, most: int, *, urgent: bool = False) -> list[Episode]:
+        """Episodes that can start now. Level tests come first: others wait for them, while quality can be played at any time.
+
+        Args:
+            most: largest number of episodes.
+            urgent: level tests alone.
+        """
         taken: list[Episode] = []
-        while self._queue and len(taken) < most:
-            self._queue.sort(key=lambda e: e.stage != "eval")
-            episode = self._queue.pop(0)
+        while len(taken) < most and (self._tests or (self._quality and not urgent)):
+            episode = (self._tests or self._quality).popleft()
             known = self._store.get(episode)
             if known is None:
                 taken.append(episode)
@@ -154,6 +160,11 @@ class Plan:
         self._store.put(record)
         self._fold(record)
 
+    @property
+    def waiting(self) -> tuple[int, int]:
+        """Number of episodes that can start now: of level tests, and for quality."""
+        return len(self._tests), len(self._quality)
+
     def expected_left(self) -> float:
         """Rough number of episodes still to come, searches that are not decided yet counted by their usual length."""
         open_searches = sum(e.searched and e.level is None for e in self.environments)
@@ -165,7 +176,7 @@ class Plan:
     def _add(self, environment: Environment, episodes: Sequence[Episode]) -> None:
         for episode in episodes:
             self._of[episode.key] = environment
-        self._queue += episodes
+            (self._quality if episode.stage == "eval" else self._tests).append(episode)
         self.total_known += len(episodes)
 
     def _fold(self, record: Record) -> None:

@@ -1,27 +1,30 @@
-"""Runs a list of episodes in lock step on any backend: the loop of gauge protocol §3.3, vectorized over worlds.
+"""Runs the episodes of an agenda in lock step on any backend: the loop of gauge protocol §3.3, vectorized over worlds.
 
-A world is a slot. When its episode ends, the next one of the list moves in, with its own terrain, friction and payload. What
-happens in an episode depends on that episode alone: not on its slot, its neighbours, or the number of threads.
+A world is a slot. Segments of episodes sit in the slots; when one ends, the next moves in, with its own terrain, friction and
+payload. What happens in a segment depends on that segment alone: not on its slot, its neighbours, or the number of threads.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
 import torch
 
-from ..backends.base import PhysicsBackend, PhysicsState, Randomization
+from ..backends.base import PhysicsBackend, Randomization
 from ..policy.base import Policy, PolicyError
 from ..policy.observation import ObservationBuilder
 from ..robots.geometry import total_mass
 from ..robots.rotation import from_yaw
 from .episodes import QUALITY, Episode, Record
-from .goals import GoalTable, target_command, target_offset
-from .metrics import MetricEvaluator
-from .noise import make_stream
+from .goals import TARGET, Schedule, target_command, target_offset
+from .noise import NoiseReader, make_stream
+from .sampling import SampleTable
+from .segments import OpenEpisode, Outcome, Segment, SegmentRules, cut_short
 from .suite import Suite
 
 GRAVITY = 9.81
@@ -30,22 +33,32 @@ GRAVITY = 9.81
 class Agenda(Protocol):
     """Who says which episodes run next."""
 
-    def take(self, most: int) -> Sequence[Episode]:
-        """Up to ``most`` episodes that can start now."""
+    def take(self, most: int, *, urgent: bool = False) -> Sequence[Episode]:
+        """Up to ``most`` episodes that can start now; with ``urgent`` only those on whose outcome other episodes wait."""
 
     def finished(self, record: Record) -> None:
         """An episode has ended."""
 
 
-@dataclass
 class Progress:
-    """How far the runner is; handed to the ``watch`` callback after every control step."""
+    """How far the runner is; handed to the ``watch`` callback after every control step, and good until it returns."""
 
-    active: tuple[Episode, ...]
-    ages: tuple[int, ...]
-    """Control steps that each active episode has behind it."""
-    control_steps: int
-    physics_steps: int
+    def __init__(self, runner: EpisodeRunner) -> None:
+        self._runner = runner
+
+    @property
+    def control_steps(self) -> int:
+        """Control steps so far, each of all worlds."""
+        return self._runner.control_steps
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps so far, added up over worlds."""
+        return self._runner.physics_steps
+
+    def active(self) -> dict[Episode, int]:
+        """Episodes at work, and the control steps that each has behind it, added up over its segments."""
+        return self._runner.ages()
 
 
 class EpisodeRunner:
@@ -71,49 +84,52 @@ class EpisodeRunner:
         self._substeps = scene.physics.substeps
         self._session = policy.session(k, device=str(device))
         self._builder = ObservationBuilder(policy.contract, scene.robot, k, device)
-        self._goals = GoalTable(suite, device, dtype)
-        self._stream = make_stream(suite.noise, scene.robot.num_joints, k, device)
-        weight = GRAVITY * total_mass(scene.robot)
-        self._metrics = MetricEvaluator(suite.metrics, scene.robot, weight, device, dtype)
-        self.columns = (*self._metrics.names, QUALITY)
+        self._schedule = Schedule(suite, device, dtype)
+        self._rules = SegmentRules(suite, self._schedule)
+        self._noise = NoiseReader(make_stream(suite.noise, scene.robot.num_joints, k, device), k, device)
+        self._table = SampleTable(suite, scene.robot, GRAVITY * total_mass(scene.robot), k, device, dtype)
+        self.columns = (*self._table.names, QUALITY)
 
         def zeros(*shape: int, kind: torch.dtype = dtype) -> torch.Tensor:
             return torch.zeros(k, *shape, device=device, dtype=kind)
 
-        whole, truth, joints = torch.int64, torch.bool, scene.robot.num_joints
-        self._rows = torch.arange(k, device=device)
-        self._episode: list[Episode | None] = [None] * k
+        whole, truth = torch.int64, torch.bool
+        # who sits where
+        self._open: dict[Episode, OpenEpisode] = {}
+        self._waiting: deque[Segment] = deque()
+        self._segment: list[Segment | None] = [None] * k
+        self._free = list(range(k))
         self._seated_at = [0] * k
-        self._active, self._ended = zeros(kind=truth), zeros(kind=truth)
-        # what does not change during an episode
-        self._spawn, self._heading = zeros(3), zeros(4)
-        self._target, self._backward = zeros(3), zeros(kind=truth)
-        self._limits, self._speed, self._most_steps = zeros(3) + 1.0, zeros(), zeros(kind=whole)
-        self._friction, self._terrain = zeros() + 1.0, zeros(kind=whole)
-        self._sequence, self._num_goals = zeros(len(suite.goals), kind=whole), zeros(kind=whole)
-        self._sampled = zeros(kind=truth)
+        self._fitted: list[tuple[float, float] | None] = [None] * k
+        self._active = zeros(kind=truth)
+        self._rows_to_play: torch.Tensor | None = None
+        self._any_target = False
+        # what does not change during a segment
+        self._spawn, self._heading, self._terrain = zeros(3), zeros(4), zeros(kind=whole)
+        self._target, self._backward, self._speed = zeros(3), zeros(kind=truth), zeros()
+        self._limits, self._friction = zeros(3) + 1.0, zeros() + 1.0
+        self._first_row, self._length = zeros(kind=whole), zeros(kind=whole)
+        self._aims, self._sampled = zeros(kind=truth), zeros(kind=truth)
         # how far it is
-        self._goal_at, self._goal_time = zeros(kind=whole), zeros(kind=torch.float64)
-        self._part, self._part_steps, self._settling = zeros(kind=whole), zeros(kind=whole), zeros(kind=truth)
-        self._tick, self._draws, self._steps = zeros(kind=whole), zeros(kind=whole), zeros(kind=whole)
-        self._done, self._reached, self._restarted = zeros(kind=truth), zeros(kind=truth), zeros(kind=truth)
+        self._settling, self._part_steps = zeros(kind=truth), zeros(kind=whole)
+        self._tick, self._steps = zeros(kind=whole), zeros(kind=whole)
+        self._done, self._reached = zeros(kind=truth), zeros(kind=truth)
         self._falls, self._diverged, self._overflowed = zeros(kind=whole), zeros(kind=truth), zeros(kind=truth)
-        self._last_action = zeros(joints, kind=torch.float32)
-        self._torque, self._torque_known = zeros(joints), zeros(kind=truth)
-        # what was seen of it
-        self.capacity = _most_samples(suite)
-        self._values = zeros(self.capacity, len(self.columns), kind=torch.float32)
-        self._where = zeros(self.capacity, 2, kind=torch.int16)
-        self._count = zeros(kind=whole)
+        self._lost, self._ended = zeros(kind=whole), zeros(kind=truth)
+        self._last_action = zeros(scene.robot.num_joints, kind=torch.float32)
+        self._towards = zeros(3)
+        # the first penetration: whether one still matters, whether there was one, and how far the segment was then
+        self._watched, self._deep = zeros(kind=truth), zeros(kind=truth)
+        self._deep_control, self._deep_steps = zeros(kind=whole), zeros(kind=whole)
+        self._deep_count, self._deep_overflowed = zeros(kind=whole), zeros(kind=truth)
         self.control_steps = 0
         self.physics_steps = 0
         # on the CPU a look at the data is free, and saves the work that nobody needs; on a GPU it would wait for the device
         self._cheap_checks = device.type == "cpu"
         self._few_rows_suffice = self._cheap_checks and _rows_are_stable(policy, k)
-        self._nobody = zeros(kind=truth)
-        self._last_ran = zeros(kind=whole)
+        self._nobody, self._nothing = zeros(kind=truth), zeros(kind=whole)
 
-    # ---- episodes come and go -------------------------------------------------------------------------------------
+    # ---- segments come and go -------------------------------------------------------------------------------------
 
     def run(self, agenda: Agenda, watch: Callable[[Progress], None] | None = None) -> None:
         """Play until the agenda has nothing left.
@@ -122,123 +138,218 @@ class EpisodeRunner:
             PolicyError: the policy's output is not finite.
         """
         with torch.inference_mode():
-            self._run(agenda, watch)
+            while self._fill(agenda):
+                self._control_step()
+                if bool(self._ended.any()):
+                    for record in self._collect():
+                        agenda.finished(record)
+                if watch is not None:
+                    watch(Progress(self))
 
-    def _run(self, agenda: Agenda, watch: Callable[[Progress], None] | None) -> None:
-        while True:
-            free = [s for s, e in enumerate(self._episode) if e is None]
-            if free:
-                episodes = agenda.take(len(free))
-                self._seat(free[: len(episodes)], episodes)
-                if len(free) == self._slots and not episodes:
-                    return
-            self._stream.reserve(self.control_steps - min(self._begun()) + 2)
-            self._control_step()
-            for record in self._collect():
-                agenda.finished(record)
-            if watch is not None:
-                active = tuple(e for e in self._episode if e is not None)
-                ages = tuple(self.control_steps - begun for begun in self._begun())
-                watch(Progress(active, ages, self.control_steps, self.physics_steps))
+    def ages(self) -> dict[Episode, int]:
+        """Episodes with segments in the slots, and the control steps played of each, ended segments included."""
+        ages: dict[Episode, int] = {}
+        for segment, begun in zip(self._segment, self._seated_at, strict=True):
+            if segment is not None:
+                known = ages.get(segment.episode)
+                if known is None:
+                    known = sum(o.control_steps for o in self._open[segment.episode].outcomes.values())
+                ages[segment.episode] = known + self.control_steps - begun
+        return ages
 
-    def _begun(self) -> list[int]:
-        """The runner's control step at which each present episode began."""
-        return [self._seated_at[s] for s, e in enumerate(self._episode) if e is not None]
+    def _fill(self, agenda: Agenda) -> bool:
+        """Let segments begin in the free slots; returns whether any are at work.
 
-    def _seat(self, slots: list[int], episodes: Sequence[Episode]) -> None:
-        """Let episodes begin in free slots."""
-        if not episodes:
-            return
-        suite, device = self.suite, self._device
+        Episodes on which others wait come first. Others begin only when no segment waits, so that few episodes are open.
+        """
+        if not self._free:
+            return True
+        for episode in reversed(agenda.take(len(self._free), urgent=True)):
+            self._waiting.extendleft(reversed(self._begin(episode)))
+        while len(self._waiting) < len(self._free):
+            episodes = agenda.take(1)
+            if not episodes:
+                break
+            self._waiting.extend(self._begin(episodes[0]))
+        count = min(len(self._free), len(self._waiting))
+        if count:
+            slots, self._free = self._free[:count], self._free[count:]
+            self._seat(slots, [self._waiting.popleft() for _ in slots])
+        return len(self._free) < self._slots
+
+    def _begin(self, episode: Episode) -> list[Segment]:
+        """Open an episode; returns its first segments."""
+        self._open[episode] = OpenEpisode(episode, self._rules)
+        return self._open[episode].start()
+
+    def _seat(self, slots: list[int], segments: Sequence[Segment]) -> None:
+        """Let segments begin in free slots."""
+        suite, schedule, device = self.suite, self._schedule, self._device
         at = torch.tensor(slots, device=device)
-        terrains = [self.backend.scene.terrains[self._terrain_index(e)] for e in episodes]
+        episodes = [s.episode for s in segments]
+        index = [self._terrain_index(e) for e in episodes]
+        terrains = [self.backend.scene.terrains[i] for i in index]
         poses = [
             t.spawns["level_eval" if e.stage == "eval" else "level_search"]
             for t, e in zip(terrains, episodes, strict=True)
         ]
-        stand, times = self._robot.stand_height, suite.commands.target_time
+        aims, stand = [s.goal == TARGET for s in segments], self._robot.stand_height
 
-        def write(into: torch.Tensor, values: list) -> None:
+        def write(into: torch.Tensor, values: Sequence[object]) -> None:
             into[at] = torch.tensor(values, device=device, dtype=into.dtype)
 
         write(self._spawn, [(p.position[0], p.position[1], p.position[2] + stand) for p in poses])
         self._heading[at] = from_yaw(torch.tensor([p.yaw for p in poses], device=device, dtype=self._dtype))
-        write(self._target, [t.target or (0.0, 0.0, 0.0) for t in terrains])
-        write(self._backward, [t.backward for t in terrains])
+        write(self._terrain, index)
+        if any(aims):
+            write(self._target, [t.target or (0.0, 0.0, 0.0) for t in terrains])
+            write(self._backward, [t.backward for t in terrains])
+            write(self._speed, [suite.commands.target_speed.get(t.family, 0.0) for t in terrains])
         write(self._limits, [suite.command_limits(t.family) for t in terrains])
-        write(self._speed, [suite.commands.target_speed.get(t.family, 0.0) for t in terrains])
-        write(self._most_steps, [round(times.get(t.family, 0.0) / self._goals.period) for t in terrains])
         write(self._friction, [e.friction for e in episodes])
-        write(self._terrain, [self._terrain_index(e) for e in episodes])
-        names = self._goals.names
-        order = [[names.index(g) for g in names if g in e.goals] for e in episodes]
-        write(self._sequence, [o + [0] * (len(names) - len(o)) for o in order])
-        write(self._num_goals, [len(o) for o in order])
-        write(self._sampled, [e.stage == "eval" for e in episodes])
-        for counter in (self._goal_at, self._goal_time, self._part, self._tick, self._draws, self._steps):
-            counter[at] = 0
-        for counter in (self._done, self._reached, self._restarted, self._falls, self._diverged, self._overflowed):
-            counter[at] = 0
-        self._values[at] = 0.0
-        self._count[at] = 0
-        self._active[at] = True
+        write(self._first_row, [schedule.first_row(s.goal, s.part) for s in segments])
+        write(
+            self._length,
+            [
+                schedule.target_steps.get(t.family, 0) if s.goal == TARGET else len(schedule.parts[s.goal][s.part])
+                for s, t in zip(segments, terrains, strict=True)
+            ],
+        )
+        write(self._aims, aims)
+        write(self._watched, [self._rules.restarts and not s.again for s in segments])
+        sampled = [e.stage == "eval" for e in episodes]
+        write(self._sampled, sampled)
+        if any(sampled):
+            steps = max(self._rules.most_steps(s) for s, kept in zip(segments, sampled, strict=True) if kept)
+            self._table.reserve(math.ceil((steps + 2) * self._substeps / suite.metrics.interval) + 2)
         mask = torch.zeros(self._slots, dtype=torch.bool, device=device)
         mask[at] = True
-        self.backend.randomize(
-            Randomization(
-                friction=torch.tensor([e.friction for e in episodes], device=device, dtype=self._dtype),
-                base_mass_offset=torch.tensor([e.payload for e in episodes], device=device, dtype=self._dtype),
-            ),
-            mask,
-        )
-        for slot, episode in zip(slots, episodes, strict=True):
-            self._stream.assign(slot, episode)
-            self._episode[slot] = episode
+        for counter in (self._tick, self._steps, self._falls, self._lost):
+            counter.masked_fill_(mask, 0)
+        for flag in (self._done, self._reached, self._deep, self._diverged, self._overflowed):
+            flag.masked_fill_(mask, 0)
+        self._table.clear(mask)
+        self._fit(slots, episodes)
+        starts = [self._rules.noise_start(s) for s in segments]
+        self._noise.begin(slots, episodes, starts, max(self._rules.most_steps(s) for s in segments))
+        for slot, segment in zip(slots, segments, strict=True):
+            self._segment[slot] = segment
             self._seated_at[slot] = self.control_steps
+        self._active |= mask
+        self._count_places()
         self._reset(mask)
 
+    def _fit(self, slots: list[int], episodes: Sequence[Episode]) -> None:
+        """Give worlds the friction and payload of their episodes, where they have others."""
+        wanted = {
+            slot: (e.friction, e.payload)
+            for slot, e in zip(slots, episodes, strict=True)
+            if self._fitted[slot] != (e.friction, e.payload)
+        }
+        if not wanted:
+            return
+        mask = torch.zeros(self._slots, dtype=torch.bool, device=self._device)
+        mask[torch.tensor(list(wanted), device=self._device)] = True
+        values = torch.tensor([wanted[s] for s in sorted(wanted)], device=self._device, dtype=self._dtype)
+        self.backend.randomize(Randomization(friction=values[:, 0], base_mass_offset=values[:, 1]), mask)
+        for slot, pair in wanted.items():
+            self._fitted[slot] = pair
+
+    def _count_places(self) -> None:
+        """Work out what depends on who is seated alone."""
+        self._any_target = any(s is not None and s.goal == TARGET for s in self._segment)
+        self._rows_to_play = None
+        if self._few_rows_suffice and self._free:
+            # slots that need an action, filled up to a multiple of eight
+            taken = [slot for slot, s in enumerate(self._segment) if s is not None]
+            count = (len(taken) + 7) // 8 * 8
+            if count < self._slots:
+                self._rows_to_play = torch.tensor((taken + self._free)[:count], device=self._device)
+
     def _collect(self) -> list[Record]:
-        """Records of the episodes that have just ended; their slots are free afterwards."""
-        if not bool(self._ended.any()):
-            return []
-        records = []
-        for slot in torch.nonzero(self._ended).flatten().tolist():
-            episode = self._episode[slot]
-            assert episode is not None
-            count = int(self._count[slot])
-            where = self._where[slot, :count].cpu().numpy().copy()
-            has_target = any(g == "target_pos_velocity" for g in episode.goals)
-            records.append(
-                Record(
-                    episode=episode,
-                    success=bool(self._reached[slot]) if has_target else None,
-                    falls=int(self._falls[slot]),
-                    diverged=bool(self._diverged[slot]),
-                    overflowed=bool(self._overflowed[slot]),
-                    restarted=bool(self._restarted[slot]),
-                    control_steps=int(self._draws[slot]),
-                    physics_steps=int(self._steps[slot]),
-                    columns=self.columns if count else (),
-                    samples=self._values[slot, :count].cpu().numpy().copy(),
-                    goal_index=where[:, 0],
-                    part_index=where[:, 1],
+        """Take the ended segments out of their slots; returns the records of the episodes that are complete with them."""
+        slots = torch.nonzero(self._ended).flatten()
+        numbers = torch.stack(
+            [
+                t[slots].to(torch.int64)
+                for t in (
+                    *(self._steps, self._falls, self._diverged, self._overflowed, self._reached, self._lost),
+                    *(self._table.count, self._deep),
+                    *(self._deep_control, self._deep_steps, self._deep_count, self._deep_overflowed),
                 )
-            )
-            self._episode[slot] = None
-        self._active &= ~self._ended
+            ],
+            dim=1,
+        ).tolist()
+        records, touched = [], set()
+        for slot, row in zip(slots.tolist(), numbers, strict=True):
+            segment = self._segment[slot]
+            assert segment is not None
+            episode = self._open[segment.episode]
+            episode.outcomes[segment] = self._outcome(slot, segment, row)
+            self._leave(slot)
+            touched.add(segment.episode)
+        # in the order in which they began
+        for episode in [e for e in self._open.values() if e.episode in touched]:
+            self._waiting.extendleft(reversed(episode.start()))
+            needed = episode.missing()
+            self._waiting = deque(s for s in self._waiting if s.episode != episode.episode or s in needed)
+            for slot, segment in enumerate(self._segment):
+                if segment is not None and segment.episode == episode.episode and segment not in needed:
+                    self._leave(slot)
+            if not needed:
+                records.append(episode.record(self.columns))
+                del self._open[episode.episode]
         self._ended.zero_()
+        self._count_places()
         return records
 
+    def _leave(self, slot: int) -> None:
+        """Free a slot."""
+        self._segment[slot] = None
+        self._active[slot] = False
+        self._free.append(slot)
+        self._free.sort()
+
+    def _outcome(self, slot: int, segment: Segment, row: list[int]) -> Outcome:
+        """What came of the segment that has just ended in a slot; ``row`` holds its numbers as ``_collect`` reads them."""
+        steps, falls, diverged, overflowed, reached, lost, count, deep, *at_penetration = row
+        samples = np.zeros((lost, len(self.columns)), dtype=np.float32)
+        kept_until = []
+        if count:
+            values, keep = self._table.read(slot, count, self._limits[slot], self._friction[slot])
+            kept_until = keep.cumsum(0).tolist()
+            samples = np.concatenate((values[keep].to(torch.float32).cpu().numpy(), samples))
+        aims = segment.goal == TARGET
+        outcome = Outcome(
+            samples=samples,
+            control_steps=self.control_steps - self._seated_at[slot],
+            physics_steps=steps,
+            falls=falls,
+            diverged=bool(diverged),
+            overflowed=bool(overflowed),
+            reached=bool(reached),
+            restarted=bool(deep) and aims,
+        )
+        if not deep or aims:
+            return outcome
+        control, physics, rows, was_overflowed = at_penetration
+        beginning = cut_short(
+            outcome,
+            samples=kept_until[rows - 1] if rows else 0,
+            control_steps=control - self._seated_at[slot],
+            physics_steps=physics,
+            overflowed=bool(was_overflowed),
+        )
+        return replace(outcome, until_penetration=beginning)
+
     def _reset(self, mask: torch.Tensor) -> None:
-        """Put episodes back to their spawn; the robot hangs limp for one physics step, then settles."""
-        if not bool(mask.any()):
-            return
+        """Put worlds back to their spawn; the robot hangs limp for one physics step, then settles."""
         self.backend.reset(mask, base_position=self._spawn, base_quaternion=self._heading, terrain_index=self._terrain)
         self.backend.step(None, worlds=mask, substeps=1)
         self._builder.reset(mask)
         self._session.reset(mask)
         self._last_action.masked_fill_(mask[:, None], 0.0)
-        self._torque_known &= ~mask
+        self._table.forget_torque(mask)
         self._settling |= mask
         self._part_steps.masked_fill_(mask, 0)
         self._steps += mask
@@ -252,124 +363,77 @@ class EpisodeRunner:
 
     def _control_step(self) -> None:
         """One turn of the loop for all slots: command, observation, action, physics, samples, events."""
-        leaving, commanded, goal = self._advance_goals()
-        active = self._active & ~self._ended
-        state = self.backend.state
-        command = self._command(state, goal, commanded)
-        noise, delay = self._stream.draw(self._draws)
-        clipped = torch.clamp(command, -self._limits, self._limits)
-        observation = self._builder.build(state, clipped, self._last_action, noise)
-        action = self._session.act(observation, self._rows_to_play(active))
-        self._check_action(observation, action, active)
+        active, interval = self._active, self.suite.metrics.interval
+        leaving = self._leaving()
+        commanded = active & ~self._settling
+        self._part_steps += commanded
+        command = clipped = self._schedule.commands(self._first_row + self._part_steps, self._limits)
+        if self._any_target:
+            command = torch.where((self._aims & commanded)[:, None], self._towards, command)
+            clipped = torch.clamp(command, -self._limits, self._limits)
+        noise, delay = self._noise.next()
+        observation = self._builder.build(self.backend.state, clipped, self._last_action, noise)
+        action = self._session.act(observation, self._rows_to_play)
+        self._check_action(observation, action)
         self._last_action = action
-        self._draws += active
-        ahead = self.suite.metrics.interval - self._tick % self.suite.metrics.interval
+        ahead = interval - self._tick % interval
         due = active & self._sampled & (ahead <= self._substeps)
-        sample_at = torch.where(due, ahead, torch.zeros_like(ahead))
-        everyone = not self._cheap_checks or bool(active.all())
+        sample_at = ahead * due
         self.backend.step(
-            self._builder.targets(action), delay=delay, sample_at=sample_at, worlds=None if everyone else active
+            self._builder.targets(action), delay=delay, sample_at=sample_at, worlds=active if self._free else None
         )
         self.control_steps += 1
-        fall, penetration, ran = self._events(active)
-        self._last_ran = ran
+        self.physics_steps += (self._slots - len(self._free)) * self._substeps
+        fall, restart, ran = self._events(due, sample_at)
         self._tick += ran
         self._steps += ran
-        due &= sample_at <= ran
+        if fall is not self._nobody:
+            due = due & (sample_at <= ran)
         if not self._cheap_checks or bool(due.any()):
-            self._take_samples(due, command, commanded)
-        if self.suite.metrics.smoothness == "control-steps":
-            self._torque.copy_(self.backend.state.joint_torque)
-            self._torque_known |= active
-        self._follow_up(fall, penetration, commanded, leaving, goal)
+            keep = due if self.suite.settling.sampled else due & commanded
+            self._table.write(self.backend.sample, due, keep, command)
+        self._table.end_step(self.backend.state, active)
+        if fall is not self._nobody:
+            self._fall(fall, commanded, ran)
+        if leaving is not self._nobody:
+            self._settling &= ~leaving
+        self._follow_up(fall, restart, commanded)
 
-    def _advance_goals(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Move the goal clocks on, close goals that are over.
+    def _leaving(self) -> torch.Tensor:
+        """Which slots end settling with this step."""
+        settling, settle = self._settling & self._active, self.suite.settling
+        if self._cheap_checks and not bool(settling.any()):
+            return self._nobody
+        state = self.backend.state
+        speed = torch.linalg.vector_norm(state.base_linear_velocity_w, dim=1)
+        still = (speed < settle.speed) & (state.time > settle.shortest)
+        return settling & (still | (state.time > settle.longest))
 
-        Returns:
-            Which slots end settling with this step, which are commanded by their goal, and the goal of each.
-        """
-        state, settle = self.backend.state, self.suite.settling
-        settling = self._settling & self._active
-        leaving = self._nobody
-        if not self._cheap_checks or bool(settling.any()):
-            speed = torch.linalg.vector_norm(state.base_linear_velocity_w, dim=1)
-            still = (speed < settle.speed) & (state.time > settle.shortest)
-            leaving = settling & (still | (state.time > settle.longest))
-        commanded = self._active & ~settling
-        self._goal_time += commanded.to(torch.float64) * self._goals.period
-        goal = self._present_goal()
-        over = commanded & torch.where(self._goals.is_target[goal], self._done, self._goals.over(goal, self._goal_time))
-        if bool(over.any()):
-            self._close_goal(over)
-            self._reset(over & ~self._ended)
-            commanded = commanded & ~over
-            goal = self._present_goal()
-        self._part_steps += commanded
-        return leaving, commanded, goal
-
-    def _rows_to_play(self, active: torch.Tensor) -> torch.Tensor | None:
-        """Slots that need an action, filled up to a multiple of eight; None for all."""
-        if not self._few_rows_suffice:
-            return None
-        order = torch.argsort((~active).to(torch.int8), stable=True)
-        count = (int(active.sum()) + 7) // 8 * 8
-        return order[:count] if count < self._slots else None
-
-    def _present_goal(self) -> torch.Tensor:
-        """Goal number of every slot, (K,)."""
-        at = torch.clamp(self._goal_at, max=self._sequence.shape[1] - 1)
-        return self._sequence[self._rows, at]
-
-    def _close_goal(self, mask: torch.Tensor) -> None:
-        """Go on to the next goal; an episode without one ends."""
-        self._goal_at += mask
-        self._goal_time.masked_fill_(mask, 0.0)
-        self._part.masked_fill_(mask, 0)
-        self._done &= ~mask
-        self._ended |= mask & (self._goal_at >= self._num_goals)
-
-    def _end_part(self, mask: torch.Tensor, goal: torch.Tensor) -> None:
-        """Go on to the next sub-command of a velocity goal; a goal without one closes."""
-        self._part += mask
-        self._close_goal(mask & (self._part >= self._goals.parts[goal]))
-
-    def _command(self, state: PhysicsState, goal: torch.Tensor, commanded: torch.Tensor) -> torch.Tensor:
-        """What the goals command, (K, 3); zero while settling."""
-        aims = self._goals.is_target[goal] & commanded
-        if self._cheap_checks and torch.equal(aims, commanded):
-            command = torch.zeros_like(self._limits)
-        else:
-            command = self._goals.velocity_command(goal, self._goal_time, self._limits)
-        if not self._cheap_checks or bool(aims.any()):
-            offset = target_offset(state, self._target, self.suite.commands.heading_frame)
-            towards = target_command(offset, self._backward, self._speed, self._limits[:, 2])
-            command = torch.where(aims[:, None], towards, command)
-        return torch.where(commanded[:, None], command, torch.zeros_like(command))
-
-    def _check_action(self, observation: torch.Tensor, action: torch.Tensor, active: torch.Tensor) -> None:
+    def _check_action(self, observation: torch.Tensor, action: torch.Tensor) -> None:
         """A policy must answer finite observations with finite actions."""
         finite = torch.isfinite(action)
         if bool(finite.all()):
             return
-        bad = active & ~finite.all(1)
+        bad = self._active & ~finite.all(1) & torch.isfinite(observation).all(1)
         if bool(bad.any()):
-            bad &= torch.isfinite(observation).all(1)
-            if bool(bad.any()):
-                slot = int(torch.nonzero(bad)[0])
-                raise PolicyError(
-                    f"the policy returned {_first_bad(action[slot])} for a finite observation at control step "
-                    f"{int(self._draws[slot])} of episode {_key(self._episode[slot])}; a policy must return finite numbers"
-                )
+            slot = int(torch.nonzero(bad)[0])
+            segment = self._segment[slot]
+            assert segment is not None
+            raise PolicyError(
+                f"the policy returned {float(action[slot][~finite[slot]][0])} for a finite observation at control step "
+                f"{self.control_steps - self._seated_at[slot]} of {segment.goal}, part {segment.part + 1}, of episode "
+                f"{segment.episode.key}; a policy must return finite numbers"
+            )
 
-    def _events(self, active: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What interrupted the step: falls, penetrations, and the number of substeps until then, (K,) each."""
-        state, last = self.backend.state, self._substeps
-        self.physics_steps += int(active.sum()) * last
-        deepens = self.suite.events.penetration is not None
+    def _events(self, due: torch.Tensor, sample_at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What happened in the step: falls, penetrations that make a target goal start again, and the number of substeps
+        until then, (K,) each. The first penetration of a velocity goal's segment interrupts nothing and is remembered.
+        """
+        state, last, active = self.backend.state, self._substeps, self._active
+        deepens = self._rules.restarts
         if self._cheap_checks:
             calm = not (bool(state.tilt_substep.any()) or bool(state.diverged.any()) or bool(state.overflowed.any()))
-            if calm and not (deepens and bool(state.penetration_substep.any())):
+            if calm and not (deepens and bool((state.penetration_substep * self._watched).any())):
                 return self._nobody, self._nobody, active * last
         never = torch.full_like(state.tilt_substep, last + 1)
         fell_at = torch.where(state.tilt_substep > 0, state.tilt_substep, never)
@@ -379,107 +443,61 @@ class EpisodeRunner:
         self._overflowed |= state.overflowed & active
         deep_at = never
         if deepens:
-            deep = (state.penetration_substep > 0) & ~self._restarted
-            deep_at = torch.where(deep, state.penetration_substep, never)
-        fall = active & (fell_at <= last) & (fell_at <= deep_at)
-        penetration = active & (deep_at <= last) & ~fall
-        ran = torch.minimum(torch.minimum(fell_at, deep_at), never - 1) * active
-        return fall, penetration, ran
+            deep_at = torch.where((state.penetration_substep > 0) & self._watched, state.penetration_substep, never)
+        deep = active & (deep_at < fell_at)
+        restart = deep & self._aims
+        fall = active & (fell_at <= last) & ~restart
+        if deepens:
+            self._deep_control = torch.where(deep, self.control_steps, self._deep_control)
+            self._deep_steps = torch.where(deep, self._steps + deep_at, self._deep_steps)
+            seen = self._table.count + (due & (sample_at <= deep_at))
+            self._deep_count = torch.where(deep, seen, self._deep_count)
+            self._deep_overflowed = torch.where(deep, self._overflowed, self._deep_overflowed)
+            self._deep |= deep
+            self._watched &= ~deep
+        ran = torch.minimum(torch.where(restart, deep_at, fell_at), never - 1) * active
+        return fall, restart, ran
 
-    def _take_samples(self, due: torch.Tensor, command: torch.Tensor, commanded: torch.Tensor) -> None:
-        """Write one row for every slot whose sample is due."""
-        sample = self.backend.sample
-        values = self._metrics.evaluate(sample, command, self._limits, self._friction, self._torque, self._torque_known)
-        if self.suite.metrics.smoothness == "samples":
-            self._torque = torch.where(due[:, None], sample.joint_torque, self._torque)
-            self._torque_known |= due
-        keep = due if self.suite.settling.sampled else due & commanded
-        at = torch.clamp(self._count, max=self.capacity - 1)
-        old = self._values[self._rows, at]
-        self._values[self._rows, at] = torch.where(keep[:, None], values.to(torch.float32), old)
-        where = torch.stack((self._goal_at, self._part), dim=1).to(torch.int16)
-        self._where[self._rows, at] = torch.where(keep[:, None], where, self._where[self._rows, at])
-        self._count += keep
-
-    def _follow_up(
-        self,
-        fall: torch.Tensor,
-        penetration: torch.Tensor,
-        commanded: torch.Tensor,
-        leaving: torch.Tensor,
-        goal: torch.Tensor,
-    ) -> None:
-        """Ends of sub-commands, reached targets, falls and penetrations; then reset whom it concerns."""
-        commands = self.suite.commands
-        going = commanded & ~fall & ~penetration
-        aims = self._goals.is_target[goal]
-        back = going & ~aims & (self._part_steps >= self._goals.steps[goal])
-        if not self._cheap_checks or bool(back.any()):
-            self._end_part(back, goal)
-        if not self._cheap_checks or bool((going & aims).any()):
-            offset = target_offset(self.backend.state, self._target, commands.target_distance)
-            near = torch.hypot(offset[:, 0], offset[:, 1]) < commands.target_radius
-            reached = going & aims & near
-            late = self._part_steps >= self._most_steps
-            over = reached | (going & aims & late)
-            self._reached |= reached
-            if self.suite.events.penetration is None:
-                self._close_goal(over)
-            else:
-                self._done |= over  # a penetration while the robot settles can still undo it
-            back = back | over
-        self._settling &= ~leaving
-        if fall is not self._nobody and bool((fall | penetration).any()):
-            self._interrupt(fall, penetration, commanded, goal)
-            back = back | fall | penetration
-        self._reset(back & ~self._ended)
-
-    def _interrupt(
-        self, fall: torch.Tensor, penetration: torch.Tensor, commanded: torch.Tensor, goal: torch.Tensor
-    ) -> None:
-        """Falls close the goal or cost the rest of the sub-command; a penetration starts the goal again."""
+    def _fall(self, fall: torch.Tensor, commanded: torch.Tensor, ran: torch.Tensor) -> None:
+        """Count falls; where they cost the rest of the sub-command, work out how many samples that is."""
         self._falls += fall
-        self._restarted |= penetration
-        self._goal_time.masked_fill_(penetration, 0.0)
-        self._part.masked_fill_(penetration, 0)
-        again = penetration & self._goals.is_target[goal]
-        self._done &= ~again
-        self._reached &= ~again
-        if self.suite.events.fall == "close-goal":
-            self._close_goal(fall)
+        if self._rules.fall_closes_goal:
             return
-        aims = self._goals.is_target[goal]
-        self._close_goal(fall & aims)
-        fall = fall & ~aims
-        # as many zeros as there would have been samples; a fall while settling costs the whole sub-command that follows
-        steps = torch.where(aims, torch.zeros_like(goal), self._goals.steps[goal])
-        begun = torch.where(commanded, self._part_steps - 1, torch.zeros_like(steps))
-        step_began = torch.where(commanded, self._tick - self._last_ran, self._tick)
-        part_ends = step_began + (steps - begun) * self._substeps
+        # a fall while settling costs the whole sub-command that would have followed
+        begun = torch.where(commanded, self._part_steps - 1, self._nothing)
+        step_began = torch.where(commanded, self._tick - ran, self._tick)
+        part_ends = step_began + (self._length - begun) * self._substeps
         interval = self.suite.metrics.interval
-        lost = (part_ends // interval - self._tick // interval) * fall * self._sampled
-        row = torch.arange(self.capacity, device=self._device)
-        blank = (row >= self._count[:, None]) & (row < (self._count + lost)[:, None])
-        where = torch.stack((self._goal_at, self._part), dim=1).to(torch.int16)
-        self._where = torch.where(blank[..., None], where[:, None], self._where)
-        self._count += lost
-        next_part = (self._part + 1) * torch.where(aims, torch.ones_like(self._goal_time), self._goals.duration[goal])
-        self._goal_time = torch.where(fall, next_part, self._goal_time)
-        self._end_part(fall, goal)
+        lost = part_ends // interval - self._tick // interval
+        self._lost = torch.where(fall & self._sampled & ~self._aims, lost, self._lost)
 
-
-def _most_samples(suite: Suite) -> int:
-    """Number of samples that no episode exceeds: every goal with the longest settling before each sub-command, twice over
-    where a penetration may start a goal again.
-    """
-    seconds = max(suite.commands.target_time.values(), default=0.0) + 3.0 * suite.settling.longest
-    parts = 1
-    for goal in suite.goals:
-        count = GoalTable.PARTS[goal.name] if goal.phases else 0
-        parts += count
-        seconds += count * (sum(goal.phases) + suite.settling.longest + 2.0 * suite.physics.control_period)
-    repeats = 1 if suite.events.penetration is None else 2
-    return repeats * (math.ceil(seconds / (suite.metrics.interval * suite.physics.timestep)) + 2 * parts)
+    def _follow_up(self, fall: torch.Tensor, restart: torch.Tensor, commanded: torch.Tensor) -> None:
+        """Ends of segments: falls, sub-commands that are over, targets reached or missed."""
+        full = self._active & ~self._settling & (self._part_steps >= self._length)
+        if not self._any_target:
+            self._ended = full if fall is self._nobody else full | fall
+            return
+        commands, state = self.suite.commands, self.backend.state
+        offset = target_offset(state, self._target, commands.target_distance)
+        going = commanded & self._aims & ~fall & ~restart
+        reached = going & (torch.hypot(offset[:, 0], offset[:, 1]) < commands.target_radius) & ~self._done
+        over = reached | (going & full & ~self._done)
+        self._reached |= reached
+        self._ended = (full & ~self._aims) | fall
+        if commands.heading_frame != commands.target_distance:
+            offset = target_offset(state, self._target, commands.heading_frame)
+        self._towards = target_command(offset, self._backward, self._speed, self._limits[:, 2])
+        if not self._rules.restarts:
+            self._ended |= over
+            return
+        # a penetration while the robot settles once more can still undo it
+        self._done &= ~restart
+        self._reached &= ~restart
+        self._ended |= self._done & ~self._settling & ~restart & self._active
+        self._done |= over
+        again = over | restart
+        if not self._cheap_checks or bool(again.any()):
+            self._reset(again)
 
 
 def _rows_are_stable(policy: Policy, slots: int) -> bool:
@@ -498,12 +516,3 @@ def _rows_are_stable(policy: Policy, slots: int) -> bool:
             if not torch.equal(whole.act(observation)[rows], part.act(observation, rows)[rows]):
                 return False
     return True
-
-
-def _first_bad(action: torch.Tensor) -> str:
-    """The first entry that is not finite."""
-    return str(float(action[~torch.isfinite(action)][0]))
-
-
-def _key(episode: Episode | None) -> str:
-    return episode.key if episode is not None else "?"

@@ -108,8 +108,9 @@ class EpisodeList:
         """Number of episodes that have not begun."""
         return len(self._queue)
 
-    def take(self, most: int) -> list[Episode]:
-        """Up to ``most`` episodes that can start now."""
+    def take(self, most: int, *, urgent: bool = False) -> list[Episode]:
+        """Up to ``most`` episodes that can start now; no episode is urgent."""
+        most = 0 if urgent else most
         taken, self._queue = self._queue[:most], self._queue[most:]
         return taken
 

@@ -57,7 +57,8 @@ class Agenda:
     def __init__(self, episodes: Sequence[Episode]) -> None:
         self.waiting, self.records = list(episodes), []
 
-    def take(self, most: int) -> list[Episode]:
+    def take(self, most: int, *, urgent: bool = False) -> list[Episode]:
+        most = 0 if urgent else most
         taken, self.waiting = self.waiting[:most], self.waiting[most:]
         return taken
 

@@ -241,7 +241,8 @@ def test_a_policy_that_answers_nonsense_leaves_what_was_finished(request_for, tm
         request.policy, go2_contract(GO2), StoredNetwork(architecture="mlp", arguments=arguments, state_dict=broken)
     )
     with pytest.raises(
-        PolicyError, match="returned nan for a finite observation at control step 0 of episode eval-flat"
+        PolicyError,
+        match="returned nan for a finite observation at control step 0 of diagonal_velocity, part 1, of episode eval-flat",
     ):
         evaluate(request, tmp_path / "run")
     assert not (tmp_path / "run" / "results.json").exists()

@@ -7,7 +7,7 @@ from itertools import groupby
 import pytest
 import torch
 from gaitgauge.backends import PhysicsState
-from gaitgauge.gauge.goals import GoalTable, check_terrain, target_command, target_offset
+from gaitgauge.gauge.goals import Schedule, check_terrain, target_command, target_offset
 from gaitgauge.gauge.suite import Goal, SuiteError, load_suite
 from gaitgauge.robots.rotation import from_euler
 from gaitgauge.terrains.registry import make_terrain
@@ -20,17 +20,20 @@ DIAGONALS = [(-1, -1), (-1, 1), (-1, 0), (1, -1), (1, 1), (1, 0), (0, -1), (0, 1
 AXES = [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)]
 
 
+def schedule(suite):
+    return Schedule(suite, torch.device("cpu"), torch.float64)
+
+
 def commands(suite, name, limits=LEVELLED):
-    """Command at every commanded step of a goal until its clock ends it."""
-    table = GoalTable(suite, torch.device("cpu"), torch.float64)
-    goal = torch.tensor([table.names.index(name)])
-    time, out = torch.zeros(1, dtype=torch.float64), []
-    while True:
-        time = time + 0.02
-        if bool(table.over(goal, time)):
-            return out
-        command = table.velocity_command(goal, time, torch.tensor([limits], dtype=torch.float64))
-        out.append(tuple(round(v, 9) + 0.0 for v in command[0].tolist()))
+    """Command at every commanded step of a goal, part after part, as the runner reads them."""
+    table = schedule(suite)
+    out = []
+    for part, steps in enumerate(table.parts[name]):
+        rows = table.first_row(name, part) + torch.arange(len(steps) + 1)
+        found = table.commands(rows, torch.tensor([limits], dtype=torch.float64)).tolist()
+        assert found[0] == [0.0, 0.0, 0.0]  # while the robot settles
+        out += [tuple(round(v, 9) + 0.0 for v in command) for command in found[1:]]
+    return out
 
 
 def runs(sequence):
@@ -39,7 +42,7 @@ def runs(sequence):
 
 def test_goals_run_in_alphabetical_order():
     for suite in (REFERENCE, OWN):
-        assert GoalTable(suite, torch.device("cpu"), torch.float64).names == (
+        assert schedule(suite).names == (
             "diagonal_velocity",
             "max_velocity",
             "target_pos_velocity",
@@ -74,15 +77,22 @@ def test_the_references_goals_have_the_same_sequence_of_commands():
 
 def test_a_clock_that_ran_for_whole_sub_commands_leaks_the_next_command():
     """After six sub-commands of 300 steps each the rounding errors have brought the clock one step ahead."""
-    table = GoalTable(REFERENCE, torch.device("cpu"), torch.float64)
-    time = torch.zeros(1, dtype=torch.float64)
-    for _ in range(1800):
-        time = time + 0.02
-    limits = torch.tensor([LEVELLED], dtype=torch.float64)
-    last = table.velocity_command(torch.tensor([0]), time, limits)
-    assert last[0].tolist() == [0.0, -1.0, 0.0]  # the seventh sub-command, (0, -), in the last step of the sixth
-    exact = GoalTable(OWN, torch.device("cpu"), torch.float64).velocity_command(torch.tensor([0]), time, limits)
-    assert exact[0].tolist() == [-1.0, 0.0, 0.0]  # the sign-inverted sixth, (+, 0)
+    assert schedule(REFERENCE).parts["diagonal_velocity"][5][-1] == (0.0, -1.0, 0.0)  # the seventh, (0, -)
+    assert schedule(OWN).parts["diagonal_velocity"][5][-1] == (-1.0, 0.0, 0.0)  # the sign-inverted sixth, (+, 0)
+
+
+def test_the_references_clock_takes_a_step_from_the_last_sub_command_of_each_goal():
+    for suite, short in ((REFERENCE, 1), (OWN, 0)):
+        table = schedule(suite)
+        assert [len(p) for p in table.parts["diagonal_velocity"]] == [300] * 7 + [300 - short]
+        assert [len(p) for p in table.parts["max_velocity"]] == [350] * 5 + [350 - short]
+
+
+def test_the_table_has_no_commands_for_the_target():
+    table = schedule(REFERENCE)
+    assert table.target_steps == {"slope": 1000, "wave": 1000, "stairs": 1500, "obstacle": 1500}
+    row = table.first_row("target_pos_velocity", 0) + torch.arange(1501)
+    assert not table.commands(row, torch.ones(1, 3, dtype=torch.float64)).any()
 
 
 def test_suites_with_other_goals_or_phases_are_refused():
@@ -90,13 +100,13 @@ def test_suites_with_other_goals_or_phases_are_refused():
         return replace(REFERENCE, goals=(replace(REFERENCE.goals[0], **changes),))
 
     with pytest.raises(SuiteError, match="unknown goal 'joystick'; choose from diagonal_velocity"):
-        GoalTable(with_goal(name="joystick"), torch.device("cpu"), torch.float64)
+        schedule(with_goal(name="joystick"))
     for phases in ((), (3.0,), (1.0, 1.0, 1.0), (3.0, 0.0)):
         with pytest.raises(SuiteError, match="give 2 lengths above zero"):
-            GoalTable(with_goal(phases=phases), torch.device("cpu"), torch.float64)
+            schedule(with_goal(phases=phases))
     with pytest.raises(SuiteError, match="give 0 lengths"):
         goals = (Goal(name="target_pos_velocity", phases=(3.0, 3.0)),)
-        GoalTable(replace(REFERENCE, goals=goals), torch.device("cpu"), torch.float64)
+        schedule(replace(REFERENCE, goals=goals))
 
 
 # ---- towards the target -----------------------------------------------------------------------------------------------

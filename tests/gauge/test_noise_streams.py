@@ -48,7 +48,7 @@ def test_the_reference_stream_is_pythons_in_the_published_order(seed):
 def test_the_reference_stream_goes_on_after_its_table(monkeypatch):
     monkeypatch.setattr(noise, "TABLE_STEPS", 7)
     made = stream(REFERENCE, (3,))
-    made.reserve(60)
+    made.assign(0, episode(MAXIMUM, seed=3), 60)
     found = [made.draw(torch.tensor([step])) for step in range(60)]
     for (numbers, delay), (terms, delays) in zip(python_draws(3, 60), found, strict=True):
         assert int(delays[0]) == delay
@@ -66,7 +66,7 @@ def test_the_reference_stream_depends_on_the_seed_and_the_step_alone():
         assert not torch.equal(together[name][3], alone[name][0])
     assert int(delays[1]) == int(delay[0])
     # a seed that comes later changes nothing for those at work
-    many.assign(2, episode(MAXIMUM, seed=77))
+    many.assign(2, episode(MAXIMUM, seed=77), 9000)
     again, _ = many.draw(torch.tensor([0, 4, 4, 1]))
     for name in TERMS:
         assert torch.equal(again[name][[0, 1, 3]], together[name][[0, 1, 3]])

@@ -9,7 +9,6 @@ import torch
 from gaitgauge.backends.fake import FakeScript
 from gaitgauge.gauge import noise
 from gaitgauge.gauge.runner import EpisodeRunner
-from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.base import PolicyError
 from scripted_gauge import (
     DIAGONAL,
@@ -104,22 +103,32 @@ def test_samples_of_a_search_are_not_kept():
 
 @pytest.mark.parametrize("name", [REFERENCE, OWN])
 def test_a_dense_grid_loses_no_sample(name):
+    """A penetration 0.2 s after the reset ends the first try of the reference at substep 20, with ten samples: 2, 4, … 20."""
     suite = short_suite(name)
     suite = replace(suite, metrics=replace(suite.metrics, interval=2))
-    backend, agenda = fake(suite, FakeScript(penetration_time=at(0.2))), Agenda([episode(MAXIMUM)])
+    backend, agenda = fake(suite), Agenda([episode(MAXIMUM)])
     run(suite, backend, agenda)
-    record = agenda.records[0]
-    assert len(record.samples) == (len(backend.sampled) if suite.settling.sampled else 6 * 10)
-    assert (column(record, "dof_limits") > 0.9).all()
+    quiet = agenda.records[0]
+    assert len(quiet.samples) == (len(backend.sampled) if suite.settling.sampled else 6 * 10)
+    record = play(suite, [episode(MAXIMUM)], FakeScript(penetration_time=at(0.2)))[0]
+    assert len(record.samples) == len(quiet.samples) + (10 if name == REFERENCE else 0)
+    for r in (quiet, record):
+        assert (column(r, "dof_limits") > 0.9).all()
 
 
 def test_room_for_samples_grows_with_the_suite():
-    """A short period between samples, long goals: more samples than any fixed table would hold."""
-    suite = load_suite(REFERENCE)
-    dense = replace(suite, metrics=replace(suite.metrics, interval=10))
-    runner = EpisodeRunner(dense, ScriptedPolicy(), fake(dense), lambda e: 0)
-    # 90 s of commands and 14 times 3 s of settling, at 50 a second, all of it twice
-    assert runner.capacity >= 2 * 50 * (90 + 14 * 3)
+    """A sample in every control step, through the longest settling, and nearly all of the first sub-command twice."""
+    suite = short_suite(REFERENCE, maximum=(0.6, 0.4))
+    suite = replace(
+        suite,
+        metrics=replace(suite.metrics, interval=2),
+        settling=replace(suite.settling, longest=1.0),
+        commands=replace(suite.commands, clock_offset=0.5),
+    )
+    script = FakeScript(motion=moving((1.0, 0, 0)), penetration_time=at(2.0))
+    record = play(suite, [episode(MAXIMUM)], script)[0]
+    # after 50 steps and the limp substep the time is beyond 1 s: 51 steps of settling, then 50
+    assert record.control_steps == len(record.samples) == 100 + 6 * (51 + 50)
 
 
 # ---- falls ----------------------------------------------------------------------------------------------------------
@@ -208,24 +217,27 @@ def test_a_policy_that_answers_with_no_number_is_an_error(value):
         action[:, 3] = torch.where(observation[:, 6].abs() > 0, value, 0.0)
         return action
 
-    with pytest.raises(PolicyError, match=rf"returned {value} for a finite observation at control step 2 of"):
+    with pytest.raises(
+        PolicyError, match=rf"returned {value} for a finite observation at control step 2 of diagonal_velocity"
+    ):
         play(short_suite(), [episode(DIAGONAL)], policy=ScriptedPolicy(act))
 
 
 def test_what_a_policy_answers_for_empty_slots_does_not_matter():
     def act(observation):
         action = torch.zeros(len(observation), 12)
-        action[1:] = math.nan
+        action[8:] = math.nan
         return action
 
-    assert len(play(short_suite(), [episode(MAXIMUM)], slots=3, policy=ScriptedPolicy(act))) == 1
+    # eight sub-commands side by side
+    assert len(play(short_suite(), [episode(DIAGONAL)], slots=10, policy=ScriptedPolicy(act))) == 1
 
 
 # ---- penetration ------------------------------------------------------------------------------------------------------
 
 
 def test_a_penetration_starts_the_goal_again_once_and_keeps_the_samples():
-    """0.2 s after a reset, in the eighth control step; and again, without effect, in every later sub-command."""
+    """0.2 s after a reset, in the tenth control step; and again, without effect, in every later sub-command."""
     suite, policy = short_suite(REFERENCE), ScriptedPolicy()
     record = play(suite, [episode(MAXIMUM)], FakeScript(penetration_time=at(0.2)), policy=policy)[0]
     quiet = play(suite, [episode(MAXIMUM)])[0]
@@ -233,7 +245,9 @@ def test_a_penetration_starts_the_goal_again_once_and_keeps_the_samples():
     assert record.falls == 0
     again = record.control_steps - quiet.control_steps
     assert again == 10
-    assert torch.equal(policy.commands()[:again], policy.commands()[again : 2 * again])
+    # what had begun is played to its end, what would have followed is not; then come all sub-commands once more
+    assert torch.equal(policy.commands()[:CYCLE], policy.commands()[CYCLE : 2 * CYCLE])
+    assert len(policy.seen) == CYCLE + quiet.control_steps
     assert (record.part_index == 0).sum() == 4 + (quiet.part_index == 0).sum()
 
 

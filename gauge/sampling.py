@@ -1,0 +1,138 @@
+"""What the metrics need to know of each sample, kept while a segment runs; the metrics themselves are worked out at its end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ..backends.base import PhysicsState
+from ..robots.base import Robot
+from .metrics import MetricEvaluator
+from .suite import Suite
+
+_MOTION = ("base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity_b")
+_JOINTS = ("joint_position", "joint_velocity", "joint_torque")
+_CONTACTS = ("ground_moment_w", "ground_force_w", "foot_normal_force", "foot_tangential_force")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampledState:
+    """The part of ``PhysicsState`` that metrics look at, of T samples."""
+
+    base_quaternion_w: torch.Tensor
+    base_linear_velocity_w: torch.Tensor
+    base_angular_velocity_b: torch.Tensor
+    joint_position: torch.Tensor
+    joint_velocity: torch.Tensor
+    joint_torque: torch.Tensor
+    ground_moment_w: torch.Tensor
+    ground_force_w: torch.Tensor
+    foot_normal_force: torch.Tensor
+    foot_tangential_force: torch.Tensor
+
+
+class SampleTable:
+    """Samples of K slots. A slot's rows depend on its own segment alone, and so do the metrics worked out from them."""
+
+    def __init__(
+        self, suite: Suite, robot: Robot, weight: float, slots: int, device: torch.device, dtype: torch.dtype
+    ) -> None:
+        """Prepare the table; ``reserve`` gives it rows.
+
+        Args:
+            suite: the rules.
+            robot: the robot.
+            weight: its weight [N].
+            slots: number of slots K.
+            device: where the states live.
+            dtype: floating-point type of the states.
+        """
+        self._metrics = MetricEvaluator(suite.metrics, robot, weight, device, dtype)
+        self.names = self._metrics.names
+        self._between_samples = suite.metrics.smoothness == "samples"
+        joints, feet = robot.num_joints, len(robot.foot_names)
+        self._fields: tuple[str, ...] = _MOTION + _JOINTS
+        self._widths = [4, 3, 3, joints, joints, joints]
+        if self._metrics.needs_contacts:
+            self._fields += _CONTACTS
+            self._widths += [3, 3, feet, feet]
+        # then the command, the torque before, whether that is known, and whether the sample counts
+        self._split = [*self._widths, 3, joints, 1, 1]
+        self._slots, self._device, self._dtype = slots, device, dtype
+        self._rows = torch.zeros(0, 0, device=device, dtype=dtype)
+        self._begin = torch.zeros(slots, dtype=torch.int64, device=device)
+        self.capacity = 0
+        """Rows of each slot."""
+        self.count = torch.zeros(slots, dtype=torch.int64, device=device)
+        """Rows that each slot has filled, (K,)."""
+        self._torque = torch.zeros(slots, joints, device=device, dtype=dtype)
+        self._torque_known = torch.zeros(slots, dtype=torch.bool, device=device)
+
+    def reserve(self, rows: int) -> None:
+        """Have room for segments of so many samples."""
+        if rows <= self.capacity:
+            return
+        # one row more, for those who have no sample to write
+        table = torch.zeros(self._slots, rows + 1, sum(self._split), device=self._device, dtype=self._dtype)
+        if self.capacity:
+            table[:, : self.capacity] = self._rows.view(self._slots, self.capacity + 1, -1)[:, :-1]
+        self._rows, self.capacity = table.flatten(0, 1), rows
+        self._begin = torch.arange(self._slots, device=self._device) * (rows + 1)
+
+    def clear(self, mask: torch.Tensor) -> None:
+        """Forget the samples of some slots, (K,) bool."""
+        self.count.masked_fill_(mask, 0)
+
+    def forget_torque(self, mask: torch.Tensor) -> None:
+        """Some robots, (K,) bool, were reset: there is no torque to compare their next one with."""
+        self._torque_known &= ~mask
+
+    def write(self, sample: PhysicsState, due: torch.Tensor, keep: torch.Tensor, command: torch.Tensor) -> None:
+        """Write a row for every slot whose sample is due.
+
+        Args:
+            sample: the state at which it is taken; the other slots' rows do not matter.
+            due: (K,) bool.
+            keep: whether it counts, (K,) bool.
+            command: commanded velocities, (K, 3).
+        """
+        values = [getattr(sample, name) for name in self._fields]
+        flags = torch.stack((self._torque_known, keep), dim=1)
+        row = torch.cat((*values, command, self._torque, flags), dim=1)
+        at = torch.where(due, torch.clamp(self.count, max=self.capacity - 1), self.capacity)
+        self._rows.index_copy_(0, self._begin + at, row)
+        self.count += due
+        if self._between_samples:
+            self._torque = torch.where(due[:, None], sample.joint_torque, self._torque)
+            self._torque_known |= due
+
+    def end_step(self, state: PhysicsState, active: torch.Tensor) -> None:
+        """A control step has ended: its torque is the one to compare with, where the suite says so."""
+        if not self._between_samples:
+            self._torque.copy_(state.joint_torque)
+            self._torque_known |= active
+
+    def read(
+        self, slot: int, count: int, limits: torch.Tensor, friction: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Metrics and quality of a slot's first ``count`` samples, and which of them count.
+
+        Args:
+            slot: which.
+            count: number of samples T.
+            limits: command limits of its segment, (3,).
+            friction: its friction coefficient, ().
+
+        Returns:
+            (T, columns), NaN where a metric is not defined, and (T,) bool.
+        """
+        begin = slot * (self.capacity + 1)
+        *values, command, before, known, keep = self._rows[begin : begin + count].split(self._split, dim=1)
+        if not self._metrics.needs_contacts:
+            values += [values[0][:, :0]] * len(_CONTACTS)
+        state = SampledState(**dict(zip(_MOTION + _JOINTS + _CONTACTS, values, strict=True)))
+        metrics = self._metrics.evaluate(
+            state, command, limits.expand(count, -1), friction.expand(count), before, known[:, 0] > 0
+        )
+        return metrics, keep[:, 0] > 0

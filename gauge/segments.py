@@ -1,0 +1,205 @@
+"""Episodes in pieces that can be played side by side, and how their outcomes make up what playing them in a row would give.
+
+Every sub-command of a velocity goal begins with a reset to the spawn, so that an episode falls into independent segments. What
+one of them does to another in a row (a fall ends its goal, a penetration starts the goal again) is decided here, afterwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .episodes import Episode, Record
+from .goals import TARGET, Schedule
+from .suite import Suite
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """One sub-command of a velocity goal, or a target goal as a whole."""
+
+    episode: Episode
+    goal: str
+    goal_index: int
+    """Place of the goal in the order in which the episode plays them."""
+    part: int
+    """Sub-command."""
+    again: bool = False
+    """Whether the episode's one penetration lies behind it: no other one counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came of a segment, or of its beginning."""
+
+    samples: NDArray[np.float32]
+    """(T, columns)."""
+    control_steps: int
+    physics_steps: int
+    falls: int = 0
+    diverged: bool = False
+    overflowed: bool = False
+    reached: bool = False
+    """Whether the target was reached."""
+    restarted: bool = False
+    """Whether a penetration made a target goal start again."""
+    until_penetration: Outcome | None = None
+    """What a velocity segment was when the robot first went too deep, if it did and if that matters; all of it ran on."""
+
+
+class SegmentRules:
+    """What a suite says about segments."""
+
+    def __init__(self, suite: Suite, schedule: Schedule) -> None:
+        self.parts = {name: len(parts) for name, parts in schedule.parts.items()}
+        self.fall_closes_goal = suite.events.fall == "close-goal"
+        self.restarts = suite.events.penetration is not None
+        settling = math.floor(suite.settling.longest / suite.physics.control_period) + 3
+        longest = max((len(p) for parts in schedule.parts.values() for p in parts), default=0)
+        self.stretch = settling + longest
+        """Control steps that no segment of a velocity goal exceeds: each has so much of its episode's noise."""
+        crossing = max(schedule.target_steps.values(), default=0) + 2 * settling
+        self._target_steps = crossing * (2 if self.restarts else 1)
+
+    def most_steps(self, segment: Segment) -> int:
+        """Control steps that the segment does not exceed."""
+        return self._target_steps if segment.goal == TARGET else self.stretch
+
+    def goals(self, episode: Episode) -> list[str]:
+        """The goals of an episode in the order in which it plays them."""
+        return [name for name in self.parts if name in episode.goals]
+
+    def noise_start(self, segment: Segment) -> int:
+        """Where in its episode's noise a segment begins, in control steps: no two segments share a draw.
+
+        First come the velocity goals' parts in order, then their second attempts, then the target goal.
+        """
+        goals = [name for name in self.goals(segment.episode) if name != TARGET]
+        total = sum(self.parts[name] for name in goals)
+        if segment.goal == TARGET:
+            return 2 * total * self.stretch
+        before = sum(self.parts[name] for name in goals[: goals.index(segment.goal)])
+        return (before + segment.part + (total if segment.again else 0)) * self.stretch
+
+    def segments(self, episode: Episode, goal_index: int, *, again: bool) -> list[Segment]:
+        """All segments of one goal of an episode."""
+        name = self.goals(episode)[goal_index]
+        return [
+            Segment(episode=episode, goal=name, goal_index=goal_index, part=part, again=again)
+            for part in range(self.parts[name])
+        ]
+
+    def count(self, episode: Episode) -> int:
+        """Number of segments that can be played side by side at first."""
+        return sum(self.parts[name] for name in self.goals(episode))
+
+
+@dataclass
+class OpenEpisode:
+    """An episode of which segments are still to be played."""
+
+    episode: Episode
+    rules: SegmentRules
+    outcomes: dict[Segment, Outcome] = field(default_factory=dict)
+    started: set[Segment] = field(default_factory=set)
+    """Segments that have been handed out."""
+
+    def missing(self) -> set[Segment]:
+        """Segments that are needed as far as is known, and have not ended."""
+        return set(self._follow()[1])
+
+    def start(self) -> list[Segment]:
+        """Needed segments that have not been handed out yet; they are now."""
+        found = [s for s in self._follow()[1] if s not in self.started]
+        self.started.update(found)
+        return found
+
+    def _follow(self) -> tuple[list[tuple[Segment, Outcome]], list[Segment], bool]:
+        """Go through the episode in order, as far as outcomes are known.
+
+        Returns:
+            What counts, complete only if nothing is missing; the segments that are missing; whether a goal was begun again.
+        """
+        counted: list[tuple[Segment, Outcome]] = []
+        missing: list[Segment] = []
+        restarted = False
+        for index, goal in enumerate(self.rules.goals(self.episode)):
+            if goal == TARGET and missing:
+                continue  # whether a penetration still matters to it depends on what comes before
+            lies_behind = goal == TARGET and restarted
+            sure = not missing
+            some, absent = self._play(
+                self.rules.segments(self.episode, index, again=lies_behind), sure and not restarted
+            )
+            counted += some
+            missing += absent
+            if sure and not absent and not restarted and some[-1][1].restarted:
+                restarted = True
+                if goal != TARGET:
+                    some, absent = self._play(self.rules.segments(self.episode, index, again=True), False)
+                    counted += some
+                    missing += absent
+        return counted, missing, restarted
+
+    def _play(self, segments: Sequence[Segment], watched: bool) -> tuple[list[tuple[Segment, Outcome]], list[Segment]]:
+        """What counts of a goal's segments up to the one that ends the attempt, and which are missing for that.
+
+        ``watched`` says whether it is certain that a penetration interrupts the goal.
+        """
+        counted, absent = [], []
+        for segment in segments:
+            outcome = self.outcomes.get(segment)
+            if outcome is None:
+                absent.append(segment)
+                continue
+            cut = outcome.until_penetration if watched else None
+            counted.append((segment, cut or outcome))
+            if cut is not None or (outcome.falls and self.rules.fall_closes_goal):
+                break
+        return counted, absent
+
+    def record(self, columns: tuple[str, ...]) -> Record:
+        """The episode's record; nothing may be missing."""
+        counted, missing, restarted = self._follow()
+        assert not missing
+        outcomes = [outcome for _, outcome in counted]
+        lengths = [len(outcome.samples) for outcome in outcomes]
+
+        def index(values: list[int]) -> NDArray[np.int16]:
+            return np.repeat(np.asarray(values, dtype=np.int16), lengths)
+
+        has_samples = sum(lengths) > 0
+        has_target = TARGET in self.episode.goals
+        return Record(
+            episode=self.episode,
+            success=any(o.reached for o in outcomes) if has_target else None,
+            falls=sum(o.falls for o in outcomes),
+            diverged=any(o.diverged for o in outcomes),
+            overflowed=any(o.overflowed for o in outcomes),
+            restarted=restarted,
+            control_steps=sum(o.control_steps for o in outcomes),
+            physics_steps=sum(o.physics_steps for o in outcomes),
+            columns=columns if has_samples else (),
+            samples=np.concatenate([o.samples for o in outcomes]),
+            goal_index=index([s.goal_index for s, _ in counted]),
+            part_index=index([s.part for s, _ in counted]),
+        )
+
+
+def cut_short(outcome: Outcome, *, samples: int, control_steps: int, physics_steps: int, overflowed: bool) -> Outcome:
+    """The beginning of a velocity segment, up to a penetration, after which its goal starts again."""
+    return replace(
+        outcome,
+        samples=outcome.samples[:samples],
+        control_steps=control_steps,
+        physics_steps=physics_steps,
+        overflowed=overflowed,
+        falls=0,
+        diverged=False,
+        restarted=True,
+        until_penetration=None,
+    )

@@ -1,0 +1,394 @@
+"""Segments played side by side make up the very record that playing them in a row would give."""
+
+import random
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from gaitgauge.backends import Scene
+from gaitgauge.gauge.goals import Schedule
+from gaitgauge.gauge.runner import EpisodeRunner
+from gaitgauge.gauge.segments import OpenEpisode, Outcome, Segment, SegmentRules, cut_short
+from gaitgauge.gauge.suite import load_suite
+from scripted_gauge import DIAGONAL, GO2, MAXIMUM, TARGET, Agenda, Puppet, ScriptedPolicy, episode, ground, short_suite
+
+REFERENCE, OWN = "robogauge-1.1", "gaitgauge-1"
+PARTS = {DIAGONAL: 8, MAXIMUM: 6}
+
+
+def rules_of(name, suite=None):
+    suite = suite or load_suite(name)
+    return SegmentRules(suite, Schedule(suite, torch.device("cpu"), torch.float64))
+
+
+# ---- assembly, against playing in a row ------------------------------------------------------------------------------
+
+
+def tale(chance, falls, penetrations):
+    """What would happen in every sub-command, in a first attempt and in a second one."""
+    told = {}
+    for goal, parts in PARTS.items():
+        for part in range(parts):
+            for again in (False, True):
+                length = chance.randrange(4, 9)
+                told[goal, part, again] = {
+                    "steps": length,
+                    "fell": chance.random() < falls,
+                    "deep": chance.randrange(1, length) if chance.random() < penetrations else None,
+                    "overflow": chance.randrange(length) if chance.random() < 0.1 else None,
+                }
+    return told
+
+
+def in_a_row(told, goals, closes, restarts):
+    """Goal after goal, part after part; a step has one sample, which says where it belongs."""
+    samples, falls, restarted, overflowed = [], 0, False, False
+    for number, goal in enumerate(goals):
+        part, again = 0, False
+        while part < PARTS[goal]:
+            told_now = told[goal, part, again]
+            length, interrupted = told_now["steps"], False
+            if restarts and not restarted and told_now["deep"] is not None:
+                length, interrupted = told_now["deep"], True
+            samples += [(number, part, again, step) for step in range(length)]
+            overflowed |= told_now["overflow"] is not None and told_now["overflow"] < length
+            if interrupted:
+                restarted, again, part = True, True, 0
+                continue
+            falls += told_now["fell"]
+            if told_now["fell"] and closes:
+                break
+            part += 1
+    return samples, falls, restarted, overflowed
+
+
+def outcome_of(told, segment, restarts):
+    it = told[segment.goal, segment.part, segment.again]
+    rows = [(segment.goal_index, segment.part, segment.again, step) for step in range(it["steps"])]
+    whole = Outcome(
+        samples=np.asarray(rows, dtype=np.float32),
+        control_steps=it["steps"],
+        physics_steps=10 * it["steps"],
+        falls=int(it["fell"]),
+        diverged=it["fell"],
+        overflowed=it["overflow"] is not None,
+    )
+    deep = it["deep"]
+    if not restarts or deep is None or segment.again:
+        return whole
+    early = it["overflow"] is not None and it["overflow"] < deep
+    cut = cut_short(whole, samples=deep, control_steps=deep, physics_steps=10 * deep, overflowed=early)
+    return Outcome(**{**vars(whole), "until_penetration": cut})
+
+
+@pytest.mark.parametrize("name", [REFERENCE, OWN])
+@pytest.mark.parametrize(("falls", "penetrations"), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.15), (0.15, 0.15), (0.6, 0.6)])
+def test_any_order_of_completion_gives_what_playing_in_a_row_gives(name, falls, penetrations):
+    chance, rules = random.Random(f"{name} {falls} {penetrations}"), rules_of(name)
+    restarts = closes = name == REFERENCE
+    for _ in range(60):
+        goals = chance.choice([(DIAGONAL, MAXIMUM), (MAXIMUM,), (DIAGONAL,)])
+        told = tale(chance, falls, penetrations)
+        samples, fell, restarted, overflowed = in_a_row(told, goals, closes, restarts)
+        opened = OpenEpisode(episode(*goals), rules)
+        playing = opened.start()
+        assert len(playing) == sum(PARTS[g] for g in goals)
+        played = 0
+        while playing:
+            segment = playing.pop(chance.randrange(len(playing)))
+            opened.outcomes[segment] = outcome_of(told, segment, restarts)
+            played += 1
+            playing += opened.start()
+            needed = opened.missing()
+            playing = [s for s in playing if s in needed]
+            assert set(playing) == needed
+        record = opened.record(("goal", "part", "again", "step"))
+        assert [tuple(row) for row in record.samples.astype(int).tolist()] == samples
+        assert record.goal_index.tolist() == [s[0] for s in samples]
+        assert record.part_index.tolist() == [s[1] for s in samples]
+        assert (record.falls, record.restarted, record.overflowed) == (fell, restarted, overflowed)
+        assert record.diverged == (fell > 0)
+        assert (record.control_steps, record.physics_steps) == (len(samples), 10 * len(samples))
+        assert record.success is None
+        assert played <= 2 * sum(PARTS[g] for g in goals)
+
+
+def test_a_target_goal_waits_for_what_comes_before_it_and_has_no_second_penetration():
+    rules = rules_of(REFERENCE)
+    for deep in (None, 2):
+        opened = OpenEpisode(episode(MAXIMUM, TARGET), rules)
+        waiting = opened.start()
+        assert {s.goal for s in waiting} == {MAXIMUM}
+        told = {
+            (MAXIMUM, part, again): {"steps": 4, "fell": False, "deep": deep, "overflow": None}
+            for part in range(6)
+            for again in (False, True)
+        }
+        while waiting[0].goal != TARGET:
+            opened.outcomes[waiting[0]] = outcome_of(told, waiting[0], True)
+            waiting = [s for s in waiting[1:] + opened.start() if s in opened.missing()]
+        assert waiting[0].again is (deep is not None)
+        zeros = np.zeros((1, 4), dtype=np.float32)
+        opened.outcomes[waiting[0]] = Outcome(samples=zeros, control_steps=1, physics_steps=10, reached=True)
+        record = opened.record(("a", "b", "c", "d"))
+        assert record.success is True
+        assert record.restarted is (deep is not None)
+        assert record.goal_index.tolist()[-1] == 1
+
+
+# ---- noise ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [REFERENCE, OWN])
+def test_no_two_segments_share_a_draw(name):
+    rules = rules_of(name)
+    for goals in ((DIAGONAL, MAXIMUM), (MAXIMUM,), (DIAGONAL, MAXIMUM, TARGET)):
+        walk = episode(*goals)
+        segments = [
+            s
+            for again in (False, True)
+            for i, g in enumerate(goals)
+            for s in rules.segments(walk, i, again=again)
+            if not (again and g == TARGET)
+        ]
+        spans = sorted((rules.noise_start(s), rules.noise_start(s) + rules.most_steps(s)) for s in segments)
+        assert len(segments) == 2 * sum(PARTS[g] for g in goals if g != TARGET) + (TARGET in goals)
+        assert rules.noise_start(segments[0]) == 0
+        assert all(end <= begin for (_, end), (begin, _) in pairwise(spans))
+        # the longest settling, then the longest sub-command, in control steps of 20 ms
+        assert all(end - begin >= 151 + 350 for begin, end in spans)
+    assert rules.noise_start(Segment(episode=episode(TARGET), goal=TARGET, goal_index=0, part=0)) == 0
+
+
+# ---- the runner -------------------------------------------------------------------------------------------------------
+
+SIGNS = {  # commanded directions of first phases that no other sub-command has at that time
+    "diagonal 1": (-1, 1, 0),
+    "diagonal 3": (1, -1, 0),
+    "diagonal 4": (1, 1, 0),
+    "maximum 4": (0, 0, -1),
+}
+
+
+class Stage(Puppet):
+    """Tells by the joints' targets what is commanded; falls and penetrations happen at given substeps since the reset.
+
+    Substep 1 hangs limp, 2 to 5 are two control steps of settling, 6 to 15 the first phase, 16 to 25 the second; the reference
+    samples at 5, 10, … 25.
+    """
+
+    def __init__(self, scene, falls, penetrations):
+        self.falls, self.penetrations = falls, penetrations
+        super().__init__(scene)
+
+    def _watch(self, mask, substep):
+        state = self._state
+        signs = torch.sign(torch.round((self.targets - self.default_pose)[:, :3], decimals=3))
+        for events, first in ((self.falls, state.tilt_substep), (self.penetrations, state.penetration_substep)):
+            for name, when in events.items():
+                here = (signs == torch.tensor(SIGNS[name])).all(1) & (self._substeps_since_reset == when)
+                first[mask & here & (first == 0)] = substep
+
+
+def stage(name, slots, falls, penetrations, count=1):
+    """Records of both goals, the same for one episode or several."""
+    suite = short_suite(name)
+
+    def act(observation):
+        action = torch.zeros(len(observation), 12)
+        action[:, :3] = observation[:, 6:9]
+        return action
+
+    scene = Scene(
+        robot=GO2,
+        parameters=GO2.parameters[suite.parameters],
+        terrains=(ground(),),
+        terrain_index=(0,) * slots,
+        physics=suite.physics,
+    )
+    agenda = Agenda([episode(DIAGONAL, MAXIMUM, seed=seed) for seed in range(count)])
+    EpisodeRunner(suite, ScriptedPolicy(act), Stage(scene, falls, penetrations), lambda e: 0).run(agenda)
+    return sorted(agenda.records, key=lambda r: r.episode.seed)
+
+
+def counts(record):
+    """Samples of each sub-command of both goals."""
+    return [
+        [int(((record.goal_index == goal) & (record.part_index == part)).sum()) for part in range(parts)]
+        for goal, parts in enumerate(PARTS.values())
+    ]
+
+
+WHOLE = [[5] * 7 + [4], [5] * 5 + [4]]  # the goal's clock ends the last sub-command a step early
+STEPS, SUBSTEPS = 12, 25
+
+
+@pytest.mark.parametrize("slots", [1, 3, 24])
+@pytest.mark.parametrize(
+    ("falls", "penetrations", "samples", "fell", "restarted", "steps", "substeps"),
+    [
+        ({}, {}, WHOLE, 0, False, 14 * STEPS - 2, 14 * SUBSTEPS - 4),
+        # a fall at substep 10, in the fifth control step: its sample counts, the rest of the goal does not exist
+        (
+            {"diagonal 1": 10},
+            {},
+            [[5, 2, 0, 0, 0, 0, 0, 0], WHOLE[1]],
+            1,
+            False,
+            STEPS + 5 + 6 * STEPS - 1,
+            SUBSTEPS + 10 + 6 * SUBSTEPS - 2,
+        ),
+        # a penetration at substep 12, in the sixth control step: the goal starts again and does not mind the next one
+        (
+            {},
+            {"diagonal 1": 12, "maximum 4": 12},
+            [[10, 7, *WHOLE[0][2:]], WHOLE[1]],
+            0,
+            True,
+            STEPS + 6 + 14 * STEPS - 2,
+            SUBSTEPS + 12 + 14 * SUBSTEPS - 4,
+        ),
+        # the penetration that a fall hides does not count, so that of the other goal does
+        (
+            {"diagonal 1": 10},
+            {"diagonal 4": 12, "maximum 4": 8},
+            [[5, 2, 0, 0, 0, 0, 0, 0], [10, 10, 10, 10, 6, 4]],
+            1,
+            True,
+            STEPS + 5 + 4 * STEPS + 4 + 6 * STEPS - 1,
+            SUBSTEPS + 10 + 4 * SUBSTEPS + 8 + 6 * SUBSTEPS - 2,
+        ),
+        # a fall after a penetration is not reached at first, but in the second attempt
+        (
+            {"diagonal 3": 12},
+            {"diagonal 3": 8},
+            [[10, 10, 10, 3, 0, 0, 0, 0], WHOLE[1]],
+            1,
+            True,
+            3 * STEPS + 4 + 3 * STEPS + 6 + 6 * STEPS - 1,
+            3 * SUBSTEPS + 8 + 3 * SUBSTEPS + 12 + 6 * SUBSTEPS - 2,
+        ),
+        # the fall comes first within a control step, and in the same substep
+        *[
+            (
+                {"diagonal 3": 8},
+                {"diagonal 3": late},
+                [[5, 5, 5, 1, 0, 0, 0, 0], WHOLE[1]],
+                1,
+                False,
+                3 * STEPS + 4 + 6 * STEPS - 1,
+                3 * SUBSTEPS + 8 + 6 * SUBSTEPS - 2,
+            )
+            for late in (8, 9)
+        ],
+        # the penetration comes first within a control step
+        (
+            {"diagonal 3": 9},
+            {"diagonal 3": 8},
+            [[10, 10, 10, 2, 0, 0, 0, 0], WHOLE[1]],
+            1,
+            True,
+            3 * STEPS + 4 + 3 * STEPS + 4 + 6 * STEPS - 1,
+            3 * SUBSTEPS + 8 + 3 * SUBSTEPS + 9 + 6 * SUBSTEPS - 2,
+        ),
+    ],
+)
+def test_falls_and_penetrations_of_the_reference(slots, falls, penetrations, samples, fell, restarted, steps, substeps):
+    record = stage(REFERENCE, slots, falls, penetrations)[0]
+    assert counts(record) == samples
+    assert (record.falls, record.restarted) == (fell, restarted)
+    assert (record.control_steps, record.physics_steps) == (steps, substeps)
+
+
+@pytest.mark.parametrize("substep", [10, 11])
+def test_a_sample_counts_up_to_the_penetration(substep):
+    """The control step has substeps 10 and 11; its sample falls on the first or, with the penetration at 10, on the same."""
+    record = stage(REFERENCE, 3, {}, {"diagonal 1": substep})[0]
+    assert counts(record)[0][1] == 2 + 5
+    early = stage(REFERENCE, 3, {}, {"diagonal 1": 9})[0]
+    assert counts(early)[0][1] == 1 + 5
+
+
+def test_the_samples_of_a_second_attempt_follow_those_of_the_first():
+    record = stage(REFERENCE, 3, {}, {"diagonal 1": 12})[0]
+    assert record.goal_index.tolist() == [0] * (7 + 39) + [1] * 29
+    parts = [*[0] * 5, 1, 1, *(p for p, n in enumerate(WHOLE[0]) for _ in range(n))]
+    assert record.part_index.tolist() == parts + [p for p, n in enumerate(WHOLE[1]) for _ in range(n)]
+
+
+@pytest.mark.parametrize("slots", [1, 3, 24])
+def test_a_fall_in_the_own_suite_costs_its_own_sub_command(slots):
+    """Samples fall on 6, 11, 16 and 21; penetrations are no events."""
+    record = stage(OWN, slots, {"diagonal 1": 12}, {"diagonal 4": 12})[0]
+    assert counts(record) == [[4] * 8, [4] * 6]
+    assert (record.falls, record.restarted) == (1, False)
+    lost = [not record.samples[i].any() for i in range(len(record.samples))]
+    assert [i for i, zero in enumerate(lost) if zero] == [4 + 2, 4 + 3]
+    assert record.control_steps == 13 * STEPS + 6
+
+
+@pytest.mark.parametrize("name", [REFERENCE, OWN])
+@pytest.mark.parametrize("events", [({}, {}), ({"maximum 4": 12}, {"diagonal 4": 9})])
+def test_slots_and_neighbours_change_no_bit_of_a_record(name, events):
+    alone = stage(name, 1, *events, count=3)
+    for slots in (3, 24, 50):
+        for one, other in zip(alone, stage(name, slots, *events, count=3), strict=True):
+            assert one.summary() == other.summary()
+            for field in ("samples", "goal_index", "part_index"):
+                assert getattr(one, field).tobytes() == getattr(other, field).tobytes()
+
+
+def test_few_episodes_are_open_at_a_time():
+    """Others begin only when slots are free and no segment waits; what is finished is handed over at once."""
+    suite = short_suite(OWN)
+    scene = Scene(
+        robot=GO2,
+        parameters=GO2.parameters[suite.parameters],
+        terrains=(ground(),),
+        terrain_index=(0,) * 4,
+        physics=suite.physics,
+    )
+    agenda, most = Agenda([episode(MAXIMUM, seed=seed) for seed in range(5)]), []
+
+    def watch(progress):
+        active = progress.active()
+        most.append(len(active))
+        assert all(0 < age <= 6 * STEPS for age in active.values())
+
+    EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0).run(agenda, watch)
+    assert [r.episode.seed for r in agenda.records] == list(range(5))
+    assert max(most) == 2
+    # thirty segments in four slots, twelve control steps each
+    assert len(most) == 8 * STEPS
+
+
+def test_level_tests_go_before_waiting_segments():
+    suite = short_suite(OWN)
+    started = []
+
+    class Urgent(Agenda):
+        def take(self, most, *, urgent=False):
+            first = [e for e in self.waiting if e.stage == "search" and self.ready]
+            rest = [] if urgent else [e for e in self.waiting if e.stage == "eval"]
+            taken = (first + rest)[:most]
+            self.waiting = [e for e in self.waiting if e not in taken]
+            return taken
+
+    agenda = Urgent([episode(DIAGONAL, MAXIMUM), episode(TARGET, stage="search")])
+    agenda.ready = False
+    scene = Scene(
+        robot=GO2,
+        parameters=GO2.parameters[suite.parameters],
+        terrains=(ground((9.0, 0.0, 0.4)),),
+        terrain_index=(0, 0),
+        physics=suite.physics,
+    )
+
+    def watch(progress):
+        agenda.ready = progress.control_steps >= 5  # in the first of seven rounds of two segments
+        started.extend((e.stage, progress.control_steps) for e, age in progress.active().items() if age <= 1)
+
+    EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0).run(agenda, watch)
+    assert ("search", STEPS + 1) in started
+    assert [r.episode.stage for r in agenda.records] == ["search", "eval"]
