@@ -7,10 +7,8 @@ payload. What happens in a segment depends on that segment alone: not on its slo
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -24,20 +22,10 @@ from .episodes import QUALITY, Episode, Record
 from .goals import TARGET, Schedule, target_command, target_offset
 from .noise import NoiseReader, make_stream
 from .sampling import SampleTable
-from .segments import OpenEpisode, Outcome, Segment, SegmentRules, cut_short
+from .segments import Agenda, Outcome, Segment, SegmentQueue, SegmentRules, cut_short
 from .suite import Suite
 
 GRAVITY = 9.81
-
-
-class Agenda(Protocol):
-    """Who says which episodes run next."""
-
-    def take(self, most: int, *, urgent: bool = False) -> Sequence[Episode]:
-        """Up to ``most`` episodes that can start now; with ``urgent`` only those on whose outcome other episodes wait."""
-
-    def finished(self, record: Record) -> None:
-        """An episode has ended."""
 
 
 class Progress:
@@ -95,8 +83,7 @@ class EpisodeRunner:
 
         whole, truth = torch.int64, torch.bool
         # who sits where
-        self._open: dict[Episode, OpenEpisode] = {}
-        self._waiting: deque[Segment] = deque()
+        self._queue = SegmentQueue(self._rules, self.columns)
         self._segment: list[Segment | None] = [None] * k
         self._free = list(range(k))
         self._seated_at = [0] * k
@@ -151,36 +138,18 @@ class EpisodeRunner:
         ages: dict[Episode, int] = {}
         for segment, begun in zip(self._segment, self._seated_at, strict=True):
             if segment is not None:
-                known = ages.get(segment.episode)
-                if known is None:
-                    known = sum(o.control_steps for o in self._open[segment.episode].outcomes.values())
+                known = ages.get(segment.episode, self._queue.steps_behind(segment.episode))
                 ages[segment.episode] = known + self.control_steps - begun
         return ages
 
     def _fill(self, agenda: Agenda) -> bool:
-        """Let segments begin in the free slots; returns whether any are at work.
-
-        Episodes on which others wait come first. Others begin only when no segment waits, so that few episodes are open.
-        """
-        if not self._free:
-            return True
-        for episode in reversed(agenda.take(len(self._free), urgent=True)):
-            self._waiting.extendleft(reversed(self._begin(episode)))
-        while len(self._waiting) < len(self._free):
-            episodes = agenda.take(1)
-            if not episodes:
-                break
-            self._waiting.extend(self._begin(episodes[0]))
-        count = min(len(self._free), len(self._waiting))
-        if count:
-            slots, self._free = self._free[:count], self._free[count:]
-            self._seat(slots, [self._waiting.popleft() for _ in slots])
+        """Let segments begin in the free slots; returns whether any are at work."""
+        if self._free:
+            segments = self._queue.take(agenda, len(self._free))
+            if segments:
+                slots, self._free = self._free[: len(segments)], self._free[len(segments) :]
+                self._seat(slots, segments)
         return len(self._free) < self._slots
-
-    def _begin(self, episode: Episode) -> list[Segment]:
-        """Open an episode; returns its first segments."""
-        self._open[episode] = OpenEpisode(episode, self._rules)
-        return self._open[episode].start()
 
     def _seat(self, slots: list[int], segments: Sequence[Segment]) -> None:
         """Let segments begin in free slots."""
@@ -280,25 +249,16 @@ class EpisodeRunner:
             ],
             dim=1,
         ).tolist()
-        records, touched = [], set()
+        outcomes = {}
         for slot, row in zip(slots.tolist(), numbers, strict=True):
             segment = self._segment[slot]
             assert segment is not None
-            episode = self._open[segment.episode]
-            episode.outcomes[segment] = self._outcome(slot, segment, row)
+            outcomes[segment] = self._outcome(slot, segment, row)
             self._leave(slot)
-            touched.add(segment.episode)
-        # in the order in which they began
-        for episode in [e for e in self._open.values() if e.episode in touched]:
-            self._waiting.extendleft(reversed(episode.start()))
-            needed = episode.missing()
-            self._waiting = deque(s for s in self._waiting if s.episode != episode.episode or s in needed)
-            for slot, segment in enumerate(self._segment):
-                if segment is not None and segment.episode == episode.episode and segment not in needed:
-                    self._leave(slot)
-            if not needed:
-                records.append(episode.record(self.columns))
-                del self._open[episode.episode]
+        records, hidden = self._queue.finish(outcomes)
+        for slot, segment in enumerate(self._segment):
+            if segment in hidden:
+                self._leave(slot)
         self._ended.zero_()
         self._count_places()
         return records
@@ -432,8 +392,10 @@ class EpisodeRunner:
         state, last, active = self.backend.state, self._substeps, self._active
         deepens = self._rules.restarts
         if self._cheap_checks:
-            calm = not (bool(state.tilt_substep.any()) or bool(state.diverged.any()) or bool(state.overflowed.any()))
-            if calm and not (deepens and bool((state.penetration_substep * self._watched).any())):
+            trouble = state.tilt_substep + state.diverged + state.overflowed
+            if deepens:
+                trouble += state.penetration_substep * self._watched
+            if not bool((trouble * active).any()):
                 return self._nobody, self._nobody, active * last
         never = torch.full_like(state.tilt_substep, last + 1)
         fell_at = torch.where(state.tilt_substep > 0, state.tilt_substep, never)
@@ -473,31 +435,39 @@ class EpisodeRunner:
 
     def _follow_up(self, fall: torch.Tensor, restart: torch.Tensor, commanded: torch.Tensor) -> None:
         """Ends of segments: falls, sub-commands that are over, targets reached or missed."""
-        full = self._active & ~self._settling & (self._part_steps >= self._length)
+        quiet = fall is self._nobody
+        settled = self._active & ~self._settling
+        full = settled & (self._part_steps >= self._length)
         if not self._any_target:
-            self._ended = full if fall is self._nobody else full | fall
+            self._ended = full if quiet else full | fall
             return
         commands, state = self.suite.commands, self.backend.state
         offset = target_offset(state, self._target, commands.target_distance)
-        going = commanded & self._aims & ~fall & ~restart
-        reached = going & (torch.hypot(offset[:, 0], offset[:, 1]) < commands.target_radius) & ~self._done
-        over = reached | (going & full & ~self._done)
-        self._reached |= reached
-        self._ended = (full & ~self._aims) | fall
+        near = torch.hypot(offset[:, 0], offset[:, 1]) < commands.target_radius
+        going = commanded & self._aims
+        if not quiet:
+            going &= ~(fall | restart)
+        over = (near | full) & going
         if commands.heading_frame != commands.target_distance:
             offset = target_offset(state, self._target, commands.heading_frame)
         self._towards = target_command(offset, self._backward, self._speed, self._limits[:, 2])
-        if not self._rules.restarts:
-            self._ended |= over
+        ended = full & ~self._aims
+        if self._cheap_checks and quiet and not bool((over | self._done).any()):
+            self._ended = ended
             return
-        # a penetration while the robot settles once more can still undo it
-        self._done &= ~restart
-        self._reached &= ~restart
-        self._ended |= self._done & ~self._settling & ~restart & self._active
-        self._done |= over
-        again = over | restart
-        if not self._cheap_checks or bool(again.any()):
-            self._reset(again)
+        over &= ~self._done
+        self._reached |= over & near
+        if self._rules.restarts:
+            # a penetration while the robot settles once more can still undo it
+            self._done &= ~restart
+            self._reached &= ~restart
+            self._ended = ended | fall | (self._done & settled & ~restart)
+            self._done |= over
+            again = over | restart
+            if not self._cheap_checks or bool(again.any()):
+                self._reset(again)
+        else:
+            self._ended = ended | fall | over
 
 
 def _rows_are_stable(policy: Policy, slots: int) -> bool:

@@ -7,8 +7,10 @@ one of them does to another in a row (a fall ends its goal, a penetration starts
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,6 +190,71 @@ class OpenEpisode:
             goal_index=index([s.goal_index for s, _ in counted]),
             part_index=index([s.part for s, _ in counted]),
         )
+
+
+class Agenda(Protocol):
+    """Who says which episodes run next."""
+
+    def take(self, most: int, *, urgent: bool = False) -> Sequence[Episode]:
+        """Up to ``most`` episodes that can start now; with ``urgent`` only those on whose outcome other episodes wait."""
+
+    def finished(self, record: Record) -> None:
+        """An episode has ended."""
+
+
+class SegmentQueue:
+    """Segments that wait for a place, and the episodes that they belong to."""
+
+    def __init__(self, rules: SegmentRules, columns: tuple[str, ...]) -> None:
+        """``columns`` are those of the samples."""
+        self._rules, self._columns = rules, columns
+        self._open: dict[Episode, OpenEpisode] = {}
+        self._waiting: deque[Segment] = deque()
+
+    def take(self, agenda: Agenda, most: int) -> list[Segment]:
+        """Up to ``most`` segments to play now.
+
+        Episodes on which others wait come first. Others begin only when no segment waits, so that few episodes are open.
+        """
+        for episode in reversed(agenda.take(most, urgent=True)):
+            self._waiting.extendleft(reversed(self._begin(episode)))
+        while len(self._waiting) < most:
+            episodes = agenda.take(1)
+            if not episodes:
+                break
+            self._waiting.extend(self._begin(episodes[0]))
+        return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
+
+    def _begin(self, episode: Episode) -> list[Segment]:
+        self._open[episode] = OpenEpisode(episode, self._rules)
+        return self._open[episode].start()
+
+    def finish(self, outcomes: Mapping[Segment, Outcome]) -> tuple[list[Record], set[Segment]]:
+        """Segments have ended.
+
+        Returns:
+            Records of the episodes that are complete with them, in the order in which they began, and segments that may still be
+            at work although nothing in the record will come of them.
+        """
+        touched = {segment.episode for segment in outcomes}
+        records, hidden = [], set()
+        for segment, outcome in outcomes.items():
+            self._open[segment.episode].outcomes[segment] = outcome
+        for episode in [e for e in self._open if e in touched]:
+            opened = self._open[episode]
+            self._waiting.extendleft(reversed(opened.start()))
+            needed = opened.missing()
+            hidden |= opened.started - needed - opened.outcomes.keys()
+            if not needed:
+                records.append(opened.record(self._columns))
+                del self._open[episode]
+        if hidden:
+            self._waiting = deque(s for s in self._waiting if s not in hidden)
+        return records, hidden
+
+    def steps_behind(self, episode: Episode) -> int:
+        """Control steps of an open episode's segments that have ended."""
+        return sum(outcome.control_steps for outcome in self._open[episode].outcomes.values())
 
 
 def cut_short(outcome: Outcome, *, samples: int, control_steps: int, physics_steps: int, overflowed: bool) -> Outcome:
