@@ -24,16 +24,23 @@ from gaitgauge.training.configuration import AlgorithmConfiguration, RunConfigur
 from tensordict import TensorDict
 
 WIDTHS = {"policy": 45, "history": 225, "privileged": 263}
+PLAIN: dict[str, Any] = {"cuda_graphs": False, "compile_mode": "none"}
 VARIANTS: dict[str, dict[str, Any]] = {
-    "float32": {"precision": "float32"},
-    "tf32": {},
-    "bfloat16": {"precision": "bfloat16"},
-    "tf32, CUDA graphs": {"cuda_graphs": True},
-    "bfloat16, CUDA graphs": {"precision": "bfloat16", "cuda_graphs": True},
-    "tf32, compiled": {"compile_mode": "default"},
+    "float32": PLAIN | {"precision": "float32"},
+    "tf32": PLAIN,
+    "bfloat16": PLAIN | {"precision": "bfloat16"},
+    "tf32, CUDA graphs": PLAIN | {"cuda_graphs": True},
+    "bfloat16, CUDA graphs": PLAIN | {"precision": "bfloat16", "cuda_graphs": True},
+    "tf32, compiled": PLAIN | {"compile_mode": "default"},
     "tf32, compiled, CUDA graphs": {"compile_mode": "default", "cuda_graphs": True},
     "bfloat16, compiled, CUDA graphs": {"precision": "bfloat16", "compile_mode": "default", "cuda_graphs": True},
-    "tf32, CUDA graphs, augmented": {"cuda_graphs": True, "symmetry": "augment"},
+    "tf32, compiled, CUDA graphs, augmented": {"compile_mode": "default", "cuda_graphs": True, "symmetry": "augment"},
+    "bfloat16, compiled, CUDA graphs, augmented": {
+        "precision": "bfloat16",
+        "compile_mode": "default",
+        "cuda_graphs": True,
+        "symmetry": "augment",
+    },
 }
 
 

@@ -16,7 +16,7 @@ STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
 SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "loss")
 LOAD_BALANCE_FORMS: tuple[str, ...] = ("sum", "mean")
 PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
-COMPILE_MODES: tuple[str, ...] = ("none", "default", "max-autotune-no-cudagraphs")
+COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default", "max-autotune-no-cudagraphs")
 
 
 class ConfigurationError(ValueError):
@@ -114,10 +114,11 @@ class AlgorithmConfiguration:
     """Weight of the mirror loss (``symmetry="loss"``)."""
     precision: str = "tf32"
     """Matrix products on a GPU: ``float32``, ``tf32`` or ``bfloat16`` (autocast; losses stay in float32)."""
-    cuda_graphs: bool = False
-    """Replay a minibatch step as one CUDA graph; single GPU only."""
-    compile_mode: str = "none"
-    """Mode of ``torch.compile`` for the loss functions: ``none``, ``default`` or ``max-autotune-no-cudagraphs``."""
+    cuda_graphs: bool | None = None
+    """Replay a minibatch step as one CUDA graph; single GPU only. None: wherever that is possible."""
+    compile_mode: str = "auto"
+    """Mode of ``torch.compile`` for the loss functions: ``none``, ``default``, ``max-autotune-no-cudagraphs``, or
+    ``auto``: ``default`` on a GPU, ``none`` elsewhere. Compiling takes about half a minute at the start."""
 
     def __post_init__(self) -> None:
         _choose("symmetry", self.symmetry, SYMMETRY_MODES)

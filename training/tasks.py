@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from types import MappingProxyType
 
-from .configuration import NetworkConfiguration, RunConfiguration, TrainingConfiguration
+from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
 from .environment_configuration import (
     FLAT_TILE,
     CommandConfiguration,
@@ -58,12 +58,15 @@ class _Settings:
     training: TrainingConfiguration
 
 
+_MIRRORED = AlgorithmConfiguration(symmetry="augment")
+
+
 def _moe_cts() -> Task:
     return Task(
         name="go2-moe-cts",
         title="Unitree Go2 on all terrains, Mixture-of-Experts student (the paper's method)",
         environment=EnvironmentConfiguration(),
-        training=TrainingConfiguration(),
+        training=TrainingConfiguration(algorithm=_MIRRORED),
     )
 
 
@@ -73,7 +76,9 @@ def _cts() -> Task:
         title="Unitree Go2 on all terrains, plain student",
         environment=EnvironmentConfiguration(),
         training=TrainingConfiguration(
-            network=NetworkConfiguration(student_encoder="mlp"), run=RunConfiguration(experiment="go2_cts")
+            algorithm=_MIRRORED,
+            network=NetworkConfiguration(student_encoder="mlp"),
+            run=RunConfiguration(experiment="go2_cts"),
         ),
     )
 
@@ -83,7 +88,7 @@ def _flat() -> Task:
     iterations.
     """
     environment = EnvironmentConfiguration(
-        num_envs=4096,
+        num_envs=8192,
         schedule=ScheduleConfiguration(horizon_steps=24 * 500),
         terrain=TerrainConfiguration(
             tiles=(FLAT_TILE,), levels=1, curriculum=False, leave_distance=None, spread_probability=0.0
@@ -99,6 +104,7 @@ def _flat() -> Task:
         rewards=RewardConfiguration(base_height=Ramp(start=-5.0, end=-10.0)),
     )
     training = TrainingConfiguration(
+        algorithm=replace(_MIRRORED, compile_mode="none"),  # compiling would take a fifth of the run
         network=NetworkConfiguration(student_encoder="mlp"),
         run=RunConfiguration(experiment="go2_flat", iterations=500, save_interval=100, gauge_interval=0),
     )

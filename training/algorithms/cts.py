@@ -87,6 +87,7 @@ class CTS(PPO):
             )
         if configuration.cuda_graphs and (not on_gpu or self.is_multi_gpu):
             raise ConfigurationError("cuda_graphs is on; it needs a single CUDA device.")
+        self._graphs = on_gpu and not self.is_multi_gpu and configuration.cuda_graphs is not False
         self.configuration = configuration
         self.mirror = mirror.to(device) if mirror is not None and configuration.symmetry != "none" else None
         self.transition = StratifiedStorage.Transition()
@@ -107,9 +108,12 @@ class CTS(PPO):
             self._mirrored_targets = torch.zeros(samples, latent_width, device=device)
         self._policy_loss: Callable[..., tuple[torch.Tensor, torch.Tensor]] = self._compute_policy_loss
         self._student_loss: Callable[..., tuple[torch.Tensor, torch.Tensor]] = self._compute_student_loss
-        if configuration.compile_mode != "none":
-            self._policy_loss = torch.compile(self._compute_policy_loss, mode=configuration.compile_mode)
-            self._student_loss = torch.compile(self._compute_student_loss, mode=configuration.compile_mode)
+        mode = configuration.compile_mode
+        if mode == "auto":
+            mode = "default" if on_gpu else "none"
+        if mode != "none":
+            self._policy_loss = torch.compile(self._compute_policy_loss, mode=mode)
+            self._student_loss = torch.compile(self._compute_student_loss, mode=mode)
         self._prepare_steps()
 
     @staticmethod
@@ -297,7 +301,7 @@ class CTS(PPO):
     def _prepare_steps(self) -> None:
         self._policy_step: Callable[[torch.Tensor, torch.Tensor], None] = self._run_policy_step
         self._student_step: Callable[[torch.Tensor], None] = self._run_student_step
-        if self.configuration.cuda_graphs:
+        if self._graphs:
             self._policy_step = GraphedStep(self._run_policy_step)
             self._student_step = GraphedStep(self._run_student_step)
 
@@ -307,7 +311,7 @@ class CTS(PPO):
             torch.device(self.device).type,
             dtype=torch.bfloat16,
             enabled=self.configuration.precision == "bfloat16",
-            cache_enabled=not self.configuration.cuda_graphs,
+            cache_enabled=not self._graphs,
         )
 
     def _run_policy_step(self, teacher_rows: torch.Tensor, student_rows: torch.Tensor) -> None:
