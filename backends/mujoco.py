@@ -101,7 +101,8 @@ class MujocoBackend(PhysicsBackend):
         self._state = BatchState(layout, self._live)
         self._sample = BatchState(layout, {k: v.copy() for k, v in self._live.items()})
         self._deep = layout.penetration
-        self._buffers: dict[tuple[int, int], Records] = {}
+        self._everyone = np.arange(n)
+        self._rooms: dict[tuple[int, int], tuple[Array, Records]] = {}
         stand = torch.tensor([0.0, 0.0, robot.stand_height], dtype=torch.float64).repeat(n, 1)
         self.reset(base_position=stand, base_quaternion=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, 1))
 
@@ -137,7 +138,7 @@ class MujocoBackend(PhysicsBackend):
     def _rows(self, worlds: torch.Tensor | None) -> NDArray[np.int64]:
         """Indices of the masked worlds."""
         if worlds is None:
-            return np.arange(self.num_worlds)
+            return self._everyone
         if worlds.dtype != torch.bool or worlds.shape != (self.num_worlds,):
             raise BackendError(
                 f"the mask of worlds must be {self.num_worlds} booleans, not {tuple(worlds.shape)} of {worlds.dtype}"
@@ -203,48 +204,77 @@ class MujocoBackend(PhysicsBackend):
     ) -> None:
         """See ``PhysicsBackend.step``."""
         rows = self._rows(worlds)
-        if len(rows) == 0:
+        n = len(rows)
+        if n == 0:
             return
+        those = slice(None) if n == self.num_worlds else rows  # a slice gives views, which saves copies
         total = self.scene.physics.substeps if substeps is None else substeps
-        held, offset = self._held[rows], self._offset[rows]
-        switch = np.full(len(rows), total, dtype=np.int64)
-        targets = held
+        held, offset, limp = self._held[those], self._offset[those], self._limp[those]
+        targets, waits = held, None
         if joint_targets is not None:
-            targets = joint_targets.to(torch.float64).numpy()[rows]
-            broken = ~np.isfinite(targets).all(1)
-            if broken.any():
+            targets = np.asarray(joint_targets.numpy(), dtype=np.float64)[those]
+            if not np.isfinite(targets).all():
+                broken = np.logical_not(np.isfinite(targets).all(axis=1))
                 targets = np.where(broken[:, None], held, targets)
                 self._state.flags["diverged"][rows[broken]] = True
-            switch = np.zeros(len(rows), dtype=np.int64) if delay is None else delay.numpy()[rows]
-        waits = np.arange(total) < switch[:, None]
-        control = np.where(waits[..., None], held[:, None], targets[:, None]) + offset[:, None]
-        limp = self._limp[rows]
-        records = self._play(rows[~limp], control[~limp])
-        if limp.any():
-            records = _merge(limp, records, self._play_limp(rows[limp], control[limp], waits[limp]))
+            if delay is not None:
+                waits = np.arange(total) < delay.numpy()[those, None]
+        control, records = self._memory(n, total)
+        control[:] = (targets + offset)[:, None]
+        if waits is not None:
+            np.copyto(control, (held + offset)[:, None], where=waits[..., None])
+        if not limp.any():
+            self._play(rows, control, records)
+        else:
+            if waits is None:
+                waits = np.full((n, total), joint_targets is None)
+            records = self._play_some_limp(rows, control, limp, waits)
         if joint_targets is not None:  # a target that waits for the whole step acts from the next one on
-            self._held[rows] = targets
-            self._limp[rows] = False
-        self._batch.forward(rows.astype(np.int32), stage=_STAGE)
-        self._watch(rows, records)
+            self._held[those] = targets
+            self._limp[those] = False
+        self._batch.forward(self._ids(rows), stage=_STAGE)
+        self._watch(those, records)
         self._flag(rows)
-        self._state.renew(rows)
+        self._state.renew(those)
         if sample_at is not None:
-            at = sample_at.numpy()[rows]
+            at = sample_at.numpy()[those]
             if at.any():
                 self._sample.take(self._state, rows, records, at)
 
-    def _play(self, rows: NDArray[np.int64], control: Array) -> Records:
-        """Step worlds with the given controls, (rows, substeps, J); returns what was recorded after each substep."""
-        n, count = control.shape[:2]
-        key = (n, count)
-        if key not in self._buffers:
-            shapes = {name: getattr(self._batch, name).shape[1:] for name in RECORDED}
-            self._buffers[key] = {name: np.zeros((n, count, *shape)) for name, shape in shapes.items()}
-        out = self._buffers[key]
-        if n:
-            self._batch.rollout(count, control, ids=rows.astype(np.int32), record=RECORDED, out=out)
-        return out
+    def _ids(self, rows: NDArray[np.int64]) -> NDArray[np.int32] | None:
+        """World indices as MuJoCo takes them: None for all."""
+        return None if len(rows) == self.num_worlds else rows.astype(np.int32)
+
+    def _memory(self, n: int, count: int) -> tuple[Array, Records]:
+        """Room for the controls of ``n`` worlds over ``count`` substeps, (n, count, J), and for what is recorded of them.
+
+        It is the same memory for every ``n``, which the processor's caches then hold.
+        """
+        if (n, count) not in self._rooms:
+            whole = self.num_worlds
+            if n == whole:
+                shapes = {name: getattr(self._batch, name).shape[1:] for name in RECORDED}
+                records = {name: np.zeros((n, count, *shape)) for name, shape in shapes.items()}
+                self._rooms[n, count] = np.zeros((n, count, self._held.shape[1])), records
+            else:
+                control, records = self._memory(whole, count)
+                self._rooms[n, count] = control[:n], {name: array[:n] for name, array in records.items()}
+        return self._rooms[n, count]
+
+    def _play(self, rows: NDArray[np.int64], control: Array, records: Records) -> None:
+        """Step worlds with the given controls, (rows, substeps, J), and record them after each substep."""
+        self._batch.rollout(control.shape[1], control, ids=self._ids(rows), record=RECORDED, out=records)
+
+    def _play_some_limp(
+        self, rows: NDArray[np.int64], control: Array, limp: NDArray[np.bool_], waits: NDArray[np.bool_]
+    ) -> Records:
+        """The same where the motors of some worlds hang limp while they wait, (rows,) and (rows, substeps)."""
+        others, some = rows[~limp], control[~limp]
+        loose = self._play_limp(rows[limp], control[limp], waits[limp])
+        records = self._memory(len(others), control.shape[1])[1]
+        if len(others):
+            self._play(others, some, records)
+        return _merge(limp, records, loose)
 
     def _play_limp(self, rows: NDArray[np.int64], control: Array, waits: NDArray[np.bool_]) -> Records:
         """The same for worlds whose motors hang limp while they wait: they get the target at which the law gives no torque."""
@@ -254,23 +284,23 @@ class MujocoBackend(PhysicsBackend):
                 self._qpos[np.ix_(rows, self._joint_q)]
                 + self._kd_over_kp[rows] * (self._qvel[np.ix_(rows, self._joint_v)])
             )
-            now = np.where(waits[:, substep, None], loose, control[:, substep])
-            parts.append({k: v.copy() for k, v in self._play(rows, now[:, None]).items()})
+            now, records = self._memory(len(rows), 1)
+            now[:] = np.where(waits[:, substep, None], loose, control[:, substep])[:, None]
+            self._play(rows, now, records)
+            parts.append({name: array.copy() for name, array in records.items()})
         return {name: np.concatenate([p[name] for p in parts], axis=1) for name in RECORDED}
 
-    def _watch(self, rows: NDArray[np.int64], records: Records) -> None:
+    def _watch(self, those: slice | NDArray[np.int64], records: Records) -> None:
         """Record the first substep at which a watched limit was exceeded."""
         physics, flags = self.scene.physics, self._state.flags
-        flags["tilt_substep"][rows] = 0
-        flags["penetration_substep"][rows] = 0
         if physics.watch_tilt is not None:
             qpos = records["qpos"]
             over = qpos[:, :, 4] ** 2 + qpos[:, :, 5] ** 2 > self._tilt_bound
-            flags["tilt_substep"][rows] = _first(over)
+            flags["tilt_substep"][those] = _first(over) if over.any() else 0
         if self._deep is not None:
             # no contact reads 0
             over = records["sensordata"][:, :, self._deep] < -float(physics.watch_penetration or 0.0)
-            flags["penetration_substep"][rows] = _first(over)
+            flags["penetration_substep"][those] = _first(over) if over.any() else 0
 
     def _warning_counts(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Number of MuJoCo's invalid-state and buffer-full warnings so far, (rows, 2)."""

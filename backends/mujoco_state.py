@@ -81,7 +81,7 @@ class BatchState(PhysicsState):
             self._computed |= {k: torch.from_numpy(v) for k, v in compute().items()}
         return self._computed[name]
 
-    def renew(self, rows: NDArray[np.int64]) -> None:
+    def renew(self, rows: slice | NDArray[np.int64]) -> None:
         """Worlds have been stepped: what was computed is out of date."""
         self._computed = {}
         if not self._complete:

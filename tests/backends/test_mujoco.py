@@ -1,0 +1,87 @@
+"""The CPU engine's own promises: what happens in a world does not depend on which worlds are stepped along with it."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+from gaitgauge.backends.base import PhysicsOptions, PhysicsState, Scene
+from gaitgauge.backends.mujoco import MujocoBackend
+from gaitgauge.robots import load_robot
+from gaitgauge.terrains import make_terrain
+
+WORLDS = 5
+NAMES = [f.name for f in fields(PhysicsState)]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    robot = load_robot("go2")
+    return Scene(
+        robot=robot,
+        parameters=next(iter(robot.parameters.values())),
+        terrains=(make_terrain("flat", 0),),
+        terrain_index=(0,) * WORLDS,
+        physics=PhysicsOptions(watch_tilt=1e-3, watch_penetration=1e-4),
+    )
+
+
+def start(scene: Scene, held: torch.Tensor | None, worlds: torch.Tensor | None, backend: MujocoBackend) -> None:
+    lift = torch.linspace(0.0, 0.1, WORLDS, dtype=torch.float64)
+    position = torch.stack((lift * 0.0, lift * 0.0, scene.robot.stand_height + lift), dim=1)
+    upright = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(WORLDS, 1)
+    backend.reset(worlds, base_position=position, base_quaternion=upright, held_target=held)
+
+
+@pytest.mark.parametrize("substeps", [None, 1, 4])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_world_moves_alike_in_any_company(scene: Scene, substeps: int | None, threads: int):
+    """Limp and held motors side by side, all worlds at once against one world at a time, to the last bit."""
+    pose = torch.tensor(scene.robot.default_joint_position, dtype=torch.float64).repeat(WORLDS, 1)
+    limp = torch.tensor([True, False, True, False, False])
+    generator = torch.Generator().manual_seed(2)
+    together = MujocoBackend(scene, threads=threads)
+    apart = [MujocoBackend(scene) for _ in range(WORLDS)]
+    alone = torch.eye(WORLDS, dtype=torch.bool)
+    for backend in (together, *apart):
+        start(scene, pose, ~limp, backend)
+        start(scene, None, limp, backend)
+    last = 10 if substeps is None else substeps
+    tilted = False
+    for step in range(12):
+        targets = pose + 0.3 * torch.randn(WORLDS, 12, generator=generator, dtype=torch.float64)
+        delay = torch.randint(0, last + 1, (WORLDS,), generator=generator)
+        sample_at = torch.randint(0, last + 1, (WORLDS,), generator=generator)
+        some = torch.rand(WORLDS, generator=generator) < 0.7
+        if step == 6:
+            for backend in (together, *apart):
+                start(scene, None, limp, backend)
+        given = None if step in (1, 7) else targets.to(torch.float32 if step % 2 else torch.float64)
+        options = {"delay": delay, "sample_at": sample_at, "substeps": substeps}
+        together.step(given, worlds=None if step % 3 == 0 else some, **options)
+        for world, backend in enumerate(apart):
+            if step % 3 == 0 or some[world]:
+                backend.step(given, worlds=alone[world], **options)
+            for name in NAMES:
+                here, there = getattr(together.state, name)[world], getattr(backend.state, name)[world]
+                assert torch.equal(here, there), f"state.{name} of world {world} after step {step}"
+                if sample_at[world] and (step % 3 == 0 or some[world]):
+                    here, there = getattr(together.sample, name)[world], getattr(backend.sample, name)[world]
+                    assert torch.equal(here, there), f"sample.{name} of world {world} after step {step}"
+        tilted |= bool(together.state.tilt_substep.any())
+    assert tilted
+
+
+def test_targets_that_are_not_finite_leave_the_old_ones_in_force(scene: Scene):
+    pose = torch.tensor(scene.robot.default_joint_position, dtype=torch.float64).repeat(WORLDS, 1)
+    broken, whole = MujocoBackend(scene), MujocoBackend(scene)
+    for backend in (broken, whole):
+        start(scene, pose, None, backend)
+    targets = pose + 0.2
+    spoilt = targets.clone()
+    spoilt[3, 5] = float("nan")
+    kept = targets.clone()
+    kept[3] = pose[3]
+    broken.step(spoilt)
+    whole.step(kept)
+    assert broken.state.diverged.tolist() == [False, False, False, True, False]
+    assert torch.isnan(spoilt[3, 5]) and torch.equal(broken.state.joint_position, whole.state.joint_position)
