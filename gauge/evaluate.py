@@ -35,7 +35,8 @@ PACKAGES = ("gaitgauge", "mujoco", "mujoco-warp", "newton", "warp-lang", "torch"
 _SLOTS = 24
 """Worlds on the CPU: enough to keep the threads busy, few enough for the policy's batch to cost little."""
 _MANY_SLOTS = 64
-"""Worlds on the CPU for runs of many environments."""
+"""Worlds on the CPU for runs of many environments, which have more level tests to play at a time."""
+_FEW_ENVIRONMENTS = 16
 _GPU_SLOTS = 4096
 """Largest number of worlds on a GPU."""
 
@@ -247,7 +248,8 @@ def _runner(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: 
     parts = sum(len(SUB_COMMANDS[g.name]) for g in suite.goals if g.name != TARGET)
     if torch.device(request.device).type == "cpu":
         at_once = max(len(plan.seeds) * parts, len(suite.matrix.search_seeds))
-        slots = min(len(plan.environments) * at_once, _SLOTS)
+        count = len(plan.environments)
+        slots = min(count * at_once, _SLOTS if count <= _FEW_ENVIRONMENTS else _MANY_SLOTS)
     else:
         tests, quality = plan.waiting
         slots = min(max(tests + quality * parts, 1), _GPU_SLOTS)

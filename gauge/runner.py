@@ -464,7 +464,7 @@ class EpisodeRunner:
             self._ended = ended | fall | (self._done & settled & ~restart)
             self._done |= over
             again = over | restart
-            if not self._cheap_checks or bool(again.any()):
+            if bool(again.any()):
                 self._reset(again)
         else:
             self._ended = ended | fall | over

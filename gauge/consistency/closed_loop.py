@@ -19,7 +19,7 @@ from ...policy.base import Policy
 from ...robots import Robot
 from ...terrains.registry import make_terrain
 from ..episodes import QUALITY, Episode, Record
-from ..goals import TARGET
+from ..goals import SUB_COMMANDS, TARGET
 from ..runner import EpisodeRunner, Progress
 from ..scoring import run_statistics
 from ..suite import Suite
@@ -108,6 +108,11 @@ class EpisodeList:
         """Number of episodes that have not begun."""
         return len(self._queue)
 
+    @property
+    def waiting_segments(self) -> int:
+        """Number of worlds in which they can be played side by side."""
+        return sum(len(SUB_COMMANDS[goal]) for episode in self._queue for goal in episode.goals)
+
     def take(self, most: int, *, urgent: bool = False) -> list[Episode]:
         """Up to ``most`` episodes that can start now; no episode is urgent."""
         most = 0 if urgent else most
@@ -156,7 +161,7 @@ def play(
     if not agenda.waiting:
         return agenda.records
     places = list(dict.fromkeys((e.terrain, e.level) for e in episodes))
-    slots = min(agenda.waiting, _SLOTS if torch.device(variant.device).type == "cpu" else _MANY_SLOTS)
+    slots = min(agenda.waiting_segments, _SLOTS if torch.device(variant.device).type == "cpu" else _MANY_SLOTS)
     scene = Scene(
         robot=robot,
         parameters=robot.parameters[suite.parameters],

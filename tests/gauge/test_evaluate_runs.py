@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -161,6 +162,21 @@ def test_seeds_and_frictions_given_twice_count_once(request_for, tmp_path):
     results = evaluate(request, tmp_path / "run")
     assert len(results["environments"]) == 1
     assert results["health"]["episodes"] == 1
+
+
+def test_the_progress_lists_every_episode_once_and_counts_down(request_for, tmp_path):
+    seen = []
+    evaluate(request_for(), tmp_path / "run", watch=seen.append)
+    assert max(len(s.active) for s in seen) > 1
+    assert all(len(set(s.active)) == len(s.active) for s in seen)
+    shares = [s.remaining_work for s in seen]
+    assert all(0.0 <= share <= 1.0 for share in shares)
+    assert shares[0] > 0.9
+    assert shares[-1] == 0.0
+    # while nothing ends and nothing begins, work that is done shows
+    steady = [(a, b) for a, b in pairwise(seen) if a.active == b.active and a.known == b.known and a.done == b.done]
+    assert steady
+    assert all(b.remaining_work <= a.remaining_work for a, b in steady)
 
 
 # ---- interruption ---------------------------------------------------------------------------------------------------------
