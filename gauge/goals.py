@@ -22,6 +22,9 @@ _SECOND_PHASE = {"diagonal_velocity": -1.0, "max_velocity": 0.0}
 
 TARGET = "target_pos_velocity"
 
+LATERAL_SPEED = 1.0
+"""Largest lateral speed on the way to the target [m/s]."""
+
 Command = tuple[float, float, float]
 
 
@@ -177,6 +180,6 @@ def target_command(
     turn = torch.where(backward, math.pi - wide, wide)
     yaw = torch.sign(bearing) * torch.minimum(2.0 * turn, yaw_limit)
     facing = torch.where(backward, wide > 0.75 * math.pi, wide < 0.25 * math.pi)
-    lateral = torch.clamp(sideways, -1.0, 1.0) * (wide >= 0.25 * math.pi)
+    lateral = torch.clamp(sideways, -LATERAL_SPEED, LATERAL_SPEED) * (wide >= 0.25 * math.pi)
     direction = 1.0 - 2.0 * backward
     return torch.stack((direction * speed * facing, lateral, direction * yaw), dim=1)

@@ -19,7 +19,7 @@ from ..policy.observation import ObservationBuilder
 from ..robots.geometry import total_mass
 from ..robots.rotation import from_yaw
 from .episodes import QUALITY, Episode, Record
-from .goals import TARGET, Schedule, target_command, target_offset
+from .goals import LATERAL_SPEED, TARGET, Schedule, target_command, target_offset
 from .noise import NoiseReader, make_stream
 from .sampling import SampleTable
 from .segments import Agenda, Outcome, Segment, SegmentQueue, SegmentRules, cut_short
@@ -77,6 +77,10 @@ class EpisodeRunner:
         self._noise = NoiseReader(make_stream(suite.noise, scene.robot.num_joints, k, device), k, device)
         self._table = SampleTable(suite, scene.robot, GRAVITY * total_mass(scene.robot), k, device, dtype)
         self.columns = (*self._table.names, QUALITY)
+        commands = suite.commands
+        fastest = max(commands.target_speed.values(), default=0.0)
+        # velocity goals keep to the limits, and so does the way to the target unless the suite is an odd one
+        self._must_clip = any(x < fastest or y < LATERAL_SPEED for x, y, _ in (commands.flat, commands.levelled))
 
         def zeros(*shape: int, kind: torch.dtype = dtype) -> torch.Tensor:
             return torch.zeros(k, *shape, device=device, dtype=kind)
@@ -91,6 +95,7 @@ class EpisodeRunner:
         self._active = zeros(kind=truth)
         self._rows_to_play: torch.Tensor | None = None
         self._any_target = False
+        self._whole_step = zeros(kind=whole)
         # what does not change during a segment
         self._spawn, self._heading, self._terrain = zeros(3), zeros(4), zeros(kind=whole)
         self._target, self._backward, self._speed = zeros(3), zeros(kind=truth), zeros()
@@ -226,6 +231,7 @@ class EpisodeRunner:
 
     def _count_places(self) -> None:
         """Work out what depends on who is seated alone."""
+        self._whole_step = self._active * self._substeps
         self._any_target = any(s is not None and s.goal == TARGET for s in self._segment)
         self._rows_to_play = None
         if self._few_rows_suffice and self._free:
@@ -329,8 +335,9 @@ class EpisodeRunner:
         self._part_steps += commanded
         command = clipped = self._schedule.commands(self._first_row + self._part_steps, self._limits)
         if self._any_target:
-            command = torch.where((self._aims & commanded)[:, None], self._towards, command)
-            clipped = torch.clamp(command, -self._limits, self._limits)
+            command = clipped = torch.where((self._aims & commanded)[:, None], self._towards, command)
+            if self._must_clip:
+                clipped = torch.clamp(command, -self._limits, self._limits)
         noise, delay = self._noise.next()
         observation = self._builder.build(self.backend.state, clipped, self._last_action, noise)
         action = self._session.act(observation, self._rows_to_play)
@@ -371,9 +378,9 @@ class EpisodeRunner:
 
     def _check_action(self, observation: torch.Tensor, action: torch.Tensor) -> None:
         """A policy must answer finite observations with finite actions."""
-        finite = torch.isfinite(action)
-        if bool(finite.all()):
+        if math.isfinite(float(action.sum())):  # the sum of anything that is not finite is not finite
             return
+        finite = torch.isfinite(action)
         bad = self._active & ~finite.all(1) & torch.isfinite(observation).all(1)
         if bool(bad.any()):
             slot = int(torch.nonzero(bad)[0])
@@ -395,8 +402,10 @@ class EpisodeRunner:
             trouble = state.tilt_substep + state.diverged + state.overflowed
             if deepens:
                 trouble += state.penetration_substep * self._watched
-            if not bool((trouble * active).any()):
-                return self._nobody, self._nobody, active * last
+            if self._free:  # worlds without a robot keep what happened to their last one
+                trouble *= active
+            if not bool(trouble.any()):
+                return self._nobody, self._nobody, self._whole_step
         never = torch.full_like(state.tilt_substep, last + 1)
         fell_at = torch.where(state.tilt_substep > 0, state.tilt_substep, never)
         # at which substep the state became invalid is not known: nothing of this control step counts

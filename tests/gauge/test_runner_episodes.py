@@ -300,6 +300,17 @@ def test_the_target_is_reached_within_a_tenth_of_a_metre(name):
     assert record.control_steps == 2 + 8 + (2 if name == REFERENCE else 0)
 
 
+@pytest.mark.parametrize(("limit", "seen"), [(1.0, 0.8), (0.5, 0.5)])
+def test_a_policy_is_asked_for_no_more_than_the_limits(limit, seen):
+    """On the way to the target too, where a suite allows less than the way's usual speed."""
+    suite = short_suite(OWN)
+    suite = replace(suite, commands=replace(suite.commands, levelled=(limit, 1.0, 1.5)))
+    suite = replace(suite, commands=replace(suite.commands, target_speed={"slope": 0.8}))
+    policy = ScriptedPolicy()
+    play(suite, [episode(TARGET, stage="search")], terrain=ground((5.0, 0.0, 0.4)), policy=policy)
+    assert policy.commands().amax(0).tolist() == pytest.approx([seen, 0.0, 0.0])
+
+
 def test_velocity_goals_alone_have_no_success():
     assert play(short_suite(), [episode(MAXIMUM)])[0].success is None
 
