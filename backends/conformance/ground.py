@@ -163,8 +163,8 @@ def clearance(terrain: Terrain, points: np.ndarray, reach: float) -> np.ndarray:
 def sliding_on_waves(bench: Bench) -> str:
     """Feet that slide over the edges of a height field meet its surface only: no false depth, no pull."""
     terrain, watch = waves(), 0.02
-    physics = {"watch_penetration": watch} if bench.supports("penetration") else {}
-    with bench.worlds(bench.stiff(), terrains=(terrain,), **physics) as worlds:
+    watched = watch if bench.supports("penetration") else None
+    with bench.worlds(bench.stiff(), terrains=(terrain,), watch_penetration=watched) as worlds:
         worlds.randomize(friction=np.full(worlds.count, 0.1))
         reference = Reference(bench.robot, bench.stiff())
         turns = np.linspace(0.0, 2.0 * np.pi, worlds.count, endpoint=False) + 0.3
