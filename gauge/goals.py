@@ -179,7 +179,7 @@ def target_command(
     wide = bearing.abs()
     turn = torch.where(backward, math.pi - wide, wide)
     yaw = torch.sign(bearing) * torch.minimum(2.0 * turn, yaw_limit)
-    facing = torch.where(backward, wide > 0.75 * math.pi, wide < 0.25 * math.pi)
+    facing = turn < 0.25 * math.pi
     lateral = torch.clamp(sideways, -LATERAL_SPEED, LATERAL_SPEED) * (wide >= 0.25 * math.pi)
     direction = 1.0 - 2.0 * backward
     return torch.stack((direction * speed * facing, lateral, direction * yaw), dim=1)
