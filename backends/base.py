@@ -237,6 +237,15 @@ class PhysicsBackend(ABC):
     def capabilities(cls) -> Mapping[str, Capability]:
         """One entry for each of ``CAPABILITY_NAMES``."""
 
+    @classmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """Which of the solver's options act when a scene asks for ``physics``, by name; for a run's results.
+
+        An engine that uses other values than it was asked for, or none, says so here. The defaults act as asked.
+        """
+        names = ("cone", "impratio", "iterations", "ls_iterations", "tolerance")
+        return {name: getattr(physics, name) for name in names}
+
     @abstractmethod
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         """Build the worlds; every world starts at the origin in the default pose and must be reset before its first step.

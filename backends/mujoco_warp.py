@@ -26,6 +26,7 @@ from .base import (
     BackendError,
     Capability,
     PhysicsBackend,
+    PhysicsOptions,
     PhysicsState,
     Randomization,
     Scene,
@@ -44,7 +45,7 @@ from .mujoco_warp_arrays import (
 )
 from .mujoco_warp_device import DeviceScope, bytes_per_world, find_device, is_memory_error, memory_advice
 from .mujoco_warp_fields import repair_height_fields
-from .mujoco_warp_model import Capacity, SharedModel, buffer_capacity, build_shared_model
+from .mujoco_warp_model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model
 from .mujoco_warp_order import CanonicalOrder
 from .mujoco_warp_parameters import BATCHED_FIELDS, WorldParameters
 
@@ -83,6 +84,11 @@ class MujocoWarpBackend(PhysicsBackend):
         )
         return entries
 
+    @classmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """See ``PhysicsBackend.solver_settings``: no tolerance below what single precision can reach."""
+        return {**super().solver_settings(physics), "tolerance": max(physics.tolerance, SMALLEST_TOLERANCE)}
+
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         self.scene = scene
         self.device = find_device(device)
@@ -116,6 +122,7 @@ class MujocoWarpBackend(PhysicsBackend):
         n, robot = scene.num_worlds, scene.robot
         self._model = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(BATCHED_FIELDS, n))
         self._model.opt.warn_overflow = 0  # alarms are reported per world, not printed by the device
+        self._model.opt.tolerance.fill_(self.solver_settings(scene.physics)["tolerance"])
         if scene.physics.deterministic:
             self._model.opt.deterministic = int(mujoco_warp.DeterminismType.ATOMICS)
         self._data = mujoco_warp.make_data(

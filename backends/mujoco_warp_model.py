@@ -26,6 +26,9 @@ DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
 SPARE_CONTACTS = 256
 """Room for contacts on top, shared by all worlds: a fallen robot has more than an average one."""
 
+SMALLEST_TOLERANCE = 1e-6
+"""Solver tolerance below which single precision goes on without getting nearer; mujoco_warp raises smaller ones to it."""
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int32]
 

@@ -20,7 +20,7 @@ import warp as wp
 
 from . import newton_kernels as kernels
 from . import newton_readout_kernels as readout
-from .base import BackendError, Capability, PhysicsBackend, PhysicsState, Randomization, Scene
+from .base import BackendError, Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, Scene
 from .mujoco_warp_device import is_memory_error, memory_advice
 from .newton_buffers import (
     MassTensors,
@@ -47,6 +47,11 @@ class NewtonBackend(PhysicsBackend):
     def capabilities(cls) -> Mapping[str, Capability]:
         """See ``PhysicsBackend.capabilities``."""
         return cls.adapter.capabilities
+
+    @classmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """See ``PhysicsBackend.solver_settings``."""
+        return cls.adapter.solver_settings(physics)
 
     @classmethod
     def with_solver(cls, solver: str) -> type[NewtonBackend]:

@@ -19,8 +19,9 @@ import warp as wp
 
 from . import newton_kernels as kernels
 from . import newton_solver_kernels as solver_kernels
-from .base import CAPABILITY_NAMES, BackendError, Capability, Scene, Support
+from .base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
 from .mujoco_warp_fields import repair_height_fields
+from .mujoco_warp_model import SMALLEST_TOLERANCE
 from .newton_model import WorldModel, carriers, import_differences
 
 repair_height_fields()
@@ -73,6 +74,11 @@ class SolverAdapter(ABC):
                 note = cls.capabilities[capability].note
                 raise BackendError(f"Newton's {cls.name} solver has no support for {capability} ({note}); {change}")
 
+    @classmethod
+    @abstractmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """See ``PhysicsBackend.solver_settings``."""
+
     @abstractmethod
     def __init__(self, world: WorldModel, scene: Scene) -> None:
         """Make the solver and its contact buffers."""
@@ -121,6 +127,13 @@ class MujocoAdapter(SolverAdapter):
     gap = 0.0
     skin = True
     own_dry_friction = True
+
+    @classmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """See ``SolverAdapter.solver_settings``: no tolerance below what single precision can reach."""
+        names = ("cone", "impratio", "iterations", "ls_iterations")
+        asked = {name: getattr(physics, name) for name in names}
+        return {**asked, "tolerance": max(physics.tolerance, SMALLEST_TOLERANCE)}
 
     def __init__(self, world: WorldModel, scene: Scene) -> None:
         physics, model = scene.physics, world.model
@@ -332,6 +345,11 @@ class SteelAdapter(SolverAdapter):
     gap = 0.01
     skin = False
     own_dry_friction = False
+
+    @classmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """See ``SolverAdapter.solver_settings``: a fixed number of sweeps over true cones."""
+        return {"cone": physics.cone, "iterations": physics.iterations}
 
     @classmethod
     def refuse(cls, scene: Scene) -> None:

@@ -422,3 +422,15 @@ def test_gpu_and_cpu_agree():
     np.testing.assert_allclose(b.base_position_w.cpu(), a.base_position_w, atol=1e-3)
     np.testing.assert_allclose(b.ground_force_w.cpu(), a.ground_force_w, atol=1.0)
     np.testing.assert_allclose(b.joint_torque.cpu(), a.joint_torque, atol=0.2)
+
+
+def test_the_solver_settings_told_are_those_that_act():
+    with_defaults = scene(tolerance=1e-8, iterations=30)
+    told = MujocoWarpBackend.solver_settings(with_defaults.physics)
+    assert told == {"cone": "elliptic", "impratio": 100.0, "iterations": 30, "ls_iterations": 50, "tolerance": 1e-6}
+    option = MujocoWarpBackend(with_defaults)._model.opt
+    assert option.iterations == 30
+    np.testing.assert_allclose(option.tolerance.numpy(), 1e-6)
+    loose = scene(tolerance=1e-4)
+    assert MujocoWarpBackend.solver_settings(loose.physics)["tolerance"] == 1e-4
+    np.testing.assert_allclose(MujocoWarpBackend(loose)._model.opt.tolerance.numpy(), 1e-4)

@@ -201,3 +201,12 @@ def test_randomizing_some_worlds_takes_a_row_for_each():
     np.testing.assert_allclose(engine._masses.friction[:, 5], [0.3, 0.4, 0.7])
     with pytest.raises(BackendError, match="friction has 3 rows for 2 worlds"):
         engine.randomize(Randomization(friction=torch.ones(3)), mask)
+
+
+def test_the_solver_settings_told_are_those_that_act():
+    asked = PhysicsOptions(tolerance=1e-8, iterations=30)
+    assert NewtonBackend.solver_settings(asked)["tolerance"] == 1e-6
+    assert NewtonBackend.with_solver("steel").solver_settings(asked) == {"cone": "elliptic", "iterations": 30}
+    option = NewtonBackend(scene(tolerance=1e-8, iterations=30))._solver._model.opt
+    np.testing.assert_allclose(option.tolerance.numpy(), 1e-6)
+    assert option.iterations == 30
