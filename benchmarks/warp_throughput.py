@@ -7,6 +7,7 @@ Every configuration runs in a process of its own, so that memory is measured fro
 
     python benchmarks/warp_throughput.py --out throughput.json
     python benchmarks/warp_throughput.py --worlds 8192 --ground boxes field --steps 400
+    python benchmarks/warp_throughput.py --plot memory.svg throughput.json   # memory by number of worlds, nothing measured
 
 From a checkout that is not installed, a link named ``gaitgauge`` to the repository in a folder on PYTHONPATH is enough.
 """
@@ -24,6 +25,10 @@ from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gaitgauge.backends.base import Scene
 
 SIZES = (1024, 2048, 4096, 8192, 16384, 32768, 65536)
 GROUNDS = ("plane", "boxes", "field")
@@ -56,12 +61,38 @@ def make_palette(ground: str) -> tuple:
     return tuple(terrains)
 
 
+def training_scene(ground: str, worlds: int) -> Scene:
+    """Go2s in the training's physics."""
+    from gaitgauge.backends.base import PhysicsOptions, Scene
+    from gaitgauge.robots import load_robot
+
+    robot = load_robot("go2")
+    terrains = make_palette(ground)
+    physics = PhysicsOptions(
+        timestep=0.005,
+        substeps=4,
+        cone="pyramidal",
+        impratio=1.0,
+        iterations=10,
+        ls_iterations=20,
+        tolerance=1e-6,
+        foot_condim=3,
+        self_collision=False,
+    )
+    return Scene(
+        robot=robot,
+        parameters=robot.parameters["training"],
+        terrains=terrains,
+        terrain_index=tuple(i % len(terrains) for i in range(worlds)),
+        physics=physics,
+    )
+
+
 def measure(name: str, ground: str, worlds: int, device: str, steps: int) -> dict:
     """Build, warm up and time one configuration."""
     import torch
     from gaitgauge.backends import make_backend
-    from gaitgauge.backends.base import PhysicsOptions, Randomization, Scene
-    from gaitgauge.robots import load_robot
+    from gaitgauge.backends.base import Randomization
 
     gpu = device.startswith("cuda")
 
@@ -77,26 +108,8 @@ def measure(name: str, ground: str, worlds: int, device: str, steps: int) -> dic
         from warp import init
 
         init()
-    robot = load_robot("go2")
-    terrains = make_palette(ground)
-    physics = PhysicsOptions(
-        timestep=0.005,
-        substeps=4,
-        cone="pyramidal",
-        impratio=1.0,
-        iterations=10,
-        ls_iterations=20,
-        tolerance=1e-6,
-        foot_condim=3,
-        self_collision=False,
-    )
-    scene = Scene(
-        robot=robot,
-        parameters=robot.parameters["training"],
-        terrains=terrains,
-        terrain_index=tuple(i % len(terrains) for i in range(worlds)),
-        physics=physics,
-    )
+    scene = training_scene(ground, worlds)
+    robot, terrains = scene.robot, scene.terrains
     free_before, start = free(), perf_counter()
     backend = make_backend(name, scene, device=device)
     synchronize()
@@ -220,6 +233,46 @@ def hardware(device: str) -> dict:
     return entry
 
 
+def plot_memory(sources: list[Path], target: Path) -> None:
+    """Draw memory for each world over the number of worlds, one line for each engine and ground, as an SVG.
+
+    Raises:
+        SystemExit: no source has a measured row.
+    """
+    import matplotlib
+
+    matplotlib.use("svg")
+    matplotlib.rcParams["svg.hashsalt"] = "gaitgauge"  # the same file each time
+    from matplotlib import pyplot
+
+    lines: dict[str, dict[int, float]] = {}
+    devices = []
+    for source in sources:
+        content = json.loads(source.read_text())
+        devices.append(content["hardware"]["device"])
+        for row in content["rows"]:
+            if row.get("bytes_per_world"):
+                label = f"{row.get('backend', 'mujoco-warp')}, {row['ground']}"
+                lines.setdefault(label, {})[row["worlds"]] = row["bytes_per_world"] / 1e3
+    if not lines:
+        raise SystemExit(f"no memory was measured in {', '.join(map(str, sources))}")
+    figure, axes = pyplot.subplots(figsize=(6.0, 3.6), layout="constrained")
+    for label, points in sorted(lines.items()):
+        worlds = sorted(points)
+        axes.plot(worlds, [points[n] for n in worlds], marker="o", label=label)
+    axes.set_xscale("log", base=2)
+    ticks = sorted({n for points in lines.values() for n in points})
+    axes.set_xticks(ticks, [f"{n:,}" for n in ticks])
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("worlds")
+    axes.set_ylabel("memory for each world [kB]")
+    axes.set_title(", ".join(sorted(set(devices))))
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.savefig(target, metadata={"Date": None})
+    pyplot.close(figure)
+
+
 def main() -> None:
     """Measure all configurations asked for, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -232,7 +285,19 @@ def main() -> None:
     parser.add_argument(
         "--single", nargs=2, metavar=("GROUND", "WORLDS"), help="measure one configuration in this process"
     )
+    parser.add_argument(
+        "--plot",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="draw memory into the first file (SVG) from the others (JSON)",
+    )
     arguments = parser.parse_args()
+    if arguments.plot:
+        if len(arguments.plot) < 2:
+            parser.error("--plot needs the SVG file to write and at least one JSON file to read")
+        plot_memory(arguments.plot[1:], arguments.plot[0])
+        return
     if arguments.single:
         ground, worlds = arguments.single[0], int(arguments.single[1])
         row = measure(arguments.backend[0], ground, worlds, arguments.device, arguments.steps)

@@ -1,21 +1,33 @@
 """The mujoco_warp engine beyond the conformance checks: its tables, its errors, and its agreement with the C engine."""
 
+import importlib.util
+import json
 import math
+import re
 from dataclasses import fields, replace
+from pathlib import Path
 
 import mujoco
+import mujoco_warp
 import numpy as np
 import pytest
 import torch
 from gaitgauge.backends import BackendError, PhysicsOptions, PhysicsState, Randomization, Scene
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
-from gaitgauge.backends.mujoco_warp_device import bytes_per_world, find_device, is_memory_error, memory_advice
+from gaitgauge.backends.mujoco_warp_device import (
+    DeviceScope,
+    bytes_per_world,
+    find_device,
+    is_memory_error,
+    memory_advice,
+)
 from gaitgauge.backends.mujoco_warp_model import PARKED, Capacity, buffer_capacity, build_shared_model
 from gaitgauge.backends.mujoco_warp_order import CONTACT_FIELDS, ROW_FIELDS
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Box, HeightField, Terrain
 
+ROOT = Path(__file__).parents[2]
 ROBOT = load_robot("go2")
 FLAT = Terrain(name="flat", family="flat")
 BLOCK = Box(center=(0.0, 0.0, 0.1), half_size=(2.0, 2.0, 0.1))
@@ -164,6 +176,80 @@ def test_memory_advice_names_a_number_that_fits():
     assert f"about {int(1e9 / per_world)} would" in text and "100000 worlds" in text
     assert is_memory_error(RuntimeError("Failed to allocate 12 bytes on device 'cuda:0'"))
     assert not is_memory_error(RuntimeError("something else"))
+
+
+def benchmark():
+    spec = importlib.util.spec_from_file_location("warp_throughput", ROOT / "benchmarks" / "warp_throughput.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_estimate_of_memory_is_that_of_a_gpu():
+    make_scene, seen = benchmark().training_scene, set()
+    for file in sorted((ROOT / "docs" / "data").glob("throughput*_h200.json")):
+        for row in json.loads(file.read_text())["rows"]:
+            if row.get("backend", "mujoco-warp") != "mujoco-warp" or row["worlds"] < 8192:
+                continue  # of few worlds, what all share is a large part
+            wanted = make_scene(row["ground"], row["worlds"])
+            shared = build_shared_model(wanted)
+            estimate = bytes_per_world(shared.model, buffer_capacity(wanted, shared), row["worlds"])
+            assert 1.0 <= estimate / row["bytes_per_world"] < 1.15, (
+                "a number of worlds would be named that does not fit"
+            )
+            seen.add((row["ground"], row["worlds"]))
+    assert {("boxes", 8192), ("field", 8192), ("boxes", 65536)} <= seen
+
+
+@pytest.mark.parametrize("where", ["make_data", "step"])
+def test_too_little_memory_is_one_sentence_with_the_number_of_worlds_that_fit(monkeypatch, where):
+    free = 10**7
+
+    def fail(*_, **__):
+        raise RuntimeError("Failed to allocate 123456 bytes on device 'cuda:0'")
+
+    monkeypatch.setattr(DeviceScope, "free_bytes", lambda _: free)
+    wanted = scene(FLAT, index=(0,) * 200)
+    shared = build_shared_model(wanted)
+    per_world = bytes_per_world(shared.model, buffer_capacity(wanted, shared), 200)
+    if where == "make_data":
+        plain = mujoco_warp.make_data
+        # the estimate itself is made of small copies
+        monkeypatch.setattr(
+            mujoco_warp, "make_data", lambda m, nworld, **k: fail() if nworld == 200 else plain(m, nworld, **k)
+        )
+    else:
+        monkeypatch.setattr(MujocoWarpBackend, "_reset_to_default", fail)
+    with pytest.raises(BackendError) as error:
+        MujocoWarpBackend(wanted)
+    number = int(
+        re.search(r"200 worlds do not fit into the memory of cpu: about (\d+) would", str(error.value)).group(1)
+    )
+    assert 1 <= number < 200
+    assert number * per_world <= free < (number + 1) * per_world
+    assert "use fewer worlds" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_another_error_while_building_is_not_taken_for_too_little_memory(monkeypatch):
+    def fail(_):
+        raise RuntimeError("something else")
+
+    monkeypatch.setattr(MujocoWarpBackend, "_reset_to_default", fail)
+    with pytest.raises(RuntimeError, match=r"^something else$"):
+        MujocoWarpBackend(scene(FLAT))
+
+
+def test_memory_is_drawn_from_measured_rows(tmp_path):
+    draw, source, target = benchmark().plot_memory, tmp_path / "rows.json", tmp_path / "memory.svg"
+    rows = [{"backend": "newton", "ground": "boxes", "worlds": n, "bytes_per_world": 1e5 + n} for n in (512, 1024)]
+    failed = {"backend": "newton", "ground": "field", "worlds": 2048, "error": "too many"}
+    source.write_text(json.dumps({"hardware": {"device": "a GPU"}, "rows": [*rows, failed]}))
+    draw([source], target)
+    text = target.read_text()
+    assert text.startswith("<?xml") and "newton, boxes" in text and "1,024" in text and "2,048" not in text
+    source.write_text(json.dumps({"hardware": {"device": "a GPU"}, "rows": [failed]}))
+    with pytest.raises(SystemExit, match="no memory was measured"):
+        draw([source], target)
 
 
 def test_capacity_is_plain_data():
