@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import fields
+from time import perf_counter
 from typing import ClassVar
 
 import mujoco
@@ -75,6 +76,8 @@ class MujocoBackend(PhysicsBackend):
         self._models = [copy.copy(self._palette[t]) for t in self._terrain]
         self._batch = mujoco.batch.Batch(nominal, n, threads, True)
         self._batch.set_models(self._models)
+        self.engine_seconds = 0.0
+        """Wall-clock time spent inside MuJoCo's stepping so far [s]."""
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         tilt = scene.physics.watch_tilt
         self._tilt_bound = 0.0 if tilt is None else 0.5 * (1.0 - np.cos(tilt))
@@ -232,7 +235,9 @@ class MujocoBackend(PhysicsBackend):
         if joint_targets is not None:  # a target that waits for the whole step acts from the next one on
             self._held[those] = targets
             self._limp[those] = False
+        began = perf_counter()
         self._batch.forward(self._ids(rows), stage=_STAGE)
+        self.engine_seconds += perf_counter() - began
         self._watch(those, records)
         self._flag(rows)
         self._state.renew(those)
@@ -263,7 +268,9 @@ class MujocoBackend(PhysicsBackend):
 
     def _play(self, rows: NDArray[np.int64], control: Array, records: Records) -> None:
         """Step worlds with the given controls, (rows, substeps, J), and record them after each substep."""
+        began = perf_counter()
         self._batch.rollout(control.shape[1], control, ids=self._ids(rows), record=RECORDED, out=records)
+        self.engine_seconds += perf_counter() - began
 
     def _play_some_limp(
         self, rows: NDArray[np.int64], control: Array, limp: NDArray[np.bool_], waits: NDArray[np.bool_]

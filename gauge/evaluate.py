@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from ..backends import Scene, make_backend
+from ..backends.mujoco import MujocoBackend
 from ..backends.registry import find_backend
 from ..policy.base import Policy
 from ..policy.contract import check_robot
@@ -25,18 +25,16 @@ from ..robots import Robot, RobotError, load_robot
 from ..terrains.registry import make_terrain, terrain_names
 from .episodes import Episode
 from .goals import SUB_COMMANDS, TARGET, check_terrain
+from .lanes import LaneJob, play, play_in_lanes
 from .pipelines import PIPELINES, Environment, Plan, make_environments
 from .results import fold, health, rows_csv
-from .runner import EpisodeRunner, Progress
+from .runner import Progress
 from .store import RunFolder, write_atomically
 from .suite import Suite, SuiteError, load_suite
 
 PACKAGES = ("gaitgauge", "mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib")
 _SLOTS = 24
-"""Worlds on the CPU: enough to keep the threads busy, few enough for the policy's batch to cost little."""
-_MANY_SLOTS = 64
-"""Worlds on the CPU for runs of many environments, which have more level tests to play at a time."""
-_FEW_ENVIRONMENTS = 16
+"""Worlds of a process on the CPU: more share the loop's cost, fewer keep more processes busy to the end."""
 _GPU_SLOTS = 4096
 """Largest number of worlds on a GPU."""
 
@@ -210,15 +208,17 @@ def evaluate(
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
     evaluated = request.pipeline != "level"
     columns: tuple[str, ...] = (*suite.metrics.weights, "quality")
-    physics_steps = 0
+    physics_steps, engine_seconds = 0, 0.0
     # A GPU plays every level of every search at once, then all quality episodes: few long batches instead of many short ones.
     stages = [evaluated] if on_cpu or all(e.level is not None for e in environments) else [False, evaluated]
     for stage in dict.fromkeys(stages):
         plan = Plan(suite, environments, seeds, store, evaluate=stage, speculative=not on_cpu)
-        runner = _runner(request, suite, robot, policy, plan)
-        runner.run(plan, _watcher(plan, watch, began))
-        physics_steps += runner.physics_steps
-        runner.backend.close()
+        job, lanes = _job(request, suite, robot, policy, plan)
+        on_step = _watcher(plan, watch, began)
+        effort = play(job, policy, plan, on_step) if lanes == 1 else play_in_lanes(job, plan, lanes, on_step)
+        physics_steps += effort.physics_steps
+        if effort.engine_seconds is not None:
+            engine_seconds += effort.engine_seconds
     results = fold(suite, environments, columns, evaluated=evaluated)
     results["policy"] = {
         "path": policy.path,
@@ -230,14 +230,17 @@ def evaluate(
     results["backend"] = request.backend
     results["robot"] = robot.name
     results["health"] = dict(health(environments))
-    results["provenance"] = _provenance(request, command, time.perf_counter() - began, physics_steps)
+    provenance = _provenance(request, command, time.perf_counter() - began, physics_steps)
+    results["provenance"] = provenance | {"processes": lanes}
+    if engine_seconds:
+        results["provenance"]["engine_seconds"] = round(engine_seconds, 2)
     write_atomically(folder / "episodes.csv", rows_csv([r for e in environments for r in (*e.trials, *e.records)]))
     write_atomically(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     return results
 
 
-def _runner(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: Plan) -> EpisodeRunner:
-    """Worlds for a plan, all terrains in one layout, and the runner that plays in them."""
+def _job(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: Plan) -> tuple[LaneJob, int]:
+    """What to play with, and in how many processes."""
     keys = [
         (e.terrain, level)
         for e in plan.environments
@@ -246,23 +249,26 @@ def _runner(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: 
     ]
     keys = list(dict.fromkeys(keys)) or [("flat", 0)]
     parts = sum(len(SUB_COMMANDS[g.name]) for g in suite.goals if g.name != TARGET)
+    lanes = 1
+    tests, quality = plan.waiting
     if torch.device(request.device).type == "cpu":
         at_once = max(len(plan.seeds) * parts, len(suite.matrix.search_seeds))
-        count = len(plan.environments)
-        slots = min(count * at_once, _SLOTS if count <= _FEW_ENVIRONMENTS else _MANY_SLOTS)
+        slots = min(len(plan.environments) * at_once, _SLOTS)
+        if request.backend == MujocoBackend.name and os.name == "posix":
+            lanes = max(min(request.threads, tests + quality), 1)
     else:
-        tests, quality = plan.waiting
         slots = min(max(tests + quality * parts, 1), _GPU_SLOTS)
-    scene = Scene(
+    job = LaneJob(
+        policy=policy.path,
+        suite=suite,
         robot=robot,
-        parameters=robot.parameters[suite.parameters],
-        terrains=tuple(make_terrain(name, level) for name, level in keys),
-        terrain_index=(0,) * slots,
-        physics=suite.physics,
+        backend=request.backend,
+        device=request.device,
+        terrains=tuple(keys),
+        slots=slots,
+        threads=max(request.threads // lanes, 1),
     )
-    backend = make_backend(request.backend, scene, device=request.device, threads=request.threads)
-    index = {key: i for i, key in enumerate(keys)}
-    return EpisodeRunner(suite, policy, backend, lambda e: index[e.terrain, e.level])
+    return job, lanes
 
 
 def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -> Callable[[Progress], None] | None:

@@ -8,13 +8,15 @@ import subprocess
 import sys
 import textwrap
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
+from gaitgauge.backends.base import BackendError
 from gaitgauge.backends.fake import FakeScript
-from gaitgauge.gauge import evaluate as evaluation
+from gaitgauge.gauge import lanes
 from gaitgauge.gauge.evaluate import Request, evaluate, prepare
 from gaitgauge.gauge.store import RunFolder, StoreError
 from gaitgauge.gauge.suite import SuiteError
@@ -89,7 +91,7 @@ def request_for(tmp_path, monkeypatch):
     policy = tmp_path / "policy.gauge.pt"
     stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
     save_policy(policy, go2_contract(GO2), stored)
-    monkeypatch.setattr(evaluation, "make_backend", puppets)
+    monkeypatch.setattr(lanes, "make_backend", puppets)
 
     def make(base="gaitgauge-1", **choices):
         suite = tmp_path / f"{base}.toml"
@@ -150,7 +152,7 @@ def test_a_level_run_has_levels_and_no_score(request_for, tmp_path):
 
 
 def test_a_policy_that_passes_nothing_scores_zero(request_for, tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluation, "make_backend", lambda name, scene, **options: Puppet(scene))
+    monkeypatch.setattr(lanes, "make_backend", lambda name, scene, **options: Puppet(scene))
     results = evaluate(request_for(terrains=("slope_fd",)), tmp_path / "run")
     assert results["score"] == 0.0
     assert results["level"] == 0.0
@@ -317,9 +319,9 @@ CHILD = """
 import sys
 sys.path.insert(0, {tests!r})
 import test_evaluate_runs as runs
-from gaitgauge.gauge import evaluate as evaluation
+from gaitgauge.gauge import evaluate as evaluation, lanes
 from pathlib import Path
-evaluation.make_backend = runs.puppets
+lanes.make_backend = runs.puppets
 evaluation.evaluate(evaluation.Request(policy={policy!r}, suite={suite!r}, backend="fake"), Path({folder!r}), resume=True)
 """
 
@@ -347,22 +349,62 @@ def test_a_process_killed_by_the_system_resumes(request_for, tmp_path):
         assert without_provenance(folder) == without_provenance(tmp_path / "whole")
 
 
-@pytest.mark.slow
-def test_threads_change_no_bit_of_the_results_in_mujoco(request_for, tmp_path, monkeypatch):
-    """Real terrains and contacts, a random policy that stumbles and falls, short goals."""
+@pytest.fixture
+def real_request(request_for, monkeypatch):
+    """A request for real terrains and contacts, a random policy that stumbles and falls, short goals."""
     monkeypatch.undo()
     request = request_for()
     text = Path(request.suite).read_text()
     text = text.replace("timestep = 0.01\nsubsteps = 2", "").replace("interval = 2", "interval = 10")
     text = text.replace("[0.04, 0.02]", "[0.4, 0.2]").replace("slope = 0.3", "slope = 2.0").replace("latency = 1", "")
     Path(request.suite).write_text(text)
+    return replace(request, backend="mujoco")
+
+
+def test_threads_change_no_bit_of_the_results_in_mujoco(real_request, tmp_path):
     for threads in (1, 2):
-        evaluate(
-            Request(policy=request.policy, suite=request.suite, backend="mujoco", threads=threads),
-            tmp_path / f"threads-{threads}",
-        )
+        evaluate(replace(real_request, threads=threads), tmp_path / f"threads-{threads}")
+    provenance = [json.loads((tmp_path / f"threads-{n}" / "results.json").read_text())["provenance"] for n in (1, 2)]
+    assert [p["processes"] for p in provenance] == [1, 2]
+    assert provenance[0]["physics_steps"] == provenance[1]["physics_steps"]
+    assert all(0.0 < p["engine_seconds"] < p["processes"] * p["seconds"] for p in provenance)
     one, two = (without_provenance(tmp_path / f"threads-{n}") for n in (1, 2))
     assert one == two
     assert 0.0 < json.loads(one)["score"] < 1.0
     for file in sorted((tmp_path / "threads-1" / "episodes").iterdir()):
         assert file.read_bytes() == (tmp_path / "threads-2" / "episodes" / file.name).read_bytes()
+
+
+def test_an_error_in_a_process_is_the_runs_error(real_request, tmp_path):
+    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
+    network = MlpNetwork(**arguments)
+    network.network[-1].bias.data.fill_(float("nan"))
+    stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
+    save_policy(Path(real_request.policy), go2_contract(GO2), stored)
+    with pytest.raises(PolicyError, match="returned nan"):
+        evaluate(replace(real_request, threads=2), tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_costs_nothing_that_was_finished(real_request, tmp_path):
+    request = replace(real_request, threads=2)
+    evaluate(request, tmp_path / "whole")
+    killed = []
+
+    def kill(status):
+        if status.done and not killed:
+            (child, *_) = children()
+            os.kill(child, signal.SIGKILL)
+            killed.append(child)
+
+    with pytest.raises(BackendError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
+        evaluate(request, tmp_path / "run", watch=kill)
+    assert children() == []
+    evaluate(request, tmp_path / "run", resume=True)
+    assert without_provenance(tmp_path / "run") == without_provenance(tmp_path / "whole")
+
+
+def children():
+    """Process ids of this process's children, from /proc."""
+    tasks = Path(f"/proc/{os.getpid()}/task").glob("*/children")
+    return [int(number) for task in tasks for number in task.read_text().split()]

@@ -1,0 +1,313 @@
+"""Playing a plan in several processes on one machine, each with worlds of its own: a lane is one such process.
+
+The control loop of a runner is one Python thread that waits for its engine and lets the engine wait for it. Two lanes of one
+thread each keep two cores busy where one lane of two threads does not. A lane asks for episodes and hands back records; what
+happens in an episode does not depend on the lane that plays it. Plan, store and results stay in the parent process.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+import torch
+
+from ..backends import Scene, make_backend
+from ..backends.base import BackendError
+from ..policy.base import Policy
+from ..policy.loading import load_policy
+from ..robots import Robot
+from ..terrains.registry import make_terrain
+from .episodes import Episode, Record
+from .pipelines import Plan
+from .runner import EpisodeRunner
+from .suite import Suite
+
+_REPORT_INTERVAL = 0.2
+"""Time between a lane's reports on how far it is [s]."""
+_PATIENCE = 0.02
+"""Time for which a lane at work does not ask again after it was told that nothing waits [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaneJob:
+    """What a lane plays with."""
+
+    policy: str
+    """Policy file."""
+    suite: Suite
+    robot: Robot
+    backend: str
+    device: str
+    terrains: tuple[tuple[str, int], ...]
+    """Names and levels of all terrains that episodes may ask for."""
+    slots: int
+    """Worlds."""
+    threads: int
+    """CPU threads of the engine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """What playing took."""
+
+    physics_steps: int
+    engine_seconds: float | None
+    """Time spent inside the engine's stepping, added up over lanes [s]; None where the engine does not measure it."""
+
+
+class LaneProgress:
+    """How far all lanes are, as they reported last (see ``runner.Progress``)."""
+
+    def __init__(self, lanes: int) -> None:
+        self._steps = [(0, 0)] * lanes
+        self._active: list[dict[Episode, int]] = [{} for _ in range(lanes)]
+
+    @property
+    def control_steps(self) -> int:
+        """Control steps so far, added up over lanes."""
+        return sum(control for control, _ in self._steps)
+
+    @property
+    def physics_steps(self) -> int:
+        """Physics steps so far, added up over worlds."""
+        return sum(physics for _, physics in self._steps)
+
+    def active(self) -> dict[Episode, int]:
+        """Episodes at work, and the control steps that each has behind it."""
+        return {episode: age for active in self._active for episode, age in active.items()}
+
+    def update(self, lane: int, control_steps: int, physics_steps: int, active: dict[Episode, int]) -> None:
+        """Take a lane's report."""
+        self._steps[lane], self._active[lane] = (control_steps, physics_steps), active
+
+
+def build_runner(job: LaneJob, policy: Policy) -> EpisodeRunner:
+    """Worlds with all terrains in one layout, and the runner that plays in them.
+
+    Raises:
+        TerrainError, BackendError: a terrain or the engine cannot be made.
+    """
+    scene = Scene(
+        robot=job.robot,
+        parameters=job.robot.parameters[job.suite.parameters],
+        terrains=tuple(make_terrain(name, level) for name, level in job.terrains),
+        terrain_index=(0,) * job.slots,
+        physics=job.suite.physics,
+    )
+    backend = make_backend(job.backend, scene, device=job.device, threads=job.threads)
+    index = {key: i for i, key in enumerate(job.terrains)}
+    return EpisodeRunner(job.suite, policy, backend, lambda e: index[e.terrain, e.level])
+
+
+def play(job: LaneJob, policy: Policy, plan: Plan, watch: Callable[[Any], None] | None) -> Effort:
+    """Play a plan to its end in this process; ``watch`` is called after every control step."""
+    runner = build_runner(job, policy)
+    try:
+        runner.run(plan, watch)
+        return Effort(physics_steps=runner.physics_steps, engine_seconds=_engine_seconds(runner))
+    finally:
+        runner.backend.close()
+
+
+def _engine_seconds(runner: EpisodeRunner) -> float | None:
+    return getattr(runner.backend, "engine_seconds", None)
+
+
+# ---- parent ----------------------------------------------------------------------------------------------------------
+
+
+def play_in_lanes(job: LaneJob, plan: Plan, lanes: int, watch: Callable[[Any], None] | None) -> Effort:
+    """Play a plan to its end in ``lanes`` processes; ``watch`` is called whenever one reports.
+
+    Raises:
+        PolicyError, BackendError …: what went wrong in a lane, or that a lane's process ended.
+    """
+    crew = _Crew(job, lanes)
+    try:
+        return crew.play(plan, watch)
+    finally:
+        crew.dismiss()
+
+
+class _Crew:
+    """The processes, and who waits for work."""
+
+    def __init__(self, job: LaneJob, lanes: int) -> None:
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._connections: list[Connection] = []
+        self._idle: set[int] = set()
+        self._progress = LaneProgress(lanes)
+        # a lane finds the same packages, whatever this process was started with
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+        try:
+            for _ in range(lanes):
+                ours, theirs = socket.socketpair()
+                with theirs:
+                    number = theirs.fileno()
+                    command = [sys.executable, "-P", "-c", f"from {__name__} import run_lane; run_lane({number})"]
+                    self._processes.append(
+                        subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL, env=environment)
+                    )
+                connection: Connection = Connection(ours.detach())
+                self._connections.append(connection)
+                connection.send(job)
+        except BaseException:
+            self.dismiss()
+            raise
+
+    def dismiss(self) -> None:
+        """End whatever still runs."""
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.wait()
+        for connection in self._connections:
+            connection.close()
+
+    def play(self, plan: Plan, watch: Callable[[Any], None] | None) -> Effort:
+        """See ``play_in_lanes``."""
+        efforts: list[Effort] = []
+        at_work = list(self._connections)
+        while at_work:
+            for connection in wait(at_work):
+                lane = self._connections.index(connection)  # type: ignore[arg-type]
+                kind, *content = self._receive(lane)
+                if kind == "take":
+                    most, urgent = content
+                    self._connections[lane].send(self._share(plan, most, urgent))
+                elif kind == "finished":
+                    plan.finished(content[0])
+                elif kind == "idle":
+                    self._idle.add(lane)
+                elif kind == "progress":
+                    self._progress.update(lane, *content)
+                    if watch is not None:
+                        watch(self._progress)
+                elif kind == "failed":
+                    raise content[0]
+                else:
+                    efforts.append(content[0])
+                    at_work.remove(self._connections[lane])
+            if not efforts:
+                self._serve(plan)
+        seconds = [e.engine_seconds for e in efforts if e.engine_seconds is not None]
+        return Effort(
+            physics_steps=sum(e.physics_steps for e in efforts), engine_seconds=sum(seconds) if seconds else None
+        )
+
+    def _receive(self, lane: int) -> tuple[Any, ...]:
+        try:
+            message: tuple[Any, ...] = self._connections[lane].recv()
+        except (EOFError, OSError) as error:
+            code = self._processes[lane].wait()
+            how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
+            raise BackendError(
+                f"a process that plays episodes {how}; what had finished is kept: go on with --resume, with fewer "
+                "--threads if memory ran out"
+            ) from error
+        return message
+
+    def _share(self, plan: Plan, most: int, urgent: bool) -> list[Episode]:
+        """Episodes for a lane that asks: no more than its part, so that another that asks next gets some, too."""
+        tests, quality = plan.waiting
+        ready = tests if urgent else tests + quality
+        return plan.take(min(most, -(-ready // len(self._connections))), urgent=urgent)
+
+    def _serve(self, plan: Plan) -> None:
+        """Give waiting lanes work, or send them home once nothing can follow any more."""
+        for lane in sorted(self._idle):
+            episodes = self._share(plan, 1, urgent=False)
+            if not episodes:
+                break
+            self._connections[lane].send(episodes)
+            self._idle.discard(lane)
+        if len(self._idle) == len(self._connections):
+            for connection in self._connections:
+                connection.send([])
+            self._idle.clear()
+
+
+# ---- child -----------------------------------------------------------------------------------------------------------
+
+
+class _RemoteAgenda:
+    """The parent's plan, as a lane sees it (see ``segments.Agenda``)."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._given: list[Episode] = []
+        self._nothing_until = 0.0
+        self._next_report = 0.0
+
+    def take(self, most: int, *, urgent: bool = False) -> Sequence[Episode]:
+        """Episodes that can start now."""
+        if self._given and most > 0 and not urgent:
+            return [self._given.pop(0)]
+        now = time.monotonic()
+        if now < self._nothing_until:
+            return []
+        self._connection.send(("take", most, urgent))
+        episodes: list[Episode] = self._connection.recv()
+        if not episodes and not urgent:
+            self._nothing_until = now + _PATIENCE
+        return episodes
+
+    def finished(self, record: Record) -> None:
+        """Hand back a record; more episodes may follow from it."""
+        self._connection.send(("finished", record))
+        self._nothing_until = 0.0
+
+    def wait(self) -> bool:
+        """Wait until there is something to play; False once nothing will come."""
+        self._connection.send(("idle",))
+        self._given = self._connection.recv()
+        self._nothing_until = 0.0
+        return bool(self._given)
+
+    def report(self, progress: Any) -> None:
+        """Tell now and then how far the runner is."""
+        now = time.monotonic()
+        if now >= self._next_report:
+            self._next_report = now + _REPORT_INTERVAL
+            self._connection.send(("progress", progress.control_steps, progress.physics_steps, progress.active()))
+
+
+def run_lane(descriptor: int) -> None:
+    """A lane's whole life; its parent is at the other end of the socket."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent ends them
+    connection: Connection = Connection(descriptor)
+    try:
+        try:
+            job = connection.recv()
+            torch.set_num_threads(1)
+            runner = build_runner(job, load_policy(job.policy, job.robot))
+            agenda = _RemoteAgenda(connection)
+            while agenda.wait():
+                runner.run(agenda, agenda.report)
+            effort = Effort(physics_steps=runner.physics_steps, engine_seconds=_engine_seconds(runner))
+            connection.send(("done", effort))
+        except (EOFError, ConnectionError):
+            return  # the parent is gone
+        except Exception as error:  # noqa: BLE001  (whatever it is, the parent has to hear of it)
+            connection.send(("failed", _portable(error)))
+    except (EOFError, ConnectionError):
+        return
+
+
+def _portable(error: Exception) -> Exception:
+    """The error itself if it survives the way to the parent, else one with the same words."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # noqa: BLE001  (some errors cannot be taken apart and put together again)
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
