@@ -31,6 +31,7 @@ import torch
 import warp as wp
 from gaitgauge.backends.base import PhysicsOptions, Scene
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
+from gaitgauge.backends.mujoco_warp_model import SMALLEST_TOLERANCE
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation import ObservationBuilder
@@ -42,8 +43,6 @@ from gaitgauge.terrains.training_tiles import FIELD_KINDS, NUM_TILE_LEVELS, TILE
 from gaitgauge.training.environment_configuration import TRAINING_PHYSICS
 
 GAUGE_BOXES = ("flat", "slope_fd", "slope_bd", "stairs_fd", "stairs_bd", "obstacle")
-SMALLEST_TOLERANCE = 1e-6
-"""mujoco_warp raises smaller ones to this when it takes over a model."""
 SCENES = ("gauge-boxes", "gauge-wave", "gauge-all", "tiles-boxes", "tiles-fields", "tiles-mix")
 
 
