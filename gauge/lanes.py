@@ -34,8 +34,10 @@ from .suite import Suite
 
 _REPORT_INTERVAL = 0.2
 """Time between a lane's reports on how far it is [s]."""
-_PATIENCE = 0.02
+_PATIENCE = 0.05
 """Time for which a lane at work does not ask again after it was told that nothing waits [s]."""
+_FEW_TESTS = 4
+"""A lane with fewer level tests at work has room for a quality episode beside them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,6 +148,8 @@ class _Crew:
         self._processes: list[subprocess.Popen[bytes]] = []
         self._connections: list[Connection] = []
         self._idle: set[int] = set()
+        self._tests, self._quality = [0] * lanes, [0] * lanes  # episodes that each lane has at work
+        self._slots = job.slots
         self._progress = LaneProgress(lanes)
         # a lane finds the same packages, whatever this process was started with
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -184,9 +188,11 @@ class _Crew:
                 kind, *content = self._receive(lane)
                 if kind == "take":
                     most, urgent = content
-                    self._connections[lane].send(self._share(plan, most, urgent))
+                    self._give(lane, self._share(plan, lane, most, urgent))
                 elif kind == "finished":
-                    plan.finished(content[0])
+                    record = content[0]
+                    plan.finished(record)
+                    self._count(lane, record.episode, -1)
                 elif kind == "idle":
                     self._idle.add(lane)
                 elif kind == "progress":
@@ -217,19 +223,37 @@ class _Crew:
             ) from error
         return message
 
-    def _share(self, plan: Plan, most: int, urgent: bool) -> list[Episode]:
-        """Episodes for a lane that asks: no more than its part, so that another that asks next gets some, too."""
-        tests, quality = plan.waiting
-        ready = tests if urgent else tests + quality
-        return plan.take(min(most, -(-ready // len(self._connections))), urgent=urgent)
+    def _give(self, lane: int, episodes: list[Episode]) -> None:
+        """Hand episodes, or the news that there are none, to a lane."""
+        for episode in episodes:
+            self._count(lane, episode, 1)
+        self._connections[lane].send(episodes)
+
+    def _count(self, lane: int, episode: Episode, change: int) -> None:
+        (self._quality if episode.stage == "eval" else self._tests)[lane] += change
+
+    def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
+        """Episodes for a lane that asks.
+
+        Searches are chains of level tests, and the longest chain decides how long a run takes. So tests fill as few lanes as hold
+        them, which play little else and step fast; the others play quality, many worlds at a time.
+        """
+        tests, quality = self._tests[lane], self._quality[lane]
+        if all(count >= self._slots for count in self._tests[:lane]):
+            episodes = plan.take(min(most, max(self._slots - tests, 0)), urgent=True)
+            if episodes or urgent:
+                return episodes
+        if urgent or tests >= _FEW_TESTS or (tests and quality):
+            return []
+        return plan.take_quality(min(most, -(-plan.waiting[1] // len(self._connections))))
 
     def _serve(self, plan: Plan) -> None:
         """Give waiting lanes work, or send them home once nothing can follow any more."""
         for lane in sorted(self._idle):
-            episodes = self._share(plan, 1, urgent=False)
+            episodes = self._share(plan, lane, 1, urgent=False) or plan.take(1)
             if not episodes:
                 break
-            self._connections[lane].send(episodes)
+            self._give(lane, episodes)
             self._idle.discard(lane)
         if len(self._idle) == len(self._connections):
             for connection in self._connections:

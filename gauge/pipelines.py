@@ -32,8 +32,9 @@ class Store(Protocol):
 class LevelTest:
     """One level, played with the search seeds, in rounds that stop as soon as the outcome is certain.
 
-    The first round has as many episodes as may fail plus one, each later one as many as must still succeed: the outcome is that
-    of playing all seeds, and the set of episodes depends on nothing but their results.
+    A round has as many episodes as must still succeed: the outcome is that of playing all seeds, and the set of episodes depends on
+    nothing but their results. Shorter rounds would save episodes where a level is failed, and cost rounds where it is passed; a
+    search is a chain of rounds, and the longest chain is what a run of few environments waits for.
     """
 
     def __init__(self, seeds: Sequence[int], pass_rate: float, *, all_at_once: bool) -> None:
@@ -56,8 +57,7 @@ class LevelTest:
         """Seeds to play now; empty while a round is running or once decided."""
         if self._running or self.passed is not None:
             return []
-        first = self.successes == self.failures == 0
-        size = len(self._waiting) if self._all else self._may_fail + 1 if first else self._needed - self.successes
+        size = len(self._waiting) if self._all else self._needed - self.successes
         seeds, self._waiting = self._waiting[:size], self._waiting[size:]
         self._running = len(seeds)
         return seeds
@@ -145,9 +145,20 @@ class Plan:
             most: largest number of episodes.
             urgent: level tests alone.
         """
+        taken = self._take(self._tests, most)
+        while not urgent and len(taken) < most and (self._tests or self._quality):
+            taken += self._take(self._tests or self._quality, 1)
+        return taken
+
+    def take_quality(self, most: int) -> list[Episode]:
+        """Quality episodes that can start now."""
+        return self._take(self._quality, most)
+
+    def _take(self, queue: deque[Episode], most: int) -> list[Episode]:
+        """The next episodes of a queue that have not run yet; what follows from the others is folded in."""
         taken: list[Episode] = []
-        while len(taken) < most and (self._tests or (self._quality and not urgent)):
-            episode = (self._tests or self._quality).popleft()
+        while queue and len(taken) < most:
+            episode = queue.popleft()
             known = self._store.get(episode)
             if known is None:
                 taken.append(episode)
