@@ -21,7 +21,7 @@ from ..robots.rotation import from_yaw
 from .episodes import QUALITY, Episode, Record
 from .goals import LATERAL_SPEED, TARGET, Schedule, target_command, target_offset
 from .noise import NoiseReader, make_stream
-from .sampling import SampleTable
+from .sampling import Samples, SampleTable
 from .segments import Agenda, Outcome, Segment, SegmentQueue, SegmentRules, cut_short
 from .suite import Suite
 
@@ -107,7 +107,7 @@ class EpisodeRunner:
         self._tick, self._steps = zeros(kind=whole), zeros(kind=whole)
         self._done, self._reached = zeros(kind=truth), zeros(kind=truth)
         self._falls, self._diverged, self._overflowed = zeros(kind=whole), zeros(kind=truth), zeros(kind=truth)
-        self._lost, self._ended = zeros(kind=whole), zeros(kind=truth)
+        self._lost = zeros(kind=whole)
         self._last_action = zeros(scene.robot.num_joints, kind=torch.float32)
         self._towards = zeros(3)
         # the first penetration: whether one still matters, whether there was one, and how far the segment was then
@@ -120,6 +120,8 @@ class EpisodeRunner:
         self._cheap_checks = device.type == "cpu"
         self._few_rows_suffice = self._cheap_checks and _rows_are_stable(policy, k)
         self._nobody, self._nothing = zeros(kind=truth), zeros(kind=whole)
+        # what the last step brought: segments that ended, and robots that go back to their spawn during theirs
+        self._ended, self._again = self._nobody, self._nobody
 
     # ---- segments come and go -------------------------------------------------------------------------------------
 
@@ -132,7 +134,10 @@ class EpisodeRunner:
         with torch.inference_mode():
             while self._fill(agenda):
                 self._control_step()
-                if bool(self._ended.any()):
+                again, ended = torch.stack((self._again, self._ended)).sum(1).tolist()
+                if again:
+                    self._reset(self._again, again)
+                if ended:
                     for record in self._collect():
                         agenda.finished(record)
                 if watch is not None:
@@ -143,9 +148,8 @@ class EpisodeRunner:
         ages: dict[Episode, int] = {}
         for segment, begun in zip(self._segment, self._seated_at, strict=True):
             if segment is not None:
-                known = ages.get(segment.episode, self._queue.steps_behind(segment.episode))
-                ages[segment.episode] = known + self.control_steps - begun
-        return ages
+                ages[segment.episode] = ages.get(segment.episode, 0) + self.control_steps - begun
+        return {episode: age + self._queue.steps_behind(episode) for episode, age in ages.items()}
 
     def _fill(self, agenda: Agenda) -> bool:
         """Let segments begin in the free slots; returns whether any are at work."""
@@ -211,7 +215,7 @@ class EpisodeRunner:
             self._seated_at[slot] = self.control_steps
         self._active |= mask
         self._count_places()
-        self._reset(mask)
+        self._reset(mask, len(slots))
 
     def _fit(self, slots: list[int], episodes: Sequence[Episode]) -> None:
         """Give worlds the friction and payload of their episodes, where they have others."""
@@ -244,47 +248,38 @@ class EpisodeRunner:
     def _collect(self) -> list[Record]:
         """Take the ended segments out of their slots; returns the records of the episodes that are complete with them."""
         slots = torch.nonzero(self._ended).flatten()
-        numbers = torch.stack(
-            [
-                t[slots].to(torch.int64)
-                for t in (
-                    *(self._steps, self._falls, self._diverged, self._overflowed, self._reached, self._lost),
-                    *(self._table.count, self._deep),
-                    *(self._deep_control, self._deep_steps, self._deep_count, self._deep_overflowed),
-                )
-            ],
-            dim=1,
-        ).tolist()
+        whole = (self._table.count, self._steps, self._falls, self._lost)
+        flags = (self._diverged, self._overflowed, self._reached, self._deep)
+        beginning = (self._deep_control, self._deep_steps, self._deep_count, self._deep_overflowed)
+        numbers = torch.stack([t.to(torch.int64) for t in (*whole, *flags, *beginning)], dim=1)
+        rows = torch.cat((slots[:, None], numbers[slots]), dim=1).tolist()
+        sampled = {slot: count for slot, count, *_ in rows if count}
+        samples: dict[int, Samples] = {}
+        if sampled:
+            tables = self._table.read(list(sampled), list(sampled.values()), self._limits, self._friction)
+            samples = dict(zip(sampled, tables, strict=True))
         outcomes = {}
-        for slot, row in zip(slots.tolist(), numbers, strict=True):
+        for slot, _, *row in rows:
             segment = self._segment[slot]
             assert segment is not None
-            outcomes[segment] = self._outcome(slot, segment, row)
-            self._leave(slot)
+            outcomes[segment] = self._outcome(slot, segment, row, samples.get(slot))
         records, hidden = self._queue.finish(outcomes)
-        for slot, segment in enumerate(self._segment):
-            if segment in hidden:
-                self._leave(slot)
-        self._ended.zero_()
+        left = [slot for slot, segment in enumerate(self._segment) if segment in outcomes or segment in hidden]
+        for slot in left:
+            self._segment[slot] = None
+        self._active[torch.tensor(left, device=self._device)] = False
+        self._free = sorted(self._free + left)
         self._count_places()
         return records
 
-    def _leave(self, slot: int) -> None:
-        """Free a slot."""
-        self._segment[slot] = None
-        self._active[slot] = False
-        self._free.append(slot)
-        self._free.sort()
-
-    def _outcome(self, slot: int, segment: Segment, row: list[int]) -> Outcome:
+    def _outcome(self, slot: int, segment: Segment, row: list[int], sampled: Samples | None) -> Outcome:
         """What came of the segment that has just ended in a slot; ``row`` holds its numbers as ``_collect`` reads them."""
-        steps, falls, diverged, overflowed, reached, lost, count, deep, *at_penetration = row
+        steps, falls, lost, diverged, overflowed, reached, deep, *at_penetration = row
         samples = np.zeros((lost, len(self.columns)), dtype=np.float32)
-        kept_until = []
-        if count:
-            values, keep = self._table.read(slot, count, self._limits[slot], self._friction[slot])
-            kept_until = keep.cumsum(0).tolist()
-            samples = np.concatenate((values[keep].to(torch.float32).cpu().numpy(), samples))
+        keep = np.zeros(0, dtype=np.bool_)
+        if sampled is not None:
+            values, keep = sampled
+            samples = np.concatenate((values[keep], samples))
         aims = segment.goal == TARGET
         outcome = Outcome(
             samples=samples,
@@ -301,15 +296,15 @@ class EpisodeRunner:
         control, physics, rows, was_overflowed = at_penetration
         beginning = cut_short(
             outcome,
-            samples=kept_until[rows - 1] if rows else 0,
+            samples=int(keep[:rows].sum()),
             control_steps=control - self._seated_at[slot],
             physics_steps=physics,
             overflowed=bool(was_overflowed),
         )
         return replace(outcome, until_penetration=beginning)
 
-    def _reset(self, mask: torch.Tensor) -> None:
-        """Put worlds back to their spawn; the robot hangs limp for one physics step, then settles."""
+    def _reset(self, mask: torch.Tensor, count: int) -> None:
+        """Put ``count`` worlds back to their spawn, (K,) bool; the robot hangs limp for one physics step, then settles."""
         self.backend.reset(mask, base_position=self._spawn, base_quaternion=self._heading, terrain_index=self._terrain)
         self.backend.step(None, worlds=mask, substeps=1)
         self._builder.reset(mask)
@@ -323,7 +318,7 @@ class EpisodeRunner:
             self._tick += mask
         else:
             self._tick.masked_fill_(mask, 0)
-        self.physics_steps += int(mask.sum())
+        self.physics_steps += count
 
     # ---- one control step -----------------------------------------------------------------------------------------
 
@@ -443,8 +438,9 @@ class EpisodeRunner:
         self._lost = torch.where(fall & self._sampled & ~self._aims, lost, self._lost)
 
     def _follow_up(self, fall: torch.Tensor, restart: torch.Tensor, commanded: torch.Tensor) -> None:
-        """Ends of segments: falls, sub-commands that are over, targets reached or missed."""
+        """Ends of segments: falls, sub-commands that are over, targets reached or missed; and who starts again."""
         quiet = fall is self._nobody
+        self._again = self._nobody
         settled = self._active & ~self._settling
         full = settled & (self._part_steps >= self._length)
         if not self._any_target:
@@ -472,9 +468,7 @@ class EpisodeRunner:
             self._reached &= ~restart
             self._ended = ended | fall | (self._done & settled & ~restart)
             self._done |= over
-            again = over | restart
-            if bool(again.any()):
-                self._reset(again)
+            self._again = over | restart
         else:
             self._ended = ended | fall | over
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
@@ -14,6 +17,9 @@ from .suite import Suite
 _MOTION = ("base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity_b")
 _JOINTS = ("joint_position", "joint_velocity", "joint_torque")
 _CONTACTS = ("ground_moment_w", "ground_force_w", "foot_normal_force", "foot_tangential_force")
+
+Samples = tuple[NDArray[np.float32], NDArray[np.bool_]]
+"""Metrics and quality of T samples, (T, columns), NaN where a metric is not defined, and which of them count, (T,)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +66,8 @@ class SampleTable:
         # then the command, the torque before, whether that is known, and whether the sample counts
         self._split = [*self._widths, 3, joints, 1, 1]
         self._slots, self._device, self._dtype = slots, device, dtype
+        # in a CPU's vector units the last bit may depend on who else is in a batch: there, every segment has one of its own
+        self._together = device.type != "cpu"
         self._rows = torch.zeros(0, 0, device=device, dtype=dtype)
         self._begin = torch.zeros(slots, dtype=torch.int64, device=device)
         self.capacity = 0
@@ -93,10 +101,12 @@ class SampleTable:
 
         Args:
             sample: the state at which it is taken; the other slots' rows do not matter.
-            due: (K,) bool.
+            due: (K,) bool; nobody's may be before ``reserve``.
             keep: whether it counts, (K,) bool.
             command: commanded velocities, (K, 3).
         """
+        if not self.capacity:
+            return
         values = [getattr(sample, name) for name in self._fields]
         flags = torch.stack((self._torque_known, keep), dim=1)
         row = torch.cat((*values, command, self._torque, flags), dim=1)
@@ -114,25 +124,30 @@ class SampleTable:
             self._torque_known |= active
 
     def read(
-        self, slot: int, count: int, limits: torch.Tensor, friction: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Metrics and quality of a slot's first ``count`` samples, and which of them count.
+        self, slots: Sequence[int], counts: Sequence[int], limits: torch.Tensor, friction: torch.Tensor
+    ) -> list[Samples]:
+        """What the metrics say of some slots' first samples.
 
         Args:
-            slot: which.
-            count: number of samples T.
-            limits: command limits of its segment, (3,).
-            friction: its friction coefficient, ().
-
-        Returns:
-            (T, columns), NaN where a metric is not defined, and (T,) bool.
+            slots: which.
+            counts: number of samples T of each, at least 1.
+            limits: command limits of all slots' segments, (K, 3).
+            friction: their friction coefficients, (K,).
         """
-        begin = slot * (self.capacity + 1)
-        *values, command, before, known, keep = self._rows[begin : begin + count].split(self._split, dim=1)
+        owner = np.repeat(slots, counts)
+        first = np.repeat(np.asarray(slots) * (self.capacity + 1) - np.cumsum(counts) + counts, counts)
+        at, slot = torch.tensor(np.stack((first + np.arange(len(owner)), owner)), device=self._device)
+        parts = [len(owner)] if self._together else list(counts)
+        rows = (self._rows[at], limits[slot], friction[slot])
+        values = torch.cat([self._evaluate(*part) for part in zip(*(x.split(parts) for x in rows), strict=True)])
+        pieces = np.split(values.cpu().numpy(), np.cumsum(counts)[:-1])
+        return [(piece[:, :-1], piece[:, -1] > 0) for piece in pieces]
+
+    def _evaluate(self, rows: torch.Tensor, limits: torch.Tensor, friction: torch.Tensor) -> torch.Tensor:
+        """Metrics and quality of rows of the table, then whether they count, (N, columns + 1) float32."""
+        *values, command, before, known, keep = rows.split(self._split, dim=1)
         if not self._metrics.needs_contacts:
             values += [values[0][:, :0]] * len(_CONTACTS)
         state = SampledState(**dict(zip(_MOTION + _JOINTS + _CONTACTS, values, strict=True)))
-        metrics = self._metrics.evaluate(
-            state, command, limits.expand(count, -1), friction.expand(count), before, known[:, 0] > 0
-        )
-        return metrics, keep[:, 0] > 0
+        metrics = self._metrics.evaluate(state, command, limits, friction, before, known[:, 0] > 0)
+        return torch.cat((metrics, keep), dim=1).to(torch.float32)

@@ -20,9 +20,9 @@ from .goals import TARGET, Schedule
 from .suite import Suite
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Segment:
-    """One sub-command of a velocity goal, or a target goal as a whole."""
+    """One sub-command of a velocity goal, or a target goal as a whole; equal to itself alone, which makes looking it up cheap."""
 
     episode: Episode
     goal: str
@@ -106,9 +106,12 @@ class OpenEpisode:
 
     episode: Episode
     rules: SegmentRules
+    number: int = 0
+    """How many episodes began before it."""
     outcomes: dict[Segment, Outcome] = field(default_factory=dict)
     started: set[Segment] = field(default_factory=set)
     """Segments that have been handed out."""
+    _made: dict[tuple[int, bool], list[Segment]] = field(default_factory=dict)
 
     def missing(self) -> set[Segment]:
         """Segments that are needed as far as is known, and have not ended."""
@@ -134,18 +137,22 @@ class OpenEpisode:
                 continue  # whether a penetration still matters to it depends on what comes before
             lies_behind = goal == TARGET and restarted
             sure = not missing
-            some, absent = self._play(
-                self.rules.segments(self.episode, index, again=lies_behind), sure and not restarted
-            )
+            some, absent = self._play(self._segments(index, again=lies_behind), sure and not restarted)
             counted += some
             missing += absent
             if sure and not absent and not restarted and some[-1][1].restarted:
                 restarted = True
                 if goal != TARGET:
-                    some, absent = self._play(self.rules.segments(self.episode, index, again=True), False)
+                    some, absent = self._play(self._segments(index, again=True), False)
                     counted += some
                     missing += absent
         return counted, missing, restarted
+
+    def _segments(self, goal_index: int, *, again: bool) -> list[Segment]:
+        """The segments of one goal, the same ones every time."""
+        if (goal_index, again) not in self._made:
+            self._made[goal_index, again] = self.rules.segments(self.episode, goal_index, again=again)
+        return self._made[goal_index, again]
 
     def _play(self, segments: Sequence[Segment], watched: bool) -> tuple[list[tuple[Segment, Outcome]], list[Segment]]:
         """What counts of a goal's segments up to the one that ends the attempt, and which are missing for that.
@@ -209,6 +216,7 @@ class SegmentQueue:
         """``columns`` are those of the samples."""
         self._rules, self._columns = rules, columns
         self._open: dict[Episode, OpenEpisode] = {}
+        self._begun = 0
         self._waiting: deque[Segment] = deque()
 
     def take(self, agenda: Agenda, most: int) -> list[Segment]:
@@ -226,8 +234,9 @@ class SegmentQueue:
         return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
 
     def _begin(self, episode: Episode) -> list[Segment]:
-        self._open[episode] = OpenEpisode(episode, self._rules)
-        return self._open[episode].start()
+        opened = self._open[episode] = OpenEpisode(episode, self._rules, self._begun)
+        self._begun += 1
+        return opened.start()
 
     def finish(self, outcomes: Mapping[Segment, Outcome]) -> tuple[list[Record], set[Segment]]:
         """Segments have ended.
@@ -236,18 +245,19 @@ class SegmentQueue:
             Records of the episodes that are complete with them, in the order in which they began, and segments that may still be
             at work although nothing in the record will come of them.
         """
-        touched = {segment.episode for segment in outcomes}
+        touched: dict[int, OpenEpisode] = {}
         records, hidden = [], set()
         for segment, outcome in outcomes.items():
-            self._open[segment.episode].outcomes[segment] = outcome
-        for episode in [e for e in self._open if e in touched]:
-            opened = self._open[episode]
+            opened = self._open[segment.episode]
+            opened.outcomes[segment] = outcome
+            touched[opened.number] = opened
+        for _, opened in sorted(touched.items()):
             self._waiting.extendleft(reversed(opened.start()))
             needed = opened.missing()
             hidden |= opened.started - needed - opened.outcomes.keys()
             if not needed:
                 records.append(opened.record(self._columns))
-                del self._open[episode]
+                del self._open[opened.episode]
         if hidden:
             self._waiting = deque(s for s in self._waiting if s not in hidden)
         return records, hidden

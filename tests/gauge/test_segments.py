@@ -11,7 +11,19 @@ from gaitgauge.gauge.goals import Schedule
 from gaitgauge.gauge.runner import EpisodeRunner
 from gaitgauge.gauge.segments import OpenEpisode, Outcome, Segment, SegmentRules, cut_short
 from gaitgauge.gauge.suite import load_suite
-from scripted_gauge import DIAGONAL, GO2, MAXIMUM, TARGET, Agenda, Puppet, ScriptedPolicy, episode, ground, short_suite
+from scripted_gauge import (
+    DIAGONAL,
+    GO2,
+    MAXIMUM,
+    TARGET,
+    Agenda,
+    Puppet,
+    ScriptedPolicy,
+    episode,
+    fake,
+    ground,
+    short_suite,
+)
 
 REFERENCE, OWN = "robogauge-1.1", "gaitgauge-1"
 PARTS = {DIAGONAL: 8, MAXIMUM: 6}
@@ -212,6 +224,7 @@ def stage(name, slots, falls, penetrations, count=1, *, looks=True):
     agenda = Agenda([*walks, *(episode(TARGET, stage="search", seed=seed) for seed in range(count))])
     runner = EpisodeRunner(suite, ScriptedPolicy(act), Stage(scene, falls, penetrations), lambda e: 0)
     runner._cheap_checks = looks
+    runner._table._together = not looks
     runner.run(agenda)
     return sorted(agenda.records, key=lambda r: (r.episode.stage, r.episode.seed))
 
@@ -370,6 +383,17 @@ def test_slots_and_neighbours_change_no_bit_of_a_record(name, events):
 def test_a_loop_that_never_looks_gives_the_same_records(name, events):
     """On a GPU a look at the data would wait for the device: everything is worked out for everybody."""
     assert_equal(stage(name, 5, *events, count=2), stage(name, 5, *events, count=2, looks=False))
+
+
+@pytest.mark.parametrize("looks", [True, False])
+def test_crossings_alone_take_no_samples(looks):
+    """A search has no quality episodes, so that the table of samples stays empty."""
+    suite = short_suite(REFERENCE)
+    runner = EpisodeRunner(suite, ScriptedPolicy(), fake(suite, slots=3, terrain=ground((5.0, 0.0, 0.4))), lambda e: 0)
+    runner._cheap_checks = looks
+    agenda = Agenda([episode(TARGET, stage="search", seed=seed) for seed in range(4)])
+    runner.run(agenda)
+    assert [(r.success, len(r.samples)) for r in agenda.records] == [(False, 0)] * 4
 
 
 def test_few_episodes_are_open_at_a_time():
