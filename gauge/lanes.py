@@ -36,8 +36,6 @@ _REPORT_INTERVAL = 0.2
 """Time between a lane's reports on how far it is [s]."""
 _PATIENCE = 0.05
 """Time for which a lane at work does not ask again after it was told that nothing waits [s]."""
-_FEW_TESTS = 4
-"""A lane with fewer level tests at work has room for a quality episode beside them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +147,6 @@ class _Crew:
         self._connections: list[Connection] = []
         self._idle: set[int] = set()
         self._tests, self._quality = [0] * lanes, [0] * lanes  # episodes that each lane has at work
-        self._slots = job.slots
         self._progress = LaneProgress(lanes)
         # a lane finds the same packages, whatever this process was started with
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -233,19 +230,14 @@ class _Crew:
         (self._quality if episode.stage == "eval" else self._tests)[lane] += change
 
     def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
-        """Episodes for a lane that asks.
-
-        Searches are chains of level tests, and the longest chain decides how long a run takes. So tests fill as few lanes as hold
-        them, which play little else and step fast; the others play quality, many worlds at a time.
-        """
-        tests, quality = self._tests[lane], self._quality[lane]
-        if all(count >= self._slots for count in self._tests[:lane]):
-            episodes = plan.take(min(most, max(self._slots - tests, 0)), urgent=True)
-            if episodes or urgent:
-                return episodes
-        if urgent or tests >= _FEW_TESTS or (tests and quality):
-            return []
-        return plan.take_quality(min(most, -(-plan.waiting[1] // len(self._connections))))
+        """Episodes for a lane that asks: level tests first, no more than its part of all that are at work or wait."""
+        lanes = len(self._connections)
+        tests, quality = plan.waiting
+        part = -(-(sum(self._tests) + tests) // lanes) - self._tests[lane]
+        episodes = plan.take(min(most, max(part, 0)), urgent=True)
+        if episodes or urgent:
+            return episodes
+        return plan.take_quality(min(most, -(-quality // lanes)))
 
     def _serve(self, plan: Plan) -> None:
         """Give waiting lanes work, or send them home once nothing can follow any more."""
