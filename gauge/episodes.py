@@ -80,7 +80,7 @@ class Record:
         return row
 
     def save(self, folder: Path) -> None:
-        """Write the record as one file, all or nothing."""
+        """Write the record as one file, all or nothing. It survives the death of the process at once, and that of the machine soon."""
         path = folder / f"{self.episode.key}.npz"
         temporary = path.with_suffix(".tmp")
         head = {**self.summary(), "goals": list(self.episode.goals), "columns": list(self.columns)}
@@ -92,8 +92,6 @@ class Record:
                 goal_index=self.goal_index,
                 part_index=self.part_index,
             )
-            file.flush()
-            os.fsync(file.fileno())
         os.replace(temporary, path)
 
     @classmethod

@@ -37,6 +37,8 @@ _SLOTS = 24
 """Worlds of a process on the CPU: more share the loop's cost, fewer keep more processes busy to the end."""
 _GPU_SLOTS = 4096
 """Largest number of worlds on a GPU."""
+_WATCH_INTERVAL = 0.2
+"""Time between two looks at how far a run is [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,6 +171,7 @@ def identity(request: Request, suite: Suite, policy: Policy, environments: list[
         "level": request.level,
         "environments": [e.key for e in environments],
         "seeds": seeds,
+        "noise": "by segment",  # runs begun before episodes fell into segments drew theirs otherwise
     }
 
 
@@ -192,7 +195,7 @@ def evaluate(
         folder: where ``results.json``, ``episodes.csv``, ``report.html`` and ``episodes/`` go.
         resume: go on with what the folder holds.
         command: the command line, for the provenance.
-        watch: called after every control step.
+        watch: called a few times a second, between control steps.
 
     Returns:
         The content of ``results.json``.
@@ -230,6 +233,7 @@ def evaluate(
     results["backend"] = request.backend
     results["robot"] = robot.name
     results["health"] = dict(health(environments))
+    results["solver"] = dict(find_backend(request.backend, request.device).solver_settings(suite.physics))
     provenance = _provenance(request, command, time.perf_counter() - began, physics_steps)
     results["provenance"] = provenance | {"processes": lanes}
     if engine_seconds:
@@ -280,7 +284,12 @@ def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -
         for name, goal in goals.items()
     }
 
+    next_time = began
+
     def on_step(progress: Progress) -> None:
+        nonlocal next_time
+        if time.perf_counter() < next_time:
+            return
         left = plan.expected_left()
         total = plan.done + left
         expected = round(total)
@@ -299,6 +308,7 @@ def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -
                 remaining_work=max(left, 0.0) / total if total else 0.0,
             )
         )
+        next_time = time.perf_counter() + _WATCH_INTERVAL
 
     return on_step
 

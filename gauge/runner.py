@@ -16,6 +16,7 @@ import torch
 from ..backends.base import PhysicsBackend, Randomization
 from ..policy.base import Policy, PolicyError
 from ..policy.observation import ObservationBuilder
+from ..policy.steady import steady_session
 from ..robots.geometry import total_mass
 from ..robots.rotation import from_yaw
 from .episodes import QUALITY, Episode, Record
@@ -70,7 +71,12 @@ class EpisodeRunner:
         device, dtype = backend.device, backend.dtype
         self._device, self._dtype = device, dtype
         self._substeps = scene.physics.substeps
-        self._session = policy.session(k, device=str(device))
+        # on the CPU a look at the data is free, and saves the work that nobody needs; on a GPU it would wait for the device
+        self._cheap_checks = device.type == "cpu"
+        if self._cheap_checks:
+            self._session, self._few_rows_suffice = steady_session(policy, k)
+        else:
+            self._session, self._few_rows_suffice = policy.session(k, device=str(device)), False
         self._builder = ObservationBuilder(policy.contract, scene.robot, k, device)
         self._schedule = Schedule(suite, device, dtype)
         self._rules = SegmentRules(suite, self._schedule)
@@ -116,9 +122,6 @@ class EpisodeRunner:
         self._deep_count, self._deep_overflowed = zeros(kind=whole), zeros(kind=truth)
         self.control_steps = 0
         self.physics_steps = 0
-        # on the CPU a look at the data is free, and saves the work that nobody needs; on a GPU it would wait for the device
-        self._cheap_checks = device.type == "cpu"
-        self._few_rows_suffice = self._cheap_checks and _rows_are_stable(policy, k)
         self._nobody, self._nothing = zeros(kind=truth), zeros(kind=whole)
         # what the last step brought: segments that ended, and robots that go back to their spawn during theirs
         self._ended, self._again = self._nobody, self._nobody
@@ -471,21 +474,3 @@ class EpisodeRunner:
             self._again = over | restart
         else:
             self._ended = ended | fall | over
-
-
-def _rows_are_stable(policy: Policy, slots: int) -> bool:
-    """Whether a policy answers to the last bit the same for an episode, however many others go through it with it.
-
-    Matrix products may sum in another order for another number of rows. Only where a trial shows that they do not, is the
-    policy run on fewer rows than there are slots.
-    """
-    width = policy.contract.observation_width
-    generator = torch.Generator().manual_seed(0)
-    observations = torch.randn(4, slots, width, generator=generator)
-    for count in range(8, slots, 8):
-        whole, part = policy.session(slots), policy.session(slots)
-        for observation in observations:
-            rows = torch.randperm(slots, generator=generator)[:count]
-            if not torch.equal(whole.act(observation)[rows], part.act(observation, rows)[rows]):
-                return False
-    return True

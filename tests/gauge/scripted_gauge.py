@@ -32,6 +32,7 @@ class ScriptedPolicy(Policy):
         self.seen: list[torch.Tensor] = []
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
+        self.seen = []  # what earlier sessions were asked, as a trial, is of no interest
         return ScriptedSession(self)
 
     def commands(self, slot: int = 0) -> torch.Tensor:
@@ -41,13 +42,13 @@ class ScriptedPolicy(Policy):
 
 class ScriptedSession(PolicySession):
     def __init__(self, policy: ScriptedPolicy) -> None:
-        self.policy = policy
+        self.policy, self.seen = policy, policy.seen
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         pass
 
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
-        self.policy.seen.append(observation.clone())
+        self.seen.append(observation.clone())
         return self.policy.act(observation)
 
 

@@ -16,6 +16,7 @@ import pytest
 import torch
 from gaitgauge.backends.base import BackendError
 from gaitgauge.backends.fake import FakeScript
+from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge import lanes
 from gaitgauge.gauge.evaluate import Request, evaluate, prepare
 from gaitgauge.gauge.store import RunFolder, StoreError
@@ -92,6 +93,7 @@ def request_for(tmp_path, monkeypatch):
     stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
     save_policy(policy, go2_contract(GO2), stored)
     monkeypatch.setattr(lanes, "make_backend", puppets)
+    monkeypatch.setattr(evaluation, "_WATCH_INTERVAL", 0.0)
 
     def make(base="gaitgauge-1", **choices):
         suite = tmp_path / f"{base}.toml"
