@@ -36,6 +36,8 @@ _REPORT_INTERVAL = 0.2
 """Time between a lane's reports on how far it is [s]."""
 _PATIENCE = 0.05
 """Time for which a lane at work does not ask again after it was told that nothing waits [s]."""
+_FEW_TESTS = 13
+"""A lane with fewer level tests at work has room for one quality episode beside them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,13 +232,19 @@ class _Crew:
         (self._quality if episode.stage == "eval" else self._tests)[lane] += change
 
     def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
-        """Episodes for a lane that asks: level tests first, no more than its part of all that are at work or wait."""
+        """Episodes for a lane that asks: level tests first, no more than its part of all that are at work or wait.
+
+        A search is a chain of tests, and the longest chain decides how long a run takes. So a lane with tests at work steps few
+        worlds beside them, and fast; quality, which can be played at any time, fills the others.
+        """
         lanes = len(self._connections)
         tests, quality = plan.waiting
         part = -(-(sum(self._tests) + tests) // lanes) - self._tests[lane]
         episodes = plan.take(min(most, max(part, 0)), urgent=True)
         if episodes or urgent:
             return episodes
+        if self._tests[lane] >= _FEW_TESTS or (self._tests[lane] and self._quality[lane]):
+            return []
         return plan.take_quality(min(most, -(-quality // lanes)))
 
     def _serve(self, plan: Plan) -> None:
