@@ -32,15 +32,17 @@ def table_console() -> Console:
 # ---- import ---------------------------------------------------------------------------------------------------------
 
 
-def import_file(source: str, destination: Path, *, force: bool) -> None:
+def import_file(source: str, destination: Path, *, force: bool, trainable: bool = False) -> None:
     """Write a foreign policy as the project's own file, and print the contract that it got.
 
     Args:
         source: a policy file, or ``latest``, ``best``, ``pretrained``.
         destination: the file to write; it appears whole or not at all.
         force: replace the destination if it exists.
+        trainable: keep the teacher and the critic of a training checkpoint.
 
     Raises:
+        CheckpointError: ``trainable``, and the source is no training checkpoint.
         UserError: the destination exists and is not to be replaced, or is a folder.
         PolicyError, ContractError: the source is no policy, or the destination cannot be written.
     """
@@ -50,9 +52,16 @@ def import_file(source: str, destination: Path, *, force: bool) -> None:
         )
     if destination.exists() and not force:
         raise UserError(f"'{destination}' already exists; give another name, or replace it with --force")
-    from ..policy.importing import import_policy
+    if trainable:
+        from ..policy.loading import find_policy, load_policy
+        from ..training.checkpoint import trim_checkpoint
 
-    contract = import_policy(source, destination)
+        trim_checkpoint(find_policy(source), destination)
+        contract = load_policy(str(destination)).contract
+    else:
+        from ..policy.importing import import_policy
+
+        contract = import_policy(source, destination)
     console = table_console()
     console.print(f"wrote {escape(str(destination))}", soft_wrap=True)
     console.print(contract_table(contract))

@@ -316,11 +316,15 @@ def import_command(
     ],
     destination: Annotated[Path, typer.Argument(help="File to write, by custom NAME.gauge.pt.")],
     force: Annotated[bool, typer.Option("--force", help="Replace the destination if it exists.")] = False,
+    trainable: Annotated[
+        bool,
+        typer.Option("--trainable", help="Keep teacher and critic of a training checkpoint, for train --init-from."),
+    ] = False,
 ) -> None:
     """Turn a foreign policy into the project's own file, with its contract."""
     from .inspect import import_file
 
-    import_file(source, destination, force=force)
+    import_file(source, destination, force=force, trainable=trainable)
 
 
 @app.command("list")

@@ -161,6 +161,10 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True) -> dict[st
         raise CheckpointError(
             f"Cannot resume from '{path}': it holds no training state; give a model_<iteration>.pt of a training run."
         )
+    if training_state and "num_envs" not in training:
+        raise CheckpointError(
+            f"Cannot resume from '{path}': it holds networks only; begin a new run with them: --init-from {path}."
+        )
     if training.get("version") != TRAINING_VERSION:
         raise CheckpointError(
             f"Cannot resume from '{path}': its training state has version {training.get('version')!r}, this "
@@ -168,3 +172,24 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True) -> dict[st
             f"{TRAINING_VERSION}."
         )
     return entries
+
+
+def trim_checkpoint(source: str | Path, destination: str | Path) -> None:
+    """Write a checkpoint's networks without what only resuming needs: a policy file from which training can begin anew
+    (``--init-from``), with its teacher and its critic.
+
+    Raises:
+        CheckpointError: ``source`` is no training checkpoint, or the destination cannot be written.
+    """
+    entries = read_checkpoint(source)
+    student, actor = entries["state_dict"], entries["actor_state_dict"]
+    # the student is in there twice; tensors that are the same object are stored once
+    shared = {name: student.get(name.removeprefix("student."), value) for name, value in actor.items()}
+    kept = {name: entries[name] for name in ("format", "version", "contract", "network", "state_dict")}
+    training = {name: entries["training"][name] for name in ("version", "task")}
+    write_checkpoint(
+        destination,
+        kept
+        | {"actor_state_dict": shared, "critic_state_dict": entries["critic_state_dict"], "iter": entries["iter"]}
+        | {"training": training},
+    )

@@ -8,7 +8,13 @@ import torch
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.symmetry import build_mirror
-from gaitgauge.training.checkpoint import CheckpointError, checkpoint_entries, read_checkpoint, write_checkpoint
+from gaitgauge.training.checkpoint import (
+    CheckpointError,
+    checkpoint_entries,
+    read_checkpoint,
+    trim_checkpoint,
+    write_checkpoint,
+)
 from gaitgauge.training.runner import TrainingDivergedError, TrainingRunner
 from gaitgauge.training.scoring import FunctionScorer
 from gaitgauge.training.seeding import seed_everything
@@ -275,3 +281,21 @@ def test_slim_checkpoints_keep_weights_and_progress(tmp_path):
     assert "episodes start anew" in said[0] and resumed.current_learning_iteration == 1
     assert_same(resumed.alg.save(), {k: entries[k] for k in resumed.alg.save()})
     resumed.learn(1)
+
+
+def test_a_trimmed_checkpoint_begins_training_with_its_teacher(tmp_path):
+    """It is a policy, holds no weight twice, and cannot be resumed."""
+    make(tmp_path).learn(2)
+    trim_checkpoint(tmp_path / "model_2.pt", tmp_path / "trimmed.pt")
+    whole, trimmed = torch.load(tmp_path / "model_2.pt"), torch.load(tmp_path / "trimmed.pt")
+    assert_same(whole["actor_state_dict"], trimmed["actor_state_dict"])
+    bias = trimmed["actor_state_dict"]["student.actor.0.bias"]
+    assert bias.data_ptr() == trimmed["state_dict"]["actor.0.bias"].data_ptr()
+    assert load_policy(str(tmp_path / "trimmed.pt")).contract.provenance["iteration"] == 2
+    runner = make(seed=3)
+    runner.load_weights(tmp_path / "trimmed.pt")
+    assert runner.alg.bootstrap is None
+    assert_same(runner.alg.actor.state_dict(), whole["actor_state_dict"])
+    assert_same(runner.alg.critic.state_dict(), whole["critic_state_dict"])
+    with pytest.raises(CheckpointError, match="holds networks only; begin a new run with them: --init-from"):
+        runner.load(str(tmp_path / "trimmed.pt"))
