@@ -211,17 +211,11 @@ def evaluate(
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
     evaluated = request.pipeline != "level"
     columns: tuple[str, ...] = (*suite.metrics.weights, "quality")
-    physics_steps, engine_seconds = 0, 0.0
-    # A GPU plays every level of every search at once, then all quality episodes: few long batches instead of many short ones.
-    stages = [evaluated] if on_cpu or all(e.level is not None for e in environments) else [False, evaluated]
-    for stage in dict.fromkeys(stages):
-        plan = Plan(suite, environments, seeds, store, evaluate=stage, speculative=not on_cpu)
-        job, lanes = _job(request, suite, robot, policy, plan)
-        on_step = _watcher(plan, watch, began)
-        effort = play(job, policy, plan, on_step) if lanes == 1 else play_in_lanes(job, plan, lanes, on_step)
-        physics_steps += effort.physics_steps
-        if effort.engine_seconds is not None:
-            engine_seconds += effort.engine_seconds
+    # A GPU plays every level of every search at once: a few long batches instead of many short ones.
+    plan = Plan(suite, environments, seeds, store, evaluate=evaluated, speculative=not on_cpu)
+    job, lanes = _job(request, suite, robot, policy, plan)
+    on_step = _watcher(plan, watch, began)
+    effort = play(job, policy, plan, on_step) if lanes == 1 else play_in_lanes(job, plan, lanes, on_step)
     results = fold(suite, environments, columns, evaluated=evaluated)
     results["policy"] = {
         "path": policy.path,
@@ -234,10 +228,10 @@ def evaluate(
     results["robot"] = robot.name
     results["health"] = dict(health(environments))
     results["solver"] = dict(find_backend(request.backend, request.device).solver_settings(suite.physics))
-    provenance = _provenance(request, command, time.perf_counter() - began, physics_steps)
+    provenance = _provenance(request, command, time.perf_counter() - began, effort.physics_steps)
     results["provenance"] = provenance | {"processes": lanes}
-    if engine_seconds:
-        results["provenance"]["engine_seconds"] = round(engine_seconds, 2)
+    if effort.engine_seconds is not None:
+        results["provenance"]["engine_seconds"] = round(effort.engine_seconds, 2)
     write_atomically(folder / "episodes.csv", rows_csv([r for e in environments for r in (*e.trials, *e.records)]))
     write_atomically(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     return results

@@ -14,7 +14,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -286,10 +286,11 @@ class _RemoteAgenda:
             self._nothing_until = now + _PATIENCE
         return episodes
 
-    def finished(self, record: Record) -> None:
+    def finished(self, record: Record) -> Collection[Episode]:
         """Hand back a record; more episodes may follow from it."""
         self._connection.send(("finished", record))
         self._nothing_until = 0.0
+        return ()  # lanes search step by step, where all that is played is needed
 
     def wait(self) -> bool:
         """Wait until there is something to play; False once nothing will come."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -120,13 +120,14 @@ class Plan:
             seeds: seeds of the quality episodes.
             store: finished episodes; those found there are not run again.
             evaluate: whether quality episodes follow once the level is known.
-            speculative: play every level at once instead of searching step by step: more work, fewer steps in a row.
+            speculative: play every level at once instead of searching step by step, and drop what turns out not to matter: more
+                work, fewer steps in a row.
         """
         self.suite, self.environments, self.seeds = suite, list(environments), list(seeds)
         self._store, self._evaluate, self._speculative = store, evaluate, speculative
         self._tests: deque[Episode] = deque()
         self._quality: deque[Episode] = deque()
-        self._of: dict[str, Environment] = {}
+        self._of: dict[Episode, Environment] = {}  # of the episodes that wait or are at work
         self.total_known = 0
         self.done = 0
         for environment in self.environments:
@@ -166,10 +167,14 @@ class Plan:
                 self._fold(known)
         return taken
 
-    def finished(self, record: Record) -> None:
-        """Keep an episode's record and ask for what follows from it."""
+    def finished(self, record: Record) -> Collection[Episode]:
+        """Keep an episode's record and ask for what follows from it.
+
+        Returns:
+            Episodes at work that nobody needs any more: of level tests played at once whose outcome is certain by now.
+        """
         self._store.put(record)
-        self._fold(record)
+        return self._fold(record)
 
     @property
     def waiting(self) -> tuple[int, int]:
@@ -186,20 +191,43 @@ class Plan:
 
     def _add(self, environment: Environment, episodes: Sequence[Episode]) -> None:
         for episode in episodes:
-            self._of[episode.key] = environment
+            self._of[episode] = environment
             (self._quality if episode.stage == "eval" else self._tests).append(episode)
         self.total_known += len(episodes)
 
-    def _fold(self, record: Record) -> None:
+    def _fold(self, record: Record) -> Collection[Episode]:
+        environment = self._of.pop(record.episode, None)
+        if environment is None:
+            return ()  # it ended together with the one after which nobody needed it
         self.done += 1
-        environment = self._of.pop(record.episode.key)
         if record.episode.stage == "eval":
             environment.records.append(record)
             environment.records.sort(key=lambda r: self.seeds.index(r.episode.seed))
-            return
+            return ()
         environment.trials.append(record)
         environment.tests[record.episode.level].record(bool(record.success))
         self._search(environment)
+        return self._drop_needless(environment) if self._speculative else ()
+
+    def _drop_needless(self, environment: Environment) -> Collection[Episode]:
+        """Forget episodes of level tests that decide about nothing any more; returns those that are at work."""
+        found = environment.level is not None
+        needless = {
+            episode
+            for episode, other in self._of.items()
+            if other is environment
+            and episode.stage == "search"
+            and (found or environment.tests[episode.level].passed is not None)
+        }
+        if not needless:
+            return ()
+        for episode in needless:
+            del self._of[episode]
+        self.total_known -= len(needless)
+        waiting = needless.intersection(self._tests)
+        if waiting:
+            self._tests = deque(e for e in self._tests if e not in waiting)
+        return needless - waiting
 
     def _search(self, environment: Environment) -> None:
         """Go on with the binary search as far as the outcomes allow."""
@@ -228,7 +256,7 @@ class Plan:
             environment.tests[level] = LevelTest(seeds, scoring.pass_rate, all_at_once=self._speculative)
         test = environment.tests[level]
         self._add(environment, [self._episode(environment, level, s, "search") for s in test.next_round()])
-        return test.passed if test.idle else None
+        return test.passed if test.idle or self._speculative else None
 
     def _queue_quality(self, environment: Environment) -> None:
         level = environment.level or 0

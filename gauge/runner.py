@@ -7,7 +7,7 @@ payload. What happens in a segment depends on that segment alone: not on its slo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -141,8 +141,11 @@ class EpisodeRunner:
                 if again:
                     self._reset(self._again, again)
                 if ended:
+                    needless: set[Episode] = set()
                     for record in self._collect():
-                        agenda.finished(record)
+                        needless.update(agenda.finished(record))
+                    if needless:
+                        self._drop(needless)
                 if watch is not None:
                     watch(Progress(self))
 
@@ -267,13 +270,22 @@ class EpisodeRunner:
             assert segment is not None
             outcomes[segment] = self._outcome(slot, segment, row, samples.get(slot))
         records, hidden = self._queue.finish(outcomes)
-        left = [slot for slot, segment in enumerate(self._segment) if segment in outcomes or segment in hidden]
-        for slot in left:
-            self._segment[slot] = None
-        self._active[torch.tensor(left, device=self._device)] = False
-        self._free = sorted(self._free + left)
-        self._count_places()
+        self._leave([slot for slot, segment in enumerate(self._segment) if segment in outcomes or segment in hidden])
         return records
+
+    def _drop(self, episodes: Collection[Episode]) -> None:
+        """Take episodes that nobody needs any more out of their slots."""
+        self._queue.drop(episodes)
+        seated = enumerate(self._segment)
+        self._leave([slot for slot, segment in seated if segment is not None and segment.episode in episodes])
+
+    def _leave(self, slots: list[int]) -> None:
+        """Free slots."""
+        for slot in slots:
+            self._segment[slot] = None
+        self._active[torch.tensor(slots, dtype=torch.int64, device=self._device)] = False
+        self._free = sorted(self._free + slots)
+        self._count_places()
 
     def _outcome(self, slot: int, segment: Segment, row: list[int], sampled: Samples | None) -> Outcome:
         """What came of the segment that has just ended in a slot; ``row`` holds its numbers as ``_collect`` reads them."""

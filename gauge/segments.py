@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -205,8 +205,8 @@ class Agenda(Protocol):
     def take(self, most: int, *, urgent: bool = False) -> Sequence[Episode]:
         """Up to ``most`` episodes that can start now; with ``urgent`` only those on whose outcome other episodes wait."""
 
-    def finished(self, record: Record) -> None:
-        """An episode has ended."""
+    def finished(self, record: Record) -> Collection[Episode]:
+        """An episode has ended; returns episodes at work that nobody needs any more."""
 
 
 class SegmentQueue:
@@ -261,6 +261,12 @@ class SegmentQueue:
         if hidden:
             self._waiting = deque(s for s in self._waiting if s not in hidden)
         return records, hidden
+
+    def drop(self, episodes: Collection[Episode]) -> None:
+        """Forget episodes that nobody needs any more."""
+        for episode in episodes:
+            self._open.pop(episode, None)
+        self._waiting = deque(s for s in self._waiting if s.episode not in episodes)
 
     def steps_behind(self, episode: Episode) -> int:
         """Control steps of an open episode's segments that have ended."""

@@ -6,7 +6,7 @@ is what physics made of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -119,10 +119,11 @@ class EpisodeList:
         taken, self._queue = self._queue[:most], self._queue[most:]
         return taken
 
-    def finished(self, record: Record) -> None:
+    def finished(self, record: Record) -> Collection[Episode]:
         """Keep an episode's record."""
         self._store.put(record)
         self.records[record.episode.key] = record
+        return ()
 
 
 def play(

@@ -1,6 +1,6 @@
 """A gauge in which nothing is left to physics: scripted policies, short suites, an engine without physics."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import fields, replace
 
 import pytest
@@ -63,8 +63,9 @@ class Agenda:
         taken, self.waiting = self.waiting[:most], self.waiting[most:]
         return taken
 
-    def finished(self, record: Record) -> None:
+    def finished(self, record: Record) -> Collection[Episode]:
         self.records.append(record)
+        return ()
 
 
 def short_suite(

@@ -41,7 +41,8 @@ def test_flat_ground_agrees_with_the_reference(tmp_path: Path):
     assert flat["quality"]["mean"] == pytest.approx(FLAT_QUALITY[0], abs=0.03)
     found = {name: values["mean50"] for name, values in flat["metrics"].items()}
     assert found == pytest.approx(FLAT_METRICS, abs=0.04)
-    assert flat["falls"] == flat["diverged"] == 0
+    assert flat["diverged"] == 0
+    assert flat["falls"] <= 1  # the reference's own episodes of this policy fell twice in 141: which one does is chance
 
 
 def test_the_whole_friction_agrees_with_the_reference(tmp_path: Path):

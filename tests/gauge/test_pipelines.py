@@ -77,7 +77,9 @@ def play(plan, success, *, most=3, order=None):
             return started
         ended = active.pop(order.randrange(len(active)) if order else 0)
         search = ended.stage == "search"
-        plan.finished(Record(episode=ended, success=success(ended) if search else None))
+        needless = plan.finished(Record(episode=ended, success=success(ended) if search else None))
+        assert set(needless) <= set(active)
+        active[:] = [e for e in active if e not in needless]
 
 
 @pytest.mark.parametrize("speculative", [False, True])
@@ -112,10 +114,33 @@ def test_the_search_does_not_depend_on_the_order_in_which_episodes_end():
             if not speculative:
                 played.add(frozenset(e.key for e in episodes))
             assert [r.episode.seed for r in item.records] == ([0, 1, 2] if item.level else [])
-            assert plan.done == plan.total_known == len(episodes) == len(item.trials) + len(item.records)
+            assert plan.done == plan.total_known == len(item.trials) + len(item.records)
+            assert speculative or plan.done == len(episodes)
             assert plan.expected_left() == 0
         assert found == {searched_level(passes)[0]}
         assert len(played) == 1
+
+
+def test_what_is_played_at_once_is_dropped_as_soon_as_it_decides_nothing():
+    """Level 6 is reached. Two failures settle a level, four successes do, and the level reached settles all others."""
+    item = environment()
+    plan = Plan(REFERENCE, [item], [0], MemoryStore(), speculative=True)
+    episodes = {(e.level, e.seed): e for e in plan.take(50)}
+    assert len(episodes) == 50
+
+    def end(level, seed):
+        return {(e.level, e.seed) for e in plan.finished(Record(episode=episodes[level, seed], success=level <= 6))}
+
+    assert end(8, 0) == set()
+    assert end(8, 3) == {(8, 1), (8, 2), (8, 4)}
+    assert end(8, 1) == set(), "it ended in the same step as the one before"
+    assert [end(5, s) for s in range(4)] == [set(), set(), set(), {(5, 4)}]
+    assert [end(6, s) for s in range(4)] == [set(), set(), set(), {(6, 4)}]
+    assert end(7, 0) == set() and item.level is None
+    rest = {(level, seed) for level in (1, 2, 3, 4, 9, 10) for seed in range(5)}
+    assert end(7, 1) == rest | {(7, 2), (7, 3), (7, 4)}
+    assert item.level == 6
+    assert [(e.stage, e.level) for e in plan.take(50)] == [("eval", 6)]
 
 
 def test_quality_follows_at_the_level_reached_with_the_other_goals():

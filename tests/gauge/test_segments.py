@@ -449,3 +449,35 @@ def test_level_tests_go_before_waiting_segments():
     EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0).run(agenda, watch)
     assert ("search", STEPS + 1) in started
     assert [r.episode.stage for r in agenda.records] == ["search", "eval"]
+
+
+@pytest.mark.parametrize("cheap_checks", [True, False])
+def test_episodes_that_nobody_needs_any_more_leave_their_slots(cheap_checks):
+    """The first to end makes another needless, of which some segments are at work and others wait; the last one goes on."""
+    suite = short_suite(OWN)
+    short, long = episode(MAXIMUM, seed=0), [episode(DIAGONAL, MAXIMUM, seed=1)]
+    last = episode(DIAGONAL, seed=3)
+
+    class Dropping(Agenda):
+        def finished(self, record):
+            super().finished(record)
+            return long if record.episode == short else ()
+
+    agenda = Dropping([short, *long, last])
+    scene = Scene(
+        robot=GO2,
+        parameters=GO2.parameters[suite.parameters],
+        terrains=(ground((9.0, 0.0, 0.4)),),
+        terrain_index=(0,) * 8,
+        physics=suite.physics,
+    )
+    seen = []
+    runner = EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0)
+    runner._cheap_checks = cheap_checks
+    runner.run(agenda, lambda progress: seen.append(set(progress.active())))
+    assert [r.episode for r in agenda.records] == [short, last]
+    first = next(i for i, active in enumerate(seen) if short not in active)
+    assert not any(set(long) & active for active in seen[first:])
+    alone = Agenda([last])
+    EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0).run(alone)
+    np.testing.assert_array_equal(agenda.records[1].samples, alone.records[0].samples)
