@@ -76,8 +76,7 @@ class MujocoBackend(PhysicsBackend):
         self._models = [copy.copy(self._palette[t]) for t in self._terrain]
         self._batch = mujoco.batch.Batch(nominal, n, threads, True)
         self._batch.set_models(self._models)
-        self.engine_seconds = 0.0
-        """Wall-clock time spent inside MuJoCo's stepping so far [s]."""
+        self.engine_seconds: float = 0.0
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         tilt = scene.physics.watch_tilt
         self._tilt_bound = 0.0 if tilt is None else 0.5 * (1.0 - np.cos(tilt))

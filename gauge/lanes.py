@@ -36,8 +36,6 @@ _REPORT_INTERVAL = 0.2
 """Time between a lane's reports on how far it is [s]."""
 _PATIENCE = 0.05
 """Time for which a lane at work does not ask again after it was told that nothing waits [s]."""
-_FEW_TESTS = 13
-"""A lane with fewer level tests at work has room for one quality episode beside them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,13 +114,9 @@ def play(job: LaneJob, policy: Policy, plan: Plan, watch: Callable[[Any], None] 
     runner = build_runner(job, policy)
     try:
         runner.run(plan, watch)
-        return Effort(physics_steps=runner.physics_steps, engine_seconds=_engine_seconds(runner))
+        return Effort(physics_steps=runner.physics_steps, engine_seconds=runner.backend.engine_seconds)
     finally:
         runner.backend.close()
-
-
-def _engine_seconds(runner: EpisodeRunner) -> float | None:
-    return getattr(runner.backend, "engine_seconds", None)
 
 
 # ---- parent ----------------------------------------------------------------------------------------------------------
@@ -148,7 +142,7 @@ class _Crew:
         self._processes: list[subprocess.Popen[bytes]] = []
         self._connections: list[Connection] = []
         self._idle: set[int] = set()
-        self._tests, self._quality = [0] * lanes, [0] * lanes  # episodes that each lane has at work
+        self._tests = [0] * lanes  # level tests that each lane has at work
         self._progress = LaneProgress(lanes)
         # a lane finds the same packages, whatever this process was started with
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -191,7 +185,7 @@ class _Crew:
                 elif kind == "finished":
                     record = content[0]
                     plan.finished(record)
-                    self._count(lane, record.episode, -1)
+                    self._tests[lane] -= record.episode.stage == "search"
                 elif kind == "idle":
                     self._idle.add(lane)
                 elif kind == "progress":
@@ -224,27 +218,17 @@ class _Crew:
 
     def _give(self, lane: int, episodes: list[Episode]) -> None:
         """Hand episodes, or the news that there are none, to a lane."""
-        for episode in episodes:
-            self._count(lane, episode, 1)
+        self._tests[lane] += sum(e.stage == "search" for e in episodes)
         self._connections[lane].send(episodes)
 
-    def _count(self, lane: int, episode: Episode, change: int) -> None:
-        (self._quality if episode.stage == "eval" else self._tests)[lane] += change
-
     def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
-        """Episodes for a lane that asks: level tests first, no more than its part of all that are at work or wait.
-
-        A search is a chain of tests, and the longest chain decides how long a run takes. So a lane with tests at work steps few
-        worlds beside them, and fast; quality, which can be played at any time, fills the others.
-        """
+        """Episodes for a lane that asks: level tests first, no more than its part of all that are at work or wait."""
         lanes = len(self._connections)
         tests, quality = plan.waiting
         part = -(-(sum(self._tests) + tests) // lanes) - self._tests[lane]
         episodes = plan.take(min(most, max(part, 0)), urgent=True)
         if episodes or urgent:
             return episodes
-        if self._tests[lane] >= _FEW_TESTS or (self._tests[lane] and self._quality[lane]):
-            return []
         return plan.take_quality(min(most, -(-quality // lanes)))
 
     def _serve(self, plan: Plan) -> None:
@@ -319,7 +303,7 @@ def run_lane(descriptor: int) -> None:
             agenda = _RemoteAgenda(connection)
             while agenda.wait():
                 runner.run(agenda, agenda.report)
-            effort = Effort(physics_steps=runner.physics_steps, engine_seconds=_engine_seconds(runner))
+            effort = Effort(physics_steps=runner.physics_steps, engine_seconds=runner.backend.engine_seconds)
             connection.send(("done", effort))
         except (EOFError, ConnectionError):
             return  # the parent is gone

@@ -38,10 +38,10 @@ def steady_session(policy: Policy, num_episodes: int) -> tuple[PolicySession, bo
     Returns:
         The session, and whether it may also be asked for the actions of any multiple of eight rows.
     """
-    counts = [n for n in range(8, num_episodes, 8) if _same(policy, num_episodes, n)]
     if not _same(policy, num_episodes, num_episodes):
         return RowwiseSession(policy, num_episodes), False
-    return policy.session(num_episodes), len(counts) == len(range(8, num_episodes, 8))
+    fewer = all(_same(policy, num_episodes, count) for count in range(8, num_episodes, 8))
+    return policy.session(num_episodes), fewer
 
 
 def _same(policy: Policy, total: int, count: int) -> bool:

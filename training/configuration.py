@@ -158,8 +158,8 @@ class RunConfiguration:
     random_episode_start: bool = True
     """Whether the first episodes start at random ages, so that resets spread over time."""
     keep_episodes: bool = True
-    """Whether checkpoints hold the running episodes, so that resuming equals never having stopped. They are most of a
-    checkpoint with thousands of environments; without them a resumed run begins new episodes on the levels reached."""
+    """Whether checkpoints hold the running episodes, so that resuming equals never having stopped. They are
+    half of a checkpoint with 8,192 environments; without them a resumed run begins new episodes on the levels reached."""
     bootstrap_iterations: int = 60
     """Iterations at the start of a run from a bare policy (``--init-from``) in which only a teacher and a critic for
     it are learned."""

@@ -104,7 +104,7 @@ def _flat() -> Task:
         rewards=RewardConfiguration(base_height=Ramp(start=-5.0, end=-10.0)),
     )
     training = TrainingConfiguration(
-        algorithm=replace(_MIRRORED, compile_mode="none"),  # compiling would take a fifth of the run
+        algorithm=replace(_MIRRORED, compile_mode="none"),  # it takes half a minute of a short run
         network=NetworkConfiguration(student_encoder="mlp"),
         run=RunConfiguration(experiment="go2_flat", iterations=500, save_interval=100, gauge_interval=0),
     )

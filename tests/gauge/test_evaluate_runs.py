@@ -368,6 +368,7 @@ def test_threads_change_no_bit_of_the_results_in_mujoco(real_request, tmp_path):
         evaluate(replace(real_request, threads=threads), tmp_path / f"threads-{threads}")
     provenance = [json.loads((tmp_path / f"threads-{n}" / "results.json").read_text())["provenance"] for n in (1, 2)]
     assert [p["processes"] for p in provenance] == [1, 2]
+    assert json.loads((tmp_path / "threads-1" / "results.json").read_text())["solver"]["iterations"] == 100
     assert provenance[0]["physics_steps"] == provenance[1]["physics_steps"]
     assert all(0.0 < p["engine_seconds"] < p["processes"] * p["seconds"] for p in provenance)
     one, two = (without_provenance(tmp_path / f"threads-{n}") for n in (1, 2))
