@@ -10,6 +10,7 @@ from gaitgauge.terrains.registry import make_terrain
 
 ROOT = Path(__file__).parents[2]
 TERRAIN = make_terrain("wave", 5)
+STEEP = make_terrain("wave", 10)
 COUNT = 200
 
 
@@ -24,10 +25,11 @@ BENCH = _load()
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("terrain", [TERRAIN, STEEP], ids=["level 5", "level 10"])
 @pytest.mark.parametrize("name", BENCH.SHAPES)
-def test_the_deepest_contact_with_a_wave_is_mujocos(name):
+def test_the_deepest_contact_with_a_wave_is_mujocos(name, terrain):
     repair_height_fields()
-    model, qpos = BENCH.model_of(name, TERRAIN), BENCH.poses(name, TERRAIN, COUNT)
+    model, qpos = BENCH.model_of(name, terrain), BENCH.poses(name, terrain, COUNT)
     seen = BENCH.compare(BENCH.contacts_of_mujoco(model, qpos), BENCH.contacts_of_mujoco_warp(model, qpos))
     assert len(seen["depth"]) > 0.5 * COUNT
     assert np.all(np.abs(seen["only"]) < 2e-5), "only what just touches may be a contact in one engine alone"
