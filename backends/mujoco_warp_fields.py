@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-# ruff: noqa: ANN201
+# ruff: noqa: ANN201, RUF046, SIM102, UP018
 """Repairs the height-field contacts of mujoco_warp 3.17, for every engine that steps it.
 
 Height fields are collided prism by prism, in a copy of MuJoCo's algorithm with three differences that matter:
