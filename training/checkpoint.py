@@ -174,6 +174,13 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True) -> dict[st
     return entries
 
 
+def reached(entries: Mapping[str, Any]) -> float:
+    """Fraction of its schedules that the run of a checkpoint or policy file had gone through; 1 where the file does not
+    say: who trains on from a finished policy wants what it was trained for at the end.
+    """
+    return min(float(entries.get("training", {}).get("progress", 1.0)), 1.0)
+
+
 def trim_checkpoint(source: str | Path, destination: str | Path) -> None:
     """Write a checkpoint's networks without what only resuming needs: a policy file from which training can begin anew
     (``--init-from``), with its teacher and its critic.
@@ -186,7 +193,9 @@ def trim_checkpoint(source: str | Path, destination: str | Path) -> None:
     # the student is in there twice; tensors that are the same object are stored once
     shared = {name: student.get(name.removeprefix("student."), value) for name, value in actor.items()}
     kept = {name: entries[name] for name in ("format", "version", "contract", "network", "state_dict")}
-    training = {name: entries["training"][name] for name in ("version", "task")}
+    training = {
+        name: entries["training"][name] for name in ("version", "task", "progress") if name in entries["training"]
+    }
     write_checkpoint(
         destination,
         kept

@@ -81,6 +81,7 @@ class CheckpointedRunner(OnPolicyRunner):
             "version": TRAINING_VERSION,
             "task": self.task,
             "settings": self.settings,
+            "progress": float(getattr(self.env, "progress", 1.0)),
             "world_size": self.gpu_world_size,
             "best_score": self.best_score,
             "best_iteration": self.best_iteration,

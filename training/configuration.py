@@ -12,6 +12,8 @@ from enum import Enum
 from pathlib import PurePath
 from typing import Any
 
+from .environment_configuration import Ramp
+
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
 SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "loss")
 LOAD_BALANCE_FORMS: tuple[str, ...] = ("sum", "mean")
@@ -87,8 +89,8 @@ class AlgorithmConfiguration:
     """Whether the value update is clipped."""
     value_coefficient: float = 1.0
     """Weight of the value loss."""
-    entropy_coefficient: float = 0.01
-    """Weight of the entropy bonus."""
+    entropy_coefficient: Ramp | float = 0.01
+    """Weight of the entropy bonus; a ramp moves with the environment's schedules."""
     learning_rate: float = 1e-3
     """Initial learning rate of teacher encoder, actor and critic."""
     learning_rate_range: tuple[float, float] = (1e-5, 1e-2)

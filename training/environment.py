@@ -140,6 +140,11 @@ class TrainingEnvironment(VecEnv):
         if capture:
             self._capture()
 
+    @property
+    def progress(self) -> torch.Tensor:
+        """Fraction of the run that schedules are at, a scalar tensor."""
+        return self.program.progress()
+
     @staticmethod
     def _start_levels(configuration: EnvironmentConfiguration) -> torch.Tensor:
         """Levels at the start: random, since a pattern over the worlds would give the student's only every second

@@ -16,7 +16,7 @@ from ..backends.registry import find_backend, list_backends
 from ..gauge.suite import load_suite
 from ..policy.loading import find_policy
 from .algorithms.symmetry import build_mirror
-from .checkpoint import CheckpointError, read_checkpoint
+from .checkpoint import CheckpointError, reached, read_checkpoint
 from .configuration import ConfigurationError
 from .environment import TrainingEnvironment
 from .gauging import gauge_scorer
@@ -39,6 +39,8 @@ DEFAULT_BACKEND = "mujoco-warp"
 QUICK_SUITE = "quick"
 _HORIZON = "environment.schedule.horizon_steps"
 _WAIT = "training.run.gauge_wait"
+_GOING_ON_RATE, _GOING_ON_STD = 3e-4, 0.3
+"""First learning rate and exploration noise of a run that begins with trained networks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +132,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         ]
         own = _last_of_each(own)
     elif request.init_from is not None:
-        read_checkpoint(_first_weights(request, task), training_state=False)
+        own = [*_going_on(read_checkpoint(_first_weights(request, task), training_state=False)), *own]
     if request.seconds is not None:
         # The limit is for the whole command: by default nothing is waited for beyond it.
         task = find_task(request.task, [f"{_WAIT}=0", *own])
@@ -158,6 +160,17 @@ def prepare(request: TrainRequest) -> TrainPlan:
     return TrainPlan(
         request=request, task=task, backend=backend, device=device, checkpoint=checkpoint, run=run, settings=settings
     )
+
+
+def _going_on(entries: Mapping[str, Any]) -> list[str]:
+    """Settings of a run that begins with trained networks, before those of the request: schedules go on where that
+    training left them, steps are smaller, and a policy without its exploration noise gets little.
+    """
+    return [
+        f"environment.schedule.begin={reached(entries):g}",
+        f"training.algorithm.learning_rate={_GOING_ON_RATE}",
+        f"training.network.initial_std={_GOING_ON_STD}",
+    ]
 
 
 def _first_weights(request: TrainRequest, task: Task) -> Path:

@@ -31,7 +31,8 @@ from .stopping import Progress, StopSignals, TrainingOutcome
 class TrainingRunner(CheckpointedRunner):
     """Trains on a vectorized environment.
 
-    An environment that can be resumed exactly has ``state_dict()`` (tensors and plain data) and
+    An environment with schedules has ``progress``, the fraction of the run that they are at, a scalar tensor; one that can be
+    resumed exactly has ``state_dict()`` (tensors and plain data) and
     ``load_state_dict(state)``; afterwards ``get_observations()`` must give what it gave before.
     """
 
@@ -187,6 +188,8 @@ class TrainingRunner(CheckpointedRunner):
                 torch.cuda.synchronize(self.device)
             collected = time.perf_counter()
             self.alg.compute_returns(obs)
+        if (progress := getattr(self.env, "progress", None)) is not None:
+            self.alg.follow(progress)
         losses = self.alg.update()
         finished = time.perf_counter()
         iteration = self.current_learning_iteration

@@ -89,6 +89,33 @@ def test_initial_weights_from_other_settings(run, trained, tmp_path):
         torch.testing.assert_close(ours["state_dict"][name], value, rtol=0, atol=1e-6)
 
 
+def test_trained_networks_go_on_where_their_schedules_stood(trained):
+    """Schedules at the place that the file names, or at their end; small first steps. What is spelled out wins."""
+
+    def plan(source: Path | str, *overrides: str):
+        task = "go2-moe-cts" if source == "pretrained" else "go2-flat"
+        return prepare(
+            TrainRequest(task=task, backend="fake", device="cpu", init_from=str(source), overrides=overrides)
+        )
+
+    begun = plan("pretrained").task
+    assert begun.environment.schedule.begin == 1.0
+    assert begun.training.algorithm.learning_rate == pytest.approx(3e-4)
+    assert begun.training.network.initial_std == pytest.approx(0.3)
+    spelled = plan("pretrained", "environment.schedule.begin=0.5", "training.algorithm.learning_rate=1e-4")
+    assert spelled.task.environment.schedule.begin == 0.5
+    assert spelled.task.training.algorithm.learning_rate == pytest.approx(1e-4)
+    entries = torch.load(trained / "model_2.pt", weights_only=True)
+    entries["training"]["progress"] = 0.25
+    torch.save(entries, trained / "quarter.pt")
+    quarter = plan(trained / "quarter.pt")
+    assert quarter.task.environment.schedule.begin == 0.25
+    assert "environment.schedule.begin=0.25" in quarter.settings["overrides"]
+    (trained / "quarter.pt").unlink()
+    new = prepare(TrainRequest(task="go2-moe-cts", backend="fake", device="cpu")).task
+    assert (new.environment.schedule.begin, new.training.network.initial_std) == (0.0, 1.0)
+
+
 def test_signal_writes_a_checkpoint_and_says_how_to_go_on(run, tmp_path):
     def stop_when_it_trains() -> None:
         while not list(tmp_path.rglob("model_2.pt")):

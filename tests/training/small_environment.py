@@ -18,7 +18,15 @@ torch.set_num_threads(1)  # small tensors: threads only get in each other's way
 
 FLAT = TerrainConfiguration(tiles=(FLAT_TILE,), levels=1, variants=1, spread_probability=0.0)
 STAIRS = TerrainConfiguration(
-    tiles=tuple(t for t in ALL_TILES if t.name in ("stairs_up", "flat")), levels=3, variants=1, spread_probability=0.0
+    tiles=tuple(
+        replace(t, share=share)
+        for t in ALL_TILES
+        for name, share in (("stairs_up", 0.25), ("flat", 0.15))
+        if t.name == name
+    ),
+    levels=3,
+    variants=1,
+    spread_probability=0.0,
 )
 STILL = ResetConfiguration(velocity=0.0, joint_scale=(1.0, 1.0))
 NO_PUSH = PushConfiguration(interval=0.0)

@@ -7,6 +7,7 @@ from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.cts import CTS
 from gaitgauge.training.algorithms.symmetry import build_mirror
 from gaitgauge.training.configuration import ConfigurationError, NetworkConfiguration
+from gaitgauge.training.environment_configuration import Ramp
 from gaitgauge.training.networks import CtsActor, CtsCritic, student_architecture
 from gaitgauge.training.runner import TrainingRunner, command_entries
 from rsl_rl.modules.distribution import GaussianDistribution
@@ -133,8 +134,8 @@ def test_gradient_flow(part):
     if part == "latent":
         loss, _ = algorithm._compute_student_loss(torch.arange(8))
     else:
-        settings = replace(algorithm.configuration, entropy_coefficient=0.0, value_coefficient=float(part == "value"))
-        algorithm.configuration = settings
+        algorithm.configuration = replace(algorithm.configuration, value_coefficient=float(part == "value"))
+        algorithm._entropy_coefficient.zero_()
         advantages = storage.advantages
         if part == "value":
             advantages.zero_()
@@ -179,6 +180,17 @@ def test_first_minibatch_has_ratio_one_and_matches_a_plain_calculation():
     assert value == pytest.approx(float(errors.square().mean()), rel=1e-4)
     assert entropy == pytest.approx(ACTIONS * 1.4189385, rel=1e-5)
     assert float(loss.detach()) == pytest.approx(surrogate + value - 0.01 * entropy, rel=1e-5)
+
+
+def test_entropy_bonus_follows_the_run():
+    algorithm, env = build("mlp", entropy_coefficient=Ramp(start=0.01, end=0.002, begin=0.5, until=1.0))
+    rollout(algorithm, env)
+    teacher, student = (rows[0] for rows in algorithm.storage.minibatch_rows(2))
+    for progress, expected in ((0.0, 0.01), (0.75, 0.006), (2.0, 0.002)):
+        algorithm.follow(torch.tensor(progress))
+        loss, metrics = algorithm._compute_policy_loss(teacher, student)
+        value, surrogate, entropy, _, _ = metrics.tolist()
+        assert float(loss.detach()) == pytest.approx(surrogate + value - expected * entropy, rel=1e-4)
 
 
 def test_load_balance_forms():

@@ -297,5 +297,6 @@ def test_a_trimmed_checkpoint_begins_training_with_its_teacher(tmp_path):
     assert runner.alg.bootstrap is None
     assert_same(runner.alg.actor.state_dict(), whole["actor_state_dict"])
     assert_same(runner.alg.critic.state_dict(), whole["critic_state_dict"])
+    assert trimmed["training"]["progress"] == whole["training"]["progress"]
     with pytest.raises(CheckpointError, match="holds networks only; begin a new run with them: --init-from"):
         runner.load(str(tmp_path / "trimmed.pt"))

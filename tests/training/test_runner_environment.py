@@ -1,9 +1,11 @@
 """The runner on the real environment, with a scripted engine in place of physics."""
 
+import pytest
 import torch
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.training.algorithms.symmetry import build_mirror
-from gaitgauge.training.checkpoint import read_checkpoint
+from gaitgauge.training.checkpoint import reached, read_checkpoint
+from gaitgauge.training.environment_configuration import Ramp
 from gaitgauge.training.runner import TrainingRunner
 from gaitgauge.training.seeding import seed_everything
 from small_environment import STAIRS, make
@@ -39,6 +41,14 @@ def test_resumes_exactly_with_the_training_environment(tmp_path):
     for name, value in a["training"]["environment"]["memory"].items():
         assert torch.equal(value, b["training"]["environment"]["memory"][name]), name
     assert load_policy(whole / "model_4.pt").contract.hash == resumed.contract.hash
+
+
+def test_the_algorithm_and_checkpoints_know_where_schedules_are(tmp_path):
+    runner = build(tmp_path, entropy_coefficient=Ramp(start=0.5, end=0.1, begin=0.0, until=0.5))
+    runner.env.program.memory.step.fill_(runner.env.configuration.schedule.horizon_steps // 4 - 6)
+    runner.learn(1)
+    assert float(runner.alg._entropy_coefficient) == pytest.approx(0.3)
+    assert reached(read_checkpoint(tmp_path / "model_1.pt")) == pytest.approx(0.25)
 
 
 def test_symmetry_fits_the_training_environment(tmp_path):

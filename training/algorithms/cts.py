@@ -27,6 +27,7 @@ from torch import nn
 
 from ..configuration import AlgorithmConfiguration, ConfigurationError, NetworkConfiguration
 from ..networks import CtsActor, CtsCritic, student_architecture
+from ..schedules import RampTable
 from .bootstrap import Bootstrap
 from .graphs import GraphedStep
 from .storage import EnvironmentSplit, StratifiedStorage
@@ -71,7 +72,7 @@ class CTS(PPO):
             gamma=configuration.discount,
             lam=configuration.gae_lambda,
             value_loss_coef=configuration.value_coefficient,
-            entropy_coef=configuration.entropy_coefficient,
+            entropy_coef=0.0,  # see ``follow``
             learning_rate=configuration.learning_rate,
             max_grad_norm=configuration.max_gradient_norm,
             use_clipped_value_loss=configuration.clip_value_loss,
@@ -97,6 +98,8 @@ class CTS(PPO):
         self.student_optimizer = torch.optim.Adam(
             actor.student_parameters(), lr=configuration.student_learning_rate, fused=on_gpu, capturable=on_gpu
         )
+        self._entropy = RampTable([configuration.entropy_coefficient], device)
+        self._entropy_coefficient = self._entropy.at(torch.zeros((), device=device))[0].clone()
         self._policy_metrics = torch.zeros(len(POLICY_METRICS), device=device)
         self._student_metrics = torch.zeros(len(STUDENT_METRICS), device=device)
         split = storage.split
@@ -178,6 +181,10 @@ class CTS(PPO):
         if not hasattr(self, "_rate"):
             self._rate = torch.zeros((), device=self.device)
         self._rate.fill_(float(value))
+
+    def follow(self, progress: torch.Tensor) -> None:
+        """Take the settings of a fraction of the run, a scalar tensor, for the next update."""
+        self._entropy_coefficient.copy_(self._entropy.at(progress)[0])
 
     def follow_student(self, iterations: int) -> None:
         """Spend the next iterations on a teacher and a critic for the present student (see ``bootstrap``)."""
@@ -402,7 +409,7 @@ class CTS(PPO):
             limited = old_values + (values - old_values).clamp(-settings.clip, settings.clip)
             errors = torch.maximum(errors, (limited - returns).square())
         value = errors.mean()
-        loss = surrogate + settings.value_coefficient * value - settings.entropy_coefficient * entropy
+        loss = surrogate + settings.value_coefficient * value - self._entropy_coefficient * entropy
         if settings.symmetry == "loss":
             loss = loss + settings.symmetry_coefficient * symmetry
         return loss, torch.stack((value, surrogate, entropy, kl, symmetry)).detach()
