@@ -23,6 +23,9 @@ BLOCK_STEPS = 32
 class NoiseStream(ABC):
     """Draws for K slots: half widths times uniform numbers in [-1, 1), and delays. Every episode has a stream of its own."""
 
+    tables: tuple[torch.Tensor, ...] = ()
+    """Memory that ``draw`` reads, and that ``assign`` may replace by other memory."""
+
     @abstractmethod
     def assign(self, slot: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
         """Read an episode's stream in a slot, up to ``steps`` control steps from its start."""
@@ -76,6 +79,11 @@ class ReferenceStream(NoiseStream):
             self._uniform = torch.cat((self._uniform, uniform))
             self._delays = torch.cat((self._delays, delays))
         self._row[slot] = self._seeds[episode.seed]
+
+    @property
+    def tables(self) -> tuple[torch.Tensor, ...]:  # type: ignore[override]
+        """See ``NoiseStream.tables``."""
+        return self._uniform, self._delays
 
     def _tables(self, generators: Sequence[_PythonGenerator], count: int) -> tuple[torch.Tensor, torch.Tensor]:
         """The next ``count`` control steps of some generators: (G, count, W) in physical units, and delays (G, count)."""

@@ -68,7 +68,8 @@ class SampleTable:
         self._slots, self._device, self._dtype = slots, device, dtype
         # in a CPU's vector units the last bit may depend on who else is in a batch: there, every segment has one of its own
         self._together = device.type != "cpu"
-        self._rows = torch.zeros(0, 0, device=device, dtype=dtype)
+        self.rows = torch.zeros(0, 0, device=device, dtype=dtype)
+        """Everybody's rows, one slot's after the other's; other memory after ``reserve``."""
         self._begin = torch.zeros(slots, dtype=torch.int64, device=device)
         self.capacity = 0
         """Rows of each slot."""
@@ -84,8 +85,8 @@ class SampleTable:
         # one row more, for those who have no sample to write
         table = torch.zeros(self._slots, rows + 1, sum(self._split), device=self._device, dtype=self._dtype)
         if self.capacity:
-            table[:, : self.capacity] = self._rows.view(self._slots, self.capacity + 1, -1)[:, :-1]
-        self._rows, self.capacity = table.flatten(0, 1), rows
+            table[:, : self.capacity] = self.rows.view(self._slots, self.capacity + 1, -1)[:, :-1]
+        self.rows, self.capacity = table.flatten(0, 1), rows
         self._begin = torch.arange(self._slots, device=self._device) * (rows + 1)
 
     def clear(self, mask: torch.Tensor) -> None:
@@ -110,11 +111,11 @@ class SampleTable:
         values = [getattr(sample, name) for name in self._fields]
         flags = torch.stack((self._torque_known, keep), dim=1)
         row = torch.cat((*values, command, self._torque, flags), dim=1)
-        at = torch.where(due, torch.clamp(self.count, max=self.capacity - 1), self.capacity)
-        self._rows.index_copy_(0, self._begin + at, row)
+        at = torch.clamp(self.count, max=self.capacity - 1).masked_fill_(~due, self.capacity)
+        self.rows.index_copy_(0, self._begin + at, row)
         self.count += due
         if self._between_samples:
-            self._torque = torch.where(due[:, None], sample.joint_torque, self._torque)
+            self._torque.copy_(torch.where(due[:, None], sample.joint_torque, self._torque))
             self._torque_known |= due
 
     def end_step(self, state: PhysicsState, active: torch.Tensor) -> None:
@@ -138,7 +139,7 @@ class SampleTable:
         first = np.repeat(np.asarray(slots) * (self.capacity + 1) - np.cumsum(counts) + counts, counts)
         at, slot = torch.tensor(np.stack((first + np.arange(len(owner)), owner)), device=self._device)
         parts = [len(owner)] if self._together else list(counts)
-        rows = (self._rows[at], limits[slot], friction[slot])
+        rows = (self.rows[at], limits[slot], friction[slot])
         values = torch.cat([self._evaluate(*part) for part in zip(*(x.split(parts) for x in rows), strict=True)])
         pieces = np.split(values.cpu().numpy(), np.cumsum(counts)[:-1])
         return [(piece[:, :-1], piece[:, -1] > 0) for piece in pieces]

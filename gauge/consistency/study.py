@@ -24,7 +24,7 @@ from ...robots.geometry import total_mass
 from ...terrains.registry import gauge_terrain_names
 from ..evaluate import PACKAGES, policy_digest, prepare
 from ..evaluate import Request as EvaluateRequest
-from ..runner import GRAVITY
+from ..slots import GRAVITY
 from ..store import RunFolder, write_atomically
 from ..suite import Suite, SuiteError, load_suite
 from .attribution import Factor, choose_factors, effect_of_switch, perturbed

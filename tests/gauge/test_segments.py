@@ -204,8 +204,8 @@ class Stage(Puppet):
                 first[mask & here & (first == 0)] = substep
 
 
-def stage(name, slots, falls, penetrations, count=1, *, looks=True):
-    """Records of both goals and of a crossing, for one seed or several; ``looks`` as on the CPU, where a look is free."""
+def stage(name, slots, falls, penetrations, count=1, *, look_interval=None):
+    """Records of both goals and of a crossing, for one seed or several; a ``look_interval`` is for GPUs, where a look waits."""
     suite = short_suite(name)
 
     def act(observation):
@@ -222,9 +222,9 @@ def stage(name, slots, falls, penetrations, count=1, *, looks=True):
     )
     walks = [episode(DIAGONAL, MAXIMUM, seed=seed) for seed in range(count)]
     agenda = Agenda([*walks, *(episode(TARGET, stage="search", seed=seed) for seed in range(count))])
-    runner = EpisodeRunner(suite, ScriptedPolicy(act), Stage(scene, falls, penetrations), lambda e: 0)
-    runner._cheap_checks = looks
-    runner._table._together = not looks
+    backend = Stage(scene, falls, penetrations)
+    runner = EpisodeRunner(suite, ScriptedPolicy(act), backend, lambda e: 0, look_interval=look_interval)
+    runner._slots._table._together = look_interval is not None
     runner.run(agenda)
     return sorted(agenda.records, key=lambda r: (r.episode.stage, r.episode.seed))
 
@@ -380,17 +380,18 @@ def test_slots_and_neighbours_change_no_bit_of_a_record(name, events):
 
 @pytest.mark.parametrize("name", [REFERENCE, OWN])
 @pytest.mark.parametrize("events", EVENTS)
-def test_a_loop_that_never_looks_gives_the_same_records(name, events):
-    """On a GPU a look at the data would wait for the device: everything is worked out for everybody."""
-    assert_equal(stage(name, 5, *events, count=2), stage(name, 5, *events, count=2, looks=False))
+@pytest.mark.parametrize("look_interval", [1, 3, 10])
+def test_a_loop_that_seldom_looks_gives_the_same_records(name, events, look_interval):
+    """On a GPU a look at the data would wait for the device: everything is worked out for everybody, and who ends waits."""
+    assert_equal(stage(name, 5, *events, count=2), stage(name, 5, *events, count=2, look_interval=look_interval))
 
 
-@pytest.mark.parametrize("looks", [True, False])
-def test_crossings_alone_take_no_samples(looks):
+@pytest.mark.parametrize("look_interval", [None, 1, 10])
+def test_crossings_alone_take_no_samples(look_interval):
     """A search has no quality episodes, so that the table of samples stays empty."""
     suite = short_suite(REFERENCE)
-    runner = EpisodeRunner(suite, ScriptedPolicy(), fake(suite, slots=3, terrain=ground((5.0, 0.0, 0.4))), lambda e: 0)
-    runner._cheap_checks = looks
+    backend = fake(suite, slots=3, terrain=ground((5.0, 0.0, 0.4)))
+    runner = EpisodeRunner(suite, ScriptedPolicy(), backend, lambda e: 0, look_interval=look_interval)
     agenda = Agenda([episode(TARGET, stage="search", seed=seed) for seed in range(4)])
     runner.run(agenda)
     assert [(r.success, len(r.samples)) for r in agenda.records] == [(False, 0)] * 4
@@ -451,8 +452,8 @@ def test_level_tests_go_before_waiting_segments():
     assert [r.episode.stage for r in agenda.records] == ["search", "eval"]
 
 
-@pytest.mark.parametrize("cheap_checks", [True, False])
-def test_episodes_that_nobody_needs_any_more_leave_their_slots(cheap_checks):
+@pytest.mark.parametrize("look_interval", [None, 1, 10])
+def test_episodes_that_nobody_needs_any_more_leave_their_slots(look_interval):
     """The first to end makes another needless, of which some segments are at work and others wait; the last one goes on."""
     suite = short_suite(OWN)
     short, long = episode(MAXIMUM, seed=0), [episode(DIAGONAL, MAXIMUM, seed=1)]
@@ -472,8 +473,7 @@ def test_episodes_that_nobody_needs_any_more_leave_their_slots(cheap_checks):
         physics=suite.physics,
     )
     seen = []
-    runner = EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0)
-    runner._cheap_checks = cheap_checks
+    runner = EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0, look_interval=look_interval)
     runner.run(agenda, lambda progress: seen.append(set(progress.active())))
     assert [r.episode for r in agenda.records] == [short, last]
     first = next(i for i, active in enumerate(seen) if short not in active)
