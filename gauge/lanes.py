@@ -7,16 +7,15 @@ happens in an episode does not depend on the lane that plays it. Plan, store and
 
 from __future__ import annotations
 
-import os
+import multiprocessing
 import pickle
 import signal
-import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import torch
@@ -36,6 +35,11 @@ _REPORT_INTERVAL = 0.2
 """Time between a lane's reports on how far it is [s]."""
 _PATIENCE = 0.05
 """Time for which a lane at work does not ask again after it was told that nothing waits [s]."""
+# a forked lane has all modules at once, which saves importing torch; elsewhere system libraries do not bear being forked
+if sys.platform == "linux":
+    _CONTEXT = multiprocessing.get_context("fork")
+else:
+    _CONTEXT = multiprocessing.get_context("spawn")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,25 +143,20 @@ class _Crew:
     """The processes, and who waits for work."""
 
     def __init__(self, job: LaneJob, lanes: int) -> None:
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: list[BaseProcess] = []
         self._connections: list[Connection] = []
         self._idle: set[int] = set()
         self._tests = [0] * lanes  # level tests that each lane has at work
         self._progress = LaneProgress(lanes)
-        # a lane finds the same packages, whatever this process was started with
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
         try:
-            for _ in range(lanes):
-                ours, theirs = socket.socketpair()
+            for lane in range(lanes):
+                ours, theirs = _CONTEXT.Pipe()
+                self._connections.append(ours)
                 with theirs:
-                    number = theirs.fileno()
-                    command = [sys.executable, "-P", "-c", f"from {__name__} import run_lane; run_lane({number})"]
-                    self._processes.append(
-                        subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL, env=environment)
-                    )
-                connection: Connection = Connection(ours.detach())
-                self._connections.append(connection)
-                connection.send(job)
+                    parents = tuple(self._connections)
+                    process = _CONTEXT.Process(target=run_lane, args=(job, theirs, parents), name=f"lane-{lane}")
+                    process.start()
+                    self._processes.append(process)
         except BaseException:
             self.dismiss()
             raise
@@ -167,7 +166,7 @@ class _Crew:
         for process in self._processes:
             process.kill()
         for process in self._processes:
-            process.wait()
+            process.join()
         for connection in self._connections:
             connection.close()
 
@@ -208,7 +207,8 @@ class _Crew:
         try:
             message: tuple[Any, ...] = self._connections[lane].recv()
         except (EOFError, OSError) as error:
-            code = self._processes[lane].wait()
+            self._processes[lane].join()
+            code = self._processes[lane].exitcode or 0
             how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
             raise BackendError(
                 f"a process that plays episodes {how}; what had finished is kept: go on with --resume, with fewer "
@@ -291,13 +291,20 @@ class _RemoteAgenda:
             self._connection.send(("progress", progress.control_steps, progress.physics_steps, progress.active()))
 
 
-def run_lane(descriptor: int) -> None:
-    """A lane's whole life; its parent is at the other end of the socket."""
+def run_lane(job: LaneJob, connection: Connection, inherited: Sequence[Connection]) -> None:
+    """A lane's whole life.
+
+    Args:
+        job: what it plays with.
+        connection: to its parent.
+        inherited: the parent's ends of all connections; while any process holds one, its lane would not notice that the
+            parent is gone.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent ends them
-    connection: Connection = Connection(descriptor)
+    for end in inherited:
+        end.close()
     try:
         try:
-            job = connection.recv()
             torch.set_num_threads(1)
             runner = build_runner(job, load_policy(job.policy, job.robot))
             agenda = _RemoteAgenda(connection)

@@ -407,7 +407,40 @@ def test_a_process_that_is_killed_costs_nothing_that_was_finished(real_request, 
     assert without_provenance(tmp_path / "run") == without_provenance(tmp_path / "whole")
 
 
-def children():
-    """Process ids of this process's children, from /proc."""
-    tasks = Path(f"/proc/{os.getpid()}/task").glob("*/children")
+ORPHANS = """
+from gaitgauge.gauge import evaluate as evaluation
+from pathlib import Path
+evaluation.evaluate(evaluation.Request(policy={policy!r}, suite={suite!r}, backend="mujoco", threads=2), Path({folder!r}))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="reads /proc")
+def test_processes_end_with_the_one_that_started_them(real_request, tmp_path):
+    code = ORPHANS.format(policy=real_request.policy, suite=real_request.suite, folder=str(tmp_path / "run"))
+    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)])
+    deadline = time.monotonic() + 60
+    lanes_started: list[int] = []
+    while time.monotonic() < deadline and len(lanes_started) < 2:
+        lanes_started = children(process.pid)
+        time.sleep(0.01)
+    assert len(lanes_started) == 2
+    process.kill()
+    process.wait()
+    while time.monotonic() < deadline and any(map(at_work, lanes_started)):
+        time.sleep(0.05)
+    assert not any(map(at_work, lanes_started))
+
+
+def at_work(process):
+    """Whether a process exists and has not ended."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def children(process=None):
+    """Process ids of a process's children, this one's if none is given, from /proc."""
+    tasks = Path(f"/proc/{process or os.getpid()}/task").glob("*/children")
     return [int(number) for task in tasks for number in task.read_text().split()]
