@@ -231,6 +231,8 @@ class PhysicsBackend(ABC):
     scene: Scene
     device: torch.device
     dtype: torch.dtype
+    state_stays: ClassVar[bool] = False
+    """Whether ``state`` is the same tensors for good, numbers in float32, which every call changes in place."""
     engine_seconds: float | None = None
     """Wall-clock time spent inside the engine's own stepping so far [s]; None where it is not measured."""
 

@@ -70,6 +70,7 @@ class MujocoWarpBackend(PhysicsBackend):
     """mujoco_warp on a CUDA device, or on the CPU for tests."""
 
     name: ClassVar[str] = "mujoco-warp"
+    state_stays: ClassVar[bool] = True
 
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:

@@ -91,6 +91,9 @@ class WorldParameters:
                 rows[item.name] = self._spread(item.name, value, mask, whole)
 
         def write(target: torch.Tensor, value: torch.Tensor) -> None:
+            if whole:
+                target.copy_(value)
+                return
             target.copy_(torch.where(mask.view(-1, *(1,) * (target.dim() - 1)), value, target))
 
         if "stiffness_scale" in rows:

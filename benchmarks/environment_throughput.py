@@ -4,6 +4,11 @@
 
 Prints the speed of the whole step and a table of its parts. The parts are timed in a second pass that waits for the
 device after each of them, so their sum is a little longer than a step.
+
+    python benchmarks/environment_throughput.py --count --num-envs 16 --device cpu
+
+counts the torch kernels of a step instead, on any machine: beside the physics their number decides about the speed, since each
+of them is small.
 """
 
 from __future__ import annotations
@@ -12,8 +17,9 @@ import argparse
 import json
 import platform
 import time
-from collections import defaultdict
-from collections.abc import Callable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +27,7 @@ from typing import Any
 import torch
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.tasks import find_task
+from torch.utils._python_dispatch import TorchDispatchMode
 
 PARTS = (
     ("random numbers", "program.uniform", "draw"),
@@ -37,6 +44,93 @@ PARTS = (
     ("packing", "", "_pack"),
 )
 """Parts of a step: title, where the callable is, its name."""
+
+
+VIEWS = {
+    *(
+        "alias",
+        "as_strided",
+        "detach",
+        "diagonal",
+        "empty",
+        "empty_like",
+        "expand",
+        "lift_fresh",
+        "new_empty",
+        "permute",
+    ),
+    *(
+        "reshape",
+        "select",
+        "slice",
+        "split",
+        "split_with_sizes",
+        "squeeze",
+        "t",
+        "transpose",
+        "unbind",
+        "unsqueeze",
+        "view",
+    ),
+    "_unsafe_view",
+}
+"""Operations that launch nothing."""
+
+
+class KernelCounter(TorchDispatchMode):
+    """Counts torch operations that launch a kernel on a GPU."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run an operation, and count it unless it is a view."""
+        self.count += function.overloadpacket.__name__ not in VIEWS
+        return function(*args, **(kwargs or {}))
+
+
+def count_kernels(environment: TrainingEnvironment) -> Counter[str]:
+    """Torch kernels of a step without a log, by part; needs an environment that is neither captured nor compiled."""
+    actions = torch.zeros(environment.num_envs, environment.num_actions, device=environment.device)
+    environment.step(actions)
+    environment.common_step_counter = 0
+    found: Counter[str] = Counter()
+    with KernelCounter() as counter:
+
+        def counted(title: str, function: Callable[..., Any]) -> Callable[..., Any]:
+            def call(*args: Any, **kwargs: Any) -> Any:
+                before = counter.count
+                result = function(*args, **kwargs)
+                found[title] += counter.count - before
+                return result
+
+            return call
+
+        with replaced_parts(environment, counted):
+            environment.step(actions)
+    found["everything else"] = counter.count - sum(found.values())
+    return found
+
+
+@contextmanager
+def replaced_parts(
+    environment: TrainingEnvironment, replacement: Callable[[str, Callable[..., Any]], Callable[..., Any]]
+) -> Iterator[None]:
+    """Every part's function replaced by ``replacement(title, function)``."""
+    originals = []
+    for title, path, name in PARTS:
+        owner: Any = environment
+        for attribute in filter(None, path.split(".")):
+            owner = getattr(owner, attribute)
+        function = getattr(owner, name)
+        originals.append((owner, name, function))
+        setattr(owner, name, replacement(title, function))
+    try:
+        yield
+    finally:
+        for owner, name, function in originals:
+            setattr(owner, name, function)
 
 
 def synchronize(device: torch.device) -> None:
@@ -72,17 +166,8 @@ def profile(environment: TrainingEnvironment, steps: int, scale: float) -> dict[
 
         return call
 
-    originals = []
-    for title, path, name in PARTS:
-        owner: Any = environment
-        for attribute in filter(None, path.split(".")):
-            owner = getattr(owner, attribute)
-        function = getattr(owner, name)
-        originals.append((owner, name, function))
-        setattr(owner, name, timed(title, function))
-    whole = measure(environment, steps, scale)
-    for owner, name, function in originals:
-        setattr(owner, name, function)
+    with replaced_parts(environment, timed):
+        whole = measure(environment, steps, scale)
     parts = {title: seconds / steps for title, seconds in spent.items()}
     return {**parts, "everything else": whole - sum(parts.values())}
 
@@ -101,6 +186,7 @@ def main() -> None:
     parser.add_argument("--action-scale", type=float, default=0.5, help="standard deviation of the random actions")
     parser.add_argument("--capture", action="store_true", help="replay the torch parts as CUDA graphs")
     parser.add_argument("--fuse", action="store_true", help="compile the torch parts")
+    parser.add_argument("--count", action="store_true", help="count torch kernels instead")
     parser.add_argument("--out", type=Path, help="file for the numbers as JSON")
     parser.add_argument("overrides", nargs="*", help="settings of the task, key=value")
     arguments = parser.parse_args()
@@ -115,6 +201,12 @@ def main() -> None:
         capture=arguments.capture,
         fuse=arguments.fuse,
     )
+    if arguments.count:
+        found = count_kernels(environment)
+        print(f"{arguments.task} on {arguments.backend}: {found.total()} torch kernels a step")
+        for title, number in found.most_common():
+            print(f"{title:<34}{number:>8}")
+        return
     synchronize(environment.device)
     built = time.perf_counter() - start
     environment.episode_length_buf = torch.randint_like(

@@ -29,6 +29,42 @@ class CommandDraw:
     """Whether the command is an extreme one, (N,) bool."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Ranges:
+    """What commands may be, for each world: the stage's range capped by the terrain's limits."""
+
+    low: torch.Tensor
+    """Lowest command of every axis, (N, 3)."""
+    high: torch.Tensor
+    """Highest command of every axis, (N, 3)."""
+    downward: torch.Tensor
+    """How far the linear axes go below zero [m/s], (N, 2)."""
+    either: torch.Tensor
+    """Linear speed that is allowed in both directions [m/s], (N, 2)."""
+    reach: torch.Tensor
+    """Way of a control step at 80 % of the highest speed [m], (N,)."""
+
+
+_RANGE_WIDTHS = (3, 3, 2, 2, 1)
+"""Columns of ``Ranges``, in order."""
+
+
+def _range_table(
+    configuration: CommandConfiguration, terrain_limits: Sequence[tuple[float, float, float]], period: float
+) -> torch.Tensor:
+    """``Ranges`` of every stage and kind of terrain, (stages, kinds, columns): looked up, not computed, in every step."""
+    stages = [(s.forward, s.lateral, s.yaw) for s in configuration.stages]
+    bounds, limit = (
+        torch.tensor(stages, dtype=torch.float32)[:, None],
+        torch.tensor(terrain_limits, dtype=torch.float32),
+    )
+    low, high = torch.maximum(bounds[..., 0], -limit), torch.minimum(bounds[..., 1], limit)
+    downward = -low[..., :2]
+    either = torch.minimum(downward, high[..., :2]).clamp_min(0.0)
+    fastest = torch.maximum(downward, high[..., :2]).amax(dim=-1, keepdim=True).clamp_min(1e-3)
+    return torch.cat((low, high, downward, either, 0.8 * period * fastest), dim=-1)
+
+
 class CommandGenerator:
     """Draws commands for all worlds at once."""
 
@@ -59,10 +95,15 @@ class CommandGenerator:
                 f"command stages begin at {begins} of the run; the first must begin at 0 and the others follow in order"
             )
         self._configuration = configuration
-        ranges = [(s.forward, s.lateral, s.yaw) for s in configuration.stages]
         self._begins = torch.tensor(begins, dtype=torch.float32, device=device)
-        self._ranges = torch.tensor(ranges, dtype=torch.float32, device=device)
-        self._limits = torch.tensor(terrain_limits, dtype=torch.float32, device=device)
+        self._table = _range_table(configuration, terrain_limits, control_period).to(device)
+        shares = (
+            configuration.extreme_probability,
+            configuration.straight_probability,
+            configuration.flip_probability,
+            configuration.stationary_yaw_probability,
+        )
+        self._shares = torch.tensor(shares, device=device)
         self._stationary = RampTable([configuration.stationary_probability], device)
         # A number below the first bound sets an axis to zero, else one below the second bound to its lower limit.
         zero = configuration.extreme_zero_probability
@@ -72,13 +113,14 @@ class CommandGenerator:
         self._length = max_episode_length
         self.interval_steps = max(round(configuration.interval / control_period), 1)
         self._stationary_steps = round(configuration.stationary_longest / control_period)
+        self._interval = torch.tensor(self.interval_steps, device=device)
 
-    def ranges(self, kind: torch.Tensor, progress: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Lowest and highest command of each world, (N, 3) each: the stage's range capped by the terrain's limits."""
+    def ranges(self, kind: torch.Tensor, progress: torch.Tensor) -> Ranges:
+        """What the present stage allows each world."""
         stage = (progress >= self._begins).sum() - 1
-        present = self._ranges.index_select(0, stage.reshape(1)).squeeze(0)
-        limit = self._limits[kind]
-        return torch.maximum(present[:, 0], -limit), torch.minimum(present[:, 1], limit)
+        rows = self._table.index_select(0, stage.reshape(1)).squeeze(0)[kind]
+        low, high, downward, either, reach = rows.split(_RANGE_WIDTHS, dim=1)
+        return Ranges(low=low, high=high, downward=downward, either=either, reach=reach.squeeze(1))
 
     def draw(
         self,
@@ -103,12 +145,13 @@ class CommandGenerator:
             extreme: whether the present command is an extreme one, (N,) bool; False at the start of an episode.
         """
         settings = self._configuration
-        low, high = self.ranges(kind, progress)
+        ranges = self.ranges(kind, progress)
+        low, high = ranges.low, ranges.high
         remaining = (self._length - episode_length).clamp_min(1)
         way = (settings.required_distance - issued.norm(dim=1) * settings.interval).clamp_min(0.0)
-        uniform_command = self._uniform(uniform, low, high, way, remaining)
-        kinds = uniform["command_kind"]
-        no_yaw = kinds[:, 1] < settings.straight_probability
+        linear, yaw = self._uniform(uniform, ranges, way, remaining)
+        kind_number = uniform["command_kind"]
+        extreme_drawn, straight, flipped, turning = (kind_number < self._shares).unbind(1)
 
         # Extreme: every axis at a limit or zero. Opposite: what the gauge does halfway through each of its diagonal
         # commands.
@@ -118,47 +161,39 @@ class CommandGenerator:
         all_zero = zero.all(dim=1)
         forward = torch.where(uniform["command_side"][:, 0] < 0.5, low[:, 0], high[:, 0])
         extremes[:, 0] = torch.where(all_zero, forward, extremes[:, 0])
-        opposite = torch.minimum(torch.maximum(-command, low), high)
-        is_opposite = extreme & (kinds[:, 2] < settings.flip_probability)
-        is_extreme = (kinds[:, 0] < settings.extreme_probability) | is_opposite
+        opposite = torch.clamp(-command, low, high)
+        is_opposite = extreme & flipped
+        is_extreme = extreme_drawn | is_opposite
 
         # Stationary: as long as the rest of the episode still allows the required way at 80 % of the highest speed.
-        fastest = torch.maximum(-low[:, :2], high[:, :2]).amax(dim=1).clamp_min(1e-3)
-        spare = remaining - (way / (0.8 * self._period * fastest)).ceil().long()
+        spare = remaining - (way / ranges.reach).ceil().long()
         stationary_steps = spare.clamp(max=self._stationary_steps)
         stationary_probability = self._stationary.at(progress)[0]
         is_stationary = ~is_extreme & (stationary_steps > 0)
-        is_stationary &= kinds[:, 0] < settings.extreme_probability + stationary_probability
+        is_stationary &= kind_number[:, 0] < settings.extreme_probability + stationary_probability
 
-        drawn = uniform_command.clone()
-        drawn[:, 2] = torch.where(no_yaw, torch.zeros_like(drawn[:, 2]), drawn[:, 2])
-        turning = kinds[:, 3] < settings.stationary_yaw_probability
-        halt = torch.zeros_like(drawn)
-        halt[:, 2] = torch.where(turning, uniform_command[:, 2], halt[:, 2])
-        drawn = torch.where(is_stationary[:, None], halt, drawn)
-        drawn = torch.where(is_extreme[:, None], extremes, drawn)
+        linear = linear.masked_fill(is_stationary[:, None], 0.0)
+        yaw = yaw.masked_fill(torch.where(is_stationary, ~turning, straight)[:, None], 0.0)
+        drawn = torch.where(is_extreme[:, None], extremes, torch.cat((linear, yaw), dim=1))
         drawn = torch.where(is_opposite[:, None], opposite, drawn)
-        steps = torch.where(is_stationary, stationary_steps, torch.full_like(stationary_steps, self.interval_steps))
-        return CommandDraw(command=drawn, steps=steps.clamp_min(1), extreme=is_extreme)
+        steps = torch.where(is_stationary, stationary_steps, self._interval)
+        return CommandDraw(command=drawn, steps=steps, extreme=is_extreme)
 
     def _uniform(
         self,
         uniform: dict[str, torch.Tensor],
-        low: torch.Tensor,
-        high: torch.Tensor,
+        ranges: Ranges,
         way: torch.Tensor,
         remaining: torch.Tensor,
-    ) -> torch.Tensor:
-        """Uniform commands whose linear speeds are at least what the rest of the episode needs, (N, 3)."""
-        magnitude = uniform["command_magnitude"]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Uniform linear speeds that are at least what the rest of the episode needs, (N, 2), and yaw rates, (N, 1)."""
+        magnitude, low, high = uniform["command_magnitude"], ranges.low, ranges.high
         command = low + magnitude * (high - low)
         if not self._configuration.dynamic:
-            return command
-        low, high, magnitude = low[:, :2], high[:, :2], magnitude[:, :2]
+            return command[:, :2], command[:, 2:]
         # The published code lets the least speed exceed the range and then always commands the positive end.
-        needed = (way / (remaining * self._period))[:, None]
-        needed = torch.minimum(needed, torch.minimum(-low, high).clamp_min(0.0))
-        below, above = (-low - needed).clamp_min(0.0), (high - needed).clamp_min(0.0)
+        needed = torch.minimum((way / (remaining * self._period))[:, None], ranges.either)
+        below, above = (ranges.downward - needed).clamp_min(0.0), (high[:, :2] - needed).clamp_min(0.0)
         negative = uniform["command_sign"] * (below + above + 2e-6) < below + 1e-6
-        linear = torch.where(negative, -needed - magnitude * below, needed + magnitude * above)
-        return torch.cat((linear, command[:, 2:]), dim=1)
+        speed = needed + magnitude[:, :2] * torch.where(negative, below, above)
+        return torch.where(negative, -speed, speed), command[:, 2:]

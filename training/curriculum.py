@@ -105,5 +105,5 @@ def next_level(
     up = farthest > configuration.promotion_distance
     slow = farthest < configuration.demotion_share * commanded
     down = ~up & (slow | fallen if configuration.demote_falls else slow)
-    moved = level + up.long() - down.long()
+    moved = torch.add(level + up, down, alpha=-1)
     return torch.where(moved >= num_levels, anywhere, moved.clamp_min(0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import torch
@@ -48,51 +49,43 @@ def draw_bodies(
     )
 
 
-@dataclass(kw_only=True)
 class MotorParameters:
-    """Drawn anew at every reset of a world, (N, J) each."""
+    """Drawn anew at every reset of a world."""
 
-    stiffness_scale: torch.Tensor
-    damping_scale: torch.Tensor
-    motor_strength: torch.Tensor
-    motor_offset: torch.Tensor
-    """[rad]."""
+    NAMES = ("stiffness_scale", "damping_scale", "motor_strength", "motor_offset")
+    """Fields of ``Randomization``, in the order of ``MOTOR_COLUMNS``; offsets in rad."""
 
-    @classmethod
-    def nominal(cls, num_envs: int, num_joints: int, device: torch.device | str) -> MotorParameters:
-        """Motors as the robot's parameter set says."""
-        ones = torch.ones(num_envs, num_joints, device=device)
-        return cls(
-            stiffness_scale=ones.clone(),
-            damping_scale=ones.clone(),
-            motor_strength=ones.clone(),
-            motor_offset=torch.zeros_like(ones),
-        )
-
-    def redraw(
-        self, ranges: RandomizationConfiguration, uniform: dict[str, torch.Tensor], worlds: torch.Tensor
+    def __init__(
+        self, ranges: RandomizationConfiguration, num_envs: int, num_joints: int, device: torch.device | str
     ) -> None:
-        """New values, in place, for the masked worlds, from uniform numbers by the names of ``MOTOR_COLUMNS``."""
-        for name, values in (
-            ("stiffness", self.stiffness_scale),
-            ("damping", self.damping_scale),
-            ("motor_strength", self.motor_strength),
-            ("motor_offset", self.motor_offset),
-        ):
-            low, high = getattr(ranges, name)
-            drawn = uniform[name] * (high - low) + low
-            values.copy_(torch.where(worlds[:, None], drawn, values))
+        """Motors as the robot's parameter set says."""
+        bounds = [getattr(ranges, name) for name in MOTOR_COLUMNS]
+        self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
+        self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]
+        self.values = torch.ones(num_envs, len(self.NAMES), num_joints, device=device)
+        """All of them, (N, 4, J)."""
+        self.values[:, self.NAMES.index("motor_offset")] = 0.0
+
+    def redraw(self, uniform: torch.Tensor, worlds: torch.Tensor) -> None:
+        """New values, in place, for the masked worlds, from uniform numbers (N, 4 J)."""
+        drawn = uniform.view(self.values.shape) * self._span + self._low
+        torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
+
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        """Copies by name, (N, J) each."""
+        return {name: values.clone() for name, values in self._by_name().items()}
+
+    def restore(self, snapshot: Mapping[str, torch.Tensor]) -> None:
+        """Copy a snapshot back."""
+        for name, values in self._by_name().items():
+            values.copy_(snapshot[name])
 
     def apply(self, backend: PhysicsBackend) -> None:
         """Write all worlds' values into the physics.
 
         All rows are written every time: selecting the rows of a mask would wait for the device to count them.
         """
-        backend.randomize(
-            Randomization(
-                stiffness_scale=self.stiffness_scale,
-                damping_scale=self.damping_scale,
-                motor_strength=self.motor_strength,
-                motor_offset=self.motor_offset,
-            )
-        )
+        backend.randomize(Randomization(**self._by_name()))
+
+    def _by_name(self) -> dict[str, torch.Tensor]:
+        return dict(zip(self.NAMES, self.values.unbind(1), strict=True))

@@ -108,7 +108,7 @@ class TrainingEnvironment(VecEnv):
         self.contract = training_contract(self.robot, parameters, configuration)
         self._generator = torch.Generator(device=self.device)
         self._generator.manual_seed(configuration.seed)
-        self._inputs = static_inputs(self.backend.state)
+        self._inputs = static_inputs(self.backend.state, stays=self.backend.state_stays)
         self.program = StepProgram(
             configuration,
             robot=self.robot,
@@ -179,13 +179,12 @@ class TrainingEnvironment(VecEnv):
         """Capture both torch parts; what their warm-up changes is put back."""
         memory, motors = self.program.memory, self.program.motors
         before = memory.snapshot()
-        motors_before = {f.name: getattr(motors, f.name).clone() for f in fields(motors)}
+        motors_before = motors.snapshot()
         with torch.no_grad():
             self._after_physics = CapturedFunction(self._after_physics)
             self._observe = CapturedFunction(self._observe)
         memory.restore(before)
-        for name, values in motors_before.items():
-            getattr(motors, name).copy_(values)
+        motors.restore(motors_before)
 
     # --- rsl_rl's interface -----------------------------------------------------------------------------------------
 
@@ -241,6 +240,8 @@ class TrainingEnvironment(VecEnv):
     # --- parts of a step --------------------------------------------------------------------------------------------
 
     def _read(self, names: tuple[str, ...]) -> None:
+        if self.backend.state_stays:
+            return
         state = self.backend.state
         for name in names:
             getattr(self._inputs, name).copy_(getattr(state, name))
@@ -275,14 +276,7 @@ class TrainingEnvironment(VecEnv):
             )
         )
         memory.last_log.copy_(torch.where(torch.isfinite(values), values, memory.last_log))
-        for sums in (
-            memory.finished_rewards,
-            memory.finished_steps,
-            memory.finished_ends,
-            memory.metric_sums,
-            memory.metric_steps,
-        ):
-            sums.zero_()
+        memory.sums.zero_()
         names = [f"Episode_Reward/{n}" for n in program.rewards.names] + [f"Episode_Termination/{n}" for n in ENDS]
         names += [f"Metrics/{n}" for n in METRICS]
         assert len(names) == terms + len(ENDS) + len(METRICS)
@@ -323,7 +317,7 @@ class TrainingEnvironment(VecEnv):
         return {
             "version": STATE_VERSION,
             "memory": self.program.memory.snapshot(),
-            "motors": {f.name: getattr(self.program.motors, f.name).clone() for f in fields(self.program.motors)},
+            "motors": self.program.motors.snapshot(),
             "bodies": {f.name: getattr(self._bodies, f.name).clone() for f in fields(self._bodies)},
             "observations": {f.name: getattr(self._observations, f.name).clone() for f in fields(self._observations)},
             "generator": self._generator.get_state(),
@@ -347,8 +341,7 @@ class TrainingEnvironment(VecEnv):
             return
         program = self.program
         program.memory.restore({name: value.to(self.device) for name, value in state["memory"].items()})
-        for name, value in state["motors"].items():
-            getattr(program.motors, name).copy_(value)
+        program.motors.restore(state["motors"])
         self._bodies = BodyParameters(**{name: value.to(self.device) for name, value in state["bodies"].items()})
         self._bodies.apply(self.backend)
         program.motors.apply(self.backend)

@@ -4,9 +4,35 @@ it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import torch
+
+EPISODE = (
+    "farthest",
+    "commanded_way",
+    "commanded_farthest",
+    "issued",
+    "action",
+    "previous_action",
+    "joint_velocity",
+    "joint_acceleration",
+    "joint_torque",
+    "foot_force",
+    "episode_rewards",
+)
+SUMS = ("finished_rewards", "finished_steps", "finished_ends", "metric_sums", "metric_steps")
+
+
+def _block(
+    numbers: Callable[..., torch.Tensor], *shape: int, names: Sequence[str], widths: Sequence[int | None]
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """A tensor, and views of its neighbouring columns by name; a width of None is a column without an axis of its own."""
+    whole = numbers(*shape, sum(1 if width is None else width for width in widths))
+    parts = whole.split([1 if width is None else width for width in widths], dim=-1)
+    views = [part.squeeze(-1) if width is None else part for part, width in zip(parts, widths, strict=True)]
+    return whole, dict(zip(names, views, strict=True))
 
 
 @dataclass(kw_only=True)
@@ -69,11 +95,17 @@ class EnvironmentMemory:
     metric_sums: torch.Tensor
     """Sums over worlds and steps since the last log, (M,)."""
     metric_steps: torch.Tensor
-    """Steps summed in ``metric_sums``, scalar."""
+    """World steps summed in ``metric_sums``, scalar."""
     last_log: torch.Tensor
     """Values logged last, kept where nothing new can be said, (T + E + M,)."""
     diverged_total: torch.Tensor
     """Diverged worlds that were reset in the run, scalar int64."""
+
+    episode: torch.Tensor
+    """The numbers that are zero when an episode begins, one row for each world, (N, …): ``EPISODE`` are its columns, so that one
+    kernel clears them all."""
+    sums: torch.Tensor
+    """All sums since the last log in one row: ``SUMS`` are its columns."""
 
     @classmethod
     def allocate(
@@ -100,41 +132,43 @@ class EnvironmentMemory:
         def flags() -> torch.Tensor:
             return torch.zeros(num_envs, dtype=torch.bool, device=device)
 
+        widths = (None, 2, None, 2, joints, joints, joints, joints, joints, feet, terms)
+        episode, columns = _block(numbers, num_envs, names=EPISODE, widths=widths)
+        sums, totals = _block(numbers, names=SUMS, widths=(terms, None, ends, metrics, None))
         return cls(
+            episode=episode,
+            sums=sums,
+            **columns,
+            **totals,
             step=counts(),
             episode_length=counts(num_envs),
             level=counts(num_envs),
             terrain_index=counts(num_envs),
             moves_level=flags(),
-            farthest=numbers(num_envs),
-            commanded_way=numbers(num_envs, 2),
-            commanded_farthest=numbers(num_envs),
             command=numbers(num_envs, 3),
             command_steps=counts(num_envs),
             command_extreme=flags(),
-            issued=numbers(num_envs, 2),
-            action=numbers(num_envs, joints),
-            previous_action=numbers(num_envs, joints),
-            joint_velocity=numbers(num_envs, joints),
-            joint_acceleration=numbers(num_envs, joints),
-            joint_torque=numbers(num_envs, joints),
-            foot_force=numbers(num_envs, feet),
             just_reset=flags(),
             history=numbers(num_envs, history, frame),
             push_phase=counts(num_envs),
-            episode_rewards=numbers(num_envs, terms),
-            finished_rewards=numbers(terms),
-            finished_steps=numbers(),
-            finished_ends=numbers(ends),
-            metric_sums=numbers(metrics),
-            metric_steps=numbers(),
             last_log=numbers(terms + ends + metrics),
             diverged_total=counts(),
         )
 
+    def begin_episode(self, worlds: torch.Tensor) -> None:
+        """Clear what belongs to one episode in the masked worlds, (N,) bool."""
+        self.episode.masked_fill_(worlds[:, None], 0.0)
+        self.episode_length.masked_fill_(worlds, 0)
+        self.command_extreme.masked_fill_(worlds, False)
+        self.just_reset.copy_(worlds)
+
+    def _names(self) -> list[str]:
+        """Everything but the tensors of which others are columns."""
+        return [f.name for f in fields(self) if f.name not in ("episode", "sums")]
+
     def snapshot(self) -> dict[str, torch.Tensor]:
         """Copies of all tensors by name."""
-        return {f.name: getattr(self, f.name).clone() for f in fields(self)}
+        return {name: getattr(self, name).clone() for name in self._names()}
 
     def restore(self, snapshot: dict[str, torch.Tensor]) -> None:
         """Copy a snapshot back.
@@ -142,12 +176,12 @@ class EnvironmentMemory:
         Raises:
             ValueError: a tensor is missing or has another shape.
         """
-        for f in fields(self):
-            present, saved = getattr(self, f.name), snapshot.get(f.name)
+        for name in self._names():
+            present, saved = getattr(self, name), snapshot.get(name)
             if saved is None or saved.shape != present.shape:
                 found = "is missing" if saved is None else f"has shape {tuple(saved.shape)}"
                 raise ValueError(
-                    f"the saved environment does not fit: '{f.name}' {found}, this environment needs "
+                    f"the saved environment does not fit: '{name}' {found}, this environment needs "
                     f"{tuple(present.shape)}; resume with the run's own configuration"
                 )
             present.copy_(saved)

@@ -52,7 +52,8 @@ class HeightRasters:
         """
         nodes = (points_xy * (1.0 / self.cell) + (self.half_size / self.cell + 0.5)).nan_to_num(0.0, 0.0, 0.0)
         nodes = nodes.clamp(0.0, float(self.nodes - 1)).long()
-        flat = (terrain_index[:, None] * self.nodes + nodes[..., 1]) * self.nodes + nodes[..., 0]
+        row = torch.add(nodes[..., 1], terrain_index[:, None], alpha=self.nodes)
+        flat = torch.add(nodes[..., 0], row, alpha=self.nodes)
         return self._heights[flat]
 
 
@@ -68,8 +69,21 @@ def heading(quaternion: torch.Tensor) -> torch.Tensor:
     """Unit vector of the body's x axis in the world's xy plane, (cos yaw, sin yaw), from quaternions wxyz (N, 4) to
     (N, 2).
     """
-    w, x, y, z = quaternion.unbind(-1)
-    direction = torch.stack((1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)), dim=-1)
+    return _heading(quaternion, quaternion[:, 2:].square())
+
+
+def heading_and_upright(quaternion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """``heading``, (N, 2), and the cosine of the angle between the body's z axis and the world's, (N,)."""
+    squares = quaternion[:, 1:].square()
+    upright = torch.rsub(squares[:, 0] + squares[:, 1], 1.0, alpha=2.0)
+    return _heading(quaternion, squares[:, 1:]), upright
+
+
+def _heading(quaternion: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
+    """``heading`` with the squares of y and z, (N, 2), at hand."""
+    mixed = quaternion[:, :2, None] * quaternion[:, None, 2:]  # wy, wz; xy, xz
+    forward = torch.rsub(squares[:, 0] + squares[:, 1], 1.0, alpha=2.0)
+    direction = torch.stack((forward, 2.0 * (mixed[:, 1, 0] + mixed[:, 0, 1])), dim=-1)
     return direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-6)
 
 

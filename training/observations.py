@@ -36,9 +36,9 @@ _NOISE_FIELD = {
 }
 
 
-def add_noise(frame: torch.Tensor, uniform: torch.Tensor, amplitude: torch.Tensor) -> torch.Tensor:
-    """A frame with independent uniform noise on every entry; ``uniform`` has numbers in [0, 1), the frame's shape."""
-    return frame + (2.0 * uniform - 1.0) * amplitude
+def add_noise(frame: torch.Tensor, signed: torch.Tensor, amplitude: torch.Tensor) -> torch.Tensor:
+    """A frame with independent uniform noise on every entry; ``signed`` has numbers in [-1, 1), the frame's shape."""
+    return frame + signed * amplitude
 
 
 def push_history(history: torch.Tensor, frame: torch.Tensor, forget: torch.Tensor) -> torch.Tensor:

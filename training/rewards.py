@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 
+from ..robots.rotation import projected_gravity
 from .environment_configuration import Ramp, RewardConfiguration
 from .schedules import RampTable
 
@@ -24,8 +25,8 @@ class RewardInputs:
     """[m/s], (N, 3)."""
     base_angular_velocity_b: torch.Tensor
     """[rad/s], (N, 3)."""
-    projected_gravity_b: torch.Tensor
-    """Unit vector, (N, 3)."""
+    base_quaternion_w: torch.Tensor
+    """wxyz, (N, 4)."""
     base_height: torch.Tensor
     """Height of the base over the mean ground below the trunk [m], (N,)."""
     command: torch.Tensor
@@ -119,7 +120,8 @@ def action_rate(inputs: RewardInputs) -> torch.Tensor:
 
 def action_smoothness(inputs: RewardInputs) -> torch.Tensor:
     """Sum of squared second differences of the raw actions."""
-    return (inputs.action - 2.0 * inputs.previous_action + inputs.second_previous_action).square().sum(dim=1)
+    change = torch.sub(inputs.action, inputs.previous_action, alpha=2.0) + inputs.second_previous_action
+    return change.square().sum(dim=1)
 
 
 def collision(inputs: RewardInputs) -> torch.Tensor:
@@ -159,7 +161,7 @@ def hip_symmetry(inputs: RewardInputs) -> torch.Tensor:
 
 def roll(inputs: RewardInputs) -> torch.Tensor:
     """Squared sideways component of gravity."""
-    return inputs.projected_gravity_b[:, 1].square()
+    return projected_gravity(inputs.base_quaternion_w)[:, 1].square()
 
 
 def torque_change(inputs: RewardInputs) -> torch.Tensor:

@@ -16,13 +16,13 @@ from ..backends.base import PhysicsState
 from ..policy.contract import PolicyContract
 from ..policy.observation import ObservationBuilder
 from ..robots.base import JointParameters, Robot
-from ..robots.rotation import from_yaw, projected_gravity, rotate_inverse
+from ..robots.rotation import from_yaw, rotate_inverse
 from .commands import COMMAND_COLUMNS, CommandGenerator
 from .curriculum import TrainingPalette, next_level
 from .domain_randomization import MOTOR_COLUMNS, MotorParameters
 from .environment_configuration import EnvironmentConfiguration
 from .environment_memory import EnvironmentMemory
-from .height_scan import HeightRasters, heading, place_pattern, scan_pattern
+from .height_scan import HeightRasters, heading, heading_and_upright, place_pattern, scan_pattern
 from .observations import add_noise, height_entries, noise_amplitude, privileged_state, push_history
 from .randomness import UniformColumns
 from .rewards import RewardFunction, RewardInputs
@@ -80,7 +80,7 @@ class StepProgram:
             max_episode_length=self.max_episode_length,
             device=device,
         )
-        self.motors = MotorParameters.nominal(num_envs, joints, device)
+        self.motors = MotorParameters(configuration.randomization, num_envs, joints, device)
         self.memory = EnvironmentMemory.allocate(
             num_envs,
             joints=joints,
@@ -137,7 +137,9 @@ class StepProgram:
         bodies = robot.collision_bodies
         self._base = bodies.index(robot.base_body)
         self._touching = torch.cat((self._indices(bodies, "thigh"), self._indices(bodies, "calf")))
-        self._sigma = torch.tensor([tile.sigma for tile in palette.tiles], device=device)[self.kind]
+        sigma = torch.tensor([tile.sigma for tile in palette.tiles], device=device)[self.kind]
+        self._sigma_growth = sigma - settings.rewards.tracking_sigma
+        self._difficulty = (torch.exp(torch.arange(1, self.num_levels + 1, device=device) * 0.1) - 1.0).clamp(max=1.0)
         ends = torch.tensor([tile.ends for tile in palette.tiles], device=device)[self.kind]
         leave = settings.terrain.leave_distance
         never = torch.full((len(self.kind),), math.inf, device=device)
@@ -150,6 +152,16 @@ class StepProgram:
         first, last = (round(t / settings.physics.timestep) for t in settings.randomization.delay)
         self._delay = (min(first, settings.physics.substeps), min(last, settings.physics.substeps))
         self.push_steps = round(settings.push.interval / self.period)
+        push = settings.push
+        self._push_size = torch.tensor(
+            (push.linear, push.linear, push.angular, push.angular, push.angular), device=device
+        )
+        self._stays = torch.full((len(self.kind), 1), math.nan, device=device)
+        self._one = torch.ones(len(self.kind), 1, device=device)
+        terrain = settings.terrain
+        self._spread_distance, self._spawn_jitter = (
+            torch.tensor(distance, device=device) for distance in (terrain.spread_distance, terrain.spawn_jitter)
+        )
 
     def _indices(self, names: tuple[str, ...], part: str) -> torch.Tensor:
         found = [i for i, name in enumerate(names) if part in name]
@@ -166,7 +178,8 @@ class StepProgram:
         first, last = self._delay
         if last == 0:
             return None
-        return first + (self.uniform["delay"][:, 0] * (last - first + 1)).long().clamp(max=last - first)
+        drawn = (self.uniform["delay"][:, 0] * (last - first + 1)).long().clamp(max=last - first)
+        return drawn if first == 0 else first + drawn
 
     def progress(self) -> torch.Tensor:
         """Fraction of the run, scalar."""
@@ -181,8 +194,7 @@ class StepProgram:
         if not self.configuration.rewards.dynamic_sigma:
             return torch.full_like(command, base)
         speed = ((command.abs() - self._sigma_low) * self._sigma_rate).clamp(0.0, 1.0)
-        difficulty = (torch.exp((self.memory.level + 1) * 0.1) - 1.0).clamp(max=1.0)
-        return base + speed * (difficulty * (self._sigma - base))[:, None]
+        return base + speed * (self._difficulty[self.memory.level] * self._sigma_growth)[:, None]
 
     def after_physics(self) -> Verdict:
         """Judge the step, update the memory, and prepare the next episode of the worlds whose episode is over."""
@@ -192,20 +204,19 @@ class StepProgram:
         progress = self.progress()
 
         velocity_b = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)
-        gravity_b = projected_gravity(state.base_quaternion_w)
-        heading_xy = heading(state.base_quaternion_w)
+        heading_xy, upright = heading_and_upright(state.base_quaternion_w)
         touching = state.body_contact_force_w.norm(dim=-1)
 
         fast = state.joint_velocity.abs().amax(dim=1)
-        finite = torch.isfinite(
-            state.base_position_w.sum(dim=1) + velocity_b.sum(dim=1) + state.joint_position.sum(dim=1)
-        )
-        diverged = state.diverged | ~finite | ~(fast <= settings.termination.joint_velocity)
+        total = state.base_position_w.sum(dim=1) + velocity_b.sum(dim=1) + state.joint_position.sum(dim=1)
+        # Both comparisons are false for NaN.
+        sound = (total.abs() < math.inf) & (fast <= settings.termination.joint_velocity)
+        diverged = state.diverged | ~sound
         base_contact = touching[:, self._base] > settings.termination.base_force
         if settings.termination.tilt is None:
             tilted = torch.zeros_like(diverged)
         else:
-            tilted = -gravity_b[:, 2] < math.cos(settings.termination.tilt)
+            tilted = upright < math.cos(settings.termination.tilt)
         fallen = base_contact | tilted | diverged
         place = state.base_position_w[:, :2].abs().amax(dim=1)
         too_long = memory.episode_length >= self.max_episode_length
@@ -213,7 +224,7 @@ class StepProgram:
         time_out = (too_long | left) & ~fallen
         done = fallen | time_out
 
-        inputs = self._reward_inputs(velocity_b, gravity_b, heading_xy, touching, fallen)
+        inputs = self._reward_inputs(velocity_b, heading_xy, touching, fallen)
         terms = self.rewards(inputs, progress).masked_fill(diverged[:, None], 0.0)
         ends = torch.stack((too_long & time_out, left & time_out, base_contact, tilted, diverged), dim=1)
         self._record(terms, inputs, ends, done, diverged)
@@ -241,7 +252,6 @@ class StepProgram:
     def _reward_inputs(
         self,
         velocity_b: torch.Tensor,
-        gravity_b: torch.Tensor,
         heading_xy: torch.Tensor,
         touching: torch.Tensor,
         fallen: torch.Tensor,
@@ -258,7 +268,7 @@ class StepProgram:
         return RewardInputs(
             base_linear_velocity_b=velocity_b,
             base_angular_velocity_b=state.base_angular_velocity_b,
-            projected_gravity_b=gravity_b,
+            base_quaternion_w=state.base_quaternion_w,
             base_height=base[:, 2] - below_base,
             command=memory.command,
             sigma=self.sigma(),
@@ -287,16 +297,13 @@ class StepProgram:
     ) -> None:
         """Add to the sums that logs are made of."""
         memory = self.memory
-        over = done.float()
         memory.episode_rewards.add_(terms)
-        memory.finished_rewards.add_((memory.episode_rewards * over[:, None]).sum(dim=0))
-        memory.finished_steps.add_((memory.episode_length * done).sum())
-        memory.finished_ends.add_(ends.sum(dim=0))
         linear = (inputs.command[:, :2] - inputs.base_linear_velocity_b[:, :2]).norm(dim=1)
         yaw = (inputs.command[:, 2] - inputs.base_angular_velocity_b[:, 2]).abs()
         errors = torch.stack((linear, yaw), dim=1).masked_fill(diverged[:, None], 0.0)
-        memory.metric_sums.add_(errors.mean(dim=0))
-        memory.metric_steps.add_(1.0)
+        finished = torch.cat((memory.episode_rewards, memory.episode_length[:, None]), dim=1) * done[:, None]
+        # In the order of ``SUMS``.
+        memory.sums.add_(torch.cat((finished, ends, errors, self._one), dim=1).sum(dim=0))
         memory.diverged_total.add_(diverged.sum())
 
     def _follow_commands(self, place: torch.Tensor, heading_xy: torch.Tensor) -> None:
@@ -310,17 +317,15 @@ class StepProgram:
 
     def _push(self, done: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         settings, state = self.configuration.push, self.inputs
-        kick = 2.0 * self.uniform["push"] - 1.0
         if self.push_steps > 0:
             push = ((self.memory.episode_length + self.memory.push_phase) % self.push_steps == 0) & ~done
         else:
             push = torch.zeros_like(done)
-        linear, angular = kick[:, :2] * settings.linear, kick[:, 2:] * settings.angular
+        linear, angular = (self.uniform.signed("push") * self._push_size).split((2, 3), dim=1)
         if settings.add:
             linear = linear + state.base_linear_velocity_w[:, :2]
             angular = angular + state.base_angular_velocity_b
-        stays = torch.full_like(linear[:, :1], math.nan)
-        return push, torch.cat((linear, stays), dim=1), angular
+        return push, torch.cat((linear, self._stays), dim=1), angular
 
     # --- new episodes -----------------------------------------------------------------------------------------------
 
@@ -338,31 +343,14 @@ class StepProgram:
             fallen=fallen,
             uniform=uniform["level"][:, 0],
         )
-        memory.level.copy_(torch.where(worlds & memory.moves_level, level, memory.level))
+        torch.where(worlds & memory.moves_level, level, memory.level, out=memory.level)
         variants = self._tile_index.shape[2]
         variant = (uniform["variant"][:, 0] * variants).long().clamp(max=variants - 1)
         tile = self._tile_index[self.kind, memory.level, variant]
-        memory.terrain_index.copy_(torch.where(worlds, tile, memory.terrain_index))
-
-        for numbers in (memory.farthest, memory.commanded_farthest):
-            numbers.masked_fill_(worlds, 0.0)
-        for rows in (
-            memory.commanded_way,
-            memory.issued,
-            memory.action,
-            memory.previous_action,
-            memory.joint_velocity,
-            memory.joint_acceleration,
-            memory.joint_torque,
-            memory.foot_force,
-            memory.episode_rewards,
-        ):
-            rows.masked_fill_(worlds[:, None], 0.0)
-        memory.episode_length.masked_fill_(worlds, 0)
-        memory.command_extreme.masked_fill_(worlds, False)
-        memory.just_reset.copy_(worlds)
+        torch.where(worlds, tile, memory.terrain_index, out=memory.terrain_index)
+        memory.begin_episode(worlds)
         self._new_commands(worlds, progress)
-        self.motors.redraw(settings.randomization, {n: uniform[n] for n in MOTOR_COLUMNS}, worlds)
+        self.motors.redraw(uniform.span(MOTOR_COLUMNS[0], MOTOR_COLUMNS[-1]), worlds)
         return self._start(worlds)
 
     def _new_commands(self, begun: torch.Tensor, progress: torch.Tensor) -> None:
@@ -378,10 +366,10 @@ class StepProgram:
             command=memory.command,
             extreme=memory.command_extreme,
         )
-        memory.command.copy_(torch.where(due[:, None], drawn.command, memory.command))
-        memory.command_steps.copy_(torch.where(due, drawn.steps, memory.command_steps))
-        memory.command_extreme.copy_(torch.where(due, drawn.extreme, memory.command_extreme))
-        memory.issued.add_(drawn.command[:, :2].masked_fill(~due[:, None], 0.0))
+        torch.where(due[:, None], drawn.command, memory.command, out=memory.command)
+        torch.where(due, drawn.steps, memory.command_steps, out=memory.command_steps)
+        torch.where(due, drawn.extreme, memory.command_extreme, out=memory.command_extreme)
+        memory.issued.add_(drawn.command[:, :2] * due[:, None])
 
     def _start(self, worlds: torch.Tensor) -> EpisodeStart:
         memory, uniform, terrain, reset = (
@@ -391,21 +379,20 @@ class StepProgram:
             self.configuration.reset,
         )
         spread = uniform["spread"][:, 0] < terrain.spread_probability
-        memory.moves_level.copy_(torch.where(worlds, ~spread, memory.moves_level))
-        place = 2.0 * uniform["place"] - 1.0
-        xy = torch.where(spread[:, None], place * terrain.spread_distance, place * terrain.spawn_jitter)
+        torch.where(worlds, ~spread, memory.moves_level, out=memory.moves_level)
+        xy = uniform.signed("place") * torch.where(spread, self._spread_distance, self._spawn_jitter)[:, None]
         yaw = uniform.between("yaw", -math.pi, math.pi)[:, 0]
         direction = torch.stack((torch.cos(yaw), torch.sin(yaw)), dim=1)
         ground = self.rasters.height(memory.terrain_index, place_pattern(self._footprint, xy, direction)).amax(dim=1)
         joints = self.default_pose * uniform.between("joints", *reset.joint_scale)
-        twist = (2.0 * uniform["twist"] - 1.0) * reset.velocity
+        twist = uniform.signed("twist") * reset.velocity
         return EpisodeStart(
             worlds=worlds,
             base_position=torch.cat((xy, ground[:, None] + self._clearance), dim=1),
             base_quaternion=from_yaw(yaw),
             base_linear_velocity=twist[:, :3],
             base_angular_velocity=twist[:, 3:],
-            joint_position=torch.minimum(torch.maximum(joints, self.joint_lower), self.joint_upper),
+            joint_position=torch.clamp(joints, self.joint_lower, self.joint_upper),
         )
 
     # --- observing --------------------------------------------------------------------------------------------------
@@ -416,7 +403,7 @@ class StepProgram:
         """
         state, memory = self.inputs, self.memory
         frame = self._builder.build(state, memory.command, memory.action)
-        noisy = add_noise(frame, self.uniform["noise"], self.noise)
+        noisy = add_noise(frame, self.uniform.signed("noise"), self.noise)
         memory.history.copy_(push_history(memory.history, noisy, memory.just_reset))
         points = place_pattern(self.scan, state.base_position_w[:, :2], heading(state.base_quaternion_w))
         ground = self.rasters.height(memory.terrain_index, points)

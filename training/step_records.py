@@ -33,8 +33,12 @@ AFTER_RESET = AFTER_STEP[:6]
 """Physics state that ``observe`` reads."""
 
 
-def static_inputs(state: PhysicsState) -> PhysicsState:
-    """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32."""
+def static_inputs(state: PhysicsState, *, stays: bool = False) -> PhysicsState:
+    """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32; or, if these stay for
+    good, the engine's own.
+    """
+    if stays:
+        return state
     return PhysicsState(**{f.name: _float32(getattr(state, f.name)).clone() for f in fields(PhysicsState)})
 
 

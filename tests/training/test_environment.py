@@ -297,7 +297,7 @@ def test_reward_is_the_sum_of_the_logged_terms():
 
 
 def test_dynamic_sigma():
-    environment = make(5, terrain=STAIRS)
+    environment = make(5, terrain=replace(STAIRS, levels=9))
     memory, program = environment.program.memory, environment.program
     assert environment.kind.tolist() == [0, 0, 0, 1, 1]
     commands = [[1.0, -0.5, 1.5], [2.0, 1.5, 3.0], [0.2, 0.0, 0.5], [2.0, 1.0, 2.0], [0.0, 0.0, 0.0]]

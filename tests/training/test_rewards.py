@@ -16,7 +16,7 @@ def quiet():
     return RewardInputs(
         base_linear_velocity_b=torch.zeros(2, 3),
         base_angular_velocity_b=torch.zeros(2, 3),
-        projected_gravity_b=torch.tensor([[0.0, 0.0, -1.0]] * 2),
+        base_quaternion_w=torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
         base_height=torch.full((2,), 0.38),
         command=torch.zeros(2, 3),
         sigma=torch.full((2, 3), 0.25),
@@ -113,7 +113,7 @@ CASES = {
         0.6 * 0.3,
         0.0,
     ),
-    "roll": ({"projected_gravity_b": one_world([0.6, -0.2, 9.0], 3)}, 0.04, 0.0),
+    "roll": ({"base_quaternion_w": one_world([0.8, 0.6, 0.0, 0.0], 4)}, 0.96**2, 0.0),
     "torque_change": ({"joint_torque": joints(2.0, 1.0), "previous_joint_torque": joints(0.0, 4.0)}, 13.0, 0.0),
     "stand_still": ({"joint_position": joints(0.5, -0.25)}, 0.75, 0.0),
     "termination": ({"fallen": torch.tensor([True, False])}, 1.0, 0.0),
