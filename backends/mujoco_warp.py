@@ -63,7 +63,7 @@ _DROPPED = int(
 )
 """Alarms that mean dropped contacts or constraints; a solver that stopped at its iteration limit is none."""
 PARKED_HEIGHT = 100.0
-"""Height at which a diverged world's robot waits for its reset, away from every contact [m]."""
+"""Height at which a robot waits, away from every contact, that has diverged or must not step [m]."""
 
 
 class MujocoWarpBackend(PhysicsBackend):
@@ -347,8 +347,9 @@ class MujocoWarpBackend(PhysicsBackend):
         n, data, motors, motion, live = self.num_worlds, self._data, self._motors, self._motion, self._live
         active, each_joint = self._active_array, (n, self._joints)
         depth, positions = self.scene.physics.watch_penetration, (n, self._motion.positions)
+        keep = [self._parked, motion, *self._kept_arrays]
         wp.launch(kernels.begin_period, dim=each_joint, inputs=[active, self._request_array, motors, live])
-        wp.launch(kernels.keep_inactive, dim=positions, inputs=[active, 0, motion, *self._kept_arrays])
+        wp.launch(kernels.keep_inactive, dim=positions, inputs=[active, 0, *keep])
         for substep in range(total):
             wp.launch(kernels.motor_law, dim=each_joint, inputs=[substep, motors, motion])
             mujoco_warp.step(self._model, data)
@@ -360,7 +361,7 @@ class MujocoWarpBackend(PhysicsBackend):
                 wp.launch(kernels.watch_penetration, dim=data.naconmax, inputs=[substep, depth, active, *tables, live])
             if sampled:
                 self._read(self._sample_array, substep + 1, self._sampled, forces=True)
-        wp.launch(kernels.keep_inactive, dim=positions, inputs=[active, 1, motion, *self._kept_arrays])
+        wp.launch(kernels.keep_inactive, dim=positions, inputs=[active, 1, *keep])
         self._read(active, 1, live, forces=True)
 
     def push(

@@ -38,18 +38,29 @@ def begin_period(active: wp.array[int], has_request: wp.array[int], motors: Moto
 
 @wp.kernel
 def keep_inactive(
-    active: wp.array[int], restore: int, motion: Motion, kept: wp.array2d[float], kept_overflow: wp.array[int]
+    active: wp.array[int],
+    restore: int,
+    parked_qpos: wp.array[float],
+    motion: Motion,
+    kept: wp.array2d[float],
+    kept_overflow: wp.array[int],
 ) -> None:
-    """Save (or restore) what a step changes in the worlds that must not step."""
+    """Save (or restore) what a step changes in the worlds that must not step.
+
+    Meanwhile their robots are out of reach of everything, since collisions and contacts are what a step takes its time for.
+    """
     world, i = wp.tid()
     if active[world] != 0:
         return
     if restore == 0:
         if i < motion.positions:
             kept[world, i] = motion.qpos[world, i]
+            motion.qpos[world, i] = parked_qpos[i]
         if i < motion.velocities:
             kept[world, motion.positions + i] = motion.qvel[world, i]
             kept[world, motion.positions + motion.velocities + i] = motion.warmstart[world, i]
+            motion.qvel[world, i] = 0.0
+            motion.warmstart[world, i] = 0.0
         if i == 0:
             kept[world, motion.positions + 2 * motion.velocities] = motion.time[world]
             kept_overflow[world] = motion.overflow[world]

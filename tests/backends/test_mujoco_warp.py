@@ -364,6 +364,26 @@ def test_a_diverged_world_is_parked_and_the_others_do_not_notice():
 
 
 @pytest.mark.slow
+def test_worlds_that_must_not_step_have_no_contacts_meanwhile_and_go_on_as_if_nothing_had_been():
+    """Contacts are what a step takes its time for. Interrupted between two steps, a robot that lands goes on to the last bit."""
+    pose = torch.tensor(ROBOT.default_joint_position).repeat(2, 1)
+    ends = []
+    for pauses in (0, 3):
+        backend = MujocoWarpBackend(scene(FLAT, index=(0, 0)))
+        backend.reset(**upright(backend, 0.3))
+        for step in range(6):
+            backend.step(pose)
+            for _ in range(pauses if step == 3 else 0):
+                backend.step(pose, worlds=torch.tensor([True, False]))
+                count = int(backend._data.nacon.numpy()[0])
+                assert count > 0 and not backend._data.contact.worldid.numpy()[:count].any()
+        ends.append({f.name: getattr(backend.state, f.name)[1].clone() for f in fields(PhysicsState)})
+    assert ends[0]["foot_normal_force"].sum() > 50.0
+    for name, value in ends[0].items():
+        assert torch.equal(value, ends[1][name]), name
+
+
+@pytest.mark.slow
 def test_randomization_rows_for_masked_worlds_or_for_all():
     backend = MujocoWarpBackend(scene(FLAT, index=(0, 0, 0, 0)))
     mask = torch.tensor([False, True, False, True])
