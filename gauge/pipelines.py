@@ -17,6 +17,10 @@ from .goals import TARGET
 from .suite import Suite, SuiteError
 
 PIPELINES = ("base", "multi", "level", "stress")
+_FEW_LEVELS = 3
+"""Levels that a search may still find, of which the quality episodes are begun early: more of them would mostly be in vain."""
+_FEW_TESTS = 0.25
+"""Share of the episodes of a search that are still open when that begins: until then, worlds have better things to do."""
 
 
 class Store(Protocol):
@@ -92,11 +96,35 @@ class Environment:
     """Episodes of the level tests."""
     low: int = 0
     high: int = 0
+    waiting: set[Episode] = field(default_factory=set)
+    """Episodes that wait or are at work, those that are ``early`` left out."""
+    early: dict[int, dict[Episode, Record | None]] = field(default_factory=dict)
+    """Quality episodes of levels that may come out, begun before the level is known, and their records once there are any."""
 
     @property
     def key(self) -> str:
         """Unique name."""
         return f"{self.terrain}-f{self.friction:.12g}-m{self.payload:.12g}"
+
+    def prospects(self) -> tuple[set[int], set[int]]:
+        """Levels about which the search may still ask, and those that it may find, after what is known so far."""
+        asked: set[int] = set()
+        found: set[int] = set()
+        ranges = [(self.low, self.high)]
+        while ranges:
+            low, high = ranges.pop()
+            if low >= high:
+                found.add(low)
+                continue
+            middle = (low + high + 1) // 2
+            passed = self.tests[middle].passed if middle in self.tests else None
+            if passed is None:
+                asked.add(middle)
+            if passed is not False:
+                ranges.append((middle, high))
+            if passed is not True:
+                ranges.append((low, middle - 1))
+        return asked, found
 
 
 class Plan:
@@ -120,13 +148,14 @@ class Plan:
             seeds: seeds of the quality episodes.
             store: finished episodes; those found there are not run again.
             evaluate: whether quality episodes follow once the level is known.
-            speculative: play every level at once instead of searching step by step, and drop what turns out not to matter: more
-                work, fewer steps in a row.
+            speculative: play every level at once instead of searching step by step, begin the quality episodes of the last few
+                levels that may come out, and drop what turns out not to matter: more work, fewer steps in a row.
         """
         self.suite, self.environments, self.seeds = suite, list(environments), list(seeds)
         self._store, self._evaluate, self._speculative = store, evaluate, speculative
         self._tests: deque[Episode] = deque()
         self._quality: deque[Episode] = deque()
+        self._early: deque[Episode] = deque()  # quality of levels that are not known yet
         self._of: dict[Episode, Environment] = {}  # of the episodes that wait or are at work
         self.total_known = 0
         self.done = 0
@@ -136,6 +165,7 @@ class Plan:
                 self._search(environment)
             elif evaluate and (environment.level > 0 or environment.terrain == "flat"):
                 self._queue_quality(environment)
+        self._tests_at_first = len(self._tests)
 
     # ---- the runner's side ----------------------------------------------------------------------------------------
 
@@ -147,8 +177,8 @@ class Plan:
             urgent: level tests alone.
         """
         taken = self._take(self._tests, most)
-        while not urgent and len(taken) < most and (self._tests or self._quality):
-            taken += self._take(self._tests or self._quality, 1)
+        while not urgent and len(taken) < most and (self._tests or self._quality or self._begin_early()):
+            taken += self._take(self._tests or self._quality or self._early, 1)
         return taken
 
     def take_quality(self, most: int) -> list[Episode]:
@@ -192,6 +222,7 @@ class Plan:
     def _add(self, environment: Environment, episodes: Sequence[Episode]) -> None:
         for episode in episodes:
             self._of[episode] = environment
+            environment.waiting.add(episode)
             (self._quality if episode.stage == "eval" else self._tests).append(episode)
         self.total_known += len(episodes)
 
@@ -199,6 +230,11 @@ class Plan:
         environment = self._of.pop(record.episode, None)
         if environment is None:
             return ()  # it ended together with the one after which nobody needed it
+        early = environment.early.get(record.episode.level, {})
+        if record.episode in early:
+            early[record.episode] = record
+            return ()
+        environment.waiting.discard(record.episode)
         self.done += 1
         if record.episode.stage == "eval":
             environment.records.append(record)
@@ -210,24 +246,21 @@ class Plan:
         return self._drop_needless(environment) if self._speculative else ()
 
     def _drop_needless(self, environment: Environment) -> Collection[Episode]:
-        """Forget episodes of level tests that decide about nothing any more; returns those that are at work."""
-        found = environment.level is not None
-        needless = {
-            episode
-            for episode, other in self._of.items()
-            if other is environment
-            and episode.stage == "search"
-            and (found or environment.tests[episode.level].passed is not None)
-        }
-        if not needless:
-            return ()
+        """Forget episodes that decide about nothing any more; returns those that are at work."""
+        asked, found = environment.prospects()
+        needless = {e for e in environment.waiting if e.stage == "search" and e.level not in asked}
+        environment.waiting -= needless
         for episode in needless:
             del self._of[episode]
         self.total_known -= len(needless)
         waiting = needless.intersection(self._tests)
         if waiting:
             self._tests = deque(e for e in self._tests if e not in waiting)
-        return needless - waiting
+        at_work = needless - waiting
+        for level in environment.early.keys() - found:
+            begun = self._at_work(environment.early.pop(level))
+            at_work.update(episode for episode, record in begun.items() if record is None)
+        return at_work
 
     def _search(self, environment: Environment) -> None:
         """Go on with the binary search as far as the outcomes allow."""
@@ -260,7 +293,43 @@ class Plan:
 
     def _queue_quality(self, environment: Environment) -> None:
         level = environment.level or 0
-        self._add(environment, [self._episode(environment, level, s, "eval") for s in self.seeds])
+        begun = self._at_work(environment.early.pop(level, {}))
+        episodes = [self._episode(environment, level, s, "eval") for s in self.seeds]
+        self._add(environment, [e for e in episodes if e not in begun])
+        self.total_known += len(begun)
+        for episode, record in begun.items():
+            self._of[episode] = environment
+            environment.waiting.add(episode)
+            if record is not None:
+                self._fold(record)
+
+    def _begin_early(self) -> bool:
+        """Where a search is about to end, begin the quality episodes of the levels that it may find; returns whether any wait."""
+        if (
+            self._early
+            or not (self._speculative and self._evaluate)
+            or len(self._of) > _FEW_TESTS * self._tests_at_first
+        ):
+            return bool(self._early)
+        for environment in self.environments:
+            if environment.level is not None:
+                continue
+            levels = environment.prospects()[1] - {0}
+            for level in sorted(levels - environment.early.keys()) if len(levels) <= _FEW_LEVELS else ():
+                episodes = [self._episode(environment, level, seed, "eval") for seed in self.seeds]
+                environment.early[level] = dict.fromkeys(episodes)
+                self._of.update(dict.fromkeys(episodes, environment))
+                self._early.extend(episodes)
+        return bool(self._early)
+
+    def _at_work(self, early: dict[Episode, Record | None]) -> dict[Episode, Record | None]:
+        """Those of some early episodes that have begun; the others are forgotten."""
+        waiting = set(self._early).intersection(early)
+        if waiting:
+            self._early = deque(e for e in self._early if e not in waiting)
+        for episode in early:
+            self._of.pop(episode, None)
+        return {episode: record for episode, record in early.items() if episode not in waiting}
 
     def _episode(self, environment: Environment, level: int, seed: int, stage: str) -> Episode:
         names = [g.name for g in self.suite.goals]

@@ -122,7 +122,7 @@ def test_the_search_does_not_depend_on_the_order_in_which_episodes_end():
 
 
 def test_what_is_played_at_once_is_dropped_as_soon_as_it_decides_nothing():
-    """Level 6 is reached. Two failures settle a level, four successes do, and the level reached settles all others."""
+    """Level 6 is reached. Two failures settle a level, four successes do, and what bisection has passed by is never asked for."""
     item = environment()
     plan = Plan(REFERENCE, [item], [0], MemoryStore(), speculative=True)
     episodes = {(e.level, e.seed): e for e in plan.take(50)}
@@ -132,15 +132,49 @@ def test_what_is_played_at_once_is_dropped_as_soon_as_it_decides_nothing():
         return {(e.level, e.seed) for e in plan.finished(Record(episode=episodes[level, seed], success=level <= 6))}
 
     assert end(8, 0) == set()
-    assert end(8, 3) == {(8, 1), (8, 2), (8, 4)}
+    higher = {(level, seed) for level in (9, 10) for seed in range(5)}
+    assert end(8, 3) == {(8, 1), (8, 2), (8, 4)} | higher
     assert end(8, 1) == set(), "it ended in the same step as the one before"
-    assert [end(5, s) for s in range(4)] == [set(), set(), set(), {(5, 4)}]
+    lower = {(level, seed) for level in (1, 2, 3, 4) for seed in range(5)}
+    assert [end(5, s) for s in range(4)] == [set(), set(), set(), {(5, 4)} | lower]
     assert [end(6, s) for s in range(4)] == [set(), set(), set(), {(6, 4)}]
     assert end(7, 0) == set() and item.level is None
-    rest = {(level, seed) for level in (1, 2, 3, 4, 9, 10) for seed in range(5)}
-    assert end(7, 1) == rest | {(7, 2), (7, 3), (7, 4)}
+    assert end(7, 1) == {(7, 2), (7, 3), (7, 4)}
     assert item.level == 6
     assert [(e.stage, e.level) for e in plan.take(50)] == [("eval", 6)]
+
+
+def test_quality_of_the_last_levels_in_question_begins_before_the_search_ends():
+    """Levels 6 and 7 are left; one walk of each ends before level 7 is failed, and the other walk of level 6 goes on."""
+    item, store = environment(), MemoryStore()
+    plan = Plan(REFERENCE, [item], [0, 1], store, speculative=True)
+    tests = {(e.level, e.seed): e for e in plan.take(50)}
+    assert plan.take(50) == [], "all worlds have level tests to play"
+    for level, seeds in ((5, 4), (6, 4), (8, 2)):
+        for seed in range(seeds):
+            plan.finished(Record(episode=tests[level, seed], success=level <= 6))
+    assert plan.take(50, urgent=True) == []
+    early = {(e.level, e.seed): e for e in plan.take(3)}
+    assert list(early) == [(6, 0), (6, 1), (7, 0)]
+    assert {e.stage for e in early.values()} == {"eval"}
+    for level in (6, 7):
+        assert plan.finished(Record(episode=early[level, 0])) == ()
+    early |= {(e.level, e.seed): e for e in plan.take(50)}
+    assert list(early)[3:] == [(7, 1)]
+    known, done = plan.total_known, plan.done
+    assert plan.finished(Record(episode=tests[7, 0], success=False)) == set()
+    assert set(plan.finished(Record(episode=tests[7, 1], success=False))) == {
+        *(tests[7, seed] for seed in (2, 3, 4)),
+        early[7, 1],
+    }
+    assert item.level == 6
+    assert [r.episode for r in item.records] == [early[6, 0]]
+    assert (plan.total_known, plan.done) == (known - 3 + 2, done + 2 + 1)
+    assert plan.take(50) == []
+    assert plan.finished(Record(episode=early[7, 1])) == ()
+    plan.finished(Record(episode=early[6, 1]))
+    assert [r.episode for r in item.records] == [early[6, 0], early[6, 1]]
+    assert plan.done == plan.total_known == len(item.trials) + len(item.records)
 
 
 def test_quality_follows_at_the_level_reached_with_the_other_goals():
