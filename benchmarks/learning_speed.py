@@ -41,6 +41,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "cuda_graphs": True,
         "symmetry": "augment",
     },
+    "tf32, compiled, CUDA graphs, alternate": {"compile_mode": "default", "cuda_graphs": True, "symmetry": "alternate"},
+    "bfloat16, compiled, CUDA graphs, alternate": {
+        "precision": "bfloat16",
+        "compile_mode": "default",
+        "cuda_graphs": True,
+        "symmetry": "alternate",
+    },
 }
 
 
@@ -88,13 +95,14 @@ def main() -> None:
     parser.add_argument("--num-envs", type=int, default=8192)
     parser.add_argument("--steps", type=int, default=24)
     parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--student-period", type=int, default=2, help="every which environment is the student's")
     parser.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--variants", nargs="*", help="names, default all", default=list(VARIANTS))
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     results = {}
     for name in options.variants:
-        settings = VARIANTS[name]
+        settings = {"student_period": options.student_period} | VARIANTS[name]
         if settings.get("cuda_graphs") and torch.device(options.device).type != "cuda":
             continue
         if torch.device(options.device).type == "cuda":
@@ -105,7 +113,7 @@ def main() -> None:
         speed = options.num_envs * options.steps / (result["rollout"] + result["update"])
         results[name] = result | {"steps_per_second": speed}
         print(
-            f"{name:36s} rollout {result['rollout'] * 1e3:8.1f} ms   update {result['update'] * 1e3:8.1f} ms   "
+            f"{name:43s} rollout {result['rollout'] * 1e3:8.1f} ms   update {result['update'] * 1e3:8.1f} ms   "
             f"{speed:12,.0f} steps/s   {result['memory_gb']:5.1f} GB",
             flush=True,
         )

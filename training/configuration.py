@@ -15,7 +15,7 @@ from typing import Any
 from .environment_configuration import Ramp
 
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
-SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "loss")
+SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "alternate", "loss")
 LOAD_BALANCE_FORMS: tuple[str, ...] = ("sum", "mean")
 PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
 COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default", "max-autotune-no-cudagraphs")
@@ -110,8 +110,9 @@ class AlgorithmConfiguration:
     mean, all samples collapsing onto one of 8 experts costs 0.0011 beside a latent error of the order of 0.01, which
     hardly counters a collapse."""
     symmetry: str = "none"
-    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image) or ``loss`` (the
-    actor is pulled towards acting alike in mirrored states)."""
+    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image), ``alternate`` (half of a minibatch
+    is replaced by its mirror image, the other half in the next pass: half of the work of ``augment``) or ``loss`` (the actor is
+    pulled towards acting alike in mirrored states)."""
     symmetry_coefficient: float = 1.0
     """Weight of the mirror loss (``symmetry="loss"``)."""
     precision: str = "tf32"

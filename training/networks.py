@@ -120,7 +120,7 @@ class CtsActor(nn.Module):
 
     def action_mean(self, latent: torch.Tensor, policy: torch.Tensor) -> torch.Tensor:
         """Mean actions (N, J) of the shared actor for latents (N, L) and current frames (N, F)."""
-        return self.student.actor(torch.cat((latent, policy), dim=-1))
+        return _last_in_float32(self.student.actor, torch.cat((latent, policy), dim=-1))
 
     def forward(
         self,
@@ -174,4 +174,15 @@ class CtsCritic(MLPModel):
 
     def value(self, latent: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         """Values (N, 1) for detached latents (N, L) and privileged observations (N, P)."""
-        return self.mlp(torch.cat((latent, privileged), dim=-1))
+        return _last_in_float32(self.mlp, torch.cat((latent, privileged), dim=-1))
+
+
+def _last_in_float32(layers: nn.Sequential, values: torch.Tensor) -> torch.Tensor:
+    """A perceptron whose last layer is computed in float32 whatever the precision of the others: an action in bfloat16 is off by
+    hundredths of the exploration noise, and probability ratios live on such differences.
+    """
+    *hidden, last = layers
+    for layer in hidden:
+        values = layer(values)
+    with torch.autocast(values.device.type, enabled=False):
+        return last(values.float())

@@ -5,7 +5,8 @@ import pytest
 import torch
 from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.cts import CTS
-from gaitgauge.training.algorithms.symmetry import build_mirror
+from gaitgauge.training.algorithms.gradients import clip_gradients
+from gaitgauge.training.algorithms.symmetry import build_mirror, passes
 from gaitgauge.training.configuration import ConfigurationError, NetworkConfiguration
 from gaitgauge.training.environment_configuration import Ramp
 from gaitgauge.training.networks import CtsActor, CtsCritic, student_architecture
@@ -229,11 +230,11 @@ def test_gradient_clip_and_non_finite_gradients():
     parameters = algorithm.actor.student_parameters()
     for p in parameters:
         p.grad = torch.full_like(p, 3.0)
-    norm, skipped = algorithm._clip(parameters)
+    norm, skipped = clip_gradients(parameters, 1.0)
     assert float(norm) > 1.0 and float(skipped) == 0.0
     assert torch.nn.utils.get_total_norm([p.grad for p in parameters]) == pytest.approx(1.0, rel=1e-3)
     parameters[0].grad[0] = float("inf")
-    _, skipped = algorithm._clip(parameters)
+    _, skipped = clip_gradients(parameters, 1.0)
     assert float(skipped) == 1.0 and all(bool((p.grad == 0).all()) for p in parameters)
 
 
@@ -248,7 +249,45 @@ def test_non_finite_minibatches_are_counted_and_leave_the_weights_finite(joint):
     assert all(v == v for v in losses.values())
 
 
-@pytest.mark.parametrize("symmetry", ["none", "augment", "loss"])
+def test_actions_and_values_are_float32_in_any_precision():
+    algorithm, env = build("mlp", precision="bfloat16")
+    groups = env.get_observations()
+    with algorithm._autocast():
+        latent = algorithm.actor.teacher_latent(groups["privileged"])
+        mean, value = (
+            algorithm.actor.action_mean(latent, groups["policy"]),
+            algorithm.critic.value(latent, groups["privileged"]),
+        )
+    assert mean.dtype == value.dtype == torch.float32
+    assert not torch.equal(mean, mean.bfloat16().float())
+
+
+def test_two_alternate_passes_see_what_an_augmented_one_sees():
+    algorithm, env = build("mlp", symmetry="augment")
+    rollout(algorithm, env)
+    storage, mirror = algorithm.storage, algorithm.mirror
+    history = storage.student_history.flatten(0, 1)
+    with torch.no_grad():
+        algorithm._mirrored_latent.copy_(algorithm.actor.student_latent(mirror.history(history))[0])
+        algorithm._targets.normal_()
+        algorithm._mirrored_targets.normal_()
+    teacher, student = (rows[0] for rows in storage.minibatch_rows(2))
+    in_history = storage.student_rows(student)
+    whole = algorithm._compute_policy_loss(teacher, student)[1][:2]
+    error = algorithm._compute_student_loss(in_history)[0]
+    algorithm.configuration = replace(algorithm.configuration, symmetry="alternate")
+    halves, errors = [], []
+    for turned in passes(2, alternate=True):
+        value, surrogate, _, kl, _ = algorithm._compute_policy_loss(turned(teacher), turned(student))[1]
+        halves.append(torch.stack((value, surrogate)))
+        errors.append(algorithm._compute_student_loss(turned(in_history))[0])
+        assert float(kl) == pytest.approx(0.0, abs=1e-6)
+    assert not torch.allclose(halves[0], halves[1])
+    torch.testing.assert_close((halves[0] + halves[1]) / 2, whole)
+    torch.testing.assert_close((errors[0] + errors[1]) / 2, error)
+
+
+@pytest.mark.parametrize("symmetry", ["none", "augment", "alternate", "loss"])
 @pytest.mark.parametrize("encoder", ["mlp", "moe", "moe_ng"])
 def test_update_runs_and_reports(encoder, symmetry):
     algorithm, env = build(encoder, symmetry=symmetry)
@@ -257,7 +296,9 @@ def test_update_runs_and_reports(encoder, symmetry):
     losses = algorithm.update()
     after = (*algorithm.actor.parameters(), *algorithm.critic.parameters())
     assert all(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
-    assert ("load_balance" in losses) == (encoder != "mlp") and ("symmetry" in losses) == (symmetry != "none")
+    assert ("load_balance" in losses) == (encoder != "mlp") and ("symmetry" in losses) == (
+        symmetry in ("augment", "loss")
+    )
     assert losses["skipped_minibatches"] == 0 and algorithm.storage.step == 0
 
 

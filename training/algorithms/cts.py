@@ -14,7 +14,7 @@ the rollout and the teacher's targets are computed once. Nothing in the passes w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -23,15 +23,15 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.env import VecEnv
 from rsl_rl.utils import reduce_gradients_in_buckets
 from tensordict import TensorDict
-from torch import nn
 
 from ..configuration import AlgorithmConfiguration, ConfigurationError, NetworkConfiguration
 from ..networks import CtsActor, CtsCritic, student_architecture
 from ..schedules import RampTable
 from .bootstrap import Bootstrap
+from .gradients import clip_gradients
 from .graphs import GraphedStep
 from .storage import EnvironmentSplit, StratifiedStorage
-from .symmetry import Mirror
+from .symmetry import Mirror, half_mirrored, half_replaced, passes, second_halves
 
 POLICY_METRICS = ("value", "surrogate", "entropy", "kl", "symmetry", "gradient_norm", "skipped")
 STUDENT_METRICS = ("latent", "load_balance", "largest_expert_share", "skipped")
@@ -263,9 +263,9 @@ class CTS(PPO):
         history = storage.student_history.flatten(0, 1)
         if mirror is not None:
             self._fill(self._mirrored_latent, lambda rows: self.actor.student_latent(mirror.history(history[rows]))[0])
-        for _ in range(settings.epochs):
+        for turned in passes(settings.epochs, alternate=settings.symmetry == "alternate"):
             for teacher, student in zip(teacher_rows, student_rows, strict=True):
-                self._policy_step(teacher, student)
+                self._policy_step(turned(teacher), turned(student))
 
         privileged = storage.observations["privileged"][:, storage.split.num_teacher :].flatten(0, 1)
         self._fill(self._targets, lambda rows: self.actor.teacher_latent(privileged[rows]))
@@ -273,9 +273,9 @@ class CTS(PPO):
             mirrored = mirror.privileged
             self._fill(self._mirrored_targets, lambda rows: self.actor.teacher_latent(mirrored(privileged[rows])))
         rows_in_history = storage.student_rows(student_rows)
-        for _ in range(settings.epochs):
+        for turned in passes(settings.epochs, alternate=settings.symmetry == "alternate"):
             for student in rows_in_history:
-                self._student_step(student)
+                self._student_step(turned(student))
         storage.clear()
         return self._report()
 
@@ -286,7 +286,7 @@ class CTS(PPO):
         policy = dict(zip(POLICY_METRICS, sums[: len(POLICY_METRICS)], strict=True))
         student = dict(zip(STUDENT_METRICS, sums[len(POLICY_METRICS) :], strict=True))
         skipped = policy.pop("skipped") + student.pop("skipped")
-        if self.mirror is None:
+        if self.mirror is None or self.configuration.symmetry == "alternate":  # no pair of images to compare
             del policy["symmetry"]
         if not self.has_experts:
             del student["load_balance"], student["largest_expert_share"]
@@ -333,10 +333,10 @@ class CTS(PPO):
             torch.distributed.all_reduce(kl, op=torch.distributed.ReduceOp.AVG)
         self._adapt_learning_rate(kl)
         if self.configuration.joint_gradient_clip:
-            norm, skipped = self._clip(self._policy_parameters)
+            norm, skipped = clip_gradients(self._policy_parameters, self.max_grad_norm)
         else:
-            norm, skipped = self._clip(self.actor.policy_parameters())
-            critic_norm, critic_skipped = self._clip(self.critic.parameters())
+            norm, skipped = clip_gradients(self.actor.policy_parameters(), self.max_grad_norm)
+            critic_norm, critic_skipped = clip_gradients(self.critic.parameters(), self.max_grad_norm)
             norm, skipped = torch.hypot(norm, critic_norm), torch.maximum(skipped, critic_skipped)
         self.optimizer.step()
         self._policy_metrics += torch.nan_to_num(torch.cat((metrics, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
@@ -358,7 +358,12 @@ class CTS(PPO):
         policy, privileged = [frames[rows] for rows in groups], [states[rows] for rows in groups]
         latent = student_latents[in_history]
         rows, copies = torch.cat(groups), 1
-        if mirror is not None:
+        alternate = mirror is not None and settings.symmetry == "alternate"
+        if mirror is not None and alternate:
+            policy = [half_mirrored(p, mirror.policy) for p in policy]
+            privileged = [half_mirrored(p, mirror.privileged) for p in privileged]
+            latent = half_replaced(latent, self._mirrored_latent[in_history])
+        elif mirror is not None:
             # Blocks: teacher, student, and their mirror images in the same order.
             policy += [mirror.policy(p) for p in policy]
             privileged += [mirror.privileged(p) for p in privileged]
@@ -384,12 +389,19 @@ class CTS(PPO):
         old_log_prob, returns = stored(storage.actions_log_prob).squeeze(-1), stored(storage.returns).squeeze(-1)
         old_values = stored(storage.values).squeeze(-1)
         distribution = self.actor.distribution
-        distribution.update(mean[:count])
-        old_mean, old_std = (stored(p) for p in storage.distribution_params)
-        kl = distribution.kl_divergence((old_mean, old_std), distribution.params).mean().detach()
+        old = [stored(p) for p in storage.distribution_params]
+        plain = mean[:count]
+        if alternate:  # how far the policy has moved is seen where it acted
+            *old, plain = (second_halves(p, len(teacher_rows)) for p in (*old, plain))
+        distribution.update(plain)
+        kl = distribution.kl_divergence(tuple(old), distribution.params).mean().detach()
         entropy = distribution.entropy.mean()
         symmetry = torch.zeros((), device=mean.device)
-        if mirror is not None:
+        if mirror is not None and alternate:
+            distribution.update(mean)
+            blocks = actions.split([len(teacher_rows), len(student_rows)])
+            actions = torch.cat([half_mirrored(block, mirror.action) for block in blocks])
+        elif mirror is not None:
             symmetry = (mean[count:] - mirror.action(mean[:count].detach())).square().mean()
         if settings.symmetry == "augment":
             # A mirrored sample counts as drawn from the mirrored policy, whose probability is that of the original.
@@ -422,7 +434,7 @@ class CTS(PPO):
         parameters = self.actor.student_parameters()
         if self.is_multi_gpu:
             reduce_gradients_in_buckets(parameters, self.gpu_world_size, self.grad_reduce_bucket_mb)
-        _, skipped = self._clip(parameters)
+        _, skipped = clip_gradients(parameters, self.max_grad_norm)
         self.student_optimizer.step()
         self._student_metrics += torch.nan_to_num(torch.cat((metrics, skipped[None])), 0.0, 0.0, 0.0)
 
@@ -432,7 +444,10 @@ class CTS(PPO):
         """
         history = self.storage.student_history.flatten(0, 1)[rows]
         target = self._targets[rows]
-        if self.mirror is not None and self.configuration.symmetry == "augment":
+        if self.mirror is not None and self.configuration.symmetry == "alternate":
+            history = half_mirrored(history, self.mirror.history)
+            target = half_replaced(target, self._mirrored_targets[rows])
+        elif self.mirror is not None and self.configuration.symmetry == "augment":
             history = torch.cat((history, self.mirror.history(history)))
             target = torch.cat((target, self._mirrored_targets[rows]))
         with self._autocast():
@@ -455,21 +470,6 @@ class CTS(PPO):
         slower, faster = (self._rate / 1.5).clamp(min=low), (self._rate * 1.5).clamp(max=high)
         rate = torch.where(kl > 2.0 * target, slower, torch.where((kl < 0.5 * target) & (kl > 0.0), faster, self._rate))
         self._rate.copy_(rate)
-
-    def _clip(self, parameters: Iterable[nn.Parameter]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Limit the joint gradient norm; gradients that are not finite become zero.
-
-        Returns:
-            The norm before, and 1.0 if the gradients were dropped, else 0.0; both ().
-        """
-        gradients = [p.grad for p in parameters if p.grad is not None]
-        norm = nn.utils.get_total_norm(gradients)
-        finite = torch.isfinite(norm)
-        factor = torch.where(finite, (self.max_grad_norm / (norm + 1e-6)).clamp(max=1.0), torch.zeros_like(norm))
-        torch._foreach_mul_(gradients, factor)
-        for gradient in gradients:
-            gradient.nan_to_num_(0.0, 0.0, 0.0)
-        return norm, (~finite).float()
 
     # Checkpoints
 

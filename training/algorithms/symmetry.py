@@ -7,7 +7,7 @@ joints that turn about the x axis (hip abduction) change sign.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -169,3 +169,28 @@ def build_mirror(
         privileged=MirrorMap.joined([VECTOR, frame, feet, joints, joints, mirror_grid(*scan_shape)]),
         action=joints,
     )
+
+
+def passes(count: int, *, alternate: bool) -> Iterator[Callable[[torch.Tensor], torch.Tensor]]:
+    """For each pass over the minibatches, the order in which it takes a minibatch's rows (B,): if half of them are mirrored, the
+    other half comes first in every second pass.
+    """
+    for number in range(count):
+        yield (lambda rows: rows.roll(len(rows) // 2)) if alternate and number % 2 else (lambda rows: rows)
+
+
+def half_mirrored(rows: torch.Tensor, mapping: MirrorMap) -> torch.Tensor:
+    """Rows (B, D) with the first half of them mirrored."""
+    half = len(rows) // 2
+    return torch.cat((mapping(rows[:half]), rows[half:]))
+
+
+def half_replaced(rows: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
+    """Rows (B, D) with the first half of them taken from ``images`` (B, D)."""
+    half = len(rows) // 2
+    return torch.cat((images[:half], rows[half:]))
+
+
+def second_halves(rows: torch.Tensor, first: int) -> torch.Tensor:
+    """What ``half_mirrored`` leaves as it is of two blocks one after the other, the first of which has ``first`` rows."""
+    return torch.cat([block[len(block) // 2 :] for block in (rows[:first], rows[first:])])
