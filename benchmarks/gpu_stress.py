@@ -13,6 +13,7 @@ trying out. ``--warm-up`` compiles the kernels before anything is timed, with th
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import logging
 import tempfile
@@ -24,12 +25,13 @@ from time import perf_counter
 from typing import Any
 
 import torch
-from gaitgauge.backends.base import Randomization
 from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge import lanes
+from gaitgauge.gauge.episodes import Episode, Record
+from gaitgauge.gauge.goals import TARGET
 from gaitgauge.gauge.lanes import LaneJob
 from gaitgauge.gauge.pipelines import Plan
-from gaitgauge.gauge.runner import LOOK_INTERVAL, EpisodeRunner
+from gaitgauge.gauge.runner import LOOK_INTERVAL, EpisodeRunner, Progress
 from gaitgauge.policy.base import Policy
 
 LINE_STEPS = 200
@@ -186,17 +188,37 @@ def summary(account: Account, began: float, ended: float) -> dict[str, Any]:
     }
 
 
-def compile_kernels(runner: EpisodeRunner) -> None:
-    """Take every kind of step once."""
-    backend = runner.backend
-    ones = torch.ones(backend.num_worlds, device=backend.device, dtype=backend.dtype)
-    backend.randomize(Randomization(friction=ones, base_mass_offset=0.0 * ones))
-    backend.step(None, worlds=ones > 0, substeps=1)
-    with torch.inference_mode():
-        runner._slots.advance(2)
-    if backend.device.type == "cuda":
-        torch.cuda.synchronize(backend.device)
-    backend.close()
+class Warming:
+    """An agenda with one walk on the first ground."""
+
+    def __init__(self, job: LaneJob) -> None:
+        terrain, level = job.terrains[0]
+        goals = tuple(goal.name for goal in job.suite.goals if goal.name != TARGET)
+        walk = {"terrain": terrain, "level": level, "friction": 0.5, "payload": 0.0, "seed": 0, "stage": "eval"}
+        self._waiting = [Episode(**walk, goals=goals)]  # type: ignore[arg-type]
+
+    def take(self, most: int, *, urgent: bool = False) -> list[Episode]:
+        """The walk, once."""
+        taken, self._waiting = ([], self._waiting) if urgent or not most else (self._waiting, [])
+        return taken
+
+    def finished(self, record: Record) -> tuple[()]:
+        """Nothing follows."""
+        return ()
+
+
+def compile_kernels(runner: EpisodeRunner, job: LaneJob) -> None:
+    """Play the beginning of a walk."""
+
+    def watch(progress: Progress) -> None:
+        if progress.control_steps >= 2 * runner._look_interval:
+            raise OutOfTimeError
+
+    with contextlib.suppress(OutOfTimeError):
+        runner.run(Warming(job), watch)
+    if runner.backend.device.type == "cuda":
+        torch.cuda.synchronize(runner.backend.device)
+    runner.backend.close()
 
 
 def run(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -208,7 +230,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
             job = replace(job, slots=arguments.slots)
         if arguments.warm_up:
             begun = perf_counter()
-            compile_kernels(plain(replace(job, slots=16), policy))
+            compile_kernels(plain(replace(job, slots=16), policy), job)
             print(f"warm-up {perf_counter() - begun:.1f} s", flush=True)
             excluded[0] += perf_counter() - begun
         runner = plain(job, policy)
