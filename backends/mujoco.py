@@ -211,7 +211,7 @@ class MujocoBackend(PhysicsBackend):
             return
         those = slice(None) if n == self.num_worlds else rows  # a slice gives views, which saves copies
         total = self.scene.physics.substeps if substeps is None else substeps
-        held, offset, limp = self._held[those], self._offset[those], self._limp[those]
+        held, offset, some_limp = self._held[those], self._offset[those], bool(self._limp[those].any())
         targets, waits = held, None
         if joint_targets is not None:
             targets = np.asarray(joint_targets.numpy(), dtype=np.float64)[those]
@@ -225,15 +225,16 @@ class MujocoBackend(PhysicsBackend):
         control[:] = (targets + offset)[:, None]
         if waits is not None:
             np.copyto(control, (held + offset)[:, None], where=waits[..., None])
-        if not limp.any():
-            self._play(rows, control, records)
-        else:
+        if some_limp:
             if waits is None:
                 waits = np.full((n, total), joint_targets is None)
-            records = self._play_some_limp(rows, control, limp, waits)
+            records = self._play_some_limp(rows, control, self._limp[those], waits)
+        else:
+            self._play(rows, control, records)
         if joint_targets is not None:  # a target that waits for the whole step acts from the next one on
             self._held[those] = targets
-            self._limp[those] = False
+            if some_limp:
+                self._limp[those] = False
         began = perf_counter()
         self._batch.forward(self._ids(rows), stage=_STAGE)
         self.engine_seconds += perf_counter() - began

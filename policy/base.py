@@ -63,7 +63,7 @@ def check_observation(observation: torch.Tensor, rows: int, contract: PolicyCont
         PolicyError: another shape; ``source`` is the policy's name in the message.
     """
     expected = (rows, contract.observation_width)
-    if tuple(observation.shape) != expected:
+    if observation.shape != expected:
         raise PolicyError(f"'{source}' takes observations of shape {expected}, not {tuple(observation.shape)}")
 
 

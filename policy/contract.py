@@ -11,6 +11,7 @@ import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 from ..robots.base import Robot
@@ -195,17 +196,17 @@ class PolicyContract:
         if not isinstance(self.provenance, Mapping):
             raise ContractError(f"contract field 'provenance' must be a table, not {self.provenance!r}")
 
-    @property
+    @cached_property
     def num_joints(self) -> int:
         """Number of joints, which is the width of an action."""
         return len(self.joint_names)
 
-    @property
+    @cached_property
     def frame_width(self) -> int:
         """Width of one observation frame."""
         return sum(TERM_WIDTH[t.name] or len(self.joint_names) for t in self.observation)
 
-    @property
+    @cached_property
     def observation_width(self) -> int:
         """Width of the network's input."""
         return self.frame_width * self.history.length

@@ -293,10 +293,10 @@ class NativeSession(PolicySession):
         with torch.no_grad():
             try:
                 if self._initial is None and rows is not None:
-                    some = checked_action(self._network(self._history[rows]), len(rows), self._contract, self._source)
-                    action = some.new_zeros(self._num_episodes, some.shape[1])
-                    action[rows] = some
-                elif self._initial is None:
+                    some = self._network(self._history.index_select(0, rows))
+                    some = checked_action(some, len(rows), self._contract, self._source)
+                    return some.new_zeros(self._num_episodes, some.shape[1]).index_copy_(0, rows, some)
+                if self._initial is None:
                     action = self._network(self._history)
                 else:
                     action, self._state = self._network(self._history, self._state)

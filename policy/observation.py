@@ -18,6 +18,7 @@ NOISE_TERMS = (
     "joint_position",
     "joint_velocity",
 )
+_NOISY = frozenset(NOISE_TERMS)
 
 
 class ObservationBuilder:
@@ -100,14 +101,14 @@ class ObservationBuilder:
             ContractError: noise for something that is not measured.
         """
         noise = noise or {}
-        if not noise.keys() <= set(NOISE_TERMS):
-            unknown = ", ".join(sorted(noise.keys() - set(NOISE_TERMS)))
+        if not noise.keys() <= _NOISY:
+            unknown = ", ".join(sorted(noise.keys() - _NOISY))
             raise ContractError(f"no noise can be added to '{unknown}'; choose from: {', '.join(NOISE_TERMS)}")
-        blocks = []
-        for term in self.contract.observation:
-            value = self._value(term.name, state, command, last_action, noise.get(term.name))
-            blocks.append(value.to(torch.float32))
-        frame = torch.cat(blocks, dim=-1) * self._scale
+        blocks = [
+            self._value(term.name, state, command, last_action, noise.get(term.name))
+            for term in self.contract.observation
+        ]
+        frame = torch.cat(blocks, dim=-1).to(torch.float32) * self._scale
         if self._limit is not None:
             frame = torch.clamp(frame, -self._limit, self._limit)
         if self.contract.history.length == 1:
