@@ -105,6 +105,7 @@ def _lower_halves(values: Array, codes: NDArray[np.intp], draws: NDArray[np.int6
     """
     order = np.argsort(values, kind="stable")
     values, codes = values[order], codes[order]
+    times = draws.astype(np.float64)
     one_hot = codes[:, None] == np.arange(draws.shape[1])
     start = np.zeros((1, draws.shape[1]))
     counts = np.concatenate((start, np.cumsum(one_hot, axis=0)))
@@ -115,12 +116,17 @@ def _lower_halves(values: Array, codes: NDArray[np.intp], draws: NDArray[np.int6
     low, high = np.ones(len(draws), dtype=np.int64), np.full(len(draws), len(values), dtype=np.int64)
     while (low < high).any():
         middle = (low + high) // 2
-        enough = (draws * counts[middle]).sum(1) >= half
+        enough = _row_products(times, counts[middle]) >= half
         low, high = np.where(enough, low, middle + 1), np.where(enough, middle, high)
     last = high - 1
-    before = (draws * counts[last]).sum(1)
-    lower = (draws * sums[last]).sum(1) + (half - before) * (values[last] if len(values) else 0.0)
+    before = _row_products(times, counts[last])
+    lower = (times * sums[last]).sum(1) + (half - before) * (values[last] if len(values) else 0.0)
     return np.where(total > 0, lower / half, 0.0)
+
+
+def _row_products(first: Array, second: Array) -> Array:
+    """Inner products of the rows of two tables of whole numbers, (B, L) both: exact in whatever order they are summed."""
+    return np.einsum("bl,bl->b", first, second)
 
 
 def bootstrap_environment(runs: Sequence[Array], resamples: int, *, name: str) -> Array:
