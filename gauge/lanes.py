@@ -7,6 +7,7 @@ happens in an episode does not depend on the lane that plays it. Plan, store and
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import pickle
 import signal
@@ -180,7 +181,7 @@ class _Crew:
                 kind, *content = self._receive(lane)
                 if kind == "take":
                     most, urgent = content
-                    self._give(lane, self._share(plan, lane, most, urgent))
+                    self._give(lane, self._share(plan, lane, most, urgent), waiting=any(plan.waiting))
                 elif kind == "finished":
                     record = content[0]
                     plan.finished(record)
@@ -216,10 +217,10 @@ class _Crew:
             ) from error
         return message
 
-    def _give(self, lane: int, episodes: list[Episode]) -> None:
-        """Hand episodes, or the news that there are none, to a lane."""
+    def _give(self, lane: int, episodes: list[Episode], *, waiting: bool = False) -> None:
+        """Hand episodes to a lane, if there are any, and say whether any more wait."""
         self._tests[lane] += sum(e.stage == "search" for e in episodes)
-        self._connections[lane].send(episodes)
+        self._connections[lane].send((episodes, waiting))
 
     def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
         """Episodes for a lane that asks: level tests first, no more than its part of all that are at work or wait."""
@@ -240,8 +241,8 @@ class _Crew:
             self._give(lane, episodes)
             self._idle.discard(lane)
         if len(self._idle) == len(self._connections):
-            for connection in self._connections:
-                connection.send([])
+            for lane in self._idle:
+                self._give(lane, [])
             self._idle.clear()
 
 
@@ -265,8 +266,8 @@ class _RemoteAgenda:
         if now < self._nothing_until:
             return []
         self._connection.send(("take", most, urgent))
-        episodes: list[Episode] = self._connection.recv()
-        if not episodes and not urgent:
+        episodes, waiting = self._receive()
+        if not episodes and not (urgent and waiting):
             self._nothing_until = now + _PATIENCE
         return episodes
 
@@ -279,9 +280,14 @@ class _RemoteAgenda:
     def wait(self) -> bool:
         """Wait until there is something to play; False once nothing will come."""
         self._connection.send(("idle",))
-        self._given = self._connection.recv()
+        self._given, _ = self._receive()
         self._nothing_until = 0.0
         return bool(self._given)
+
+    def _receive(self) -> tuple[list[Episode], bool]:
+        """Episodes, and whether any more wait."""
+        answer: tuple[list[Episode], bool] = self._connection.recv()
+        return answer
 
     def report(self, progress: Any) -> None:
         """Tell now and then how far the runner is."""
@@ -306,6 +312,7 @@ def run_lane(job: LaneJob, connection: Connection, inherited: Sequence[Connectio
     try:
         try:
             torch.set_num_threads(1)
+            gc.freeze()  # what the lane has from its parent is not looked through for garbage again
             runner = build_runner(job, load_policy(job.policy, job.robot))
             agenda = _RemoteAgenda(connection)
             while agenda.wait():
