@@ -47,6 +47,18 @@ class CheckpointedRunner(OnPolicyRunner):
     _submitted: int
     _fresh: bool
 
+    def _configure_multi_gpu(self) -> None:
+        """Join the processes that torchrun started; on the CPU too, where rsl_rl would ask for a GPU."""
+        world = int(os.environ.get("WORLD_SIZE", "1"))
+        if world == 1 or torch.device(self.device).type == "cuda":
+            super()._configure_multi_gpu()
+            return
+        self.gpu_world_size, self.is_distributed = world, True
+        self.gpu_global_rank, self.gpu_local_rank = int(os.environ["RANK"]), int(os.environ["LOCAL_RANK"])
+        ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank, "world_size": world}
+        self.cfg["multi_gpu"] = ranks
+        torch.distributed.init_process_group(backend="gloo", rank=self.gpu_global_rank, world_size=world)
+
     def stored_network(self) -> StoredNetwork:
         """The student as it is deployed."""
         actor = self.alg.get_policy()

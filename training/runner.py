@@ -171,6 +171,8 @@ class TrainingRunner(CheckpointedRunner):
             self.scorer.close()
         if self.logger.writer is not None:
             self.logger.close()
+        if self.is_distributed and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
 
     def _iterate(self, obs: TensorDict, start: int, total: int) -> TensorDict:
         """One rollout and one update; returns the next observations."""

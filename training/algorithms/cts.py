@@ -329,8 +329,8 @@ class CTS(PPO):
         kl = metrics[POLICY_METRICS.index("kl")]
         if self.is_multi_gpu:
             reduce_gradients_in_buckets(self._policy_parameters, self.gpu_world_size, self.grad_reduce_bucket_mb)
-            kl = kl.clone()
-            torch.distributed.all_reduce(kl, op=torch.distributed.ReduceOp.AVG)
+            kl = kl / self.gpu_world_size
+            torch.distributed.all_reduce(kl)
         self._adapt_learning_rate(kl)
         if self.configuration.joint_gradient_clip:
             norm, skipped = clip_gradients(self._policy_parameters, self.max_grad_norm)

@@ -1,0 +1,98 @@
+"""Training in two processes of one machine, as torchrun starts them; on the CPU."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+SMALL = (
+    "training.algorithm.minibatches=1",
+    "training.algorithm.epochs=2",
+    "training.run.steps_per_iteration=4",
+    "training.run.save_interval=2",
+    "training.network.actor_hidden=8",
+    "training.network.critic_hidden=8",
+    "training.network.teacher_hidden=8",
+    "training.network.student_hidden=8",
+)
+TRAIN = (
+    *("-m", "gaitgauge.cli.main", "train", "go2-flat", "--backend", "fake", "--device", "cpu", "--num-envs", "8"),
+    *("--no-score", "--seed", "5", *SMALL),
+)
+SCRIPT = """
+import torch
+from gaitgauge.training.runner import TrainingRunner
+from toy_training import ToyEnv, toy_configuration, toy_contract
+import os
+rank = int(os.environ["RANK"])
+torch.manual_seed(rank)
+runner = TrainingRunner(ToyEnv(seed=rank), toy_configuration(), contract=toy_contract(), task="toy")
+runner.learn(3)
+mine = torch.cat([p.detach().flatten() for p in (*runner.alg.actor.parameters(), *runner.alg.critic.parameters())])
+both = [torch.zeros_like(mine) for _ in range(2)]
+torch.distributed.all_gather(both, mine)
+seen = [torch.zeros_like(runner.env.command) for _ in range(2)]
+torch.distributed.all_gather(seen, runner.env.command)
+assert not torch.equal(*seen), "both processes saw the same"
+assert torch.equal(*both), "the networks drifted apart"
+assert runner.alg.learning_rate != 1e-3
+runner.close()
+"""
+
+
+def start(folder: Path, *command: str) -> subprocess.Popen[str]:
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *command]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
+    return subprocess.Popen(
+        launcher, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+@pytest.mark.slow
+def test_gradients_are_averaged(tmp_path):
+    (tmp_path / "learn.py").write_text(SCRIPT)
+    process = start(tmp_path, "learn.py")
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+
+
+@pytest.mark.slow
+def test_one_process_speaks_and_both_are_kept(tmp_path):
+    process = start(tmp_path, *TRAIN, "--iterations", "2")
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    assert output.count("run directory") == 1
+    (run,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    assert len(list(run.glob("events.out.tfevents.*"))) == 1
+    assert sorted(f.name for f in run.glob("model_*.pt")) == ["model_2.pt", "model_2.rank1.pt"]
+    first, second = (torch.load(run / f"model_2{end}.pt", weights_only=True) for end in ("", ".rank1"))
+    assert first["training"]["log"]["total_steps"] == 2 * 4 * 8 * 2
+    mine, other = first["training"]["environment"]["bodies"], second["environment"]["bodies"]
+    assert not torch.equal(mine["friction"], other["friction"])
+    resumed = start(tmp_path, *TRAIN, "--resume", "latest", "--iterations", "3")
+    output, _ = resumed.communicate(timeout=300)
+    assert resumed.returncode == 0, output
+    assert "episodes start anew" not in output
+    assert (run / "model_3.rank1.pt").is_file()
+
+
+@pytest.mark.slow
+def test_a_signal_ends_both_with_a_checkpoint(tmp_path):
+    process = start(tmp_path, *TRAIN, "--iterations", "1000000")
+    deadline = time.monotonic() + 120.0
+    while not list(tmp_path.rglob("model_2.pt")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=60)
+    assert "--resume" in output, output
+    (run,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    description = json.loads((run / "run.json").read_text())
+    assert description["outcome"] == "signal"
+    last = run / f"model_{description['iteration']}.pt"
+    assert last.is_file() and last.with_suffix(".rank1.pt").is_file()
