@@ -102,13 +102,12 @@ class EpisodeRunner:
             while self._fill(agenda):
                 self._slots.advance(self._look_interval)
                 self.control_steps += self._look_interval
-                # a GPU is at work by now: files are written and searches folded meanwhile
-                self._report(agenda)
-                self._look()
                 if self._at_once:
-                    self._report(agenda)
-                if watch is not None:
-                    watch(Progress(self))
+                    self._look()
+                    self._report(agenda, watch)
+                else:  # a GPU is at work by now: files are written and searches folded meanwhile
+                    self._report(agenda, watch)
+                    self._look()
 
     def ages(self) -> dict[Episode, int]:
         """Episodes with segments in the slots, and the control steps played of each, ended segments included."""
@@ -156,8 +155,8 @@ class EpisodeRunner:
         self._complete += records
         self._leave([slot for slot, segment in enumerate(self._segment) if segment in outcomes or segment in hidden])
 
-    def _report(self, agenda: Agenda) -> None:
-        """Hand complete episodes to the agenda, and drop what it does not need any more."""
+    def _report(self, agenda: Agenda, watch: Callable[[Progress], None] | None = None) -> None:
+        """Hand complete episodes to the agenda, drop what it does not need any more, and tell how far the runner is."""
         needless: set[Episode] = set()
         for record in self._complete:
             needless.update(agenda.finished(record))
@@ -166,6 +165,8 @@ class EpisodeRunner:
             self._queue.drop(needless)
             seated = enumerate(self._segment)
             self._leave([slot for slot, segment in seated if segment is not None and segment.episode in needless])
+        if watch is not None:
+            watch(Progress(self))
 
     def _leave(self, slots: list[int]) -> None:
         """Free slots."""

@@ -163,7 +163,11 @@ class Slots:
             return
         mask = self._seats.mask(list(wanted))
         values = torch.tensor([wanted[s] for s in sorted(wanted)], device=self._device, dtype=self._dtype)
-        self.backend.randomize(Randomization(friction=values[:, 0], base_mass_offset=values[:, 1]), mask)
+        # a mass changes constants that an engine has to work out anew
+        fitted = [self._fitted[slot] for slot in wanted]
+        heavier = any(old is None or old[1] != new[1] for old, new in zip(fitted, wanted.values(), strict=True))
+        change = Randomization(friction=values[:, 0], base_mass_offset=values[:, 1] if heavier else None)
+        self.backend.randomize(change, mask)
         for slot, pair in wanted.items():
             self._fitted[slot] = pair
 
