@@ -36,6 +36,8 @@ _REPORT_INTERVAL = 0.2
 """Time between a lane's reports on how far it is [s]."""
 _PATIENCE = 0.05
 """Time for which a lane at work does not ask again after it was told that nothing waits [s]."""
+_TOGETHER = 8
+"""Level tests that are left to one lane: policies are run on eight rows or more, and so few worlds are mostly the loop's cost."""
 # a forked lane has all modules at once, which saves importing torch; elsewhere system libraries do not bear being forked
 if sys.platform == "linux":
     _CONTEXT = multiprocessing.get_context("fork")
@@ -223,12 +225,15 @@ class _Crew:
         self._connections[lane].send((episodes, waiting))
 
     def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
-        """Episodes for a lane that asks: level tests first, no more than its part of all that are at work or wait."""
+        """Episodes for a lane that asks: level tests first, a few together or its part of all that are at work or wait.
+
+        Others wait for level tests, so that a lane with such does not slow them with quality while another has none.
+        """
         lanes = len(self._connections)
         tests, quality = plan.waiting
-        part = -(-(sum(self._tests) + tests) // lanes) - self._tests[lane]
+        part = max(-(-(sum(self._tests) + tests) // lanes), _TOGETHER) - self._tests[lane]
         episodes = plan.take(min(most, max(part, 0)), urgent=True)
-        if episodes or urgent:
+        if episodes or urgent or (self._tests[lane] and not all(self._tests)):
             return episodes
         return plan.take_quality(min(most, -(-quality // lanes)))
 
