@@ -288,6 +288,7 @@ def play(
     backend: Annotated[str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.")] = "mujoco",
     device: Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")] = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,
+    gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
 ) -> None:
     """Watch a policy walk: in MuJoCo's viewer, in a browser, or in a video file without a display."""
     from .play import run_play
@@ -305,6 +306,7 @@ def play(
         friction=friction,
         seed=seed,
         port=port,
+        gamepad=gamepad,
     )
 
 

@@ -9,6 +9,7 @@ import mujoco.viewer
 from rich.console import Console
 
 from .errors import UserError
+from .gamepad import Gamepad
 from .play_session import Command, PlaySession
 from .scenery import COLLISION_GROUP, show, visual_model
 
@@ -62,8 +63,8 @@ class Keyboard:
             self.command = (forward, lateral, yaw)
 
 
-def watch(session: PlaySession, command: Command | None, seconds: float | None) -> None:
-    """Open the window; returns when it is closed or the time is over.
+def watch(session: PlaySession, command: Command | None, seconds: float | None, gamepad: Gamepad | None = None) -> None:
+    """Open the window; returns when it is closed or the time is over. Keys and gamepad steer, the last to act wins.
 
     Raises:
         UserError: the window cannot be opened.
@@ -90,6 +91,8 @@ def watch(session: PlaySession, command: Command | None, seconds: float | None) 
             if keyboard.restart:
                 keyboard.restart = False
                 session.reset()
+            if gamepad is not None and (asked := gamepad.moved()) is not None:
+                keyboard.command = told = asked  # not told: it changes with every step
             session.step(keyboard.command or session.autopilot())
             with viewer.lock():
                 show(model, data, session.position())

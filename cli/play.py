@@ -39,6 +39,7 @@ def run_play(
     friction: float,
     seed: int,
     port: int,
+    gamepad: bool = False,
 ) -> None:
     """Load, build, and hand over to the viewer.
 
@@ -49,6 +50,10 @@ def run_play(
     chosen = _viewer(viewer, out)
     if seconds is not None and not _SHORTEST <= seconds <= _LONGEST:
         raise UserError(f"--seconds is {seconds:g}; give {_SHORTEST:g} to {_LONGEST:g} seconds")
+    if gamepad and chosen != "native":
+        raise UserError(
+            f"--gamepad steers the window and the viewer is '{chosen}'; add --viewer native, or leave it out"
+        )
     if not 0.0 < friction <= 10.0:
         raise UserError(f"--friction is {friction:g}; give a coefficient above 0 and at most 10")
     video = out or Path("play.mp4")
@@ -84,9 +89,15 @@ def run_play(
         if chosen == "video":
             _record(session, video, seconds or _VIDEO_SECONDS, command)
         elif chosen == "native":
+            from .gamepad import Gamepad
             from .native_viewer import watch
 
-            watch(session, command, seconds)
+            pad = Gamepad(session.limits) if gamepad else None
+            try:
+                watch(session, command, seconds, pad)
+            finally:
+                if pad is not None:
+                    pad.close()
         else:
             from .browser_viewer import serve
 

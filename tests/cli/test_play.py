@@ -4,6 +4,7 @@ import math
 import socket
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -149,6 +150,59 @@ def test_keys():
     assert not keyboard.restart
     keyboard.press(260)
     assert keyboard.restart
+
+
+# ---- gamepad --------------------------------------------------------------------------------------------------------
+
+
+class FakePads:
+    """What ``Gamepad`` uses of pygame, with sticks to be set by hand."""
+
+    CONTROLLER_AXIS_LEFTX, CONTROLLER_AXIS_LEFTY, CONTROLLER_AXIS_RIGHTX = 0, 1, 2
+
+    def __init__(self, pads):
+        self.sticks, self.ended = {0: 0, 1: 0, 2: 0}, False
+        self.display = SimpleNamespace(init=lambda: None)
+        self.event = SimpleNamespace(pump=lambda: None)
+        pad = SimpleNamespace(get_axis=lambda axis: self.sticks[axis])
+        controller = SimpleNamespace(
+            init=lambda: None, get_count=lambda: len(pads), is_controller=lambda i: pads[i], Controller=lambda i: pad
+        )
+        self._sdl2 = SimpleNamespace(controller=controller)
+
+    def quit(self):
+        self.ended = True
+
+
+def test_sticks():
+    from gaitgauge.cli.gamepad import Gamepad
+
+    driver = FakePads([False, True])
+    pad = Gamepad((2.0, 1.0, 1.5), driver)
+    assert pad.moved() is None, "keys act until a stick moves"
+    driver.sticks |= {0: 3000, 1: -32768, 2: 32767}  # a worn stick; up; right
+    assert pad.moved() == (2.0, 0.0, -1.5)
+    assert pad.moved() is None
+    driver.sticks |= {0: -32768, 1: 0, 2: 0}
+    assert pad.moved() == (0.0, 1.0, 0.0)
+    driver.sticks[0] = -round(0.56 * 32767)
+    assert pad.moved()[1] == pytest.approx(0.5, abs=1e-3)
+    pad.close()
+    assert driver.ended
+
+
+def test_no_gamepad_and_no_extra(refused, policy, monkeypatch):
+    from gaitgauge.cli.errors import UserError
+    from gaitgauge.cli.gamepad import Gamepad
+
+    driver = FakePads([False])
+    with pytest.raises(UserError, match="there is no gamepad"):
+        Gamepad((1.0, 1.0, 1.0), driver)
+    assert driver.ended
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(UserError, match=r"gaitgauge\[gamepad\]"):
+        Gamepad((1.0, 1.0, 1.0))
+    assert "--viewer native" in refused("play", policy, "--viewer", "viser", "--gamepad")
 
 
 # ---- browser --------------------------------------------------------------------------------------------------------
