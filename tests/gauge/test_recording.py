@@ -5,12 +5,25 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeScript
+from gaitgauge.backends import Scene
+from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge import recording
 from gaitgauge.gauge.recording import StepRecording
 from gaitgauge.gauge.runner import EpisodeRunner
 from gaitgauge.policy.base import PolicyError
-from scripted_gauge import DIAGONAL, MAXIMUM, TARGET, Agenda, ScriptedPolicy, episode, fake, ground, moving, short_suite
+from scripted_gauge import (
+    DIAGONAL,
+    GO2,
+    MAXIMUM,
+    TARGET,
+    Agenda,
+    ScriptedPolicy,
+    episode,
+    fake,
+    ground,
+    moving,
+    short_suite,
+)
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -177,3 +190,28 @@ def test_an_action_that_is_no_number_is_named_at_the_next_look(interval, record,
             act=act,
             script=FakeScript(motion=moving()),
         )
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", [REFERENCE, OWN])
+def test_a_gpu_replays_what_it_recorded(name):
+    """An engine without physics, so that nothing but recording can make a difference."""
+    suite = short_suite(name)
+    suite = replace(suite, metrics=replace(suite.metrics, interval=2))
+    scene = Scene(
+        robot=GO2,
+        parameters=GO2.parameters[suite.parameters],
+        terrains=(ground((0.25, 0.0, 0.4)),),
+        terrain_index=(0,) * 5,
+        physics=suite.physics,
+    )
+
+    def outcome(capture):
+        backend = FakeBackend(scene, device="cuda", script=FakeScript(motion=swaying))
+        agenda = Agenda([episode(DIAGONAL, MAXIMUM), *(episode(TARGET, stage="search", seed=s) for s in range(3))])
+        runner = EpisodeRunner(suite, ScriptedPolicy(gait), backend, lambda e: 0, look_interval=4, capture=capture)
+        runner.run(agenda)
+        assert runner._slots._recording.enabled == capture
+        return sorted(agenda.records, key=lambda r: r.episode)
+
+    assert_equal(outcome(False), outcome(True))
