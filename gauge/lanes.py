@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Collection, Sequence
+from ctypes import c_longlong
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -34,8 +35,6 @@ from .suite import Suite
 
 _REPORT_INTERVAL = 0.2
 """Time between a lane's reports on how far it is [s]."""
-_PATIENCE = 0.05
-"""Time for which a lane at work does not ask again after it was told that nothing waits [s]."""
 _TOGETHER = 8
 """Level tests that are left to one lane: policies are run on eight rows or more, and so few worlds are mostly the loop's cost."""
 # a forked lane has all modules at once, which saves importing torch; elsewhere system libraries do not bear being forked
@@ -150,6 +149,8 @@ class _Crew:
         self._connections: list[Connection] = []
         self._idle: set[int] = set()
         self._tests = [0] * lanes  # level tests that each lane has at work
+        # how often what there is to take has changed: lanes look at it in every control step, and ask only when it has
+        self._changes = _CONTEXT.RawValue("q", 0)
         self._progress = LaneProgress(lanes)
         try:
             for lane in range(lanes):
@@ -157,7 +158,9 @@ class _Crew:
                 self._connections.append(ours)
                 with theirs:
                     parents = tuple(self._connections)
-                    process = _CONTEXT.Process(target=run_lane, args=(job, theirs, parents), name=f"lane-{lane}")
+                    process = _CONTEXT.Process(
+                        target=run_lane, args=(job, theirs, self._changes, parents), name=f"lane-{lane}"
+                    )
                     process.start()
                     self._processes.append(process)
         except BaseException:
@@ -188,6 +191,7 @@ class _Crew:
                     record = content[0]
                     plan.finished(record)
                     self._tests[lane] -= record.episode.stage == "search"
+                    self._changes.value += 1
                 elif kind == "idle":
                     self._idle.add(lane)
                 elif kind == "progress":
@@ -222,6 +226,7 @@ class _Crew:
     def _give(self, lane: int, episodes: list[Episode], *, waiting: bool = False) -> None:
         """Hand episodes to a lane, if there are any, and say whether any more wait."""
         self._tests[lane] += sum(e.stage == "search" for e in episodes)
+        self._changes.value += bool(episodes)
         self._connections[lane].send((episodes, waiting))
 
     def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
@@ -257,36 +262,37 @@ class _Crew:
 class _RemoteAgenda:
     """The parent's plan, as a lane sees it (see ``segments.Agenda``)."""
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
+    def __init__(self, connection: Connection, changes: c_longlong) -> None:
+        """``changes`` counts how often what there is to take has changed."""
+        self._connection, self._changes = connection, changes
         self._given: list[Episode] = []
-        self._nothing_until = 0.0
+        self._nothing_at = -1  # the count at which there was nothing to take
         self._next_report = 0.0
 
     def take(self, most: int, *, urgent: bool = False) -> Sequence[Episode]:
         """Episodes that can start now."""
         if self._given and most > 0 and not urgent:
             return [self._given.pop(0)]
-        now = time.monotonic()
-        if now < self._nothing_until:
+        changes = self._changes.value
+        if changes == self._nothing_at:
             return []
         self._connection.send(("take", most, urgent))
         episodes, waiting = self._receive()
         if not episodes and not (urgent and waiting):
-            self._nothing_until = now + _PATIENCE
+            self._nothing_at = changes
         return episodes
 
     def finished(self, record: Record) -> Collection[Episode]:
         """Hand back a record; more episodes may follow from it."""
         self._connection.send(("finished", record))
-        self._nothing_until = 0.0
+        self._nothing_at = -1
         return ()  # lanes search step by step, where all that is played is needed
 
     def wait(self) -> bool:
         """Wait until there is something to play; False once nothing will come."""
         self._connection.send(("idle",))
         self._given, _ = self._receive()
-        self._nothing_until = 0.0
+        self._nothing_at = -1
         return bool(self._given)
 
     def _receive(self) -> tuple[list[Episode], bool]:
@@ -302,12 +308,13 @@ class _RemoteAgenda:
             self._connection.send(("progress", progress.control_steps, progress.physics_steps, progress.active()))
 
 
-def run_lane(job: LaneJob, connection: Connection, inherited: Sequence[Connection]) -> None:
+def run_lane(job: LaneJob, connection: Connection, changes: c_longlong, inherited: Sequence[Connection]) -> None:
     """A lane's whole life.
 
     Args:
         job: what it plays with.
         connection: to its parent.
+        changes: see ``_RemoteAgenda``.
         inherited: the parent's ends of all connections; while any process holds one, its lane would not notice that the
             parent is gone.
     """
@@ -319,7 +326,7 @@ def run_lane(job: LaneJob, connection: Connection, inherited: Sequence[Connectio
             torch.set_num_threads(1)
             gc.freeze()  # what the lane has from its parent is not looked through for garbage again
             runner = build_runner(job, load_policy(job.policy, job.robot))
-            agenda = _RemoteAgenda(connection)
+            agenda = _RemoteAgenda(connection, changes)
             while agenda.wait():
                 runner.run(agenda, agenda.report)
             effort = Effort(physics_steps=runner.physics_steps, engine_seconds=runner.backend.engine_seconds)
