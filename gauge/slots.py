@@ -81,7 +81,7 @@ class Slots:
         self._fitted: list[tuple[float, float] | None] = [None] * k
         self._terrain = torch.zeros(k, device=device, dtype=torch.int64)
         self._rows_to_play: torch.Tensor | None = None
-        self._any_target = not looks
+        self._any_target, self._any_sampled = not looks, not looks
         # what a control step is about
         self._nobody, self._nothing = torch.zeros_like(self._seats.active), torch.zeros_like(self._seats.tick)
         self._whole_step = self._nothing
@@ -135,7 +135,7 @@ class Slots:
         mask = seats.mask(sorted(self._back))
         seats.active |= mask
         if self._looks and self._changed:
-            self._any_target = targets
+            self._any_target, self._any_sampled = targets, bool((seats.sampled & seats.active).any())
             self._whole_step = seats.active * self._substeps
             self._rows_to_play = self._rows()
         self._changed = False
@@ -290,11 +290,13 @@ class Slots:
         self._check_action()
         if self._refused:
             return
-        interval = self.suite.metrics.interval
         seats.played += seats.active
-        ahead = interval - seats.tick % interval
-        self._due = seats.active & seats.sampled & (ahead <= self._substeps)
-        self._sample_at = ahead * self._due
+        self._due, self._sample_at = self._nobody, self._nothing
+        if self._any_sampled:
+            interval = self.suite.metrics.interval
+            ahead = interval - seats.tick % interval
+            self._due = seats.active & seats.sampled & (ahead <= self._substeps)
+            self._sample_at = ahead * self._due
         self._targets = self._builder.targets(self._action)
 
     def _check_action(self) -> None:
@@ -321,12 +323,13 @@ class Slots:
         fall, restart, ran = self._events(due, self._sample_at)
         seats.tick += ran
         seats.steps += ran
-        if fall is not self._nobody:
+        if self._any_sampled and fall is not self._nobody:
             due = due & (self._sample_at <= ran)
-        if not self._looks or bool(due.any()):
+        if not self._looks or (self._any_sampled and bool(due.any())):
             keep = due if self.suite.settling.sampled else due & commanded
             self._table.write(self.backend.sample, due, keep, self._command)
-        self._table.end_step(state, active)
+        if self._any_sampled:
+            self._table.end_step(state, active)
         if fall is not self._nobody:
             self._fall(fall, commanded, ran)
         if self._leaving is not self._nobody:

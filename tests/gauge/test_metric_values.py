@@ -22,7 +22,7 @@ from gaitgauge.gauge.metrics import (
     torque_smoothness,
     zmp_margin,
 )
-from gaitgauge.gauge.runner import GRAVITY
+from gaitgauge.gauge.slots import GRAVITY
 from gaitgauge.gauge.suite import SuiteError, load_suite
 from gaitgauge.robots import JointParameters, Robot
 from gaitgauge.robots.geometry import stance_span, total_mass
