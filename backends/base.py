@@ -235,6 +235,9 @@ class PhysicsBackend(ABC):
     """Whether ``state`` is the same tensors for good, numbers in float32, which every call changes in place."""
     engine_seconds: float | None = None
     """Wall-clock time spent inside the engine's own stepping so far [s]; None where it is not measured."""
+    eventful: bool = True
+    """False where the engine knows that ``tilt_substep``, ``penetration_substep``, ``diverged`` and ``overflowed`` are zero in
+    all worlds of the last step, so that nobody has to look."""
 
     @classmethod
     @abstractmethod

@@ -238,8 +238,10 @@ class MujocoBackend(PhysicsBackend):
         began = perf_counter()
         self._batch.forward(self._ids(rows), stage=_STAGE)
         self.engine_seconds += perf_counter() - began
-        self._watch(those, records)
+        seen = self._watch(those, records)
         self._flag(rows)
+        flags = self._state.flags
+        self.eventful = seen or bool(flags["diverged"][those].any() or flags["overflowed"][those].any())
         self._state.renew(those)
         if sample_at is not None:
             at = sample_at.numpy()[those]
@@ -297,17 +299,23 @@ class MujocoBackend(PhysicsBackend):
             parts.append({name: array.copy() for name, array in records.items()})
         return {name: np.concatenate([p[name] for p in parts], axis=1) for name in RECORDED}
 
-    def _watch(self, those: slice | NDArray[np.int64], records: Records) -> None:
-        """Record the first substep at which a watched limit was exceeded."""
-        physics, flags = self.scene.physics, self._state.flags
+    def _watch(self, those: slice | NDArray[np.int64], records: Records) -> bool:
+        """Record the first substep at which a watched limit was exceeded; returns whether any was."""
+        physics, seen = self.scene.physics, {}
         if physics.watch_tilt is not None:
             qpos = records["qpos"]
-            over = qpos[:, :, 4] ** 2 + qpos[:, :, 5] ** 2 > self._tilt_bound
-            flags["tilt_substep"][those] = _first(over) if over.any() else 0
+            seen["tilt_substep"] = qpos[:, :, 4] ** 2 + qpos[:, :, 5] ** 2 > self._tilt_bound
         if self._deep is not None:
             # no contact reads 0
-            over = records["sensordata"][:, :, self._deep] < -float(physics.watch_penetration or 0.0)
-            flags["penetration_substep"][those] = _first(over) if over.any() else 0
+            seen["penetration_substep"] = records["sensordata"][:, :, self._deep] < -float(
+                physics.watch_penetration or 0.0
+            )
+        exceeded = False
+        for name, over in seen.items():
+            some = bool(over.any())
+            self._state.flags[name][those] = _first(over) if some else 0
+            exceeded |= some
+        return exceeded
 
     def _warning_counts(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Number of MuJoCo's invalid-state and buffer-full warnings so far, (rows, 2)."""

@@ -236,7 +236,8 @@ class _Crew:
         """
         lanes = len(self._connections)
         tests, quality = plan.waiting
-        part = max(-(-(sum(self._tests) + tests) // lanes), _TOGETHER) - self._tests[lane]
+        together = 1 if self._idle else _TOGETHER
+        part = max(-(-(sum(self._tests) + tests) // lanes), together) - self._tests[lane]
         episodes = plan.take(min(most, max(part, 0)), urgent=True)
         if episodes or urgent or (self._tests[lane] and not all(self._tests)):
             return episodes

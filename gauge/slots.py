@@ -349,6 +349,8 @@ class Slots:
         seats = self._seats
         state, last, active = self.backend.state, self._substeps, seats.active
         deepens = self.rules.restarts
+        if self._looks and not self.backend.eventful:
+            return self._nobody, self._nobody, self._whole_step
         if self._looks:
             trouble = state.tilt_substep + state.diverged + state.overflowed
             if deepens:

@@ -1,6 +1,6 @@
 """The CPU engine's own promises: what happens in a world does not depend on which worlds are stepped along with it."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -69,6 +69,31 @@ def test_a_world_moves_alike_in_any_company(scene: Scene, substeps: int | None, 
                     assert torch.equal(here, there), f"sample.{name} of world {world} after step {step}"
         tilted |= bool(together.state.tilt_substep.any())
     assert tilted
+
+
+@pytest.mark.parametrize("cause", ["tilt", "penetration", "target"])
+def test_a_step_is_eventful_exactly_where_a_flag_is_set(scene: Scene, cause: str):
+    physics = PhysicsOptions(watch_tilt=0.5, watch_penetration=0.01)
+    backend = MujocoBackend(replace(scene, terrains=(make_terrain("wave", 1),), physics=physics))
+    pose = torch.tensor(scene.robot.default_joint_position, dtype=torch.float64).repeat(WORLDS, 1)
+    high = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64).repeat(WORLDS, 1)
+    upright = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(WORLDS, 1)
+    backend.reset(base_position=high, base_quaternion=upright, held_target=pose)
+    backend.step(pose)
+    assert not backend.eventful
+    if cause == "tilt":
+        upright[2] = torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])
+    elif cause == "penetration":
+        high[2, 2] = 0.1
+    else:
+        pose[2, 3] = torch.nan
+    backend.reset(base_position=high, base_quaternion=upright)
+    backend.step(pose)
+    assert backend.eventful
+    pose[2, 3] = 0.0
+    others = torch.arange(WORLDS) != 2
+    backend.step(pose, worlds=others)
+    assert not backend.eventful, "the world with the event did not step"
 
 
 def test_targets_that_are_not_finite_leave_the_old_ones_in_force(scene: Scene):
