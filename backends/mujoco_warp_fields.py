@@ -1,5 +1,3 @@
-# mypy: ignore-errors
-# ruff: noqa: ANN201, RUF046, SIM102, UP018
 """Repairs the height-field contacts of mujoco_warp 3.17, for every engine that steps it.
 
 Height fields are collided prism by prism, in a copy of MuJoCo's algorithm with three differences that matter:
@@ -12,159 +10,124 @@ Height fields are collided prism by prism, in a copy of MuJoCo's algorithm with 
 - The field's surface is lifted by the contact margin and the geom inflated by half of it, but the distance between these
   is reported: contacts would begin with a jolt, and feet stand that much too high.
 
-MuJoCo does none of this. Two functions of mujoco_warp are wrapped: one label for all vertices, so that the plain contact
-is used; and after the test of a prism, no contact where it is apart, and distances without the margin.
+MuJoCo does none of this. Two functions of mujoco_warp are replaced: the support function, by one with one label for all
+vertices, so that the plain contact is used; and the narrow phase, by one that collides height fields itself, with no contact
+where a prism is apart, and distances without the margin, before mujoco_warp does the rest.
 
-Of the prisms under a geom's bounding box most do not touch it. Where the plane of a prism's top or one of its upright sides
-lies between the two, the search for their distance (GJK) is left out: a geom's prisms are tested by one thread, in turn.
-For spheres (feet, which touch most) the distance is found in closed form.
+It also shares the work otherwise. A geom's prisms are tested by one thread, in turn, in mujoco_warp: of thousands of robots one
+always lies on the ground, and its thread is what all the others wait for. Here every prism has a thread of its own, and
+searches for a distance (GJK) are made only where no plane of the prism separates the two and no closed form is known.
 """
 
-# Warp reads the annotations of functions: no ``from __future__ import annotations`` here.
+from __future__ import annotations
+
+from typing import Any
+
 import warp as wp
-from mujoco_warp._src import collision_convex, collision_gjk
-from mujoco_warp._src.collision_core import Geom
-from mujoco_warp._src.collision_gjk import SupportPoint
-from mujoco_warp._src.collision_gjk import ccd as plain_ccd
-from mujoco_warp._src.collision_gjk import support as plain_support
-from mujoco_warp._src.types import GeomType, mat63
+from mujoco_warp import Data, Model
+from mujoco_warp._src import collision_convex, collision_driver, collision_gjk
+from mujoco_warp._src.collision_convex import convex_narrowphase as plain_narrowphase
+from mujoco_warp._src.collision_core import CollisionContext
+from mujoco_warp._src.math import upper_trid_index
+from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType, OverflowType
 
-wp.set_module_options({"enable_backward": False})
+from . import mujoco_warp_field_kernels as kernels
+from .mujoco_warp_field_contacts import Contacts, Materials, write_contacts
+from .mujoco_warp_prisms import support
 
-_TOUCH = wp.constant(-1.0e-6)
-"""Distance between lifted field and inflated geom above which they do not touch [m]; single precision sees no less."""
-
-
-_CLEAR = wp.constant(1.0e-5)
-"""Gap to one of a prism's planes above which it does not touch [m]; wide enough for the rounding of positions."""
-
-
-@wp.func
-def stays_clear(prism: mat63, geom: Geom, geomtype: int) -> bool:
-    """Whether the plane of the prism's top, or of a side, separates it from a geom that is given in the field's frame."""
-    top = wp.cross(prism[4] - prism[3], prism[5] - prism[3])
-    top = wp.normalize(wp.where(top[2] < 0.0, -top, top))
-    if wp.dot(plain_support(geom, geomtype, -top).point - prism[3], top) > _CLEAR:
-        return True
-    for i in range(3):
-        corner = prism[3 + i]
-        edge = prism[3 + (i + 1) % 3] - corner
-        side = wp.normalize(wp.vec3(edge[1], -edge[0], 0.0))
-        if wp.dot(prism[3 + (i + 2) % 3] - corner, side) > 0.0:
-            side = -side
-        if wp.dot(plain_support(geom, geomtype, -side).point - corner, side) > _CLEAR:
-            return True
-    return False
+_PRISMS = (8, 64)
+"""Prisms that can be listed: for each contact that there is room for, and for each world besides."""
+_TOUCHES = (2, 64)
+"""Prisms that may touch, of all that are listed: likewise. More than become contacts, of which a shape has four at most."""
+_WARP = 32
+"""Threads that a GPU runs in step."""
+_SERIAL_THREADS = 64
+"""Threads on a CPU, where they run in turn."""
+_TEST_THREADS = 512
+"""Threads for each multiprocessor of a GPU that test prisms, each a few in turn."""
+_SEARCH_THREADS = 256
+"""Threads for each multiprocessor that search: as many as fit at 255 registers. Each has its own scratch memory."""
 
 
-@wp.func
-def nearest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3) -> wp.vec3:
-    """The point of a triangle that is nearest to ``p``: under it on the plane, or else on one of the three edges."""
-    normal = wp.cross(b - a, c - a)
-    if (
-        wp.dot(wp.cross(b - a, p - a), normal) >= 0.0
-        and wp.dot(wp.cross(c - b, p - b), normal) >= 0.0
-        and wp.dot(wp.cross(a - c, p - c), normal) >= 0.0
-    ):
-        return p - normal * (wp.dot(p - a, normal) / wp.dot(normal, normal))
-    nearest, smallest = a, float(wp.inf)
-    for i in range(3):
-        start = wp.where(i == 0, a, wp.where(i == 1, b, c))
-        edge = wp.where(i == 0, b, wp.where(i == 1, c, a)) - start
-        point = start + edge * wp.clamp(wp.dot(p - start, edge) / wp.dot(edge, edge), 0.0, 1.0)
-        if wp.length_sq(p - point) < smallest:
-            nearest, smallest = point, wp.length_sq(p - point)
-    return nearest
+def colliding_kinds(model: Model, table: list[tuple[GeomType, GeomType]]) -> tuple[int, ...]:
+    """Types of the geoms that may meet a height field in this model."""
+    counts = model.geom_pair_type_count
+    return tuple(
+        int(other)
+        for field, other in table
+        if field == GeomType.HFIELD and counts[upper_trid_index(len(GeomType), int(field), int(other))]
+    )
 
 
-@wp.func
-def sphere_on_prism(prism: mat63, sphere: Geom):
-    """Distance and nearest points of prism and sphere in closed form, where that is so simple; the flag says whether."""
-    # of a triangle and all that lies straight below it, nothing is nearer to a point that looks down on the triangle
-    first = nearest_on_triangle(prism[3], prism[4], prism[5], sphere.pos)
-    apart = sphere.pos - first
-    away = wp.length(apart)
-    radius = sphere.size[0] + 0.5 * sphere.margin
-    simple = apart[2] >= 0.0 and away > _CLEAR
-    return simple, away - radius, first, sphere.pos - apart * (radius / wp.max(away, _CLEAR))
+def scratch_memory(rows: int, iterations: int) -> kernels.Scratch:
+    """Memory for polytopes that are expanded so many times."""
+    vertices, faces = 10 + 2 * iterations, 6 + MJ_MAX_EPAFACES * iterations
+    points = wp.empty((rows, vertices + faces), dtype=wp.vec3)
+    numbers = wp.empty((rows, vertices + faces + MJ_MAX_EPAHORIZON), dtype=int)
+    scratch: Any = kernels.Scratch()
+    scratch.vertices, scratch.projections = points[:, :vertices], points[:, vertices:]
+    scratch.vertex_numbers, scratch.faces = numbers[:, :vertices], numbers[:, vertices : vertices + faces]
+    scratch.horizon = numbers[:, vertices + faces :]
+    scratch.squares = wp.empty((rows, faces), dtype=float)
+    return scratch
 
 
-@wp.func
-def support(geom: Geom, geomtype: int, dir: wp.vec3) -> SupportPoint:
-    """mujoco_warp's support point, with one label for all vertices of a height field's prism."""
-    point = plain_support(geom, geomtype, dir)
-    if geomtype == int(GeomType.HFIELD):
-        point.vertex_index = -1
-    return point
+def empty_lists(contacts: int, worlds: int) -> kernels.Lists:
+    """Lists for so many worlds with room for so many contacts together."""
+    prisms, touches = (each * contacts + spare * worlds for each, spare in (_PRISMS, _TOUCHES))
+    lists = kernels.Lists()
+    lists.counts = wp.zeros(3, dtype=int)
+    lists.spans = wp.empty(contacts, dtype=wp.vec2i)
+    lists.prisms = wp.empty(prisms, dtype=wp.vec2i)
+    lists.touches = wp.empty(touches, dtype=kernels.Touch)
+    lists.searches = wp.empty(touches, dtype=wp.vec3i)
+    return lists
 
 
-@wp.func
-def ccd(
-    tolerance: float,
-    cutoff: float,
-    gjk_iterations: int,
-    epa_iterations: int,
-    geom1: Geom,
-    geom2: Geom,
-    geomtype1: int,
-    geomtype2: int,
-    x_1: wp.vec3,
-    x_2: wp.vec3,
-    vert: wp.array[wp.vec3],
-    vert_index: wp.array[int],
-    face: wp.array[int],
-    face_pr: wp.array[wp.vec3],
-    face_norm2: wp.array[float],
-    horizon: wp.array[int],
-    warn_overflow: bool,
-    worldid: int,
-    overflow_out: wp.array[int],
-):
-    """mujoco_warp's distance of two convex shapes; of a field's prism (frame: the field's) as MuJoCo reports it."""
-    if geomtype1 == int(GeomType.HFIELD):
-        if stays_clear(geom1.polyvert, geom2, geomtype2):
-            return _CLEAR, 0, wp.vec3(), wp.vec3(), -1
-    index, count, simple = int(-1), int(1), bool(False)
-    distance, first, second = float(0.0), wp.vec3(), wp.vec3()
-    if geomtype1 == int(GeomType.HFIELD) and geomtype2 == int(GeomType.SPHERE):
-        simple, distance, first, second = sphere_on_prism(geom1.polyvert, geom2)
-    if not simple:
-        distance, count, first, second, index = plain_ccd(
-            tolerance,
-            cutoff,
-            gjk_iterations,
-            epa_iterations,
-            geom1,
-            geom2,
-            geomtype1,
-            geomtype2,
-            x_1,
-            x_2,
-            vert,
-            vert_index,
-            face,
-            face_pr,
-            face_norm2,
-            horizon,
-            warn_overflow,
-            worldid,
-            overflow_out,
-        )
-    if geomtype1 == int(GeomType.HFIELD):
-        if distance > _TOUCH:
-            count = 0
-        else:
-            # of shapes that overlap, the first's witness point lies ahead of the second's along the normal
-            apart = first - second
-            normal = wp.normalize(apart)
-            lift, inflation = geom2.margin * normal[2], 0.5 * geom2.margin
-            shift = -0.5 * (lift - inflation) * normal
-            first, second = first + shift, second + shift
-            distance += lift + inflation
-    return distance, count, first, second, index
+def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: tuple[int, ...]) -> None:
+    """Write the contacts between height fields and geoms of these types; the lists are given back at the end.
+
+    Worlds of which contacts are lost, since a list is full, get mujoco_warp's alarm ``HFIELD``.
+    """
+    multiprocessors = data.ncollision.device.sm_count
+    testing = multiprocessors * _TEST_THREADS or _SERIAL_THREADS
+    searching = max(1, min(multiprocessors * _SEARCH_THREADS or _SERIAL_THREADS, data.naccdmax))
+    shapes = _filled(kernels.Shapes(), model, model.opt, data, context)
+    materials = _filled(Materials(), model)
+    contacts = _filled(Contacts(), data.contact, data)
+    lists = empty_lists(data.naconmax, data.nworld)
+    scratch = scratch_memory(searching, model.opt.ccd_iterations)
+    test_prisms, search_prisms = kernels.prism_kernels(kinds)
+    printed = model.opt.warn_overflow
+    warn, warn_horizon = (bool(printed & bit) for bit in (OverflowType.HFIELD, OverflowType.EPA_HORIZON))
+    wp.launch(kernels.list_prisms, dim=data.naconmax, inputs=[shapes, lists, warn])
+    wp.launch(test_prisms, dim=testing, inputs=[shapes, lists, testing, warn])
+    iterations = [model.opt.ccd_iterations] * 2
+    inputs = [shapes, lists, scratch, searching, *iterations, warn_horizon]
+    # in small blocks, so that few searches still reach many processors
+    wp.launch(search_prisms, dim=searching, inputs=inputs, block_dim=_WARP)
+    wp.launch(write_contacts, dim=data.naconmax, inputs=[shapes, lists, materials, contacts])
+
+
+def convex_narrowphase(
+    model: Model, data: Data, context: CollisionContext, table: list[tuple[GeomType, GeomType]]
+) -> None:
+    """Collide height fields here, and all other convex shapes of the table in mujoco_warp."""
+    kinds = colliding_kinds(model, table)
+    if kinds:
+        collide_fields(model, data, context, kinds)
+    plain_narrowphase(model, data, context, [pair for pair in table if pair[0] != GeomType.HFIELD])
 
 
 def repair_height_fields() -> None:
     """Let mujoco_warp use the functions above. To be called before its first collision kernel is built; idempotent."""
     collision_gjk.support = collision_convex.support = support
-    collision_convex.ccd = ccd
+    collision_driver.convex_narrowphase = convex_narrowphase
+
+
+def _filled(struct: Any, *sources: object) -> Any:
+    """The struct with every field from the first source that has one of that name."""
+    for name in struct._cls.vars:
+        source = next(source for source in sources if hasattr(source, name))
+        setattr(struct, name, getattr(source, name))
+    return struct

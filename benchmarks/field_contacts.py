@@ -77,15 +77,23 @@ def contacts_of_mujoco(model: mujoco.MjModel, qpos: np.ndarray) -> list[list[Con
     return found
 
 
-def contacts_of_mujoco_warp(model: mujoco.MjModel, qpos: np.ndarray) -> list[list[Contact]]:
-    """The same of mujoco_warp, all poses at once, on Warp's present device."""
+def collided(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco_warp.Data:
+    """A world of mujoco_warp for each pose, all at once, on Warp's present device."""
     count = len(qpos)
     device_model = mujoco_warp.put_model(model)
-    room = 8 * count
+    room = 8 * count * max(1, model.ngeom - 1)
     data = mujoco_warp.make_data(model, nworld=count, naconmax=room, naccdmax=room, njmax=64)
     data.qpos.assign(qpos.astype(np.float32))
     for stage in (mujoco_warp.kinematics, mujoco_warp.com_pos, mujoco_warp.collision):
         stage(device_model, data)
+    return data
+
+
+def contacts_of_mujoco_warp(model: mujoco.MjModel, qpos: np.ndarray) -> list[list[Contact]]:
+    """The contacts that act (nearer than the margin) in each pose."""
+    data = collided(model, qpos)
+    if data.overflow.numpy().any():
+        raise RuntimeError("contacts were lost: the benchmark makes too little room for them")
     contact, number = data.contact, int(data.nacon.numpy()[0])
     columns = [getattr(contact, name).numpy()[:number] for name in ("worldid", "dist", "frame", "pos")]
     found: list[list[Contact]] = [[] for _ in qpos]
