@@ -22,6 +22,7 @@ import io
 import json
 import os
 import pickle
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -254,7 +255,44 @@ class NativePolicy(FilePolicy):
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes, with a copy of the network."""
         network = copy.deepcopy(self.network).to(device)
+        if device == "cpu":
+            network = frozen(network, num_episodes)
         return NativeSession(network, num_episodes, self.contract, torch.device(device), self.path)
+
+
+class FrozenNetwork:
+    """A network without a memory of its own as one recorded sequence of operations: layers cost little more than their work."""
+
+    def __init__(self, recorded: Any, network: Any) -> None:
+        """``recorded`` does what ``network`` does."""
+        self.history_length, self.frame_width = network.history_length, network.frame_width
+        self._recorded = recorded
+
+    def __call__(self, history: torch.Tensor) -> torch.Tensor:
+        """Actions (N, J) for ``history`` (N, H, F)."""
+        action: torch.Tensor = self._recorded(history)
+        return action
+
+
+def frozen(network: Any, num_episodes: int) -> Any:
+    """The network as a ``FrozenNetwork`` where that gives the same actions to the last bit, else the network itself."""
+    if hasattr(network, "initial_state"):
+        return network
+    network.eval()
+    with torch.inference_mode(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what a recording would not follow; the comparison below sees it
+        generator = torch.Generator().manual_seed(0)
+        inputs = [
+            torch.randn(rows, network.history_length, network.frame_width, generator=generator)
+            for rows in (num_episodes, 8, num_episodes + 1)
+        ]
+        try:
+            recorded = torch.jit.freeze(torch.jit.trace(network, inputs[0], check_trace=False))
+            # twice: the second call is the one that its executor has optimized
+            same = all(torch.equal(recorded(x), network(x)) for x in inputs + inputs)
+        except RuntimeError:
+            return network
+    return FrozenNetwork(recorded, network) if same else network
 
 
 class NativeSession(PolicySession):

@@ -6,7 +6,7 @@ import torch
 from gaitgauge.policy import networks
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.policy.native import ForeignFile, StoredNetwork, save_policy
+from gaitgauge.policy.native import ForeignFile, FrozenNetwork, StoredNetwork, frozen, save_policy
 from gaitgauge.policy.networks import CtsNetwork, ExpertMixture, MlpNetwork, MoeCtsNetwork
 from torch import nn
 
@@ -63,6 +63,35 @@ def test_rows_do_not_influence_each_other(cts_file, observations, run):
     others = torch.arange(EPISODES) != 1
     assert torch.equal(a[:, others], b[:, others])
     assert b[3:, 1].isnan().all()
+
+
+def test_a_session_on_the_cpu_replays_its_network_to_the_last_bit(cts_file):
+    policy = load_policy(cts_file)
+    replayed = frozen(policy.network, 5)
+    assert isinstance(replayed, FrozenNetwork)
+    for rows in (1, 5, 13):
+        history = torch.randn(rows, policy.network.history_length, policy.network.frame_width)
+        with torch.inference_mode():
+            assert torch.equal(replayed(history), policy.network(history))
+
+
+class Moody(nn.Module):
+    """Does something else on its second call, which a recording does not know."""
+
+    history_length, frame_width = 1, 3
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+
+    def forward(self, history: torch.Tensor) -> torch.Tensor:
+        self.calls += 1
+        return history[:, -1] * (1.0 if self.calls == 1 else 2.0)
+
+
+def test_a_network_that_cannot_be_replayed_is_called():
+    network = Moody()
+    assert frozen(network, 4) is network
 
 
 def test_sessions_are_independent_and_repeatable(cts_file, observations, run):
