@@ -3,7 +3,8 @@
     python benchmarks/training_curve.py RUN [RUN ...] --csv curve.csv --svg curve.svg [--before curve.csv]
 
 Stretches are given in the order in which they were trained; environment steps and seconds are added up. ``--before`` puts the
-rows of an earlier table in front, for stretches whose run directories are gone.
+rows of an earlier table in front, for stretches whose run directories are gone. Printed is how well reward and terrain level rank the
+scored checkpoints as MuJoCo does: do training's own figures mislead?
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ COLUMNS = {
 }
 FIELDS = ("stretch", "iteration", "environment_steps_millions", "hours", *COLUMNS)
 EVERY = 20
+WINDOW = 12.0
+"""Over how many million environment steps training's own figures are averaged before a score is compared with them."""
 
 
 def read_stretch(run: Path, number: int, steps_before: float, hours_before: float) -> list[dict[str, str]]:
@@ -81,6 +84,43 @@ def main() -> None:
         writer.writerows(rows)
     if arguments.svg:
         draw(rows, arguments.svg)
+    print_ranks(rows)
+
+
+def print_ranks(rows: list[dict[str, str]]) -> None:
+    """Rank correlation (Spearman) of the score in MuJoCo with training's own figures, over all stretches and within each."""
+    from scipy.stats import spearmanr
+
+    print(f"{'score in MuJoCo and':22} {'all':>12}" + "".join(f"{f'stretch {n}':>15}" for n in stretches(rows)))
+    for name in ("mean_reward", "mean_terrain_level"):
+        line = f"{name.replace('_', ' '):22}"
+        for number in ("", *stretches(rows)):
+            points = [
+                (float(row["quick_score"]), recent(rows, row, name))
+                for row in rows
+                if row["quick_score"] and number in ("", row["stretch"])
+            ]
+            rank = f"{spearmanr(*zip(*points, strict=True)).statistic:+.2f}" if len(points) > 2 else "-"
+            line += f"{rank + f' ({len(points)})':>{15 if number else 13}}"
+        print(line)
+
+
+def stretches(rows: list[dict[str, str]]) -> list[str]:
+    """Numbers of the stretches, in order."""
+    return sorted({row["stretch"] for row in rows}, key=int)
+
+
+def recent(rows: list[dict[str, str]], at: dict[str, str], name: str) -> float:
+    """Mean of a figure over the last ``WINDOW`` million environment steps before a row of its stretch."""
+    end = float(at["environment_steps_millions"])
+    values = [
+        float(row[name])
+        for row in rows
+        if row["stretch"] == at["stretch"]
+        and row[name]
+        and 0.0 <= end - float(row["environment_steps_millions"]) < WINDOW
+    ]
+    return sum(values) / len(values)
 
 
 def draw(rows: list[dict[str, str]], path: Path) -> None:
