@@ -236,8 +236,7 @@ class _Crew:
         """
         lanes = len(self._connections)
         tests, quality = plan.waiting
-        together = 1 if self._idle else _TOGETHER
-        part = max(-(-(sum(self._tests) + tests) // lanes), together) - self._tests[lane]
+        part = max(-(-(sum(self._tests) + tests) // lanes), _TOGETHER) - self._tests[lane]
         episodes = plan.take(min(most, max(part, 0)), urgent=True)
         if episodes or urgent or (self._tests[lane] and not all(self._tests)):
             return episodes
