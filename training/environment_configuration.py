@@ -97,6 +97,9 @@ class RewardConfiguration:
     """Tracking of the commanded horizontal velocity."""
     yaw_tracking: float = 0.5
     """Tracking of the commanded yaw rate."""
+    progress: float = 0.0
+    """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an
+    obstacle."""
     vertical_velocity: Ramp = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
     """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
     roll_pitch_rate: float = -0.05
@@ -328,6 +331,11 @@ class TerminationConfiguration:
     """Angle between the base's z axis and the world's [rad]; None for no limit."""
     joint_velocity: float = 150.0
     """Joint speed beyond anything real, which counts as a diverged world [rad/s]."""
+    stuck: float | None = None
+    """Time without progress after which a robot that did as commanded before is stuck [s]: its episode ends as a failure and moves
+    the level down. None for never."""
+    stuck_from: float = 0.1
+    """Fraction of the run from which being stuck ends episodes: a robot that cannot walk yet is always stuck."""
 
 
 TRAINING_PHYSICS = PhysicsOptions(

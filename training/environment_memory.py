@@ -14,6 +14,7 @@ EPISODE = (
     "commanded_way",
     "commanded_farthest",
     "issued",
+    "shortfall",
     "action",
     "previous_action",
     "joint_velocity",
@@ -66,6 +67,8 @@ class EnvironmentMemory:
     """Whether the present command is an extreme one, (N,) bool."""
     issued: torch.Tensor
     """Sum of the linear commands issued in this episode [m/s], (N, 2)."""
+    shortfall: torch.Tensor
+    """Share of the commanded speed that is missing of late, an exponential average, (N,)."""
     action: torch.Tensor
     """Raw action of the last step, (N, J)."""
     previous_action: torch.Tensor
@@ -132,7 +135,7 @@ class EnvironmentMemory:
         def flags() -> torch.Tensor:
             return torch.zeros(num_envs, dtype=torch.bool, device=device)
 
-        widths = (None, 2, None, 2, joints, joints, joints, joints, joints, feet, terms)
+        widths = (None, 2, None, 2, None, joints, joints, joints, joints, joints, feet, terms)
         episode, columns = _block(numbers, num_envs, names=EPISODE, widths=widths)
         sums, totals = _block(numbers, names=SUMS, widths=(terms, None, ends, metrics, None))
         return cls(

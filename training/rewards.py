@@ -16,6 +16,9 @@ from ..robots.rotation import projected_gravity
 from .environment_configuration import Ramp, RewardConfiguration
 from .schedules import RampTable
 
+SLOWEST_COMMAND = 0.1
+"""Commanded speed below which nothing is asked of a robot's progress [m/s]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RewardInputs:
@@ -81,6 +84,25 @@ def yaw_tracking(inputs: RewardInputs) -> torch.Tensor:
     """exp(−Δωz²/σw)."""
     error = inputs.command[:, 2] - inputs.base_angular_velocity_b[:, 2]
     return torch.exp(-error.square() / inputs.sigma[:, 2])
+
+
+def progress(inputs: RewardInputs) -> torch.Tensor:
+    """Velocity along the commanded direction over the commanded speed, within ±1; 0 below ``SLOWEST_COMMAND``."""
+    return torch.where(commanded_to_move(inputs.command), progress_share(inputs), 0.0)
+
+
+def progress_share(inputs: RewardInputs) -> torch.Tensor:
+    """Share of the commanded speed that the robot has along the command, within ±1; without a meaning below
+    ``SLOWEST_COMMAND``.
+    """
+    command = inputs.command[:, :2]
+    along = (inputs.base_linear_velocity_b[:, :2] * command).sum(dim=1)
+    return torch.clamp(along / command.square().sum(dim=1).clamp_min(SLOWEST_COMMAND**2), -1.0, 1.0)
+
+
+def commanded_to_move(command: torch.Tensor) -> torch.Tensor:
+    """Whether the linear command is fast enough to ask for progress, (N,) bool."""
+    return command[:, :2].square().sum(dim=1) >= SLOWEST_COMMAND**2
 
 
 def vertical_velocity(inputs: RewardInputs) -> torch.Tensor:
@@ -187,6 +209,7 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
     for f in (
         linear_tracking,
         yaw_tracking,
+        progress,
         vertical_velocity,
         roll_pitch_rate,
         joint_acceleration,

@@ -25,7 +25,7 @@ from .environment_memory import EnvironmentMemory
 from .height_scan import HeightRasters, heading, heading_and_upright, place_pattern, scan_pattern
 from .observations import add_noise, height_entries, noise_amplitude, privileged_state, push_history
 from .randomness import UniformColumns
-from .rewards import RewardFunction, RewardInputs
+from .rewards import RewardFunction, RewardInputs, commanded_to_move, progress_share
 from .step_records import ENDS, METRICS, EpisodeStart, Observations, Verdict
 
 
@@ -33,6 +33,10 @@ def joint_ranges(robot: Robot) -> torch.Tensor:
     """Lower and upper limit of every joint of the robot's model [rad], (J, 2)."""
     model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
     return torch.tensor([list(model.joint(name).range) for name in robot.joint_names], dtype=torch.float32)
+
+
+STUCK_SHORTFALL = 0.9
+"""Share of the commanded speed that is missing of late from which a robot counts as stuck."""
 
 
 class StepProgram:
@@ -222,11 +226,13 @@ class StepProgram:
         too_long = memory.episode_length >= self.max_episode_length
         left = place > self._leave
         time_out = (too_long | left) & ~fallen
-        done = fallen | time_out
-
         inputs = self._reward_inputs(velocity_b, heading_xy, touching, fallen)
+        stuck = self._stuck(inputs, progress) & ~fallen
+        time_out &= ~stuck
+        done = fallen | stuck | time_out
+
         terms = self.rewards(inputs, progress).masked_fill(diverged[:, None], 0.0)
-        ends = torch.stack((too_long & time_out, left & time_out, base_contact, tilted, diverged), dim=1)
+        ends = torch.stack((too_long & time_out, left & time_out, base_contact, tilted, stuck, diverged), dim=1)
         self._record(terms, inputs, ends, done, diverged)
 
         memory.previous_action.copy_(memory.action)
@@ -238,7 +244,7 @@ class StepProgram:
         self._follow_commands(place, heading_xy)
         push, push_linear, push_angular = self._push(done)
         # A diverged world is the engine's failure: it moves no level.
-        start = self.begin_episodes(done, fallen & ~diverged, progress)
+        start = self.begin_episodes(done, (fallen & ~diverged) | stuck, progress)
         return Verdict(
             reward=terms.sum(dim=1),
             done=done,
@@ -291,6 +297,17 @@ class StepProgram:
             base_height_target=settings.base_height_target,
             foot_height_length=settings.foot_height_scale * settings.base_height_target,
         )
+
+    def _stuck(self, inputs: RewardInputs, progress: torch.Tensor) -> torch.Tensor:
+        """Robots that have not done what they were told for too long, (N,) bool; how much is missing is remembered."""
+        settings = self.configuration.termination
+        if settings.stuck is None:
+            return torch.zeros_like(inputs.fallen)
+        missing = torch.where(commanded_to_move(inputs.command), 1.0 - progress_share(inputs), 0.0).nan_to_num(0.0)
+        # After this much time at a standstill an average that began at 0 has come to STUCK_SHORTFALL.
+        rate = 1.0 - (1.0 - STUCK_SHORTFALL) ** (self.period / settings.stuck)
+        self.memory.shortfall.lerp_(missing, rate)
+        return (self.memory.shortfall > STUCK_SHORTFALL) & (progress >= settings.stuck_from)
 
     def _record(
         self, terms: torch.Tensor, inputs: RewardInputs, ends: torch.Tensor, done: torch.Tensor, diverged: torch.Tensor

@@ -8,7 +8,7 @@ import torch
 
 from ..backends.base import PhysicsState
 
-ENDS = ("time_out", "left_tile", "base_contact", "tilt", "diverged")
+ENDS = ("time_out", "left_tile", "base_contact", "tilt", "stuck", "diverged")
 """Ways to end an episode, in the order of ``EnvironmentMemory.finished_ends``; the first two are time-outs to the
 learner."""
 METRICS = ("linear_velocity_error", "yaw_rate_error")

@@ -7,7 +7,17 @@ import torch
 from gaitgauge.backends.fake import FakeScript
 from gaitgauge.terrains import TerrainError
 from gaitgauge.training.curriculum import assign_kinds, build_palette, next_level
-from gaitgauge.training.environment_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration, TileConfiguration
+from gaitgauge.training.environment_configuration import (
+    ALL_TILES,
+    FLAT_TILE,
+    CommandConfiguration,
+    CommandStage,
+    Ramp,
+    ScheduleConfiguration,
+    TerminationConfiguration,
+    TerrainConfiguration,
+    TileConfiguration,
+)
 from small_environment import STAIRS, gliding, idle, make
 
 
@@ -152,3 +162,66 @@ def test_commanded_way_follows_the_robot_s_heading():
     idle(environment, 39)
     assert memory.commanded_way.norm(dim=1).tolist() == pytest.approx([0.0] * 4, abs=0.03)
     assert memory.commanded_farthest.tolist() == pytest.approx([0.5] * 4, abs=0.02)
+
+
+def walking(speed_share, command):
+    """A script in which each base has that share of the commanded speed, (N,), along the command."""
+
+    def motion(backend):
+        linear = torch.zeros(backend.num_worlds, 3, dtype=backend.dtype)
+        linear[:, 0] = command * torch.tensor(speed_share)
+        return linear, torch.zeros_like(linear)
+
+    return FakeScript(motion=motion)
+
+
+def forward_at(speed):
+    """Commands that are all the same forward speed."""
+    return CommandConfiguration(
+        stages=(CommandStage(begin=0.0, forward=(speed, speed), lateral=(0.0, 0.0), yaw=(0.0, 0.0)),),
+        dynamic=False,
+        extreme_probability=0.0,
+        stationary_probability=Ramp(start=0.0, end=0.0),
+    )
+
+
+STUCK = TerminationConfiguration(stuck=1.0, stuck_from=0.0)
+
+
+def test_a_robot_without_progress_is_stuck_after_the_time_set():
+    shares = (0.0, 0.05, 0.3, 1.0)
+    environment = make(4, script=walking(shares, 0.5), commands=forward_at(0.5), termination=STUCK)
+    first = torch.zeros(4)
+    for step in range(1, 76):
+        _, _, done, extras = idle(environment)
+        assert extras["time_outs"].sum() == 0
+        first = torch.where((first == 0) & (done == 1), float(step), first)
+    assert first[0] == pytest.approx(50, abs=1), "1 s of control steps of 20 ms"
+    assert 50 < first[1] < 75, "a little progress takes longer"
+    assert first[2:].tolist() == [0, 0], "slow or fast, they come on"
+
+
+def test_being_stuck_lowers_the_level():
+    environment = make(4, terrain=STAIRS, commands=forward_at(0.5), termination=STUCK)
+    environment.program.memory.level.fill_(2)
+    while not idle(environment)[2].any():
+        assert environment.program.memory.level.tolist() == [2] * 4
+    assert environment.program.memory.level.tolist() == [1] * 4
+
+
+def test_who_was_told_to_stand_is_not_stuck():
+    environment = make(4, terrain=STAIRS, commands=forward_at(0.0), termination=STUCK)
+    assert not any(bool(idle(environment)[2].any()) for _ in range(75))
+
+
+def test_being_stuck_ends_nothing_before_its_time_in_the_run():
+    later = replace(STUCK, stuck_from=0.5)
+    environment = make(
+        4,
+        terrain=STAIRS,
+        commands=forward_at(0.5),
+        termination=later,
+        schedule=ScheduleConfiguration(horizon_steps=160),
+    )
+    ends = [bool(idle(environment)[2].any()) for _ in range(85)]
+    assert ends.index(True) == 79, "half of the run"

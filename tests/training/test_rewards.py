@@ -85,6 +85,11 @@ CASES = {
         math.exp(-1.0),
         1.0,
     ),
+    "progress": (
+        {"command": one_world([0.6, -0.8, 9.0], 3), "base_linear_velocity_b": one_world([0.5, 0.0, 9.0], 3)},
+        0.3,
+        0.0,
+    ),
     "vertical_velocity": ({"base_linear_velocity_b": one_world([9.0, 9.0, -0.5], 3)}, 0.25, 0.0),
     "roll_pitch_rate": ({"base_angular_velocity_b": one_world([1.0, -2.0, 9.0], 3)}, 5.0, 0.0),
     "joint_acceleration": ({"joint_acceleration": joints(3.0, -4.0)}, 25.0, 0.0),
@@ -160,3 +165,18 @@ def test_every_weight_names_a_term():
     settings = {"tracking_sigma", "dynamic_sigma", "sigma_linear_range", "sigma_yaw_range", "base_height_target"}
     settings |= {"foot_height_scale", "foot_height_over", "collision_force", "soft_limit"}
     assert {f.name for f in fields(RewardConfiguration)} - settings == set(REWARD_TERMS)
+
+
+@pytest.mark.parametrize(
+    ("command", "velocity", "expected"),
+    [
+        ([0.5, 0.0], [2.0, 0.0], 1.0),
+        ([0.5, 0.0], [-2.0, 0.0], -1.0),
+        ([0.5, 0.0], [0.0, 1.0], 0.0),
+        ([0.0, -1.0], [0.3, -0.25], 0.25),
+        ([0.05, 0.05], [1.0, 1.0], 0.0),
+    ],
+)
+def test_progress_is_the_share_of_the_commanded_speed(quiet, command, velocity, expected):
+    inputs = replace(quiet, command=one_world(command, 3), base_linear_velocity_b=one_world(velocity, 3))
+    assert float(REWARD_TERMS["progress"](inputs)[0]) == pytest.approx(expected)
