@@ -1,36 +1,25 @@
 """Contacts of single shapes with a height field: those of mujoco_warp, as repaired here, against MuJoCo's."""
 
-import importlib.util
-from pathlib import Path
-
+import field_contacts
 import numpy as np
 import pytest
 from gaitgauge.backends.mujoco_warp_fields import repair_height_fields
 from gaitgauge.terrains.registry import make_terrain
 
-ROOT = Path(__file__).parents[2]
 TERRAIN = make_terrain("wave", 5)
 STEEP = make_terrain("wave", 10)
 COUNT = 200
 
 
-def _load():
-    spec = importlib.util.spec_from_file_location("field_contacts", ROOT / "benchmarks" / "field_contacts.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-BENCH = _load()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("terrain", [TERRAIN, STEEP], ids=["level 5", "level 10"])
-@pytest.mark.parametrize("name", BENCH.SHAPES)
+@pytest.mark.parametrize("name", field_contacts.SHAPES)
 def test_the_deepest_contact_with_a_wave_is_mujocos(name, terrain):
     repair_height_fields()
-    model, qpos = BENCH.model_of(name, terrain), BENCH.poses(name, terrain, COUNT)
-    seen = BENCH.compare(BENCH.contacts_of_mujoco(model, qpos), BENCH.contacts_of_mujoco_warp(model, qpos))
+    model, qpos = field_contacts.model_of(name, terrain), field_contacts.poses(name, terrain, COUNT)
+    seen = field_contacts.compare(
+        field_contacts.contacts_of_mujoco(model, qpos), field_contacts.contacts_of_mujoco_warp(model, qpos)
+    )
     assert len(seen["depth"]) > 0.5 * COUNT
     assert np.all(np.abs(seen["only"]) < 2e-5), "only what just touches may be a contact in one engine alone"
     # Where a shape's axis is below the ground two ways out are nearly as short, and the engines may choose unlike.
@@ -45,9 +34,9 @@ def test_the_deepest_contact_with_a_wave_is_mujocos(name, terrain):
 @pytest.mark.slow
 def test_a_spheres_contacts_lie_between_it_and_the_ground():
     repair_height_fields()
-    model, qpos = BENCH.model_of("foot", TERRAIN), BENCH.poses("foot", TERRAIN, COUNT)
-    radius = float(BENCH.SHAPES["foot"][1])
-    for row, found in zip(qpos, BENCH.contacts_of_mujoco_warp(model, qpos), strict=True):
+    model, qpos = field_contacts.model_of("foot", TERRAIN), field_contacts.poses("foot", TERRAIN, COUNT)
+    radius = float(field_contacts.SHAPES["foot"][1])
+    for row, found in zip(qpos, field_contacts.contacts_of_mujoco_warp(model, qpos), strict=True):
         for distance, normal, position in found:
             assert normal[2] > -0.01
             # on the line along the normal through the centre, halfway between the surfaces

@@ -1,8 +1,6 @@
 """How the prisms of a height field are shared among threads: nothing but time may depend on it, and no loss is silent."""
 
-import importlib.util
-from pathlib import Path
-
+import field_contacts
 import mujoco
 import mujoco_warp
 import numpy as np
@@ -11,20 +9,11 @@ from gaitgauge.backends import mujoco_warp_fields as fields
 from gaitgauge.terrains.registry import make_terrain
 from mujoco_warp._src import collision_driver
 
-ROOT = Path(__file__).parents[2]
 TERRAIN = make_terrain("wave", 7)
 COUNT = 60
 
 
-def _load():
-    spec = importlib.util.spec_from_file_location("field_contacts", ROOT / "benchmarks" / "field_contacts.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-BENCH = _load()
-NAMES = tuple(BENCH.SHAPES)
+NAMES = tuple(field_contacts.SHAPES)
 
 pytestmark = pytest.mark.slow
 
@@ -37,13 +26,18 @@ def _repaired():
 def _together() -> mujoco.MjModel:
     """All shapes as free bodies of one world, which meet the field and not each other."""
     spec = mujoco.MjSpec()
-    for name, (kind, size, _) in BENCH.SHAPES.items():
+    for name, (kind, size, _) in field_contacts.SHAPES.items():
         body = spec.worldbody.add_body(name=name)
         body.add_freejoint()
         sizes = [float(s) for s in size.split()]
         shape = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
         body.add_geom(
-            type=shape, size=sizes + [0.0] * (3 - len(sizes)), margin=BENCH.MARGIN, mass=1, contype=2, conaffinity=1
+            type=shape,
+            size=sizes + [0.0] * (3 - len(sizes)),
+            margin=field_contacts.MARGIN,
+            mass=1,
+            contype=2,
+            conaffinity=1,
         )
     heights = TERRAIN.height_field
     top = float(heights.heights.max())
@@ -64,7 +58,7 @@ def _together() -> mujoco.MjModel:
 
 
 def _poses() -> np.ndarray:
-    return np.concatenate([BENCH.poses(name, TERRAIN, COUNT) for name in NAMES], axis=1)
+    return np.concatenate([field_contacts.poses(name, TERRAIN, COUNT) for name in NAMES], axis=1)
 
 
 def _rows(data: mujoco_warp.Data) -> np.ndarray:
@@ -78,7 +72,7 @@ def _rows(data: mujoco_warp.Data) -> np.ndarray:
 @pytest.fixture(scope="module")
 def whole() -> np.ndarray:
     fields.repair_height_fields()
-    data = BENCH.collided(_together(), _poses())
+    data = field_contacts.collided(_together(), _poses())
     assert not data.overflow.numpy().any()
     return _rows(data)
 
@@ -87,7 +81,7 @@ def test_shapes_in_one_world_touch_as_each_alone_does(whole):
     model = _together()
     for index, name in enumerate(NAMES):
         geom = model.body(name).geomadr[0]
-        alone = BENCH.collided(BENCH.model_of(name, TERRAIN), _poses()[:, 7 * index : 7 * index + 7])
+        alone = field_contacts.collided(field_contacts.model_of(name, TERRAIN), _poses()[:, 7 * index : 7 * index + 7])
         mine = whole[(whole[:, 1:3] == geom).any(axis=1)]
         theirs = _rows(alone)
         assert len(mine) == len(theirs) > COUNT / 2
@@ -98,7 +92,7 @@ def test_shapes_in_one_world_touch_as_each_alone_does(whole):
 @pytest.mark.parametrize("threads", [1, 7, 1000])
 def test_contacts_do_not_depend_on_how_many_threads_share_them(monkeypatch, whole, threads):
     monkeypatch.setattr(fields, "_SERIAL_THREADS", threads)
-    assert np.array_equal(_rows(BENCH.collided(_together(), _poses())), whole)
+    assert np.array_equal(_rows(field_contacts.collided(_together(), _poses())), whole)
 
 
 def test_contacts_do_not_depend_on_the_order_in_which_pairs_come(monkeypatch, whole):
@@ -114,13 +108,13 @@ def test_contacts_do_not_depend_on_the_order_in_which_pairs_come(monkeypatch, wh
         fields.convex_narrowphase(model, data, context, table)
 
     monkeypatch.setattr(collision_driver, "convex_narrowphase", shuffled)
-    assert np.array_equal(_rows(BENCH.collided(_together(), _poses())), whole)
+    assert np.array_equal(_rows(field_contacts.collided(_together(), _poses())), whole)
 
 
 @pytest.mark.parametrize("short", ["_PRISMS", "_TOUCHES"])
 def test_worlds_that_lose_contacts_say_so_and_the_others_keep_theirs(monkeypatch, whole, short):
     monkeypatch.setattr(fields, short, (0, 20))
-    data = BENCH.collided(_together(), _poses())
+    data = field_contacts.collided(_together(), _poses())
     alarm = data.overflow.numpy()
     assert set(alarm) == {0, int(mujoco_warp.OverflowType.HFIELD)}
     rows = _rows(data)
@@ -150,7 +144,9 @@ def _chosen(distances: np.ndarray, points: np.ndarray, normals: np.ndarray) -> l
 def test_of_all_contacts_those_are_chosen_that_the_rule_names(monkeypatch):
     kept, plain = [], fields.empty_lists
     monkeypatch.setattr(fields, "empty_lists", lambda *sizes: kept.append(plain(*sizes)) or kept[-1])
-    data = BENCH.collided(BENCH.model_of("trunk", TERRAIN), BENCH.poses("trunk", TERRAIN, COUNT))
+    data = field_contacts.collided(
+        field_contacts.model_of("trunk", TERRAIN), field_contacts.poses("trunk", TERRAIN, COUNT)
+    )
     rows, touches = _rows(data), kept[0].touches.numpy()
     spans, prisms = kept[0].spans.numpy(), kept[0].prisms.numpy()
     several = 0

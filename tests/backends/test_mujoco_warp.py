@@ -1,6 +1,5 @@
 """The mujoco_warp engine beyond the conformance checks: its tables, its errors, and its agreement with the C engine."""
 
-import importlib.util
 import json
 import math
 import re
@@ -12,6 +11,7 @@ import mujoco_warp
 import numpy as np
 import pytest
 import torch
+import warp_throughput
 from gaitgauge.backends import BackendError, PhysicsOptions, PhysicsState, Randomization, Scene
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
 from gaitgauge.backends.mujoco_warp_device import (
@@ -178,15 +178,8 @@ def test_memory_advice_names_a_number_that_fits():
     assert not is_memory_error(RuntimeError("something else"))
 
 
-def benchmark():
-    spec = importlib.util.spec_from_file_location("warp_throughput", ROOT / "benchmarks" / "warp_throughput.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_estimate_of_memory_is_that_of_a_gpu():
-    make_scene, seen = benchmark().training_scene, set()
+    make_scene, seen = warp_throughput.training_scene, set()
     for file in sorted((ROOT / "docs" / "data").glob("throughput*_h200.json")):
         for row in json.loads(file.read_text())["rows"]:
             if row.get("backend", "mujoco-warp") != "mujoco-warp" or row["worlds"] < 8192:
@@ -240,7 +233,7 @@ def test_another_error_while_building_is_not_taken_for_too_little_memory(monkeyp
 
 
 def test_memory_is_drawn_from_measured_rows(tmp_path):
-    draw, source, target = benchmark().plot_memory, tmp_path / "rows.json", tmp_path / "memory.svg"
+    draw, source, target = warp_throughput.plot_memory, tmp_path / "rows.json", tmp_path / "memory.svg"
     rows = [{"backend": "newton", "ground": "boxes", "worlds": n, "bytes_per_world": 1e5 + n} for n in (512, 1024)]
     failed = {"backend": "newton", "ground": "field", "worlds": 2048, "error": "too many"}
     source.write_text(json.dumps({"hardware": {"device": "a GPU"}, "rows": [*rows, failed]}))

@@ -1,26 +1,12 @@
 """mujoco_warp's solver against float64, as ``benchmarks/solver_accuracy.py`` measures it."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
-
-ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def accuracy():
-    spec = importlib.util.spec_from_file_location("solver_accuracy", ROOT / "benchmarks" / "solver_accuracy.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["solver_accuracy"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+import solver_accuracy as accuracy
 
 
-def test_the_float64_solution_is_mujocos(accuracy):
+def test_the_float64_solution_is_mujocos():
     """A box that slides on one corner, with dry friction on a hinge: MuJoCo's own accelerations."""
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><option cone="elliptic" impratio="10" tolerance="0" iterations="200" jacobian="dense"/><worldbody>'
@@ -51,7 +37,7 @@ def test_the_float64_solution_is_mujocos(accuracy):
 
 
 @pytest.mark.slow
-def test_single_precision_comes_near_with_few_iterations(accuracy, capsys):
+def test_single_precision_comes_near_with_few_iterations(capsys):
     accuracy.main(["--worlds", "16", "--states", "2", "--walk", "15"])
     table = [line.split() for line in capsys.readouterr().out.splitlines()]
     rows = {(int(r[0]), float(r[1])): [float(v) for v in r[2:]] for r in table if len(r) == 11}

@@ -1,28 +1,15 @@
 """The profile of the mujoco-warp engine: its cases, its terrains, and one small run on the CPU."""
 
-import importlib.util
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import warp_profile as profile
 from gaitgauge.terrains.training_tiles import make_tile
 
-ROOT = Path(__file__).parents[2]
 
-
-@pytest.fixture(scope="module")
-def profile():
-    spec = importlib.util.spec_from_file_location("warp_profile", ROOT / "benchmarks" / "warp_profile.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["warp_profile"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_every_scene_is_measured_and_shares_sum_to_one(profile):
+def test_every_scene_is_measured_and_shares_sum_to_one():
     cases = profile.standard_cases()
     assert {c.scene for c in cases} == set(profile.SCENES)
     for name in profile.SCENES:
@@ -34,7 +21,7 @@ def test_every_scene_is_measured_and_shares_sum_to_one(profile):
         assert all(has_field) == (name in ("gauge-wave", "tiles-fields"))
 
 
-def test_a_coarser_field_has_its_nodes_on_the_old_surface(profile):
+def test_a_coarser_field_has_its_nodes_on_the_old_surface():
     tile = make_tile("wave", 5)
     coarse = profile.respaced(tile, 0.4)
     assert coarse.height_field.heights.shape == (21, 21)
@@ -42,7 +29,7 @@ def test_a_coarser_field_has_its_nodes_on_the_old_surface(profile):
     assert profile.respaced(tile, 0.05).height_field.heights.shape == (161, 161)
 
 
-def test_only_iterations_and_tolerance_change_without_a_new_scene(profile):
+def test_only_iterations_and_tolerance_change_without_a_new_scene():
     case = profile.standard_cases()[0]
     assert not profile.needs_new_scene(case, replace(case, iterations=7, tolerance=1e-3))
     assert profile.needs_new_scene(None, case)
@@ -59,12 +46,12 @@ def test_only_iterations_and_tolerance_change_without_a_new_scene(profile):
         ("Memset (Device)", "Memset (Device)"),
     ],
 )
-def test_kernel_names_lose_what_tells_variants_apart(profile, name, short):
+def test_kernel_names_lose_what_tells_variants_apart(name, short):
     assert profile.short_name(name) == short
 
 
 @pytest.mark.slow
-def test_a_small_run_on_the_cpu_times_steps_and_kernels(profile, tmp_path, capsys):
+def test_a_small_run_on_the_cpu_times_steps_and_kernels(tmp_path, capsys):
     out = tmp_path / "profile.json"
     arguments = ["--device", "cpu", "--worlds-scale", "0.001", "--steps", "2", "--walk", "2", "--out", str(out)]
     profile.main([*arguments, "--scene", "gauge-wave", "tiles-mix", "--cases", "3", "--time", "300"])
@@ -80,7 +67,7 @@ def test_a_small_run_on_the_cpu_times_steps_and_kernels(profile, tmp_path, capsy
 
 
 @pytest.mark.slow
-def test_cases_that_do_not_fit_into_the_time_are_named(profile, tmp_path, capsys):
+def test_cases_that_do_not_fit_into_the_time_are_named(tmp_path, capsys):
     arguments = ["--device", "cpu", "--worlds-scale", "0.001", "--steps", "1", "--walk", "1", "--scene", "gauge-wave"]
     profile.main([*arguments, "--time", "-1", "--out", str(tmp_path / "profile.json")])
     assert "left out for lack of time: gauge-wave, 3 worlds" in capsys.readouterr().out

@@ -1,10 +1,10 @@
-import importlib.util
 import os
 import pickle
 import sys
 import zipfile
 from pathlib import Path
 
+import import_public_cts
 import numpy as np
 import pytest
 import torch
@@ -16,8 +16,6 @@ from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import save_policy
 from gaitgauge.policy.networks import CtsNetwork, multilayer_perceptron
 from torch import nn
-
-ROOT = Path(__file__).parents[2]
 
 
 def refused(path: Path | str, **options: object) -> str:
@@ -233,12 +231,9 @@ def test_published_weights_are_converted_and_checked(tmp_path, observations, mon
     weights = {k.replace("encoder.", "student_encoder."): v.numpy() for k, v in network.state_dict().items()}
     sample = {"sample/observations": frames.numpy(), "sample/actions": np.array(actions)}
     np.savez(tmp_path / "weights.npz", **weights, **sample)
-    spec = importlib.util.spec_from_file_location("import_public_cts", ROOT / "benchmarks" / "import_public_cts.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
     monkeypatch.setattr(sys, "argv", ["import", str(tmp_path / "weights.npz"), str(tmp_path / "own.pt")])
-    script.main()
+    import_public_cts.main()
     assert torch.equal(load_policy(tmp_path / "own.pt").session(1).act(frames[:1])[0], torch.from_numpy(actions[0]))
     np.savez(tmp_path / "weights.npz", **weights, **{**sample, "sample/actions": np.array(actions) + 1e-3})
     with pytest.raises(SystemExit, match="published"):
-        script.main()
+        import_public_cts.main()

@@ -1,7 +1,4 @@
-import importlib.util
-from pathlib import Path
-from types import ModuleType
-
+import make_trot_policy
 import mujoco
 import numpy as np
 import pytest
@@ -15,20 +12,10 @@ from gaitgauge.policy.trot import TrotController
 from gaitgauge.robots.rotation import rotate_inverse
 from gaitgauge.terrains.registry import make_terrain
 
-ROOT = Path(__file__).parents[2]
-
 
 @pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_trot_policy", ROOT / "benchmarks" / "make_trot_policy.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def controller(script) -> TrotController:
-    return TrotController(**script.make()[1].arguments)
+def controller() -> TrotController:
+    return TrotController(**make_trot_policy.make()[1].arguments)
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +52,8 @@ def test_inverse_kinematics_and_jacobian(controller, joints):
     assert torch.isfinite(controller.joint_positions(torch.zeros_like(feet))).all()
 
 
-def test_rows_do_not_influence_each_other_and_resets_forget(script, run, observations):
-    policy = NativePolicy(*script.make(), path="trot")
+def test_rows_do_not_influence_each_other_and_resets_forget(run, observations):
+    policy = NativePolicy(*make_trot_policy.make(), path="trot")
     together = run(policy.session(4), observations)
     changed = observations.clone()
     changed[:, 0] += 1.0
@@ -77,14 +64,14 @@ def test_rows_do_not_influence_each_other_and_resets_forget(script, run, observa
     assert not torch.equal(together[6:, 1], again[:, 1])
 
 
-def test_the_file_is_reproducible(script, tmp_path):
+def test_the_file_is_reproducible(tmp_path):
     for name in ("a", "b"):
-        save_policy(tmp_path / name / "go2.gauge.pt", *script.make())
+        save_policy(tmp_path / name / "go2.gauge.pt", *make_trot_policy.make())
     first = (tmp_path / "a" / "go2.gauge.pt").read_bytes()
     assert first == (tmp_path / "b" / "go2.gauge.pt").read_bytes()
 
 
-def test_walks_as_told_despite_noise_and_latency(script, go2):
+def test_walks_as_told_despite_noise_and_latency(go2):
     """Forward, backward, sideways, round and standing, on level ground under the gauge's disturbances."""
     commands = torch.tensor([[0.6, 0, 0], [-0.6, 0, 0], [0, 0.4, 0], [0, 0, 0.8], [0, 0, 0]], dtype=torch.float64)
     count, suite = len(commands), load_suite("gaitgauge-1")
@@ -96,7 +83,7 @@ def test_walks_as_told_despite_noise_and_latency(script, go2):
         physics=suite.physics,
     )
     backend = make_backend("mujoco", scene, threads=1)
-    policy = NativePolicy(*script.make(), path="trot")
+    policy = NativePolicy(*make_trot_policy.make(), path="trot")
     session = policy.session(count)
     builder = ObservationBuilder(go2_contract(go2), go2, count)
     action, generator = torch.zeros(count, 12), torch.Generator().manual_seed(3)

@@ -1,28 +1,15 @@
 """``benchmarks/gap_over_training.py``: where checkpoints stand, which tables belong together, what a ranking says."""
 
-import importlib.util
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
+import gap_over_training as gap
 import pytest
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.training.tasks import find_task
 
-FILE = Path(__file__).parents[2] / "benchmarks" / "gap_over_training.py"
-
-
-@pytest.fixture(scope="module")
-def gap():
-    specification = importlib.util.spec_from_file_location("gap_over_training", FILE)
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[specification.name] = module
-    specification.loader.exec_module(module)
-    return module
-
 
 @pytest.fixture
-def folders(gap, tmp_path, monkeypatch):
+def folders(tmp_path, monkeypatch):
     """Two folders of files that say when they were saved: iteration in the name, 2 million steps an iteration."""
 
     def load_policy(path):
@@ -46,7 +33,7 @@ def folders(gap, tmp_path, monkeypatch):
     return make
 
 
-def test_a_count_that_starts_over_is_added_and_one_that_goes_on_is_not(gap, folders):
+def test_a_count_that_starts_over_is_added_and_one_that_goes_on_is_not(folders):
     found = gap.find_checkpoints(folders((10, 20), (5, 15), (20, 30)), None)
     assert [(c.stretch, c.iteration, c.steps) for c in found] == [
         (1, 10, 20.0),
@@ -58,14 +45,14 @@ def test_a_count_that_starts_over_is_added_and_one_that_goes_on_is_not(gap, fold
     ]
 
 
-def test_steps_before_are_taken_as_given(gap, folders):
+def test_steps_before_are_taken_as_given(folders):
     made = folders((10,), (5, 10))
     assert [c.steps for c in gap.find_checkpoints(made, [0.0, 100.0], every=10)] == [20.0, 120.0]
     with pytest.raises(gap.GapError, match="1 numbers for 2 folders"):
         gap.find_checkpoints(made, [0.0])
 
 
-def test_training_suite_keeps_times_and_takes_the_physics(gap, tmp_path):
+def test_training_suite_keeps_times_and_takes_the_physics(tmp_path):
     plain, environment = load_suite("robogauge-1.1"), find_task("go2-moe-cts").environment
     suite = load_suite(str(gap.training_suite(plain, environment.physics, environment.joints.parameters, tmp_path)))
     assert suite.physics.control_period == pytest.approx(0.02)
@@ -75,7 +62,7 @@ def test_training_suite_keeps_times_and_takes_the_physics(gap, tmp_path):
     assert (suite.scoring, suite.goals, suite.matrix) == (plain.scoring, plain.goals, plain.matrix)
 
 
-def test_tables_of_two_engines_become_one(gap, tmp_path):
+def test_tables_of_two_engines_become_one(tmp_path):
     who = {"stretch": "1", "iteration": "20", "environment_steps_millions": "40", "policy_sha256": "a", "protocol": "p"}
     cpu = who | {"mujoco_score": "0.5", "mujoco_warp_score": ""}
     gpu = who | {"mujoco_score": "", "mujoco_warp_score": "0.7", "training_physics": "d"}
@@ -87,7 +74,7 @@ def test_tables_of_two_engines_become_one(gap, tmp_path):
         gap.merge(cpu, gpu | {"policy_sha256": "b"})
 
 
-def test_ranking(gap):
+def test_ranking():
     scores = {"mujoco_score": (0.1, 0.4, 0.3), "mujoco_warp_score": (0.2, 0.5, 0.6), "mean_reward": (3.0, 2.0, 1.0)}
     rows = [{name: str(values[i]) for name, values in scores.items()} for i in range(3)]
     warp, reward, level = gap.correlations(rows)
@@ -96,7 +83,7 @@ def test_ranking(gap):
     assert "too few" in level
 
 
-def test_training_figures_are_those_before_the_checkpoint(gap):
+def test_training_figures_are_those_before_the_checkpoint():
     series = [(1.0, 10.0), (2.0, 20.0), (3.0, 30.0), (4.0, 99.0)]
     assert gap.mean_before(series, 3.0, 1.5) == 25.0
     assert gap.mean_before(series, 9.0, 1.0) is None
