@@ -118,6 +118,8 @@ class RewardConfiguration:
     """Squared second difference of the actions."""
     collision: float = -1.0
     """Number of thighs and calves that touch something."""
+    base_collision: float = 0.0
+    """The base touches something; of use where ``TerminationConfiguration.base_force`` lets it live."""
     joint_limits: float = -2.0
     """Joint angle beyond the soft limits [rad]."""
     foot_regulation: float = -0.05
@@ -150,7 +152,7 @@ class RewardConfiguration:
     foot_height_over: str = "foot"
     """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
     collision_force: float = 0.1
-    """Contact force from which a thigh or calf counts as touching [N]."""
+    """Contact force from which a thigh, a calf or the base counts as touching [N]."""
     soft_limit: float = 0.9
     """Share of a joint's range, about its middle, that is free of the joint-limit penalty."""
 

@@ -66,6 +66,8 @@ class RewardInputs:
     """[m/s], (N, F, 3)."""
     touching_bodies: torch.Tensor
     """Number of thighs and calves in contact, (N,)."""
+    base_touching: torch.Tensor
+    """1 where the base touches something, (N,)."""
     fallen: torch.Tensor
     """Worlds whose episode ends by a fall, (N,) bool."""
     base_height_target: float
@@ -151,6 +153,11 @@ def collision(inputs: RewardInputs) -> torch.Tensor:
     return inputs.touching_bodies
 
 
+def base_collision(inputs: RewardInputs) -> torch.Tensor:
+    """1 while the base touches something."""
+    return inputs.base_touching
+
+
 def joint_limits(inputs: RewardInputs) -> torch.Tensor:
     """Sum of the angles beyond the soft limits [rad]. The paper counts joints; the code's angle has a slope to
     follow.
@@ -219,6 +226,7 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
         action_rate,
         action_smoothness,
         collision,
+        base_collision,
         joint_limits,
         foot_regulation,
         hip_regulation,

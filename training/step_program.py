@@ -293,6 +293,7 @@ class StepProgram:
             foot_height=state.foot_position_w[..., 2] - below_feet,
             foot_velocity_w=state.foot_velocity_w,
             touching_bodies=(touching[:, self._touching] > settings.collision_force).sum(dim=1).float(),
+            base_touching=(touching[:, self._base] > settings.collision_force).float(),
             fallen=fallen,
             base_height_target=settings.base_height_target,
             foot_height_length=settings.foot_height_scale * settings.base_height_target,

@@ -35,6 +35,7 @@ def quiet():
         foot_height=torch.ones(2, 4),
         foot_velocity_w=torch.zeros(2, 4, 3),
         touching_bodies=torch.zeros(2),
+        base_touching=torch.zeros(2),
         fallen=torch.zeros(2, dtype=torch.bool),
         base_height_target=0.38,
         foot_height_length=0.0095,
@@ -103,6 +104,7 @@ CASES = {
         0.0,
     ),
     "collision": ({"touching_bodies": torch.tensor([3.0, 0.0])}, 3.0, 0.0),
+    "base_collision": ({"base_touching": torch.tensor([1.0, 0.0])}, 1.0, 0.0),
     "joint_limits": ({"joint_position": joints(1.25, -1.5, 0.9)}, 0.75, 0.0),
     "foot_regulation": (
         {
