@@ -37,6 +37,8 @@ _REPORT_INTERVAL = 0.2
 """Time between a lane's reports on how far it is [s]."""
 _TOGETHER = 8
 """Level tests that are left to one lane: policies are run on eight rows or more, and so few worlds are mostly the loop's cost."""
+_AHEAD = 16
+"""Level tests beside which a lane plays ahead of time: more worlds slow those that are sure to be needed."""
 # a forked lane has all modules at once, which saves importing torch; elsewhere system libraries do not bear being forked
 if sys.platform == "linux":
     _CONTEXT = multiprocessing.get_context("fork")
@@ -148,9 +150,12 @@ class _Crew:
         self._processes: list[BaseProcess] = []
         self._connections: list[Connection] = []
         self._idle: set[int] = set()
-        self._tests = [0] * lanes  # level tests that each lane has at work
+        self._at_work: list[set[Episode]] = [set() for _ in range(lanes)]
         # how often what there is to take has changed: lanes look at it in every control step, and ask only when it has
         self._changes = _CONTEXT.RawValue("q", 0)
+        # what each lane has at work although nobody needs it any more, and how often it had anything of that kind
+        self._needless: list[list[Episode]] = [[] for _ in range(lanes)]
+        self._calls = [_CONTEXT.RawValue("q", 0) for _ in range(lanes)]
         self._progress = LaneProgress(lanes)
         try:
             for lane in range(lanes):
@@ -159,7 +164,9 @@ class _Crew:
                 with theirs:
                     parents = tuple(self._connections)
                     process = _CONTEXT.Process(
-                        target=run_lane, args=(job, theirs, self._changes, parents), name=f"lane-{lane}"
+                        target=run_lane,
+                        args=(job, theirs, self._changes, self._calls[lane], parents),
+                        name=f"lane-{lane}",
                     )
                     process.start()
                     self._processes.append(process)
@@ -186,12 +193,16 @@ class _Crew:
                 kind, *content = self._receive(lane)
                 if kind == "take":
                     most, urgent = content
-                    self._give(lane, self._share(plan, lane, most, urgent), waiting=any(plan.waiting))
+                    episodes = self._share(plan, lane, most, urgent)
+                    self._give(lane, episodes, waiting=any(plan.waiting) or bool(plan.likely()))
                 elif kind == "finished":
                     record = content[0]
+                    self._at_work[lane].discard(record.episode)
                     plan.finished(record)
-                    self._tests[lane] -= record.episode.stage == "search"
                     self._changes.value += 1
+                elif kind == "needless":
+                    self._connections[lane].send(self._needless[lane])
+                    self._needless[lane] = []
                 elif kind == "idle":
                     self._idle.add(lane)
                 elif kind == "progress":
@@ -204,6 +215,7 @@ class _Crew:
                     efforts.append(content[0])
                     at_work.remove(self._connections[lane])
             if not efforts:
+                self._call_off(plan.needless())
                 self._serve(plan)
         seconds = [e.engine_seconds for e in efforts if e.engine_seconds is not None]
         return Effort(
@@ -225,22 +237,36 @@ class _Crew:
 
     def _give(self, lane: int, episodes: list[Episode], *, waiting: bool = False) -> None:
         """Hand episodes to a lane, if there are any, and say whether any more wait."""
-        self._tests[lane] += sum(e.stage == "search" for e in episodes)
+        self._at_work[lane].update(episodes)
         self._changes.value += bool(episodes)
         self._connections[lane].send((episodes, waiting))
 
     def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
         """Episodes for a lane that asks: level tests first, a few together or its part of all that are at work or wait.
 
-        Others wait for level tests, so that a lane with such does not slow them with quality while another has none.
+        Others wait for level tests, so that a lane with such does not slow them with quality while another has none. A lane with
+        few level tests and nothing else plays ahead of time.
         """
         lanes = len(self._connections)
-        tests, quality = plan.waiting
-        part = max(-(-(sum(self._tests) + tests) // lanes), _TOGETHER) - self._tests[lane]
+        waiting, quality = plan.waiting
+        tests = [sum(e.stage == "search" for e in episodes) for episodes in self._at_work]
+        part = max(-(-(sum(tests) + waiting) // lanes), _TOGETHER) - tests[lane]
         episodes = plan.take(min(most, max(part, 0)), urgent=True)
-        if episodes or urgent or (self._tests[lane] and not all(self._tests)):
+        if episodes or urgent:
             return episodes
-        return plan.take_quality(min(most, -(-quality // lanes)))
+        if all(tests) or not tests[lane]:
+            episodes = plan.take_quality(min(most, -(-quality // lanes)))
+        if not episodes and tests[lane] == len(self._at_work[lane]) < _AHEAD:
+            episodes = plan.take_ahead(1)
+        return episodes
+
+    def _call_off(self, episodes: Sequence[Episode]) -> None:
+        """Tell the lanes that have them at work that nobody needs some episodes any more."""
+        for episode in episodes:
+            lane = next(lane for lane, at_work in enumerate(self._at_work) if episode in at_work)
+            self._at_work[lane].discard(episode)
+            self._needless[lane].append(episode)
+            self._calls[lane].value += 1
 
     def _serve(self, plan: Plan) -> None:
         """Give waiting lanes work, or send them home once nothing can follow any more."""
@@ -262,9 +288,10 @@ class _Crew:
 class _RemoteAgenda:
     """The parent's plan, as a lane sees it (see ``segments.Agenda``)."""
 
-    def __init__(self, connection: Connection, changes: c_longlong) -> None:
-        """``changes`` counts how often what there is to take has changed."""
-        self._connection, self._changes = connection, changes
+    def __init__(self, connection: Connection, changes: c_longlong, calls: c_longlong) -> None:
+        """``changes`` counts how often what there is to take has changed, ``calls`` how often something was called off."""
+        self._connection, self._changes, self._calls = connection, changes, calls
+        self._heard = 0  # of the calls
         self._given: list[Episode] = []
         self._nothing_at = -1  # the count at which there was nothing to take
         self._next_report = 0.0
@@ -288,6 +315,17 @@ class _RemoteAgenda:
         self._nothing_at = -1
         return ()  # lanes search step by step, where all that is played is needed
 
+    def needless(self) -> Collection[Episode]:
+        """Episodes at work that nobody needs any more."""
+        calls = self._calls.value
+        if calls == self._heard:
+            return ()
+        self._heard = calls
+        self._connection.send(("needless",))
+        episodes: list[Episode] = self._connection.recv()
+        self._given = [e for e in self._given if e not in episodes]
+        return episodes
+
     def wait(self) -> bool:
         """Wait until there is something to play; False once nothing will come."""
         self._connection.send(("idle",))
@@ -308,13 +346,15 @@ class _RemoteAgenda:
             self._connection.send(("progress", progress.control_steps, progress.physics_steps, progress.active()))
 
 
-def run_lane(job: LaneJob, connection: Connection, changes: c_longlong, inherited: Sequence[Connection]) -> None:
+def run_lane(
+    job: LaneJob, connection: Connection, changes: c_longlong, calls: c_longlong, inherited: Sequence[Connection]
+) -> None:
     """A lane's whole life.
 
     Args:
         job: what it plays with.
         connection: to its parent.
-        changes: see ``_RemoteAgenda``.
+        changes, calls: see ``_RemoteAgenda``.
         inherited: the parent's ends of all connections; while any process holds one, its lane would not notice that the
             parent is gone.
     """
@@ -326,9 +366,9 @@ def run_lane(job: LaneJob, connection: Connection, changes: c_longlong, inherite
             torch.set_num_threads(1)
             gc.freeze()  # what the lane has from its parent is not looked through for garbage again
             runner = build_runner(job, load_policy(job.policy, job.robot))
-            agenda = _RemoteAgenda(connection, changes)
+            agenda = _RemoteAgenda(connection, changes, calls)
             while agenda.wait():
-                runner.run(agenda, agenda.report)
+                runner.run(agenda, agenda.report, agenda.needless)
             effort = Effort(physics_steps=runner.physics_steps, engine_seconds=runner.backend.engine_seconds)
             connection.send(("done", effort))
         except (EOFError, ConnectionError):

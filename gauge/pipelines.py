@@ -73,6 +73,11 @@ class LevelTest:
         self.failures += not success
 
     @property
+    def nearly_passed(self) -> bool:
+        """Whether nothing has failed and one more success decides."""
+        return self.failures == 0 and self.successes == self._needed - 1
+
+    @property
     def idle(self) -> bool:
         """No episode of it is running."""
         return self._running == 0
@@ -100,6 +105,9 @@ class Environment:
     """Episodes that wait or are at work, those that are ``early`` left out."""
     early: dict[int, dict[Episode, Record | None]] = field(default_factory=dict)
     """Quality episodes of levels that may come out, begun before the level is known, and their records once there are any."""
+
+    ahead: dict[Episode, Record | None] = field(default_factory=dict)
+    """Episodes begun although nobody has asked for them yet, and their records once there are any."""
 
     @property
     def key(self) -> str:
@@ -194,7 +202,9 @@ class Plan:
             if known is None:
                 taken.append(episode)
             else:
+                environment = self._of[episode]
                 self._fold(known)
+                self._take_over(environment)
         return taken
 
     def finished(self, record: Record) -> Collection[Episode]:
@@ -203,8 +213,17 @@ class Plan:
         Returns:
             Episodes at work that nobody needs any more: of level tests played at once whose outcome is certain by now.
         """
+        environment = self._of.get(record.episode)
+        if environment is not None and record.episode in environment.ahead:
+            environment.ahead[record.episode] = record
+            return ()
+        if environment is None and not self._speculative:
+            return ()  # given up in the moment in which it ended
         self._store.put(record)
-        return self._fold(record)
+        needless = self._fold(record)
+        if environment is not None:
+            self._take_over(environment)
+        return needless
 
     @property
     def waiting(self) -> tuple[int, int]:
@@ -216,6 +235,62 @@ class Plan:
         open_searches = sum(e.searched and e.level is None for e in self.environments)
         later = open_searches * (4.0 + (len(self.seeds) if self._evaluate else 0))
         return self.total_known - self.done + later
+
+    # ---- ahead of time --------------------------------------------------------------------------------------------
+
+    def take_ahead(self, most: int) -> list[Episode]:
+        """Episodes that will be asked for if level tests end as they began, for those who have nothing better to play.
+
+        What comes of them is kept in memory until somebody asks for it, and forgotten where nobody does: neither results nor store
+        show what was played ahead.
+        """
+        taken: list[Episode] = []
+        for environment, episode in self.likely()[:most]:
+            environment.ahead[episode] = None
+            self._of[episode] = environment
+            taken.append(episode)
+        return taken
+
+    def likely(self) -> list[tuple[Environment, Episode]]:
+        """What ``take_ahead`` has to offer."""
+        found = []
+        for environment in self.environments:
+            level = (environment.low + environment.high + 1) // 2
+            test = environment.tests.get(level) if environment.level is None else None
+            if test is not None and test.nearly_passed:
+                found += [(environment, e) for e in self._if_passed(environment, level) if e not in environment.ahead]
+        return [(environment, e) for environment, e in found if self._store.get(e) is None]
+
+    def _if_passed(self, environment: Environment, level: int) -> list[Episode]:
+        """What a search asks for next if a level is passed."""
+        if level < environment.high:
+            following = (level + environment.high + 1) // 2
+            return [self._episode(environment, following, s, "search") for s in self._new_test().next_round()]
+        return [self._episode(environment, level, s, "eval") for s in self.seeds] if self._evaluate else []
+
+    def needless(self) -> list[Episode]:
+        """Forget what was begun ahead and will never be asked for; returns the episodes of it that are at work."""
+        at_work = []
+        for environment in self.environments:
+            if not environment.ahead:
+                continue
+            asked, found = environment.prospects()
+            for episode in sorted(environment.ahead):
+                if episode.level not in (asked if episode.stage == "search" else found):
+                    del self._of[episode]
+                    if environment.ahead.pop(episode) is None:
+                        at_work.append(episode)
+        return at_work
+
+    def _take_over(self, environment: Environment) -> None:
+        """What was begun ahead and is asked for by now becomes like any other episode."""
+        while asked := sorted(environment.ahead.keys() & environment.waiting):
+            for episode in asked:
+                (self._quality if episode.stage == "eval" else self._tests).remove(episode)
+                record = environment.ahead.pop(episode)
+                if record is not None:
+                    self._store.put(record)
+                    self._fold(record)
 
     # ---- folding --------------------------------------------------------------------------------------------------
 
@@ -285,11 +360,14 @@ class Plan:
     def _queue_test(self, environment: Environment, level: int) -> bool | None:
         """Queue the next round of a level's test; returns its outcome if it has one."""
         if level not in environment.tests:
-            scoring, seeds = self.suite.scoring, self.suite.matrix.search_seeds
-            environment.tests[level] = LevelTest(seeds, scoring.pass_rate, all_at_once=self._speculative)
+            environment.tests[level] = self._new_test()
         test = environment.tests[level]
         self._add(environment, [self._episode(environment, level, s, "search") for s in test.next_round()])
         return test.passed if test.idle or self._speculative else None
+
+    def _new_test(self) -> LevelTest:
+        seeds, rate = self.suite.matrix.search_seeds, self.suite.scoring.pass_rate
+        return LevelTest(seeds, rate, all_at_once=self._speculative)
 
     def _queue_quality(self, environment: Environment) -> None:
         level = environment.level or 0

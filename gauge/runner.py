@@ -7,7 +7,7 @@ how often somebody looks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import numpy as np
@@ -92,8 +92,18 @@ class EpisodeRunner:
         """Physics steps up to the last look, added up over worlds."""
         return self._slots.physics_steps
 
-    def run(self, agenda: Agenda, watch: Callable[[Progress], None] | None = None) -> None:
+    def run(
+        self,
+        agenda: Agenda,
+        watch: Callable[[Progress], None] | None = None,
+        needless: Callable[[], Collection[Episode]] = tuple,
+    ) -> None:
         """Play until the agenda has nothing left.
+
+        Args:
+            agenda: what to play.
+            watch: called at every look.
+            needless: asked at every look for episodes at work that nobody needs any more.
 
         Raises:
             PolicyError: the policy's output is not finite.
@@ -105,8 +115,10 @@ class EpisodeRunner:
                 if self._at_once:
                     self._look()
                     self._report(agenda, watch)
+                    self._drop(needless())
                 else:  # a GPU is at work by now: files are written and searches folded meanwhile
                     self._report(agenda, watch)
+                    self._drop(needless())
                     self._look()
 
     def ages(self) -> dict[Episode, int]:
@@ -161,12 +173,16 @@ class EpisodeRunner:
         for record in self._complete:
             needless.update(agenda.finished(record))
         self._complete.clear()
+        self._drop(needless)
+        if watch is not None:
+            watch(Progress(self))
+
+    def _drop(self, needless: Collection[Episode]) -> None:
+        """Leave what nobody needs any more."""
         if needless:
             self._queue.drop(needless)
             seated = enumerate(self._segment)
             self._leave([slot for slot, segment in seated if segment is not None and segment.episode in needless])
-        if watch is not None:
-            watch(Progress(self))
 
     def _leave(self, slots: list[int]) -> None:
         """Free slots."""
