@@ -38,7 +38,7 @@ _REPORT_INTERVAL = 0.2
 _TOGETHER = 8
 """Level tests that are left to one lane: policies are run on eight rows or more, and so few worlds are mostly the loop's cost."""
 _AHEAD = 16
-"""Level tests beside which a lane plays ahead of time: more worlds slow those that are sure to be needed."""
+"""Episodes beside which a lane begins none ahead of time: more of them slow those that are sure to be needed."""
 # a forked lane has all modules at once, which saves importing torch; elsewhere system libraries do not bear being forked
 if sys.platform == "linux":
     _CONTEXT = multiprocessing.get_context("fork")
@@ -244,8 +244,8 @@ class _Crew:
     def _share(self, plan: Plan, lane: int, most: int, urgent: bool) -> list[Episode]:
         """Episodes for a lane that asks: level tests first, a few together or its part of all that are at work or wait.
 
-        Others wait for level tests, so that a lane with such does not slow them with quality while another has none. A lane with
-        few level tests and nothing else plays ahead of time.
+        Others wait for level tests, so that a lane with such does not slow them with quality while another has none. What is
+        left of a lane's worlds plays ahead of time.
         """
         lanes = len(self._connections)
         waiting, quality = plan.waiting
@@ -256,7 +256,7 @@ class _Crew:
             return episodes
         if all(tests) or not tests[lane]:
             episodes = plan.take_quality(min(most, -(-quality // lanes)))
-        if not episodes and tests[lane] == len(self._at_work[lane]) < _AHEAD:
+        if not episodes and len(self._at_work[lane]) < _AHEAD:
             episodes = plan.take_ahead(1)
         return episodes
 

@@ -135,12 +135,12 @@ def crew(lanes):
     return made
 
 
-def test_a_lane_without_quality_plays_ahead_and_hears_at_once_when_that_is_over():
+def test_a_lane_with_little_to_do_plays_ahead_and_hears_when_that_is_over():
     _, _, plan, last = begun()
     made = crew(3)
     made._at_work[0].add(last)
-    made._at_work[1].add(episode(DIAGONAL))
-    assert made._share(plan, 1, 9, False) == [], "quality needs its worlds"
+    made._at_work[1].update(episode(DIAGONAL, seed=seed) for seed in range(16))
+    assert made._share(plan, 1, 9, False) == [], "it has enough to do"
     assert made._share(plan, 2, 9, True) == [], "nobody waits for it yet"
     ahead = made._share(plan, 2, 9, False)
     assert [e.level for e in ahead] == [8]
