@@ -112,7 +112,8 @@ class MujocoWarpBackend(PhysicsBackend):
         except (RuntimeError, torch.cuda.OutOfMemoryError) as error:
             if isinstance(error, BackendError) or not is_memory_error(error):
                 raise
-            per_world = bytes_per_world(self._shared.model, capacity, scene.num_worlds)
+            processors = wp.device_from_torch(self.device).sm_count
+            per_world = bytes_per_world(self._shared.model, capacity, scene.num_worlds, processors)
             raise BackendError(memory_advice(scene.num_worlds, self.device, free, per_world)) from error
 
     # ---- building -------------------------------------------------------------------------------------------------

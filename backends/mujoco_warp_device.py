@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from .base import BackendError
+from .mujoco_warp_fields import SEARCH_THREADS, scratch_bytes
 from .mujoco_warp_model import Capacity
 
 _SCRATCH_FACTOR = 1.3
@@ -87,13 +88,14 @@ def is_memory_error(error: BaseException) -> bool:
     return isinstance(error, torch.cuda.OutOfMemoryError) or "failed to allocate" in text or "out of memory" in text
 
 
-def bytes_per_world(model: mujoco.MjModel, capacity: Capacity, worlds: int) -> float:
-    """Memory that one more world needs [bytes], scratch memory included as an estimate; measured on small copies.
+def bytes_per_world(model: mujoco.MjModel, capacity: Capacity, worlds: int, processors: int = 132) -> float:
+    """Memory that one world needs [bytes], scratch memory included as an estimate; measured on small copies.
 
     Args:
         model: the model that all worlds share.
         capacity: buffer sizes for ``worlds`` worlds.
         worlds: number of worlds that the capacity is for.
+        processors: multiprocessors of the GPU; an H200's if nothing is said.
     """
 
     def size(count: int) -> int:
@@ -108,7 +110,13 @@ def bytes_per_world(model: mujoco.MjModel, capacity: Capacity, worlds: int) -> f
         return sum(_array_bytes(part) for part in (data, data.contact, data.efc))
 
     data = (size(3) - size(1)) / 2
-    return _SCRATCH_FACTOR * data + _CONVEX_BYTES * capacity.convex / worlds + _OWN_BYTES
+    convex, searches = float(capacity.convex), 0.0
+    ground = model.geom_type[model.geom_bodyid == 0]
+    if mujoco.mjtGeom.mjGEOM_HFIELD in ground:
+        searches = min(processors * SEARCH_THREADS, capacity.convex) * scratch_bytes(model.opt.ccd_iterations)
+        if mujoco.mjtGeom.mjGEOM_BOX not in ground:
+            convex = 0.0  # height fields have a narrowphase of their own
+    return _SCRATCH_FACTOR * data + (_CONVEX_BYTES * convex + searches) / worlds + _OWN_BYTES
 
 
 def memory_advice(worlds: int, device: torch.device, free: int, per_world: float) -> str:

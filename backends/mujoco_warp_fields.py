@@ -45,7 +45,7 @@ _SERIAL_THREADS = 64
 """Threads on a CPU, where they run in turn."""
 _TEST_THREADS = 512
 """Threads for each multiprocessor of a GPU that test prisms, each a few in turn."""
-_SEARCH_THREADS = 256
+SEARCH_THREADS = 256
 """Threads for each multiprocessor that search: as many as fit at 255 registers. Each has its own scratch memory."""
 
 
@@ -72,6 +72,21 @@ def scratch_memory(rows: int, iterations: int) -> kernels.Scratch:
     return scratch
 
 
+def scratch_bytes(iterations: int) -> int:
+    """Size of the memory of one search [bytes]."""
+    with wp.ScopedDevice("cpu"):
+        scratch = scratch_memory(1, iterations)
+    parts = (
+        scratch.vertices,
+        scratch.projections,
+        scratch.vertex_numbers,
+        scratch.faces,
+        scratch.horizon,
+        scratch.squares,
+    )
+    return sum(part.size * wp.types.type_size_in_bytes(part.dtype) for part in parts)
+
+
 def empty_lists(contacts: int, worlds: int) -> kernels.Lists:
     """Lists for so many worlds with room for so many contacts together."""
     prisms, touches = (each * contacts + spare * worlds for each, spare in (_PRISMS, _TOUCHES))
@@ -91,7 +106,7 @@ def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: t
     """
     multiprocessors = data.ncollision.device.sm_count
     testing = multiprocessors * _TEST_THREADS or _SERIAL_THREADS
-    searching = max(1, min(multiprocessors * _SEARCH_THREADS or _SERIAL_THREADS, data.naccdmax))
+    searching = max(1, min(multiprocessors * SEARCH_THREADS or _SERIAL_THREADS, data.naccdmax))
     shapes = _filled(kernels.Shapes(), model, model.opt, data, context)
     materials = _filled(Materials(), model)
     contacts = _filled(Contacts(), data.contact, data)

@@ -122,7 +122,6 @@ class MujocoAdapter(SolverAdapter):
             support=Support.APPROXIMATE,
             note="to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces",
         ),
-        height_field=Capability(support=Support.EXACT, note="about four times slower than boxes"),
     )
     gap = 0.0
     skin = True
