@@ -304,7 +304,11 @@ class _Policy:
         reference, design = prepared.reference.label, prepared.design
         pairs = {
             v.label: compare(
-                design, self._records[reference], self._records[v.label], floor=floor, name=f"{self._name}/{v.label}"
+                design,
+                self._records[reference],
+                self._records[v.label],
+                floor=floor,
+                name=f"{self._name}/{reference}/{v.label}",  # as in the gaps: one difference, one interval
             )
             for v in prepared.others
         }

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import zlib
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from gaitgauge.backends.base import BackendError
 from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.consistency import open_loop
 from gaitgauge.gauge.consistency.attribution import choose_factors
-from gaitgauge.gauge.consistency.closed_loop import make_cells
+from gaitgauge.gauge.consistency.closed_loop import Design, make_cells
 from gaitgauge.gauge.consistency.errors import ConsistencyError
 from gaitgauge.gauge.consistency.page import render, write_page
+from gaitgauge.gauge.consistency.statistics import Estimate
 from gaitgauge.gauge.consistency.study import Request, study
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.policy.contract import go2_contract
@@ -261,6 +263,22 @@ def test_the_reference_can_be_any_engine(request_of, tmp_path):
     assert results["reference"] == "fake@ls_iterations=7"
     assert results["compared"] == ["fake"]
     assert results["policies"][0]["pairs"]["fake"]["overall"]["difference"]["value"] > 0.0
+
+
+@pytest.mark.parametrize("reference", ["fake", "fake@ls_iterations=7"])
+def test_a_difference_has_one_interval_wherever_it_stands(request_of, tmp_path, monkeypatch, reference):
+    """Resamples are drawn by name: with another name in another table, one difference would have two intervals."""
+
+    def estimate(design, values, name, rows=None, *, magnitude=False):
+        number = float(zlib.crc32(name.encode()))
+        return Estimate(value=0.0, low=-number, high=number)
+
+    monkeypatch.setattr(Design, "estimate", estimate)
+    results = study(request_of(reference=reference), tmp_path / "out", make=engine(motion=drifting))["policies"][0]
+    (gap,), (pair,) = results["gaps"], results["pairs"].values()
+    assert gap["pair"][0] == reference
+    for name in ("gap", "difference"):
+        assert gap["overall"][name] == pair["overall"][name]
 
 
 def test_cells():
