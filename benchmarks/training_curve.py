@@ -51,6 +51,7 @@ def read_stretch(run: Path, number: int, steps_before: float, hours_before: floa
         row = {"stretch": str(number), "iteration": str(index + 1)}
         row["environment_steps_millions"] = f"{steps_before + (index + 1 - first) * per_iteration / 1e6:.2f}"
         row["hours"] = f"{hours_before + (times[index] - times[first]) / 3600:.4f}"
+        row |= dict.fromkeys(COLUMNS, "")
         for name, series in values.items():
             at = index + 1 if name == "quick_score" else index
             row[name] = f"{series[at]:.4g}" if at in series else ""
@@ -133,7 +134,8 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
         own = [row for row in rows if row["stretch"] == number]
         scored = [(float(r["environment_steps_millions"]), float(r["quick_score"])) for r in own if r["quick_score"]]
         level = [(float(r["environment_steps_millions"]), r["mean_terrain_level"]) for r in own]
-        axes.plot(*zip(*scored, strict=True), "o-", label=f"stretch {number}")
+        if scored:
+            axes.plot(*zip(*scored, strict=True), "o-", label=f"stretch {number}")
         levels.plot(*zip(*[(x, float(y)) for x, y in level if y], strict=True), color="0.7", linewidth=1, zorder=0)
         axes.axvline(float(own[-1]["environment_steps_millions"]), color="0.9", linewidth=1)
     axes.set_xlabel("environment steps [million]")

@@ -16,6 +16,7 @@ from .environment_configuration import (
     Ramp,
     RewardConfiguration,
     ScheduleConfiguration,
+    TerminationConfiguration,
     TerrainConfiguration,
 )
 from .overrides import TaskError, apply_overrides
@@ -60,11 +61,23 @@ class _Settings:
 
 _MIRRORED = AlgorithmConfiguration(symmetry="augment", student_period=2)
 _ALL_TERRAINS = EnvironmentConfiguration(
-    rewards=RewardConfiguration(linear_tracking=1.5, foot_regulation=-0.1, foot_height_scale=0.05),
+    rewards=RewardConfiguration(
+        yaw_tracking=0.75,
+        progress=1.5,
+        collision=-0.5,
+        base_collision=-1.0,
+        foot_regulation=-0.1,
+        foot_height_scale=0.05,
+    ),
     commands=CommandConfiguration(straight_probability=0.5),
+    termination=TerminationConfiguration(base_force=80.0, stuck=2.5),
 )
-_ALL_TERRAINS_LEARNING = replace(_MIRRORED, entropy_coefficient=Ramp(start=0.01, end=0.003, begin=0.3, until=0.5))
-# Exploration is worth more while the robot learns to walk and to climb than once it is to be precise.
+_ALL_TERRAINS_LEARNING = AlgorithmConfiguration(
+    symmetry="alternate",
+    student_period=2,
+    # Exploration is worth more while the robot learns to walk and to climb than once it is to be precise.
+    entropy_coefficient=Ramp(start=0.01, end=0.003, begin=0.3, until=0.5),
+)
 
 
 def _moe_cts() -> Task:
