@@ -251,12 +251,17 @@ class NativePolicy(FilePolicy):
         self.path = path
         self.stored = stored
         self.network = build_network(stored, contract, source=path)
+        self._recorded: dict[int, FrozenNetwork] = {}
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
-        """Start work on ``num_episodes`` episodes, with a copy of the network."""
-        network = copy.deepcopy(self.network).to(device)
-        if device == "cpu":
-            network = frozen(network, num_episodes)
+        """Start work on ``num_episodes`` episodes, with a copy of the network as it is in the first session of so many on the CPU."""
+        network = self._recorded.get(num_episodes) if device == "cpu" else None
+        if network is None:
+            network = copy.deepcopy(self.network).to(device)
+            if device == "cpu":
+                network = frozen(network, num_episodes)
+            if isinstance(network, FrozenNetwork):
+                self._recorded[num_episodes] = network  # it remembers nothing, and recording takes a while
         return NativeSession(network, num_episodes, self.contract, torch.device(device), self.path)
 
 

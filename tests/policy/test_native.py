@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from gaitgauge.policy import networks
+from gaitgauge.policy import native, networks
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import ForeignFile, FrozenNetwork, StoredNetwork, frozen, save_policy
@@ -73,6 +73,17 @@ def test_a_session_on_the_cpu_replays_its_network_to_the_last_bit(cts_file):
         history = torch.randn(rows, policy.network.history_length, policy.network.frame_width)
         with torch.inference_mode():
             assert torch.equal(replayed(history), policy.network(history))
+
+
+def test_sessions_share_a_recording_and_nothing_else(cts_file, observations, run, monkeypatch):
+    policy, recorded = load_policy(cts_file), []
+    monkeypatch.setattr(native, "frozen", lambda network, count: recorded.append(count) or frozen(network, count))
+    first = run(policy.session(EPISODES), observations)
+    other = policy.session(EPISODES)
+    run(other, observations.flip(0))
+    assert torch.equal(run(policy.session(EPISODES), observations), first)
+    policy.session(3)
+    assert recorded == [EPISODES, 3]
 
 
 class Moody(nn.Module):
