@@ -255,7 +255,7 @@ class NativePolicy(FilePolicy):
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes, with a copy of the network as it is in the first session of so many on the CPU."""
-        network = self._recorded.get(num_episodes) if device == "cpu" else None
+        network: Any = self._recorded.get(num_episodes) if device == "cpu" else None
         if network is None:
             network = copy.deepcopy(self.network).to(device)
             if device == "cpu":
