@@ -28,15 +28,14 @@ from .randomness import UniformColumns
 from .rewards import RewardFunction, RewardInputs, commanded_to_move, progress_share
 from .step_records import ENDS, METRICS, EpisodeStart, Observations, Verdict
 
+STUCK_SHORTFALL = 0.9
+"""Share of the commanded speed that is missing of late from which a robot counts as stuck."""
+
 
 def joint_ranges(robot: Robot) -> torch.Tensor:
     """Lower and upper limit of every joint of the robot's model [rad], (J, 2)."""
     model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
     return torch.tensor([list(model.joint(name).range) for name in robot.joint_names], dtype=torch.float32)
-
-
-STUCK_SHORTFALL = 0.9
-"""Share of the commanded speed that is missing of late from which a robot counts as stuck."""
 
 
 class StepProgram:
