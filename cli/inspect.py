@@ -32,7 +32,7 @@ def table_console() -> Console:
 # ---- import ---------------------------------------------------------------------------------------------------------
 
 
-def import_file(source: str, destination: Path, *, force: bool, trainable: bool = False) -> None:
+def import_file(source: str, destination: Path, *, force: bool, trainable: bool = False, raw: bool = False) -> None:
     """Write a foreign policy as the project's own file, and print the contract that it got.
 
     Args:
@@ -40,6 +40,7 @@ def import_file(source: str, destination: Path, *, force: bool, trainable: bool 
         destination: the file to write; it appears whole or not at all.
         force: replace the destination if it exists.
         trainable: keep the teacher and the critic of a training checkpoint.
+        raw: with ``trainable``, the weights after the last update instead of their average.
 
     Raises:
         CheckpointError: ``trainable``, and the source is no training checkpoint.
@@ -56,7 +57,7 @@ def import_file(source: str, destination: Path, *, force: bool, trainable: bool 
         from ..policy.loading import find_policy, load_policy
         from ..training.checkpoint import trim_checkpoint
 
-        trim_checkpoint(find_policy(source), destination)
+        trim_checkpoint(find_policy(source), destination, raw=raw)
         contract = load_policy(str(destination)).contract
     else:
         from ..policy.importing import import_policy

@@ -322,11 +322,14 @@ def import_command(
         bool,
         typer.Option("--trainable", help="Keep teacher and critic of a training checkpoint, for train --init-from."),
     ] = False,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="The same with the weights after the last update, not their average.")
+    ] = False,
 ) -> None:
     """Turn a foreign policy into the project's own file, with its contract."""
     from .inspect import import_file
 
-    import_file(source, destination, force=force, trainable=trainable)
+    import_file(source, destination, force=force, trainable=trainable or raw, raw=raw)
 
 
 @app.command("list")

@@ -1,9 +1,9 @@
 """Checkpoints: a policy file that also holds everything a run needs to continue as if it had never stopped.
 
-A checkpoint is a file of ``policy.native``'s format (contract, network, weights of the student), so every command
-that takes a policy takes it. Beside these it has rsl_rl's usual entries (``actor_state_dict`` … ``iter``) and
-``training``, what only a resumed run reads. It holds tensors and plain data only and is read without the ability to
-run code.
+A checkpoint is a file of ``policy.native``'s format (contract, network, averaged weights of the student), so every command
+that takes a policy takes it. Beside these it has rsl_rl's usual entries (``actor_state_dict`` … ``iter``; the weights after the
+last update), ``average`` (the averaged networks) and ``training``, what only a resumed run reads. It holds tensors and plain data
+only and is read without the ability to run code.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -181,24 +182,43 @@ def reached(entries: Mapping[str, Any]) -> float:
     return min(float(entries.get("training", {}).get("progress", 1.0)), 1.0)
 
 
-def trim_checkpoint(source: str | Path, destination: str | Path) -> None:
+def learned_networks(entries: Mapping[str, Any], *, raw: bool = False) -> Mapping[str, Any]:
+    """``actor_state_dict`` and ``critic_state_dict`` of a checkpoint: the averages where it has any, unless ``raw``."""
+    return entries if raw else entries.get("average", entries)
+
+
+def student_state(actor: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The deployed network's part of an actor's state dictionary."""
+    return {n.removeprefix("student."): value for n, value in actor.items() if n.startswith("student.")}
+
+
+def trim_checkpoint(source: str | Path, destination: str | Path, *, raw: bool = False) -> None:
     """Write a checkpoint's networks without what only resuming needs: a policy file from which training can begin anew
     (``--init-from``), with its teacher and its critic.
+
+    Args:
+        source: the checkpoint.
+        destination: the policy file.
+        raw: the weights after the last update instead of their average.
 
     Raises:
         CheckpointError: ``source`` is no training checkpoint, or the destination cannot be written.
     """
     entries = read_checkpoint(source)
-    student, actor = entries["state_dict"], entries["actor_state_dict"]
-    # the student is in there twice; tensors that are the same object are stored once
-    shared = {name: student.get(name.removeprefix("student."), value) for name, value in actor.items()}
-    kept = {name: entries[name] for name in ("format", "version", "contract", "network", "state_dict")}
+    networks = learned_networks(entries, raw=raw)
+    actor, critic = networks["actor_state_dict"], networks["critic_state_dict"]
+    kept = {name: entries[name] for name in ("format", "version", "contract", "network")}
+    if raw:
+        contract = PolicyContract.from_json(entries["contract"])
+        kept["contract"] = replace(contract, provenance={**contract.provenance, "weights": "last update"}).to_json()
     training = {
         name: entries["training"][name] for name in ("version", "task", "progress") if name in entries["training"]
     }
     write_checkpoint(
         destination,
         kept
-        | {"actor_state_dict": shared, "critic_state_dict": entries["critic_state_dict"], "iter": entries["iter"]}
+        # The student is in there twice; tensors that are the same object are stored once.
+        | {"state_dict": student_state(actor), "actor_state_dict": actor, "critic_state_dict": critic}
+        | {"iter": entries["iter"]}
         | {"training": training},
     )

@@ -14,11 +14,14 @@ from rsl_rl.runners import OnPolicyRunner
 from ..policy.contract import PolicyContract, difference
 from ..policy.native import StoredNetwork
 from .algorithms.cts import CTS
+from .averaging import WeightAverage
 from .checkpoint import (
     TRAINING_VERSION,
     CheckpointError,
     checkpoint_entries,
+    learned_networks,
     read_checkpoint,
+    student_state,
     write_checkpoint,
 )
 from .configuration import TrainingConfiguration
@@ -35,6 +38,7 @@ class CheckpointedRunner(OnPolicyRunner):
     """The part of ``runner.TrainingRunner`` that saves and loads; the attributes are set there."""
 
     alg: CTS
+    average: WeightAverage
     logger: RunLogger
     configuration: TrainingConfiguration
     contract: PolicyContract
@@ -60,11 +64,13 @@ class CheckpointedRunner(OnPolicyRunner):
         torch.distributed.init_process_group(backend="gloo", rank=self.gpu_global_rank, world_size=world)
 
     def stored_network(self) -> StoredNetwork:
-        """The student as it is deployed."""
+        """The student as it is deployed: with averaged weights."""
+        return self._stored(self.average.state_dict())
+
+    def _stored(self, average: Mapping[str, Any]) -> StoredNetwork:
         actor = self.alg.get_policy()
-        return StoredNetwork(
-            architecture=actor.architecture, arguments=actor.arguments, state_dict=actor.student.state_dict()
-        )
+        weights = student_state(average["actor_state_dict"])
+        return StoredNetwork(architecture=actor.architecture, arguments=actor.arguments, state_dict=weights)
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
         """Write a checkpoint; other ranks than the first write only their own environment and random states beside it.
@@ -98,7 +104,9 @@ class CheckpointedRunner(OnPolicyRunner):
             "best_score": self.best_score,
             "best_iteration": self.best_iteration,
         }
-        extra = learned | {"iter": self.current_learning_iteration, "infos": infos, "training": training}
+        average = self.average.state_dict()
+        extra = learned | {"iter": self.current_learning_iteration, "infos": infos}
+        extra |= {"average": average, "training": training}
         provenance = dict(self.contract.provenance) | {
             "task": self.task,
             "run": self.log_dir.name if self.log_dir else "",
@@ -106,7 +114,7 @@ class CheckpointedRunner(OnPolicyRunner):
             "environment_steps": self.logger.tot_timesteps,
         }
         contract = replace(self.contract, provenance=provenance)
-        write_checkpoint(path, checkpoint_entries(contract, self.stored_network(), extra))
+        write_checkpoint(path, checkpoint_entries(contract, self._stored(average), extra))
         self.logger.save_model(path, self.current_learning_iteration)
 
     def load(
@@ -130,6 +138,9 @@ class CheckpointedRunner(OnPolicyRunner):
             raise CheckpointError(
                 f"Cannot resume from '{path}': its weights do not fit the networks of this run: {reason}"
             ) from error
+        self.average.load_state_dict(entries.get("average"))
+        if "average" not in entries:
+            self._message(f"'{path}' holds no average of weights: it begins here.")
         self.current_learning_iteration = entries["iter"]
         self.best_score, self.best_iteration = training["best_score"], training["best_iteration"]
         # A score may have come back, and best.pt been replaced, after the checkpoint was written.
@@ -173,7 +184,7 @@ class CheckpointedRunner(OnPolicyRunner):
         self._check_network(path, entries, "start")
         try:
             if "training" in entries:
-                self.alg.load(entries, {"actor": True, "critic": True}, True)
+                self.alg.load(dict(learned_networks(entries)), {"actor": True, "critic": True}, True)
             else:
                 self.alg.actor.student.load_state_dict(entries["state_dict"])
                 self.alg.follow_student(self.configuration.run.bootstrap_iterations)
@@ -182,6 +193,7 @@ class CheckpointedRunner(OnPolicyRunner):
             raise CheckpointError(
                 f"Cannot start from '{path}': its weights do not fit the networks of this run: {reason}"
             ) from error
+        self.average.load_state_dict(None)
 
     def _load_environment(self, path: str, state: Any) -> bool:
         if state is None or not hasattr(self.env, "load_state_dict"):

@@ -166,6 +166,9 @@ class RunConfiguration:
     bootstrap_iterations: int = 60
     """Iterations at the start of a run from a bare policy (``--init-from``) in which only a teacher and a critic for
     it are learned."""
+    average_age: float = 0.1
+    """How far back the averaged weights, which are played and gauged, lie in the mean: a fraction of the iterations done (see
+    ``averaging``); 0 for the weights of the last iteration alone, at most 0.5."""
     nonfinite_limit: float = 0.01
     """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run
     stops."""
@@ -174,6 +177,8 @@ class RunConfiguration:
         _positive(self, "steps_per_iteration", "iterations", "save_interval", "nonfinite_limit")
         if self.bootstrap_iterations < 1:
             raise ConfigurationError(f"bootstrap_iterations is {self.bootstrap_iterations}; it must be at least 1.")
+        if not 0.0 <= self.average_age <= 0.5:
+            raise ConfigurationError(f"average_age is {self.average_age:g}; it must be between 0 (no average) and 0.5.")
         if self.gauge_interval < 0:
             raise ConfigurationError(f"gauge_interval is {self.gauge_interval}; it must be 0 (never) or positive.")
         if not self.experiment or PurePath(self.experiment).name != self.experiment:

@@ -16,9 +16,11 @@ from typing import Any
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
+from torch import nn
 
 from ..policy.contract import TERM_WIDTH, PolicyContract
 from .algorithms.symmetry import Mirror
+from .averaging import WeightAverage
 from .checkpoint import copy_checkpoint
 from .checkpointed_runner import CheckpointedRunner, TrainingDivergedError
 from .configuration import TrainingConfiguration
@@ -89,6 +91,8 @@ class TrainingRunner(CheckpointedRunner):
             gpu_global_rank=self.gpu_global_rank,
             device=device,
         )
+        networks: dict[str, nn.Module] = {"actor_state_dict": self.alg.actor, "critic_state_dict": self.alg.critic}
+        self.average = WeightAverage(networks, age=configuration.run.average_age)
         self.best_score: float | None = None
         self.best_iteration: int | None = None
         self._progress = progress or (lambda _: None)
@@ -193,6 +197,7 @@ class TrainingRunner(CheckpointedRunner):
         if (progress := getattr(self.env, "progress", None)) is not None:
             self.alg.follow(progress)
         losses = self.alg.update()
+        self.average.update()
         finished = time.perf_counter()
         iteration = self.current_learning_iteration
         self.current_learning_iteration += 1

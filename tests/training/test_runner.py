@@ -288,15 +288,16 @@ def test_a_trimmed_checkpoint_begins_training_with_its_teacher(tmp_path):
     make(tmp_path).learn(2)
     trim_checkpoint(tmp_path / "model_2.pt", tmp_path / "trimmed.pt")
     whole, trimmed = torch.load(tmp_path / "model_2.pt"), torch.load(tmp_path / "trimmed.pt")
-    assert_same(whole["actor_state_dict"], trimmed["actor_state_dict"])
+    average = whole["average"]
+    assert_same(average["actor_state_dict"], trimmed["actor_state_dict"])
     bias = trimmed["actor_state_dict"]["student.actor.0.bias"]
     assert bias.data_ptr() == trimmed["state_dict"]["actor.0.bias"].data_ptr()
     assert load_policy(str(tmp_path / "trimmed.pt")).contract.provenance["iteration"] == 2
     runner = make(seed=3)
     runner.load_weights(tmp_path / "trimmed.pt")
     assert runner.alg.bootstrap is None
-    assert_same(runner.alg.actor.state_dict(), whole["actor_state_dict"])
-    assert_same(runner.alg.critic.state_dict(), whole["critic_state_dict"])
+    assert_same(runner.alg.actor.state_dict(), average["actor_state_dict"])
+    assert_same(runner.alg.critic.state_dict(), average["critic_state_dict"])
     assert trimmed["training"]["progress"] == whole["training"]["progress"]
     with pytest.raises(CheckpointError, match="holds networks only; begin a new run with them: --init-from"):
         runner.load(str(tmp_path / "trimmed.pt"))
