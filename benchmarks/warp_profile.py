@@ -39,8 +39,8 @@ from gaitgauge.robots import load_robot
 from gaitgauge.robots.rotation import from_yaw
 from gaitgauge.terrains.base import HeightField, Terrain
 from gaitgauge.terrains.registry import make_terrain
-from gaitgauge.terrains.training_tiles import FIELD_KINDS, NUM_TILE_LEVELS, TILE_KINDS, TRAINING_MIX, make_tile
-from gaitgauge.training.environment_configuration import TRAINING_PHYSICS
+from gaitgauge.terrains.training_tiles import NUM_TILE_LEVELS, make_tile
+from gaitgauge.training.environment_configuration import ALL_TILES, TRAINING_PHYSICS
 
 GAUGE_BOXES = ("flat", "slope_fd", "slope_bd", "stairs_fd", "stairs_bd", "obstacle")
 SCENES = ("gauge-boxes", "gauge-wave", "gauge-all", "tiles-boxes", "tiles-fields", "tiles-mix")
@@ -118,16 +118,16 @@ def make_ground(scene: str, spacing: float | None) -> tuple[list[Terrain], np.nd
             shares += [1.0 / len(levels)] * len(levels)
         return terrains, np.array(shares) / sum(shares)
     kinds = {
-        "tiles-boxes": [k for k in TILE_KINDS if k not in FIELD_KINDS],
-        "tiles-fields": sorted(FIELD_KINDS),
-        "tiles-mix": list(TILE_KINDS),
+        "tiles-boxes": [t for t in ALL_TILES if make_tile(t.name, 0).height_field is None],
+        "tiles-fields": [t for t in ALL_TILES if make_tile(t.name, 0).height_field is not None],
+        "tiles-mix": list(ALL_TILES),
     }[scene]
     terrains, shares = [], []
     for kind in kinds:
         for level in range(NUM_TILE_LEVELS):
-            tile = make_tile(kind, level)
+            tile = make_tile(kind.name, level)
             terrains.append(tile if spacing is None or tile.height_field is None else respaced(tile, spacing))
-            shares.append(TRAINING_MIX[kind])
+            shares.append(kind.share)
     return terrains, np.array(shares) / sum(shares)
 
 

@@ -43,8 +43,12 @@ def box_top(box: Box, x: FloatArray, y: FloatArray) -> FloatArray:
     Returns:
         Height [m], same shape; -inf where the line misses the box.
     """
-    rotation = rotation_matrix(box.quaternion)
     offset_x, offset_y = x - box.center[0], y - box.center[1]
+    if box.quaternion == (1.0, 0.0, 0.0, 0.0):
+        reach_x, reach_y = box.half_size[0] + EDGE_TOLERANCE, box.half_size[1] + EDGE_TOLERANCE
+        hit = (np.abs(offset_x) <= reach_x) & (np.abs(offset_y) <= reach_y)
+        return np.where(hit, box.center[2] + box.half_size[2], -np.inf)
+    rotation = rotation_matrix(box.quaternion)
     lowest = np.full(x.shape, -np.inf)
     highest = np.full(x.shape, np.inf)
     inside: NDArray[np.bool_] = np.ones(x.shape, dtype=bool)

@@ -7,6 +7,7 @@ called the radius: half the side of the square through a point.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,6 +19,8 @@ _THICKNESS = 0.4  # of the tilted plates, enough that no foot passes through in 
 _BURIED = 0.05  # how far a plate reaches on below the floor, so that no crack opens where it meets it [m]
 
 Quaternion = tuple[float, float, float, float]
+Span = tuple[float, float]
+"""Least and largest coordinate [m]."""
 
 
 def square_block(radius: float, height: float) -> Box:
@@ -78,6 +81,34 @@ def square_hill(inner: float, outer: float, gradient: float) -> tuple[Box, ...]:
             top = np.array([inner, side * inner, rise]) + reach / 2 * along + width / 2 * inward
             boxes.append(_plate(tuple(top), (reach, width), _multiply(downhill, _about_z(side * swing)), turn))
     return tuple(boxes)
+
+
+def patchwork(inner: float, outer: float, random: np.random.Generator) -> list[tuple[Span, Span]]:
+    """28 rectangles (range of x, range of y) that fill the square of radius ``outer`` but for that of radius ``inner``.
+
+    Four equal regions go round the middle like the sails of a windmill. Each is cut lengthwise into two strips, these
+    into three and four pieces, at random places.
+    """
+    width, length = outer - inner, outer + inner
+    patches: list[tuple[Span, Span]] = []
+    for turn in range(4):
+        across = _cuts(width, 2, random)
+        for strip in range(2):
+            along = _cuts(length, 3 + (strip + turn) % 2, random)
+            low, high = inner + across[strip], inner + across[strip + 1]
+            for first, last in pairwise(along):
+                x, y = (low, high), (first - inner, last - inner)
+                for _ in range(turn):
+                    x, y = (-y[1], -y[0]), x
+                patches.append((x, y))
+    return patches
+
+
+def _cuts(length: float, pieces: int, random: np.random.Generator) -> list[float]:
+    """Ends of ``pieces`` pieces of a line, in order from 0 to ``length``; each is 0.4 to 1.6 times the mean long."""
+    places = np.arange(pieces + 1) + random.uniform(-0.3, 0.3, pieces + 1)
+    places[0], places[-1] = 0, pieces
+    return (places * (length / pieces)).tolist()
 
 
 def grid_coordinates(radius: float) -> tuple[FloatArray, FloatArray]:

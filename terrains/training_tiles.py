@@ -1,14 +1,17 @@
-"""The ground that policies learn on: one small tile per world, centred at the origin, eight kinds at ten levels.
+"""The ground that policies learn on: one small tile per world, centred at the origin, of nine kinds at twelve levels.
 
-A tile is 8 x 8 m. The robot starts near its centre and has crossed it when it is more than half a tile away. Kinds,
-proportions and difficulties follow the published training code; decided differently here:
+A tile is 8 x 8 m. The robot starts near its centre and has crossed it when it is more than half a tile away. Kinds and
+difficulties start from the published training code; decided differently here:
 
-- Every world has its own tile, so beyond it comes no next one but level ground: the floor plane, or around pits a rim
-  of boxes as high as the tile's edge, which ends at ``TileShape.extent``.
-- Flat, slopes, stairs and obstacles are boxes, which GPU engines collide four times as fast as height fields and which
-  keep risers vertical. Only the wave and the rough slope are height fields; they come down to the floor at the edge.
-- Obstacles stand on the floor, none are holes in it (nothing can be below the floor plane): the rectangles have the
-  heights h and h/2, not +-h and +-h/2, and rectangles that would cover the start are drawn again.
+- Every world has its own tile, so beyond it comes no next one but level ground: the floor plane, or around pits and
+  patches a rim of boxes as high as the tile's edge, which ends at ``TileShape.extent``.
+- Flat, slopes, stairs, obstacles and bars are boxes, which GPU engines collide four times as fast as height fields and
+  which keep risers vertical. Only the wave and the rough slope are height fields.
+- What is to be crossed can not be walked around: stairs, slopes and bars are square rings about the start, obstacles a
+  patchwork without gaps. Nothing can be below the floor plane, so patchwork and start stand as high as its pits are deep.
+- Where a robot must not learn one measure by heart, it is drawn by seed: treads and risers, width, gap and height of
+  bars, length, height, direction and place of waves, the size of patches.
+- Levels go on beyond the hardest that the gauge asks for, since who trains at the limit fails there half of the time.
 - Slopes are plain truncated pyramids with the platform of the stairs, 2.7 m of slope on each side. The published ones
   are products of two ramps that are cut off 2.4 m from the centre and leave 1.6 m of slope.
 - Heights are not rounded down to 5 mm.
@@ -16,19 +19,19 @@ proportions and difficulties follow the published training code; decided differe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .base import Box, FloatArray, HeightField, Pose, Terrain
 from .registry import TerrainError
 from .tile_geometry import (
     edge_taper,
     grid_coordinates,
+    patchwork,
     roughness,
     square_block,
     square_frame,
@@ -36,95 +39,109 @@ from .tile_geometry import (
     square_pit_walls,
 )
 
-TRAINING_MIX: Mapping[str, float] = MappingProxyType(
-    {
-        "wave": 0.05,
-        "slope_up": 0.10,
-        "slope_down": 0.10,
-        "rough_slope": 0.05,
-        "stairs_up": 0.25,
-        "stairs_down": 0.10,
-        "obstacles": 0.20,
-        "flat": 0.15,
-    }
-)
-"""Share of the worlds that train on each kind."""
-
-TILE_KINDS = tuple(TRAINING_MIX)
-"""All kinds of tile; a kind's number is its place here."""
-FIELD_KINDS = frozenset({"wave", "rough_slope"})
-"""Kinds that are height fields; all others are boxes (``flat`` has none)."""
-RANDOM_KINDS = frozenset({"wave", "rough_slope", "obstacles"})
-"""Kinds that differ from seed to seed."""
-LEVELLESS_KINDS = frozenset({"flat"})
-"""Kinds that are the same at every level."""
-
-NUM_TILE_LEVELS = 10
-"""Levels are 0..9; the difficulty of a level is level / 10."""
+NUM_TILE_LEVELS = 12
+"""Levels are 0..11; the difficulty of a level is level / 10. The gauge's hardest ground is that of level 8 to 10."""
 TILE_SIZE = 8.0
 """Side of a tile [m]; more than half of it from the centre, horizontally, the robot has crossed the tile."""
 MAX_TILE_BOXES = 36
 """No tile of the default shape has more boxes; a model with this many can hold every tile."""
 
+_EDGE = TILE_SIZE / 2
+_FIELD_EDGE = 5.6  # half the side of height fields: waves go on beyond the tile and come down where nobody walks [m]
+_LAST_RISER = 0.2  # distance from the last riser or bar to the tile's edge, at least: it is crossed before the edge [m]
+_OVERLAP = 0.2  # how far a step reaches under the next one, so that no crack opens between them [m]
+
+Range = tuple[float, float]
+
 
 @dataclass(frozen=True, kw_only=True)
 class TileShape:
-    """Dimensions of the tiles. Pairs are the value at difficulty 0 and its growth up to difficulty 1."""
+    """Dimensions of the tiles. Pairs are the value at difficulty 0 and its growth up to difficulty 1, where a comment
+    does not call them a range to draw from.
+    """
 
     platform_radius: float = 1.3
     """Half the side of the level square in the middle of slopes and stairs [m]."""
     slope_gradient: tuple[float, float] = (0.10, 0.52)
     """Rise over run."""
     stair_riser: tuple[float, float] = (0.05, 0.23)
-    """Height of a step [m]."""
-    stair_tread: float = 0.30
-    """Depth of a step [m]."""
+    """Mean height of a step [m]."""
+    stair_tread: Range = (0.26, 0.36)
+    """Range of a flight's mean depth of a step [m]."""
+    stair_irregularity: float = 0.15
+    """Treads and risers of one flight differ from their mean by up to a share, drawn from 0 to this."""
     stair_count: int = 9
-    """Number of risers between the platform and the tile's edge."""
+    """Largest number of risers between the platform and the tile's edge."""
     obstacle_height: tuple[float, float] = (0.05, 0.25)
-    """Height of the higher rectangles; the lower ones have half of it [m]."""
-    obstacle_count: int = 20
-    """Number of rectangles."""
-    obstacle_sides: tuple[float, ...] = (1.0, 1.4, 1.8)
-    """Side lengths to choose from [m]."""
-    obstacle_lattice: float = 0.4
-    """Rectangles have their corners on a lattice of this spacing [m]."""
+    """Height of obstacles over the level of the start, and depth of pits below it [m]; bars have up to this height."""
     obstacle_free_radius: float = 1.5
-    """Half the side of the square around the start that stays free [m]."""
-    wave_amplitude: tuple[float, float] = (0.05, 0.10)
-    """Amplitude of each of the two waves [m]."""
-    wave_length: float = 1.6
-    """Wavelength [m]."""
+    """Half the side of the level square around the start between obstacles [m]."""
+    obstacle_shares: tuple[float, float, float, float, float] = (0.15, 0.2, 0.3, 0.2, 0.15)
+    """Shares of the patches at -1, -1/2, 0, 1/2 and 1 times ``obstacle_height`` over the start."""
+    bar_start: Range = (1.3, 1.7)
+    """Range of half the side of the level square inside the first bar [m]."""
+    bar_width: Range = (0.3, 1.2)
+    """Range of a bar's width [m]."""
+    bar_gap: Range = (0.5, 1.2)
+    """Range of the distance between two bars [m]."""
+    bar_height: Range = (0.8, 1.0)
+    """Range of a bar's height as a share of ``obstacle_height``."""
+    wave_steepness: tuple[float, float] = (0.20, 0.50)
+    """Largest gradient of each of the two waves, 2 pi amplitude / length."""
+    wave_length: Range = (1.4, 2.8)
+    """Range of each wave's length [m]."""
+    wave_share: Range = (0.75, 1.0)
+    """Range of each wave's gradient as a share of ``wave_steepness``."""
     roughness: float = 0.05
-    """Largest height above and below the smooth surface of waves and rough slopes [m]."""
+    """Largest height above and below the smooth surface of rough slopes [m]; waves have a share of it, drawn from 0 to 1."""
     taper: float = 0.8
-    """Width of the zone in which a height field comes down to the floor at the tile's edge [m]."""
+    """Width of the zone in which a height field comes down to the floor at its edge [m]."""
     extent: float = 40.0
     """Half the side of the rim around pits [m]; beyond it is the floor, as deep below as the pit."""
 
     def __post_init__(self) -> None:
-        half = TILE_SIZE / 2
-        if self.platform_radius + self.stair_tread * self.stair_count > half + 1e-9:
+        if self.platform_radius + self.stair_tread[0] > _EDGE - _LAST_RISER:
             raise TerrainError(
-                f"a platform of radius {self.platform_radius} m and {self.stair_count} steps of {self.stair_tread} m "
-                f"do not fit within {half} m of the centre; use fewer or shorter steps or a smaller platform"
+                f"a platform of radius {self.platform_radius} m leaves no room for two steps of {self.stair_tread[0]} m "
+                f"within {_EDGE - _LAST_RISER:g} m of the centre; use shorter steps or a smaller platform"
             )
-        longest = max(self.obstacle_sides)
-        if self.obstacle_free_radius + longest > half:
+        if not 0 < self.obstacle_free_radius < _EDGE:
             raise TerrainError(
-                f"obstacles of {longest} m do not fit between the free square of radius {self.obstacle_free_radius} m "
-                f"and the tile's edge at {half} m; use shorter sides or a smaller free square"
+                f"obstacle_free_radius is {self.obstacle_free_radius} m; it must be above 0 and less than the tile's "
+                f"{_EDGE:g} m, so that there is room for obstacles"
             )
+        for name in ("stair_tread", "bar_start", "bar_width", "bar_gap", "bar_height", "wave_length", "wave_share"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise TerrainError(f"{name} is {low}, {high}; a range needs two numbers above 0, the smaller one first")
 
 
-def make_tile(kind: str, level: int, seed: int = 0, *, shape: TileShape | None = None) -> Terrain:
+DEFAULT_SHAPE = TileShape()
+
+Ground = tuple[Box, ...] | HeightField
+"""What a tile consists of beside the floor plane."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TileKind:
+    """How tiles of one kind are made."""
+
+    build: Callable[[float, TileShape, np.random.Generator], Ground]
+    """Function of the difficulty (level / 10), the dimensions and the seed's random numbers."""
+    random: bool = True
+    """Whether tiles differ from seed to seed."""
+    levelled: bool = True
+    """Whether tiles differ from level to level."""
+
+
+def make_tile(kind: str, level: int, seed: int = 0, *, shape: TileShape = DEFAULT_SHAPE) -> Terrain:
     """Build a training tile.
 
     Args:
-        kind: one of ``TILE_KINDS``.
-        level: 0..9.
+        kind: a key of ``TILE_KINDS``.
+        level: 0..11.
         seed: chooses among the tiles of a random kind; the same arguments give the same tile. Other kinds ignore it.
-        shape: dimensions; None for the defaults.
+        shape: dimensions.
 
     Returns:
         A terrain with one spawn, ``train``, on the ground in the middle. Its family is ``tile_field`` for the kinds
@@ -133,126 +150,123 @@ def make_tile(kind: str, level: int, seed: int = 0, *, shape: TileShape | None =
     Raises:
         TerrainError: unknown kind or level.
     """
-    if kind not in TRAINING_MIX:
+    if kind not in TILE_KINDS:
         close = get_close_matches(kind, TILE_KINDS, n=1)
         hint = f"did you mean '{close[0]}'?" if close else f"choose one of: {', '.join(TILE_KINDS)}"
         raise TerrainError(f"unknown kind of training tile '{kind}'; {hint}")
     if level not in range(NUM_TILE_LEVELS):
         raise TerrainError(f"training tile '{kind}' has levels 0 to {NUM_TILE_LEVELS - 1}, not {level}")
-    shape = TileShape() if shape is None else shape
-    difficulty = level / NUM_TILE_LEVELS
-    random = np.random.default_rng((seed, TILE_KINDS.index(kind), level))
-    boxes: tuple[Box, ...] = ()
-    field = None
-    if kind in FIELD_KINDS:
-        build = _wave_heights if kind == "wave" else _rough_slope_heights
-        heights = build(difficulty, shape, random)
-        heights.setflags(write=False)
-        field = HeightField(center=(0.0, 0.0), half_size=(TILE_SIZE / 2, TILE_SIZE / 2), heights=heights)
-    elif kind == "obstacles":
-        boxes = _obstacles(difficulty, shape, random)
-    elif kind != "flat":
-        boxes = _slope_or_stairs(kind, difficulty, shape)
-    family = "tile_boxes" if field is None else "tile_field"
-    ground = Terrain(name=f"tile_{kind}", family=family, level=level, boxes=boxes, height_field=field)
+    random = np.random.default_rng((seed, list(TILE_KINDS).index(kind), level))
+    built = TILE_KINDS[kind].build(level / 10, shape, random)
+    if isinstance(built, HeightField):
+        built.heights.setflags(write=False)
+        ground = Terrain(name=f"tile_{kind}", family="tile_field", level=level, height_field=built)
+    else:
+        ground = Terrain(name=f"tile_{kind}", family="tile_boxes", level=level, boxes=built)
     start = Pose(position=(0.0, 0.0, float(ground.height(0.0, 0.0))))
     return replace(ground, spawns={"train": start})
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TilePalette:
-    """All tiles of a training run, and where to find which."""
-
-    terrains: tuple[Terrain, ...]
-    """The tiles, each once."""
-    index: NDArray[np.int64]
-    """Place in ``terrains`` of a kind (by its place in ``TILE_KINDS``), level and variant, (kinds, levels, variants).
-    Kinds that are not random have one tile for all variants, ``flat`` has one for all levels."""
-
-
-def tile_palette(*, variants: int = 4, seed: int = 0, shape: TileShape | None = None) -> TilePalette:
-    """Build every kind of tile at every level.
-
-    Args:
-        variants: how many different tiles of each random kind and level.
-        seed: seed of the first variant; the others follow.
-        shape: dimensions; None for the defaults.
-
-    Raises:
-        TerrainError: no variant was asked for.
-    """
-    if variants < 1:
-        raise TerrainError(f"a palette needs at least 1 variant of each tile, not {variants}")
-    terrains: list[Terrain] = []
-    index = np.zeros((len(TILE_KINDS), NUM_TILE_LEVELS, variants), dtype=np.int64)
-    for number, kind in enumerate(TILE_KINDS):
-        for level in range(NUM_TILE_LEVELS):
-            for variant in range(variants):
-                if kind in LEVELLESS_KINDS and level > 0:
-                    index[number, level, variant] = index[number, 0, 0]
-                elif kind not in RANDOM_KINDS and variant > 0:
-                    index[number, level, variant] = index[number, level, 0]
-                else:
-                    index[number, level, variant] = len(terrains)
-                    terrains.append(make_tile(kind, level, seed + variant, shape=shape))
-    return TilePalette(terrains=tuple(terrains), index=index)
 
 
 def _at(difficulty: float, pair: tuple[float, float]) -> float:
     return pair[0] + pair[1] * difficulty
 
 
-def _slope_or_stairs(kind: str, difficulty: float, shape: TileShape) -> tuple[Box, ...]:
-    edge, platform = TILE_SIZE / 2, shape.platform_radius
-    if kind.startswith("slope"):
-        gradient = _at(difficulty, shape.slope_gradient)
-        if kind == "slope_down":
-            return square_hill(platform, edge, gradient)
-        rim = square_frame(edge, shape.extent, gradient * (edge - platform))
-        return square_pit_walls(platform, edge, gradient) + rim
-    riser = _at(difficulty, shape.stair_riser)
-    radii = [platform + shape.stair_tread * step for step in range(shape.stair_count)]  # of the risers, inside out
-    if kind == "stairs_down":
-        return tuple(square_block(r, riser * (shape.stair_count - step)) for step, r in enumerate(radii))
-    # Each step reaches a tread's depth under the next one, so that no crack opens between them; the last is the rim.
-    outer = [r + 2 * shape.stair_tread for r in radii[:-1]] + [shape.extent]
-    frames = (square_frame(r, o, riser * (step + 1)) for step, (r, o) in enumerate(zip(radii, outer, strict=True)))
-    return tuple(box for frame in frames for box in frame)
+def _flat(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    return ()
 
 
-def _obstacles(difficulty: float, shape: TileShape, random: np.random.Generator) -> tuple[Box, ...]:
-    edge, free = TILE_SIZE / 2, shape.obstacle_free_radius
-    height = _at(difficulty, shape.obstacle_height)
-    cells = int(TILE_SIZE / shape.obstacle_lattice + 1e-9)
-    boxes: list[Box] = []
-    while len(boxes) < shape.obstacle_count:
-        side_x, side_y = random.choice(shape.obstacle_sides, 2)
-        corner_x, corner_y = random.integers(0, cells, 2) * shape.obstacle_lattice - edge
-        high = height if random.random() < 0.5 else height / 2
-        x, y = corner_x + side_x / 2, corner_y + side_y / 2
-        outside = corner_x + side_x > edge + 1e-9 or corner_y + side_y > edge + 1e-9
-        covers_start = abs(x) < free + side_x / 2 and abs(y) < free + side_y / 2
-        if not outside and not covers_start:
-            boxes.append(
-                Box(center=(float(x), float(y), high / 2), half_size=(float(side_x / 2), float(side_y / 2), high / 2))
-            )
+def _slope_up(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    platform, gradient = shape.platform_radius, _at(difficulty, shape.slope_gradient)
+    rim = square_frame(_EDGE, shape.extent, gradient * (_EDGE - platform))
+    return square_pit_walls(platform, _EDGE, gradient) + rim
+
+
+def _slope_down(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    return square_hill(shape.platform_radius, _EDGE, _at(difficulty, shape.slope_gradient))
+
+
+def _flight(difficulty: float, shape: TileShape, random: np.random.Generator) -> tuple[list[float], list[float]]:
+    """Radius and height of each riser, inside out [m]."""
+    tread, irregularity = random.uniform(*shape.stair_tread), random.uniform(0.0, shape.stair_irregularity)
+    treads, risers = 1.0 + irregularity * random.uniform(-1.0, 1.0, (2, shape.stair_count))
+    radii = shape.platform_radius + np.concatenate(([0.0], np.cumsum(tread * treads[:-1])))
+    fitting = int((radii <= _EDGE - _LAST_RISER).sum())
+    return radii[:fitting].tolist(), (_at(difficulty, shape.stair_riser) * risers[:fitting]).tolist()
+
+
+def _stairs_up(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    radii, risers = _flight(difficulty, shape, random)
+    outer = [radius + _OVERLAP for radius in radii[1:]] + [shape.extent]  # the last step is the rim
+    heights = np.cumsum(risers).tolist()
+    return tuple(b for frame in zip(radii, outer, heights, strict=True) for b in square_frame(*frame))
+
+
+def _stairs_down(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    radii, risers = _flight(difficulty, shape, random)
+    return tuple(square_block(radius, sum(risers[step:])) for step, radius in enumerate(radii))
+
+
+def _obstacles(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    """Patches of five heights around the start, without gaps: edges are up to twice the obstacle height."""
+    height, free = _at(difficulty, shape.obstacle_height), shape.obstacle_free_radius
+    shares = np.array(shape.obstacle_shares) / sum(shape.obstacle_shares)
+    boxes = [square_block(free, height), *square_frame(_EDGE, shape.extent, height)]
+    for x_range, y_range in patchwork(free, _EDGE, random):
+        top = height * (1.0 + random.choice((-1.0, -0.5, 0.0, 0.5, 1.0), p=shares))
+        if top > 0:
+            (x, half_x), (y, half_y) = (((a + b) / 2, (b - a) / 2) for a, b in (x_range, y_range))
+            boxes.append(Box(center=(x, y, top / 2), half_size=(half_x, half_y, top / 2)))
     return tuple(boxes)
 
 
-def _wave_heights(difficulty: float, shape: TileShape, random: np.random.Generator) -> FloatArray:
-    x, y = grid_coordinates(TILE_SIZE / 2)
-    amplitude = _at(difficulty, shape.wave_amplitude)
-    number = 2 * np.pi / shape.wave_length
-    wave = amplitude * (np.sin(number * x) + np.cos(number * y))
-    lifted = 2 * amplitude + shape.roughness + wave + roughness(len(x), shape.roughness, random)
-    heights: FloatArray = lifted * edge_taper(x, y, TILE_SIZE / 2, shape.taper)
-    return heights
+def _bars(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    """Square rings about the start, each to be climbed and left again."""
+    height = _at(difficulty, shape.obstacle_height)
+    boxes: list[Box] = []
+    inner = random.uniform(*shape.bar_start)
+    while inner <= _EDGE - _LAST_RISER:
+        outer = inner + random.uniform(*shape.bar_width)
+        boxes += square_frame(inner, outer, height * random.uniform(*shape.bar_height))
+        inner = outer + random.uniform(*shape.bar_gap)
+    return tuple(boxes)
 
 
-def _rough_slope_heights(difficulty: float, shape: TileShape, random: np.random.Generator) -> FloatArray:
-    x, y = grid_coordinates(TILE_SIZE / 2)
-    edge, gradient = TILE_SIZE / 2, _at(difficulty, shape.slope_gradient)
-    from_edge = edge - np.maximum(np.maximum(np.abs(x), np.abs(y)), shape.platform_radius)
+def _wave(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    """Two waves at right angles, each with its own length, height and place, in a random direction."""
+    x, y = grid_coordinates(_FIELD_EDGE)
+    steepness = _at(difficulty, shape.wave_steepness)
+    direction = random.uniform(0.0, math.pi)
+    rough = shape.roughness * random.uniform()
+    lifted = rough + roughness(len(x), rough, random)
+    for turn in (0.0, math.pi / 2):
+        length = random.uniform(*shape.wave_length)
+        amplitude = steepness * random.uniform(*shape.wave_share) * length / (2 * math.pi)
+        along = math.cos(direction + turn) * x + math.sin(direction + turn) * y
+        lifted += amplitude * (1.0 + np.sin(2 * math.pi * along / length + random.uniform(0.0, 2 * math.pi)))
+    return _field(lifted * edge_taper(x, y, _FIELD_EDGE, shape.taper))
+
+
+def _rough_slope(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
+    x, y = grid_coordinates(_FIELD_EDGE)
+    radius = np.maximum(np.maximum(np.abs(x), np.abs(y)), shape.platform_radius)
+    smooth = _at(difficulty, shape.slope_gradient) * (_EDGE - radius).clip(0.0)
     lifted = shape.roughness + roughness(len(x), shape.roughness, random)
-    heights: FloatArray = gradient * from_edge + lifted * edge_taper(x, y, edge, shape.taper)
-    return heights
+    return _field(smooth + lifted * edge_taper(x, y, _EDGE, shape.taper))
+
+
+def _field(heights: FloatArray) -> HeightField:
+    return HeightField(center=(0.0, 0.0), half_size=(_FIELD_EDGE, _FIELD_EDGE), heights=heights)
+
+
+TILE_KINDS: dict[str, TileKind] = {
+    "wave": TileKind(build=_wave),
+    "slope_up": TileKind(build=_slope_up, random=False),
+    "slope_down": TileKind(build=_slope_down, random=False),
+    "rough_slope": TileKind(build=_rough_slope),
+    "stairs_up": TileKind(build=_stairs_up),
+    "stairs_down": TileKind(build=_stairs_down),
+    "obstacles": TileKind(build=_obstacles),
+    "flat": TileKind(build=_flat, random=False, levelled=False),
+    "bars": TileKind(build=_bars),
+}
+"""All kinds of tile by name. A kind of one's own is another entry; its place decides its random numbers."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from ..terrains.base import Terrain
-from ..terrains.training_tiles import LEVELLESS_KINDS, RANDOM_KINDS, make_tile
+from ..terrains.training_tiles import TILE_KINDS, make_tile
 from .configuration import ConfigurationError
 from .environment_configuration import TerrainConfiguration, TileConfiguration
 
@@ -43,15 +43,18 @@ def build_palette(configuration: TerrainConfiguration) -> TrainingPalette:
     terrains: list[Terrain] = []
     index = torch.zeros(len(tiles), configuration.levels, configuration.variants, dtype=torch.int64)
     for number, tile in enumerate(tiles):
+        kind = TILE_KINDS.get(tile.name)  # make_tile says what is wrong with an unknown one
         for level in range(configuration.levels):
             for variant in range(configuration.variants):
-                if tile.name in LEVELLESS_KINDS and level > 0:
+                if kind and not kind.levelled and level > 0:
                     index[number, level] = index[number, 0]
-                elif tile.name not in RANDOM_KINDS and variant > 0:
+                elif kind and not kind.random and variant > 0:
                     index[number, level, variant] = index[number, level, 0]
                 else:
                     index[number, level, variant] = len(terrains)
-                    terrains.append(make_tile(tile.name, level, configuration.seed + variant))
+                    terrains.append(
+                        make_tile(tile.name, level, configuration.seed + variant, shape=configuration.shape)
+                    )
     return TrainingPalette(terrains=tuple(terrains), tiles=tiles, index=index)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..backends.base import PhysicsOptions
+from ..terrains.training_tiles import DEFAULT_SHAPE, NUM_TILE_LEVELS, TileShape
 
 Range = tuple[float, float]
 
@@ -223,20 +224,21 @@ class TileConfiguration:
 
 _MODERATE, _SLOW, _STRAIGHT = (1.5, 1.0, 1.5), (1.0, 1.0, 1.5), (1.0, 0.5, 1.5)
 
-FLAT_TILE = TileConfiguration(name="flat", share=0.1, command_limits=(2.0, 1.0, 2.0), sigma=0.25, ends=False)
+FLAT_TILE = TileConfiguration(name="flat", share=0.09, command_limits=(2.0, 1.0, 2.0), sigma=0.25, ends=False)
 """Level ground without end."""
 ALL_TILES = (
-    TileConfiguration(name="wave", share=0.1, command_limits=_MODERATE, sigma=5.0 / 12.0),
-    TileConfiguration(name="slope_up", share=0.075, command_limits=_MODERATE, sigma=0.25),
-    TileConfiguration(name="slope_down", share=0.075, command_limits=_MODERATE, sigma=0.25),
-    TileConfiguration(name="rough_slope", share=0.05, command_limits=_MODERATE, sigma=0.25),
-    TileConfiguration(name="stairs_up", share=0.3, command_limits=_STRAIGHT, sigma=0.5),
+    TileConfiguration(name="wave", share=0.15, command_limits=_MODERATE, sigma=5.0 / 12.0),
+    TileConfiguration(name="slope_up", share=0.06, command_limits=_MODERATE, sigma=0.25),
+    TileConfiguration(name="slope_down", share=0.06, command_limits=_MODERATE, sigma=0.25),
+    TileConfiguration(name="rough_slope", share=0.04, command_limits=_MODERATE, sigma=0.25),
+    TileConfiguration(name="stairs_up", share=0.25, command_limits=_STRAIGHT, sigma=0.5),
     TileConfiguration(name="stairs_down", share=0.1, command_limits=_SLOW, sigma=0.5),
-    TileConfiguration(name="obstacles", share=0.2, command_limits=_STRAIGHT, sigma=0.75),
+    TileConfiguration(name="bars", share=0.12, command_limits=_STRAIGHT, sigma=0.75),
+    TileConfiguration(name="obstacles", share=0.13, command_limits=_STRAIGHT, sigma=0.75),
     FLAT_TILE,
 )
-"""Every kind. Sigmas are the published ones, limits too but for slower sideways commands on stairs upwards and obstacles; waves
-and stairs upwards have more than their published share, slopes and flat less."""
+"""Every kind. Sigmas are the published ones (bars have that of obstacles), limits too but for slower sideways commands on stairs
+upwards, bars and obstacles; waves and all that is to be climbed have more than their published share, slopes and flat less."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,9 +247,11 @@ class TerrainConfiguration:
 
     tiles: tuple[TileConfiguration, ...] = ALL_TILES
     """Kinds of training tile."""
-    levels: int = 10
+    shape: TileShape = DEFAULT_SHAPE
+    """Dimensions of the tiles."""
+    levels: int = NUM_TILE_LEVELS
     """Number of levels, from the easiest."""
-    variants: int = 2
+    variants: int = 4
     """Different tiles per kind and level, where a kind has chance in it."""
     seed: int = 0
     """Seed of the tiles' chance."""

@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 from gaitgauge.terrains import TerrainError
+from gaitgauge.terrains.base import Box
+from gaitgauge.terrains.gauge_terrains import STAIR_RISERS, slope_gradient, wave_heights
 from gaitgauge.terrains.training_tiles import (
-    FIELD_KINDS,
     MAX_TILE_BOXES,
     NUM_TILE_LEVELS,
-    RANDOM_KINDS,
     TILE_KINDS,
     TILE_SIZE,
-    TRAINING_MIX,
+    TileKind,
     TileShape,
     make_tile,
-    tile_palette,
 )
 
 LEVELS = range(NUM_TILE_LEVELS)
+FIELDS = ("wave", "rough_slope")
 
 
 @pytest.fixture(scope="module")
@@ -24,11 +24,6 @@ def points():
     """Random places on and around a tile, and their radius max(|x|, |y|)."""
     xy = np.random.default_rng(0).uniform(-5.0, 5.0, (4000, 2))
     return xy[:, 0], xy[:, 1], np.abs(xy).max(axis=1)
-
-
-def test_mix():
-    assert sum(TRAINING_MIX.values()) == pytest.approx(1.0)
-    assert list(TRAINING_MIX.values()) == [0.05, 0.10, 0.10, 0.05, 0.25, 0.10, 0.20, 0.15]
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -48,50 +43,118 @@ def test_slope_hill_falls_in_every_direction_to_the_floor(level, points):
     assert make_tile("slope_down", level).height(x, y) == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_stairs(level, points):
+def profile(tile, *, angle=0.0):
+    """Heights every millimetre from the middle straight outwards."""
+    distance = np.arange(0.0, 5.0, 0.001) + 0.0005
+    return distance, tile.height(distance * np.cos(angle), distance * np.sin(angle))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("level", [0, 7, 11])
+def test_stairs(level, seed, points):
     x, y, radius = points
-    riser = 0.05 + 0.023 * level
-    climbed = np.clip(np.floor((radius - 1.3) / 0.3) + 1, 0, 9)
-    up, down = make_tile("stairs_up", level), make_tile("stairs_down", level)
-    assert up.height(x, y) == pytest.approx(climbed * riser, abs=1e-9)
-    assert down.height(x, y) == pytest.approx((9 - climbed) * riser, abs=1e-9)
-    assert len(up.boxes) == 36 and len(down.boxes) == 9
+    mean = 0.05 + 0.023 * level
+    for kind, sign in (("stairs_up", 1), ("stairs_down", -1)):
+        tile = make_tile(kind, level, seed)
+        distance, height = profile(tile)
+        places = np.flatnonzero(np.diff(height))
+        risers, at = sign * np.diff(height)[places], distance[places] + 0.0005
+        assert 7 <= len(risers) <= 9
+        assert at[0] == pytest.approx(1.3, abs=1e-3) and at[-1] <= 3.8 + 1e-3
+        assert np.all(np.abs(risers / mean - 1.0) <= 0.15 + 1e-6)
+        treads = np.diff(at)
+        assert np.all((treads >= 0.26 * 0.85 - 2e-3) & (treads <= 0.36 * 1.15 + 2e-3))
+        # The same all round.
+        line = np.interp(radius, distance, height)
+        far_from_edges = np.abs(radius[:, None] - at).min(axis=1) > 2e-3
+        assert tile.height(x, y)[far_from_edges] == pytest.approx(line[far_from_edges], abs=1e-9)
+        assert height[0 if sign > 0 else -1] == 0.0
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_obstacles(level, points):
+def test_some_flights_are_regular_and_some_are_not():
+    spread = []
+    for seed in range(20):
+        height = profile(make_tile("stairs_up", 9, seed))[1]
+        risers = np.diff(height)[np.flatnonzero(np.diff(height))]
+        spread.append(risers.std() / risers.mean())
+    assert min(spread) < 0.02 < 0.05 < max(spread)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("level", [0, 7, 11])
+def test_obstacles_are_patches_without_gaps(level, seed, points):
     x, y, radius = points
     high = 0.05 + 0.025 * level
-    tile = make_tile("obstacles", level, seed=3)
-    assert len(tile.boxes) == 20
+    tile = make_tile("obstacles", level, seed)
     height = tile.height(x, y)
-    assert np.all(height[(radius < 1.5) | (radius > 4.0)] == 0.0)
-    assert np.unique(np.round(height, 9)) == pytest.approx([0.0, high / 2, high])
-    for box in tile.boxes:
-        sides = 2 * np.array(box.half_size[:2])
-        corner = (np.array(box.center[:2]) - sides / 2 + 4.0) / 0.4
-        assert corner == pytest.approx(np.round(corner), abs=1e-6)
-        assert {round(s, 6) for s in sides} <= {1.0, 1.4, 1.8}
+    assert height[(radius < 1.5) | (radius > 4.0)] == pytest.approx(high)
+    seen = np.unique(np.round(height / high, 9))
+    assert set(seen) <= {0.0, 0.5, 1.0, 1.5, 2.0} and len(seen) >= 4
+    area = sum(4 * b.half_size[0] * b.half_size[1] for b in tile.boxes if max(b.half_size[:2]) < 4.0)
+    assert area <= TILE_SIZE**2 + 1e-9
+    for box in tile.boxes[5:]:
+        assert 2 * min(box.half_size[:2]) >= 0.4 and 2 * max(box.half_size[:2]) <= 3.0
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_wave(level):
-    amplitude = 0.05 + 0.01 * level
-    tile = make_tile("wave", level, seed=1)
-    field = tile.height_field
-    assert field.heights.shape == (81, 81) and field.half_size == (4.0, 4.0) and field.heights.min() == 0.0
-    line = np.linspace(-3.2, 3.2, 65)
-    x, y = np.meshgrid(line, line)
-    smooth = amplitude * (2 + np.sin(2 * np.pi * x / 1.6) + np.cos(2 * np.pi * y / 1.6)) + 0.05
-    rough = tile.height(x, y) - smooth
-    assert np.abs(rough).max() <= 0.05 + 1e-9 and rough.std() > 0.015 and abs(rough.mean()) < 0.005
+def test_patches_stand_next_to_pits():
+    """Edges of twice the obstacle height, as on the published tile, and of every other height."""
+    steps = set()
+    for seed in range(10):
+        tile = make_tile("obstacles", 9, seed)
+        for angle in np.linspace(0, 2 * np.pi, 36):
+            steps |= set(np.round(np.abs(np.diff(profile(tile, angle=angle)[1])) / 0.275, 6))
+    assert steps == {0.0, 0.5, 1.0, 1.5, 2.0}
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("level", [0, 7, 11])
+def test_bars_cannot_be_walked_around(level, seed):
+    high = 0.05 + 0.025 * level
+    tile = make_tile("bars", level, seed)
+    distance, straight = profile(tile)
+    edges = distance[np.flatnonzero(np.diff(straight))] + 0.0005
+    ups, downs = edges[0::2], edges[1::2]
+    assert 1.3 - 1e-3 <= ups[0] <= 1.7 + 1e-3 and ups[-1] <= 3.8 + 1e-3
+    assert np.all((downs - ups[: len(downs)] >= 0.3 - 2e-3) & (downs - ups[: len(downs)] <= 1.2 + 2e-3))
+    assert np.all((ups[1:] - downs[: len(ups) - 1] >= 0.5 - 2e-3) & (ups[1:] - downs[: len(ups) - 1] <= 1.2 + 2e-3))
+    tops = straight[straight > 0]
+    assert np.all((tops >= 0.8 * high - 1e-9) & (tops <= high + 1e-9))
+    for angle in np.linspace(0.0, 2 * np.pi, 50):
+        assert len(np.unique(profile(tile, angle=angle)[1])) == len(np.unique(straight))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("level", [0, 7, 11])
+def test_wave(level, seed):
+    steepness = 0.20 + 0.05 * level
+    field = make_tile("wave", level, seed).height_field
+    assert field.heights.shape == (113, 113) and field.half_size == (5.6, 5.6) and field.heights.min() == 0.0
+    inner = field.heights[8:-8, 8:-8]
+    # Two waves of 0.75 to 1.0 of the steepness and 1.4 to 2.8 m, and up to 5 cm above and below them.
+    swing = 2 * steepness / (2 * np.pi)
+    assert 2 * swing * 0.75 * 1.4 * 0.8 <= np.ptp(inner) <= 2 * swing * 2.8 + 0.1
+    assert np.abs(np.diff(inner, axis=1)).max() / 0.1 <= np.sqrt(2) * steepness + 0.5 + 1e-9
+
+
+def test_waves_differ_in_height_and_direction():
+    swing = [np.ptp(make_tile("wave", 10, seed).height_field.heights[8:-8, 8:-8]) for seed in range(12)]
+    assert max(swing) > 1.3 * min(swing)
+    assert min(swing) < np.ptp(wave_heights(10)) < max(swing)
+
+
+def test_levels_go_on_beyond_the_gauge():
+    """The hardest ground of the gauge is easier than the hardest of training, and harder than the easiest."""
+    riser = make_tile("stairs_up", 11).height(4.5, 0.0) / 9
+    assert riser > STAIR_RISERS[-1]
+    assert make_tile("slope_up", 11).height(4.5, 0.0) / 2.7 > slope_gradient(10)
+    assert make_tile("bars", 11).height(np.linspace(0, 5, 500), 0.0).max() > 0.05 + 0.23
+    assert profile(make_tile("bars", 8))[1].max() < 0.28
 
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_rough_slope(level):
     tile = make_tile("rough_slope", level, seed=1)
-    assert tile.height_field.heights.shape == (81, 81) and tile.height_field.heights.min() == 0.0
+    assert tile.height_field.heights.shape == (113, 113) and tile.height_field.heights.min() == 0.0
     line = np.linspace(-3.2, 3.2, 65)
     x, y = np.meshgrid(line, line)
     smooth = (0.10 + 0.052 * level) * (4.0 - np.clip(np.maximum(np.abs(x), np.abs(y)), 1.3, None)) + 0.05
@@ -99,21 +162,19 @@ def test_rough_slope(level):
     assert np.abs(rough).max() <= 0.05 + 1e-9 and rough.std() > 0.015
 
 
-@pytest.mark.parametrize("kind", sorted(FIELD_KINDS))
+@pytest.mark.parametrize("kind", FIELDS)
 def test_height_fields_end_level_with_the_floor(kind):
     heights = make_tile(kind, 9).height_field.heights
     edges = np.concatenate([heights[0], heights[-1], heights[:, 0], heights[:, -1]])
     assert np.all(edges == 0.0) and heights.min() == 0.0
-    # No steeper on the way down than the ramp zone's smooth step makes it.
-    assert np.abs(np.diff(heights[:, -9:], axis=1)).max() < 0.15
 
 
 @pytest.mark.parametrize("kind", TILE_KINDS)
-@pytest.mark.parametrize("level", [0, 9])
+@pytest.mark.parametrize("level", LEVELS)
 def test_what_holds_for_every_tile(kind, level):
     tile = make_tile(kind, level, seed=5)
     assert len(tile.boxes) <= MAX_TILE_BOXES
-    assert (tile.height_field is not None) == (kind in FIELD_KINDS) == (tile.family == "tile_field")
+    assert (tile.height_field is not None) == (kind in FIELDS) == (tile.family == "tile_field")
     assert (tile.name, tile.level) == (f"tile_{kind}", level)
     x, y, z = tile.spawns["train"].position
     assert (x, y) == (0.0, 0.0) and z == tile.height(0.0, 0.0)
@@ -127,39 +188,34 @@ def test_the_seed_says_everything(kind):
         return tile.boxes, None if tile.height_field is None else tile.height_field.heights.tobytes()
 
     assert content(7) == content(7)
-    assert (content(7) != content(8)) == (kind in RANDOM_KINDS)
+    assert (content(7) != content(8)) == TILE_KINDS[kind].random
 
 
-def test_palette_has_every_tile_once():
-    palette = tile_palette(variants=3, seed=10)
-    assert palette.index.shape == (8, 10, 3)
-    assert sorted(set(palette.index.ravel())) == list(range(len(palette.terrains)))
-    assert len(palette.terrains) == 3 * 10 * 3 + 4 * 10 + 1
-    for number, kind in enumerate(TILE_KINDS):
-        for level in (0, 6):
-            chosen = [palette.terrains[i] for i in palette.index[number, level]]
-            assert {t.name for t in chosen} == {f"tile_{kind}"}
-            assert {t.level for t in chosen} == ({0} if kind == "flat" else {level})
-            assert len({id(t) for t in chosen}) == (3 if kind in RANDOM_KINDS else 1)
-    second = palette.terrains[palette.index[TILE_KINDS.index("obstacles"), 6, 1]]
-    assert second.boxes == make_tile("obstacles", 6, 11).boxes
+def test_a_kind_of_ones_own(monkeypatch):
+    def ditch(difficulty, shape, random):
+        return (Box(center=(0.0, 0.0, 0.5), half_size=(1.0, 1.0, 0.5)),)
+
+    monkeypatch.setitem(TILE_KINDS, "ditch", TileKind(build=ditch, random=False, levelled=False))
+    assert make_tile("ditch", 3).spawns["train"].position == (0.0, 0.0, 1.0)
 
 
 def test_bad_requests():
     with pytest.raises(TerrainError, match="unknown kind of training tile 'stairs_upp'; did you mean 'stairs_up'"):
         make_tile("stairs_upp", 0)
-    with pytest.raises(TerrainError, match="levels 0 to 9, not 10"):
-        make_tile("wave", 10)
-    with pytest.raises(TerrainError, match="at least 1 variant"):
-        tile_palette(variants=0)
-    with pytest.raises(TerrainError, match=r"do not fit within 4\.0 m"):
-        TileShape(stair_count=10)
-    with pytest.raises(TerrainError, match=r"obstacles of 3\.0 m do not fit"):
-        TileShape(obstacle_sides=(3.0,))
+    with pytest.raises(TerrainError, match="levels 0 to 11, not 12"):
+        make_tile("wave", 12)
+    with pytest.raises(TerrainError, match=r"leaves no room for two steps of 0\.26 m within 3\.8 m"):
+        TileShape(platform_radius=3.7)
+    with pytest.raises(TerrainError, match=r"obstacle_free_radius is 4\.0 m"):
+        TileShape(obstacle_free_radius=4.0)
+    with pytest.raises(TerrainError, match=r"bar_width is 1\.0, 0\.5; a range"):
+        TileShape(bar_width=(1.0, 0.5))
 
 
 def test_other_dimensions():
-    shape = TileShape(stair_riser=(0.1, 0.0), stair_count=6, platform_radius=1.0)
+    shape = TileShape(
+        stair_riser=(0.1, 0.0), stair_count=6, platform_radius=1.0, stair_tread=(0.3, 0.3), stair_irregularity=0.0
+    )
     tile = make_tile("stairs_up", 0, shape=shape)
     assert len(tile.boxes) == 24
-    assert tile.height(TILE_SIZE / 2, 0.0) == pytest.approx(0.6)
+    assert tile.height(np.array([1.05, 1.35, TILE_SIZE / 2]), 0.0) == pytest.approx([0.1, 0.2, 0.6])

@@ -85,10 +85,10 @@ def test_students_and_teachers_share_every_kind_and_level():
 def test_palette_holds_each_tile_once():
     configuration = TerrainConfiguration(levels=2, variants=3)
     palette = build_palette(configuration)
-    assert palette.index.shape == (8, 2, 3)
+    assert palette.index.shape == (9, 2, 3)
     names = [tile.name for tile in palette.tiles]
-    stairs, flat, wave = names.index("stairs_up"), names.index("flat"), names.index("wave")
-    assert palette.index[stairs].unique().numel() == 2, "no chance in stairs"
+    slope, flat, wave = names.index("slope_up"), names.index("flat"), names.index("wave")
+    assert palette.index[slope].unique().numel() == 2, "no chance in slopes"
     assert palette.index[flat].unique().numel() == 1
     assert palette.index[wave].unique().numel() == 6
     for k, tile in enumerate(palette.tiles):
