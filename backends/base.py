@@ -48,6 +48,9 @@ class PhysicsOptions:
     """Whether the robot's own bodies collide with each other."""
     torque_limits: bool = True
     """Whether motor torque is clipped to the parameter set's ``torque_limit``."""
+    torque_speed_limit: bool = False
+    """Whether these limits follow the joint's speed: the torque in the direction of motion falls from the speed of full torque to
+    zero at the no-load speed. Needs ``torque_limits`` and a parameter set that knows its motors' speeds."""
     watch_tilt: float | None = None
     """Tilt of the base's z axis against the world's [rad] whose first substep is recorded in ``PhysicsState.tilt_substep``."""
     watch_penetration: float | None = None
@@ -195,6 +198,7 @@ CAPABILITY_NAMES: tuple[str, ...] = (
     "push",
     "external_force",
     "torque_limits",
+    "torque_speed_limit",
     "joint_friction",
     "elliptic_cone",
     "foot_condim_6",

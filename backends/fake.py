@@ -25,6 +25,7 @@ from .base import (
     Scene,
     Support,
 )
+from .motor_law import MotorLimits, motor_torque
 
 GRAVITY = 9.81
 """[m/s²]; it acts on nothing, it only turns masses into weights."""
@@ -101,7 +102,8 @@ class FakeBackend(PhysicsBackend):
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:
         """Only what concerns motors and bookkeeping is real."""
-        exact = ("gains", "motor_strength", "motor_offset", "latency", "push", "torque_limits", "deterministic", "gpu")
+        motors = ("gains", "motor_strength", "motor_offset", "latency", "torque_limits", "torque_speed_limit")
+        exact = (*motors, "push", "deterministic", "gpu")
         noted = Capability(
             support=Support.APPROXIMATE, note="accepted and recorded, without effect: there is no physics"
         )
@@ -133,7 +135,7 @@ class FakeBackend(PhysicsBackend):
         self.default_pose = self._tensor(robot.default_joint_position).expand(worlds, -1)
         self.stiffness = self._tensor(scene.parameters.stiffness)
         self.damping = self._tensor(scene.parameters.damping)
-        self.torque_limit = self._tensor(scene.parameters.torque_limit)
+        self.limits = MotorLimits.of(scene).to(device=self.device, dtype=self.dtype)
         self.foot_points_b = self._tensor([(x, y, -robot.stand_height) for x, y in FOOT_POINTS])
         bodies = robot.collision_bodies
         self.base_index = bodies.index(robot.base_body) if robot.base_body in bodies else 0
@@ -367,12 +369,15 @@ class FakeBackend(PhysicsBackend):
         state, model = self._state, self.randomized
         assert model.stiffness_scale is not None and model.damping_scale is not None
         assert model.motor_strength is not None and model.motor_offset is not None
-        error = self.targets - state.joint_position + model.motor_offset
-        torque = self.stiffness * model.stiffness_scale * error
-        torque = torque - self.damping * model.damping_scale * state.joint_velocity
-        if self.scene.physics.torque_limits:
-            torque = torque.clamp(-self.torque_limit, self.torque_limit)
-        return torch.where(self.limp[:, None], torch.zeros_like(torque), torque * model.motor_strength)
+        torque = motor_torque(
+            self.targets - state.joint_position + model.motor_offset,
+            state.joint_velocity,
+            stiffness=self.stiffness * model.stiffness_scale,
+            damping=self.damping * model.damping_scale,
+            strength=model.motor_strength,
+            limits=self.limits,
+        )
+        return torch.where(self.limp[:, None], torch.zeros_like(torque), torque)
 
     def _watch(self, mask: torch.Tensor, substep: int) -> None:
         """Record the first substep at which a watch tripped."""

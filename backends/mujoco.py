@@ -1,7 +1,8 @@
 """The reference engine: MuJoCo on the CPU, many worlds on a thread pool (``mujoco.batch.Batch``), float64, bit-reproducible.
 
 Every world runs on a model of its own, a copy of its terrain's, so that friction, masses and gains can differ. The motor
-law is an affine actuator inside the model and is therefore evaluated at every physics step. After a step, positions and
+law is an affine actuator inside the model and is therefore evaluated at every physics step; where its limits follow the
+speed, every physics step gets the target whose torque they allow. After a step, positions and
 velocities are those of the new state, forces those of the step just taken; the penetration watch sees the contacts with
 which each substep started.
 """
@@ -31,6 +32,7 @@ from .base import (
     Support,
 )
 from .description import ModelFields
+from .motor_law import MotorLimits
 from .mujoco_model import CONTACT_SLOTS, FOOT_SLOTS, build_models
 from .mujoco_state import RECORDED, BatchState, Records, StateLayout
 
@@ -70,6 +72,7 @@ class MujocoBackend(PhysicsBackend):
         self.device = torch.device("cpu")
         self.dtype = torch.float64
         n, robot = scene.num_worlds, scene.robot
+        self._limits = MotorLimits.of(scene)
         self._palette = build_models(scene)
         self._terrain = np.asarray(scene.terrain_index, dtype=np.int64)
         nominal = self._palette[0]
@@ -88,8 +91,9 @@ class MujocoBackend(PhysicsBackend):
         self._held = np.zeros((n, joints))
         self._offset = np.zeros((n, joints))
         self._limp = np.ones(n, dtype=bool)
+        self._gain, self._strength = np.zeros((n, joints)), np.ones((n, joints))
         self._kd_over_kp = np.zeros((n, joints))
-        self._update_gain_ratio(range(n))
+        self._read_gains(range(n))
         self._warned = np.zeros((n, 2), dtype=np.int64)
         self._live = {
             "time": self._time,
@@ -225,9 +229,12 @@ class MujocoBackend(PhysicsBackend):
         control[:] = (targets + offset)[:, None]
         if waits is not None:
             np.copyto(control, (held + offset)[:, None], where=waits[..., None])
-        if some_limp:
-            if waits is None:
-                waits = np.full((n, total), joint_targets is None)
+        if some_limp and waits is None:
+            waits = np.full((n, total), joint_targets is None)
+        if self._limits.by_speed:
+            loose = np.zeros((n, total), dtype=bool) if waits is None else waits & self._limp[those, None]
+            records = self._play_singly(rows, control, loose)
+        elif some_limp and waits is not None:
             records = self._play_some_limp(rows, control, self._limp[those], waits)
         else:
             self._play(rows, control, records)
@@ -279,22 +286,30 @@ class MujocoBackend(PhysicsBackend):
     ) -> Records:
         """The same where the motors of some worlds hang limp while they wait, (rows,) and (rows, substeps)."""
         others, some = rows[~limp], control[~limp]
-        loose = self._play_limp(rows[limp], control[limp], waits[limp])
+        loose = self._play_singly(rows[limp], control[limp], waits[limp])
         records = self._memory(len(others), control.shape[1])[1]
         if len(others):
             self._play(others, some, records)
         return _merge(limp, records, loose)
 
-    def _play_limp(self, rows: NDArray[np.int64], control: Array, waits: NDArray[np.bool_]) -> Records:
-        """The same for worlds whose motors hang limp while they wait: they get the target at which the law gives no torque."""
+    def _play_singly(self, rows: NDArray[np.int64], control: Array, loose: NDArray[np.bool_]) -> Records:
+        """The same, a substep at a time, where a target must follow the state: ``loose`` motors, (rows, substeps), get the one
+        at which the law gives no torque, and those at a limit that depends on the speed the one that gives the limit.
+        """
         parts = []
         for substep in range(control.shape[1]):
-            loose = (
-                self._qpos[np.ix_(rows, self._joint_q)]
-                + self._kd_over_kp[rows] * (self._qvel[np.ix_(rows, self._joint_v)])
-            )
+            position, velocity = self._qpos[np.ix_(rows, self._joint_q)], self._qvel[np.ix_(rows, self._joint_v)]
+            free = position + self._kd_over_kp[rows] * velocity
+            target = control[:, substep]
+            if self._limits.by_speed:
+                gain, strength = self._gain[rows], self._strength[rows]
+                asked = gain * (target - free)
+                lower, upper = self._limits.bounds(velocity)
+                given = asked.clip(lower * strength, upper * strength)
+                cut = (given != asked) & (gain > 0.0)
+                target = np.where(cut, free + np.divide(given, gain, out=np.zeros_like(gain), where=cut), target)
             now, records = self._memory(len(rows), 1)
-            now[:] = np.where(waits[:, substep, None], loose, control[:, substep])[:, None]
+            now[:] = np.where(loose[:, substep, None], free, target)[:, None]
             self._play(rows, now, records)
             parts.append({name: array.copy() for name, array in records.items()})
         return {name: np.concatenate([p[name] for p in parts], axis=1) for name in RECORDED}
@@ -347,7 +362,7 @@ class MujocoBackend(PhysicsBackend):
                 self._randomized.setdefault(int(row), {})[item.name] = entry
         for row in rows:
             self._apply_randomization(int(row))
-        self._update_gain_ratio(rows)
+        self._read_gains(rows)
         self._batch.set_models(self._models)
 
     def _apply_randomization(self, row: int) -> None:
@@ -381,11 +396,13 @@ class MujocoBackend(PhysicsBackend):
         model.actuator_forcerange[:] = nominal.actuator_forcerange * strength[:, None]
         self._offset[row] = values.get("motor_offset", 0.0)
 
-    def _update_gain_ratio(self, rows: range | NDArray[np.int64]) -> None:
-        """kd/kp of each motor, from which the torque-free target of a limp motor follows."""
+    def _read_gains(self, rows: range | NDArray[np.int64]) -> None:
+        """Read kp and strength of each motor, and kd/kp, from which the torque-free target follows."""
         for row in rows:
             model = self._models[row]
             gain = model.actuator_gainprm[:, 0]
+            self._gain[row] = gain
+            self._strength[row] = self._randomized.get(int(row), {}).get("motor_strength", 1.0)
             self._kd_over_kp[row] = np.divide(
                 -model.actuator_biasprm[:, 2], gain, out=np.zeros_like(gain), where=gain > 0
             )

@@ -15,6 +15,7 @@ import warp as wp
 
 from .base import PhysicsState
 from .mujoco_warp_model import FootChains, PaletteTables, SharedModel
+from .warp.motor_law import Limits
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 """mujoco_warp's five friction coefficients of a contact: sliding twice, torsional, rolling twice."""
@@ -78,7 +79,7 @@ class Motors:
     """Address of each joint in qpos."""
     joint_v: wp.array[int]
     """Address of each joint in qvel."""
-    limit: wp.array[float]
+    limits: Limits
     stiffness: wp.array2d[float]
     damping: wp.array2d[float]
     strength: wp.array2d[float]

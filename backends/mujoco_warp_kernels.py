@@ -10,6 +10,7 @@ of them needs the host.
 import warp as wp
 
 from .mujoco_warp_arrays import ContactArrays, Motion, Motors, Palette, Roles, StateArrays
+from .warp.motor_law import motor_torque
 
 wp.set_module_options({"enable_backward": False})
 
@@ -77,7 +78,7 @@ def keep_inactive(
 
 @wp.kernel
 def motor_law(substep: int, motors: Motors, motion: Motion) -> None:
-    """Torque = clip(kp (target + offset - q) - kd q̇) · strength, with the target that acts in this substep (from 0)."""
+    """The motor law with the target that acts in this substep (from 0)."""
     world, joint = wp.tid()
     target = motors.current[world, joint]
     limp = motors.limp[world]
@@ -87,9 +88,12 @@ def motor_law(substep: int, motors: Motors, motion: Motion) -> None:
     position = motion.qpos[world, motors.joint_q[joint]]
     velocity = motion.qvel[world, motors.joint_v[joint]]
     error = target + motors.offset[world, joint] - position
-    torque = motors.stiffness[world, joint] * error - motors.damping[world, joint] * velocity
-    if not wp.isnan(torque):  # clamp would hide an invalid target
-        torque = wp.clamp(torque, -motors.limit[joint], motors.limit[joint]) * motors.strength[world, joint]
+    stiffness, damping, strength = (
+        motors.stiffness[world, joint],
+        motors.damping[world, joint],
+        motors.strength[world, joint],
+    )
+    torque = motor_torque(joint, error, velocity, stiffness, damping, strength, motors.limits)
     if limp != 0:
         torque = 0.0
     motors.torque[world, joint] = torque

@@ -11,8 +11,10 @@ import warp as wp
 
 from .base import BackendError, Randomization, Scene
 from .description import ModelFields
+from .motor_law import MotorLimits
 from .mujoco_warp_arrays import Motors, shared_array, to_warp
 from .mujoco_warp_model import SharedModel
+from .warp.motor_law import limit_arrays
 
 BATCHED_FIELDS = (
     "geom_friction",
@@ -28,7 +30,6 @@ BATCHED_FIELDS = (
     "dof_invweight0",
 )
 """Model fields of which every world has its own."""
-_NO_LIMIT = 1.0e30
 _SMALLEST_MASS = 0.01
 """Mass that a base keeps, whatever is taken from it [kg]."""
 
@@ -48,12 +49,9 @@ class WorldParameters:
         self._offset = torch.zeros((n, joints), dtype=torch.float32, device=device)
         self.requested = torch.zeros((n, joints), dtype=torch.float32, device=device)
         self.delay = torch.zeros(n, dtype=torch.int32, device=device)
-        limit = torch.full((joints,), _NO_LIMIT)
-        if scene.physics.torque_limits:
-            limit = torch.tensor(constants.torque_limit)
         motors = Motors()
         motors.joint_q, motors.joint_v = to_warp(shared.joint_q, int), to_warp(shared.joint_v, int)
-        motors.limit = to_warp(limit.numpy(), float)
+        motors.limits = limit_arrays(MotorLimits.of(scene))
         motors.stiffness, motors.damping = shared_array(self._stiffness), shared_array(self._damping)
         motors.strength, motors.offset = shared_array(self._strength), shared_array(self._offset)
         motors.requested, motors.delay = shared_array(self.requested), shared_array(self.delay)
@@ -143,7 +141,7 @@ class WorldParameters:
             joint_friction_loss=first("dof_frictionloss")[dofs],
             stiffness=self._stiffness[0].cpu().numpy() * strength,
             damping=self._damping[0].cpu().numpy() * strength,
-            torque_limit=self.motors.limit.numpy() * strength,
+            torque_limit=self.motors.limits.torque.numpy() * strength,
             foot_friction=friction[feet, 0],
             floor_friction=float(friction[floor, 0]),
             foot_priority=priority[feet] - priority[floor],

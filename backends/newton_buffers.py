@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 
 from . import newton_kernels as kernels
 from .base import PhysicsState, Scene
+from .motor_law import MotorLimits
 from .newton_model import SlotTables, WorldLayout, WorldModel
 from .newton_solvers import SolverAdapter, dry_friction_slope
+from .warp.motor_law import limit_arrays
 
-LARGEST_TORQUE = 1e6
-"""Stands for no torque limit [N·m]."""
 SMALLEST_MASS = 0.01
 """A base never gets lighter than this [kg]."""
 
@@ -130,11 +130,10 @@ class MotorTensors:
         self.offset = torch.zeros((n, joints), dtype=torch.float32, device=device)
         self.requested = torch.zeros((n, joints), dtype=torch.float32, device=device)
         self.delay = torch.zeros(n, dtype=torch.int32, device=device)
-        limit = constants.torque_limit if scene.physics.torque_limits else (LARGEST_TORQUE,) * joints
         dofs = np.array([int(world.reference.joint(name).dofadr[0]) for name in scene.robot.joint_names])
         self.structure = structure(
             kernels.Motors,
-            limit=floats(limit, on),
+            limits=limit_arrays(MotorLimits.of(scene), on),
             stiffness=wp.from_torch(self.stiffness),
             damping=wp.from_torch(self.damping),
             strength=wp.from_torch(self.strength),

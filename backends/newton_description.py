@@ -37,7 +37,7 @@ def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors) -> di
         joint_friction_loss=np.maximum(dry, first("joint_friction", layout.dofs)[dofs]),
         stiffness=motors.stiffness[0].cpu().numpy() * strength,
         damping=motors.damping[0].cpu().numpy() * strength,
-        torque_limit=motors.structure.limit.numpy() * strength,
+        torque_limit=motors.structure.limits.torque.numpy() * strength,
         foot_friction=friction[feet],
         floor_friction=float(friction[floor]),
     ).describe()

@@ -13,6 +13,8 @@ velocity, both in the world frame; ``body_qd`` likewise. The contract's are wxyz
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
+from .warp.motor_law import Limits, motor_torque
+
 wp.set_module_options({"enable_backward": False})
 
 POSITION_LIMIT = wp.constant(1.0e5)
@@ -51,7 +53,7 @@ class Layout:
 class Motors:
     """Motor law and targets."""
 
-    limit: wp.array[float]
+    limits: Limits
     stiffness: wp.array2d[float]
     damping: wp.array2d[float]
     strength: wp.array2d[float]
@@ -266,7 +268,7 @@ def motor_law(
     joint_qd: wp.array[float],
     joint_f: wp.array[float],
 ):
-    """Torque = clip(kp (target + offset - q) - kd q̇) · strength, with the target that acts in this substep (from 0)."""
+    """The motor law with the target that acts in this substep (from 0), and dry friction where the solver has none."""
     world, joint = wp.tid()
     target = motors.current[world, joint]
     limp = motors.limp[world]
@@ -277,8 +279,12 @@ def motor_law(
     position = joint_q[world * layout.coordinates + layout.joint_q[joint]]
     velocity = joint_qd[dof]
     error = target + motors.offset[world, joint] - position
-    torque = motors.stiffness[world, joint] * error - motors.damping[world, joint] * velocity
-    torque = wp.clamp(torque, -motors.limit[joint], motors.limit[joint]) * motors.strength[world, joint]
+    stiffness, damping, strength = (
+        motors.stiffness[world, joint],
+        motors.damping[world, joint],
+        motors.strength[world, joint],
+    )
+    torque = motor_torque(joint, error, velocity, stiffness, damping, strength, motors.limits)
     if limp != 0 or diverged[world]:
         torque = 0.0
     motors.torque[world, joint] = torque

@@ -12,7 +12,8 @@ class JointParameters:
     """One named set of joint and motor constants. Every tuple has one entry per joint, in the robot's joint order.
 
     The motor law is ``torque = stiffness * (target - q) - damping * qd``, clipped to ``torque_limit`` where the physics
-    options ask for torque limits, then multiplied by the motor strength.
+    options ask for torque limits, then multiplied by the motor strength. Where they ask for limits by speed, the torque
+    in the direction of motion falls from ``driving_torque_limit`` at ``full_torque_speed`` to zero at ``no_load_speed``.
     """
 
     stiffness: tuple[float, ...]
@@ -27,6 +28,12 @@ class JointParameters:
     """Passive viscous damping of the joint [N·m·s/rad]."""
     friction_loss: tuple[float, ...]
     """Dry friction of the joint [N·m]."""
+    driving_torque_limit: tuple[float, ...] | None = None
+    """Largest motor torque in the direction of motion [N·m]; None where it is ``torque_limit``, as against it."""
+    full_torque_speed: tuple[float, ...] | None = None
+    """Joint speed up to which the driving torque is there [rad/s]; None where it is not known."""
+    no_load_speed: tuple[float, ...] | None = None
+    """Joint speed from which the motor drives no more [rad/s]; None where it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)

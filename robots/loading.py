@@ -1,9 +1,9 @@
 """Reads a robot from a ``robot.toml``.
 
 The file's keys are the fields of ``Robot`` and, in ``[parameters.NAME]`` tables, those of ``JointParameters``; all must
-be there. ``mjcf`` is relative to the file. A value per joint is one number for all joints, a list in the order of
-``joint_names``, or a table whose keys are joint names or their endings (``calf`` fits ``FL_calf`` and
-``FL_calf_joint``); the longest fitting key wins.
+be there but those that have a default. ``mjcf`` is relative to the file. A value per joint is one number for all joints,
+a list in the order of ``joint_names``, or a table whose keys are joint names or their endings (``calf`` fits ``FL_calf``
+and ``FL_calf_joint``); the longest fitting key wins.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Collection, Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -111,14 +111,34 @@ class _Reader:
             if not isinstance(table, dict):
                 raise self.error(prefix[:-1], f"is {table!r} but must be a table: [parameters.{set_name}]")
             keys = [f.name for f in fields(JointParameters)]
-            self.check_keys(table, keys, prefix)
-            constants = {key: self.per_joint(table[key], prefix + key, joint_names) for key in keys}
+            optional = [f.name for f in fields(JointParameters) if f.default is not MISSING]
+            self.check_keys(table, keys, prefix, optional)
+            constants = {key: self.per_joint(table[key], prefix + key, joint_names) for key in keys if key in table}
             for key, values in constants.items():
                 for joint, number in zip(joint_names, values, strict=True):
                     if number < 0:
                         raise self.error(prefix + key, f"is {number:g} for {joint} but must not be negative")
+            self.check_motors(constants, prefix, joint_names)
             sets[set_name] = JointParameters(**constants)
         return sets
+
+    def check_motors(
+        self, constants: Mapping[str, tuple[float, ...]], prefix: str, joint_names: tuple[str, ...]
+    ) -> None:
+        """Refuse a curve of torque over speed that is half given or rises."""
+        if ("full_torque_speed" in constants) != ("no_load_speed" in constants):
+            raise self.error(prefix + "full_torque_speed", "and no_load_speed belong together; give both or neither")
+        for i, joint in enumerate(joint_names):
+            if "no_load_speed" in constants:
+                full, none = constants["full_torque_speed"][i], constants["no_load_speed"][i]
+                if full >= none:
+                    problem = f"is {full:g} rad/s for {joint} but must be below no_load_speed, {none:g}"
+                    raise self.error(prefix + "full_torque_speed", problem)
+            if "driving_torque_limit" in constants:
+                driving, limit = constants["driving_torque_limit"][i], constants["torque_limit"][i]
+                if driving > limit:
+                    problem = f"is {driving:g} N·m for {joint} but must not be above torque_limit, {limit:g}"
+                    raise self.error(prefix + "driving_torque_limit", problem)
 
     def per_joint(self, value: object, key: str, joint_names: tuple[str, ...]) -> tuple[float, ...]:
         if isinstance(value, list):
@@ -151,12 +171,14 @@ class _Reader:
             raise self.error("command_limits", f"is {value} but its entries must not be negative")
         return forward, lateral, yaw
 
-    def check_keys(self, data: Mapping[str, Any], allowed: list[str], prefix: str) -> None:
+    def check_keys(
+        self, data: Mapping[str, Any], allowed: list[str], prefix: str, optional: Collection[str] = ()
+    ) -> None:
         for key in data:
             if key not in allowed:
                 hint = did_you_mean(key, allowed) or f"; allowed are: {', '.join(allowed)}"
                 raise self.error(prefix + key, f"is an unknown key{hint}")
-        missing = [prefix + key for key in allowed if key not in data]
+        missing = [prefix + key for key in allowed if key not in data and key not in optional]
         if missing:
             raise RobotError(f"{self.file}: missing {'keys' if len(missing) > 1 else 'key'} {', '.join(missing)}")
 

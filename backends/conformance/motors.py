@@ -59,6 +59,38 @@ def motor_strength(bench: Bench) -> str:
     return ""
 
 
+@check("motors/speed_limit", "torque_limits", "torque_speed_limit", "motor_strength")
+def motor_speed_limit(bench: Bench) -> str:
+    """With limits by speed the driving torque falls linearly to zero at the no-load speed; braking torque stays whole."""
+    # 15 rad/s lies half-way between full torque (16 N·m, up to 10 rad/s) and none (20 rad/s)
+    parameters = bench.soft(
+        torque_limit=20.0, driving_torque_limit=16.0, full_torque_speed=10.0, no_load_speed=20.0, damping=0.0
+    )
+    speed = np.array([0.0, 5.0, 10.0, 12.5, 15.0, 17.5, 20.0, 25.0, -5.0, -15.0, -25.0, -2.5])
+    forward = np.array([16.0, 16.0, 16.0, 12.0, 8.0, 4.0, 0.0, 0.0, 20.0, 20.0, 20.0, 20.0])
+    backward = -np.array([16.0, 20.0, 20.0, 20.0, 20.0, 20.0, 20.0, 20.0, 16.0, 8.0, 0.0, 16.0])
+    joints = np.arange(bench.robot.num_joints) % len(speed)
+    # far beyond the limits in both directions, with half the strength, and 3 N·m, which only the fastest are too fast for
+    reach = np.array([100.0, -100.0, 100.0, 3.0 / parameters.stiffness[0]])[:, None]
+    wanted = np.stack([forward, backward, 0.5 * forward, np.minimum(forward, 3.0)])[:, joints]
+    strength = np.ones_like(wanted)
+    strength[2] = 0.5
+    with bench.worlds(parameters, torque_limits=True, torque_speed_limit=True) as worlds:
+        worlds.randomize(motor_strength=strength)
+        worlds.reset(joint_position=worlds.default_pose, joint_velocity=np.tile(speed[joints], (worlds.count, 1)))
+        worlds.step(worlds.default_pose + reach, substeps=1)
+        error = expect_close("joint_torque with limits by speed [N·m]", worlds.read().joint_torque, wanted, 4e-3)
+        # it is the speed of each substep that counts
+        worlds.reset(joint_velocity=np.full_like(wanted, 12.0))
+        worlds.step(worlds.default_pose + 100.0, sample_at=[9] * worlds.count)
+        before, after = worlds.read_sample(), worlds.read()
+        share = np.clip(2.0 - before.joint_velocity / 10.0, 0.0, 1.0)
+        expect(bool((share < 0.79).any()), "the check's own joints do not become faster")
+        wanted = np.where(before.joint_velocity >= 0.0, 16.0 * share, 20.0) * strength
+        expect_close("joint_torque of the last substep [N·m]", after.joint_torque, wanted, 4e-3)
+    return f"largest error {error:.1e} N·m"
+
+
 @check("motors/gains", "gains")
 def motor_gains(bench: Bench) -> str:
     """Stiffness and damping are scaled for each world and joint on their own."""

@@ -61,6 +61,12 @@ REQUESTS: dict[str, Callable[[Bench], None]] = {
     "push": lambda bench: _ask(bench, lambda w: w.push(linear_velocity_w=np.ones((w.count, 3)))),
     "external_force": lambda bench: _ask(bench, lambda w: w.apply_force(np.ones((w.count, 3)))),
     "torque_limits": lambda bench: _build(bench, torque_limits=True),
+    "torque_speed_limit": lambda bench: _build(
+        bench,
+        parameters=bench.soft(full_torque_speed=10.0, no_load_speed=20.0),
+        torque_limits=True,
+        torque_speed_limit=True,
+    ),
     "joint_friction": lambda bench: _build(bench, parameters=bench.soft(friction_loss=0.2)),
     "elliptic_cone": lambda bench: _build(bench, cone="elliptic"),
     "foot_condim_6": lambda bench: _build(bench, foot_condim=6),

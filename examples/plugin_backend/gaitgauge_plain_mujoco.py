@@ -20,6 +20,7 @@ from gaitgauge.backends import (
     Support,
 )
 from gaitgauge.backends.base import CAPABILITY_NAMES
+from gaitgauge.backends.motor_law import MotorLimits, motor_torque
 from gaitgauge.terrains.base import Terrain
 
 CANNOT = {
@@ -49,7 +50,7 @@ class PlainMujocoBackend(PhysicsBackend):
         self.scene, self.device, self.dtype = scene, torch.device("cpu"), torch.float64
         n, robot, constants = scene.num_worlds, scene.robot, scene.parameters
         self._kp, self._kd = np.asarray(constants.stiffness), np.asarray(constants.damping)
-        self._limit = np.asarray(constants.torque_limit) if scene.physics.torque_limits else np.inf
+        self._limits = MotorLimits.of(scene)
         self._palette = [self._build(terrain) for terrain in scene.terrains]
         self._terrain = list(scene.terrain_index)
         self._changes: list[dict[str, Any]] = [{} for _ in range(n)]
@@ -209,10 +210,14 @@ class PlainMujocoBackend(PhysicsBackend):
         torque = np.zeros(len(self._at_v))
         if not self._limp[row]:
             motors = {name: values[row] for name, values in self._motors.items()}
-            error = self._target[row] - data.qpos[self._at_q] + motors["motor_offset"]
-            torque = self._kp * motors["stiffness_scale"] * error
-            torque -= self._kd * motors["damping_scale"] * data.qvel[self._at_v]
-            torque = np.clip(torque, -self._limit, self._limit) * motors["motor_strength"]
+            torque = motor_torque(
+                self._target[row] - data.qpos[self._at_q] + motors["motor_offset"],
+                data.qvel[self._at_v],
+                stiffness=self._kp * motors["stiffness_scale"],
+                damping=self._kd * motors["damping_scale"],
+                strength=motors["motor_strength"],
+                limits=self._limits,
+            )
         self._arrays["joint_torque"][row] = torque
         if np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all() and np.isfinite(torque).all():
             data.qfrc_applied[self._at_v] = torque

@@ -147,6 +147,36 @@ class ForgetsAtReset(MujocoBackend):
         super().reset(*args, **kwargs)
 
 
+class MotorFault(MujocoBackend):
+    """An engine that builds its motors from another scene."""
+
+    def __init__(self, scene, **rest):
+        super().__init__(self.spoil(scene), **rest)
+
+
+class SpeedIgnored(MotorFault):
+    def spoil(self, scene):
+        return replace(scene, physics=replace(scene.physics, torque_speed_limit=False))
+
+
+class BrakesAsItDrives(MotorFault):
+    def spoil(self, scene):
+        driving = scene.parameters.driving_torque_limit
+        return replace(scene, parameters=replace(scene.parameters, torque_limit=driving))
+
+
+class SpeedOfThePeriod(MujocoBackend):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.begin, self._limits = None, replace(self._limits)
+        bounds = self._limits.bounds
+        object.__setattr__(self._limits, "bounds", lambda velocity: bounds(self.begin))
+
+    def step(self, *args, **kwargs):
+        self.begin = self.state.joint_velocity.numpy().copy()
+        super().step(*args, **kwargs)
+
+
 class SwallowsRequests(MujocoBackend):
     @classmethod
     def capabilities(cls):
@@ -169,6 +199,9 @@ FAULTS = [
     (FootForceCountedTwice, "contact/feet"),
     (DivergenceHidden, "health/divergence"),
     (LateTargets, "motors/latency"),
+    (SpeedIgnored, "motors/speed_limit"),
+    (BrakesAsItDrives, "motors/speed_limit"),
+    (SpeedOfThePeriod, "motors/speed_limit"),
     (LateSample, "stepping/sample_at"),
     (StepsEverybody, "stepping/mask"),
     (ResetsForceNever, "disturbance/force_reset"),

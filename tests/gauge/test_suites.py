@@ -88,6 +88,17 @@ def test_digests_tell_suites_of_one_name_apart(suite_file):
     assert one.digest == load_suite(suite_file(mine("[settling]\nlongest = 2"))).digest
 
 
+def test_published_suites_keep_their_digests():
+    # results bear them: what a suite may say anew must not change what was published
+    assert load_suite("robogauge-1.1").digest.startswith("a43a0522c0c034c0")
+    assert load_suite("gaitgauge-1").digest.startswith("364e879262c30d63")
+
+
+def test_a_suite_may_limit_torque_by_speed(suite_file):
+    plain, limited = (load_suite(suite_file(mine(text))) for text in ("", "[physics]\ntorque_speed_limit = true"))
+    assert limited.physics.torque_speed_limit and limited.digest != plain.digest
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

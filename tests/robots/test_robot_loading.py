@@ -102,11 +102,24 @@ def test_go2_parameter_sets():
         armature=(0.01,) * 12,
         joint_damping=(0.1,) * 12,
         friction_loss=(0.2,) * 12,
+        driving_torque_limit=(20.2, 20.2, 38.72) * 4,
+        full_torque_speed=(13.5, 13.5, 7.04) * 4,
+        no_load_speed=(30.0, 30.0, 15.65) * 4,
     )
-    assert sets["training"] == replace(sets["gauge"], torque_limit=(23.7, 23.7, 35.55) * 4)
+    assert sets["training"] == replace(
+        sets["gauge"],
+        torque_limit=(23.7, 23.7, 35.55) * 4,
+        driving_torque_limit=(20.2, 20.2, 30.3) * 4,
+        full_torque_speed=(13.5, 13.5, 8.91) * 4,
+    )
     without = (0.0,) * 12
     assert sets["training-published"] == replace(
-        sets["training"], armature=without, joint_damping=without, friction_loss=without
+        sets["training"],
+        armature=without,
+        joint_damping=without,
+        friction_loss=without,
+        full_torque_speed=(13.5, 13.5, 9.0) * 4,
+        no_load_speed=(30.0, 30.0, 20.0) * 4,
     )
 
 
@@ -150,6 +163,21 @@ def test_longest_key_wins(write_hopper):
         ("armature = 0.01", 'armature = "0.01"', "parameters.soft.armature holds '0.01'"),
         ("armature = 0.01", "armature = -0.01", "parameters.soft.armature is -0.01 for hip but must not be negative"),
         ("[40, 50]", "[40, 50, 60]", "parameters.soft.torque_limit has 3 values but there are 2 joints"),
+        (
+            "armature = 0.01",
+            "armature = 0.01\nno_load_speed = 20",
+            "full_torque_speed and no_load_speed belong together",
+        ),
+        (
+            "armature = 0.01",
+            "armature = 0.01\nfull_torque_speed = 20\nno_load_speed = 20",
+            "full_torque_speed is 20 rad/s for hip but must be below no_load_speed, 20",
+        ),
+        (
+            "armature = 0.01",
+            "armature = 0.01\ndriving_torque_limit = 41",
+            "driving_torque_limit is 41 N·m for hip but must not be above torque_limit, 40",
+        ),
         ("knee = 2.0", "ankle = 2.0", "'ankle', which is neither a joint nor the ending of one"),
         ("knee = 2.0", "left_kne = 2.0", "did you mean 'left_knee'?"),
         (", knee = 2.0", "", "no value for the joint 'left_knee_joint'"),

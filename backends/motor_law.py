@@ -1,0 +1,94 @@
+"""The motor law, for engines that compute it in NumPy or torch; ``warp.motor_law`` is the same for kernels.
+
+Torque = kp (target + offset − q) − kd q̇, clipped to limits, then multiplied by the motor strength. With
+``PhysicsOptions.torque_speed_limit`` the limits follow the joint's speed: in the direction of motion a motor gives its
+driving torque up to the speed of full torque, from there a torque that falls linearly to zero at the no-load speed;
+against the motion it keeps its whole torque at any speed. A joint at rest counts as driven.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from .base import BackendError, Scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotorLimits:
+    """Torque limits of the joints. Arrays (J,), NumPy float64 or whatever ``to`` made of them."""
+
+    torque: Any
+    """Largest torque [N·m]; infinity for none."""
+    driving: Any
+    """Largest torque in the direction of motion [N·m]."""
+    no_load_speed: Any
+    """Speed from which a motor drives no more [rad/s]; infinity where the speed does not matter."""
+    fall: Any
+    """How far below it the driving torque begins to fall [rad/s]."""
+    by_speed: bool
+    """Whether the speed matters."""
+
+    @classmethod
+    def of(cls, scene: Scene) -> MotorLimits:
+        """The limits that a scene asks for.
+
+        Raises:
+            BackendError: a limit by speed without data of the motors, or without torque limits.
+        """
+        constants, physics = scene.parameters, scene.physics
+        torque = np.asarray(constants.torque_limit, dtype=np.float64)
+        if not physics.torque_limits:
+            torque = np.full_like(torque, np.inf)
+        if not physics.torque_speed_limit:
+            still = {"no_load_speed": np.full_like(torque, np.inf), "fall": np.ones_like(torque)}
+            return cls(torque=torque, driving=torque, **still, by_speed=False)
+        if not physics.torque_limits:
+            raise BackendError(
+                "PhysicsOptions.torque_speed_limit is on while torque_limits is off; turn both on, or neither"
+            )
+        full, none = constants.full_torque_speed, constants.no_load_speed
+        if full is None or none is None:
+            raise BackendError(
+                f"PhysicsOptions.torque_speed_limit is on, but this parameter set of robot '{scene.robot.name}' does not "
+                "say how fast its motors turn; add full_torque_speed and no_load_speed to robot.toml, or turn it off"
+            )
+        driving = torque if constants.driving_torque_limit is None else np.asarray(constants.driving_torque_limit)
+        return cls(
+            torque=torque,
+            driving=driving,
+            no_load_speed=np.asarray(none),
+            fall=np.asarray(none) - np.asarray(full),
+            by_speed=True,
+        )
+
+    def to(self, *, device: torch.device, dtype: torch.dtype) -> MotorLimits:
+        """The same limits as torch tensors."""
+        names = ("torque", "driving", "no_load_speed", "fall")
+        tensors = {name: torch.as_tensor(getattr(self, name), device=device, dtype=dtype) for name in names}
+        return MotorLimits(**tensors, by_speed=self.by_speed)
+
+    def bounds(self, velocity: Any) -> tuple[Any, Any]:
+        """Least and largest torque [N·m] at joint velocities [rad/s], (…, J)."""
+        if not self.by_speed:
+            return -self.torque, self.torque
+        where = torch.where if isinstance(velocity, torch.Tensor) else np.where
+        driving = self.driving * ((self.no_load_speed - abs(velocity)) / self.fall).clip(0.0, 1.0)
+        return where(velocity <= 0, -driving, -self.torque), where(velocity >= 0, driving, self.torque)
+
+
+def motor_torque(error: Any, velocity: Any, *, stiffness: Any, damping: Any, strength: Any, limits: MotorLimits) -> Any:
+    """Torque of the motors [N·m], (…, J); NaN where an argument is.
+
+    Args:
+        error: target + offset − position [rad].
+        velocity: joint velocity [rad/s].
+        stiffness: kp [N·m/rad].
+        damping: kd [N·m·s/rad].
+        strength: factor on the torque after its limit.
+        limits: of the same kind of arrays.
+    """
+    return (stiffness * error - damping * velocity).clip(*limits.bounds(velocity)) * strength

@@ -1,0 +1,1 @@
+"""What the engines that run on Warp share."""
