@@ -1,0 +1,26 @@
+"""Trains legged-robot walking policies on Warp physics and judges them in an engine they never trained in.
+
+The names below are imported at their first use, so that ``import gaitgauge`` costs nothing; ``api.py`` documents them.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from .version import __version__
+
+if TYPE_CHECKING:
+    from .api import Results, evaluate, load_policy, load_results, train
+
+__all__ = ["Results", "__version__", "evaluate", "load_policy", "load_results", "train"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        return getattr(import_module(".api", __name__), name)
+    raise AttributeError(f"module 'gaitgauge' has no attribute '{name}'; it has {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -12,11 +12,28 @@ from .errors import report_errors
 
 app = typer.Typer(
     name="gaitgauge",
-    help="Train legged-robot walking policies on Warp physics and judge them in an engine they never trained in.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _version(value: bool) -> None:
+    if value:
+        from ..version import __version__
+
+        print(f"gaitgauge {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def gaitgauge(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Train legged-robot walking policies on Warp physics and judge them in an engine they never trained in."""
+
 
 PolicyArgument = Annotated[
     str,

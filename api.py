@@ -1,0 +1,188 @@
+"""The project as a library: judge, train and read policies from Python.
+
+Each function does what the command of the same name does, with the same defaults, and raises the same one-sentence
+errors. Heavy packages are imported inside the functions.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .policy.base import Policy
+    from .training.stopping import TrainingOutcome
+
+
+class ResultsError(ValueError):
+    """A folder or file that holds no results; the message says what is wrong."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """What an evaluation found: ``results.json`` as it stands, and shortcuts to what is asked for most."""
+
+    path: Path
+    """Where ``results.json`` lies."""
+    data: Mapping[str, Any]
+    """Its content; ``docs/results.md`` explains every key."""
+
+    @property
+    def score(self) -> float | None:
+        """The benchmark, 0 to 1: mean over terrains; None where levels alone were searched."""
+        value = self.data["score"]
+        return None if value is None else float(value)
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """95 % interval of the score; None where there is none."""
+        ends = self.data.get("score_interval")
+        return None if ends is None else (float(ends[0]), float(ends[1]))
+
+    @property
+    def terrains(self) -> Mapping[str, Mapping[str, Any]]:
+        """Score, interval, level and statistics of each terrain."""
+        found: Mapping[str, Mapping[str, Any]] = self.data["terrains"]
+        return found
+
+    @property
+    def metrics(self) -> Mapping[str, Mapping[str, Any]]:
+        """Each metric of the suite, weighted by level."""
+        found: Mapping[str, Mapping[str, Any]] = self.data["metrics"]
+        return found
+
+    @property
+    def suite(self) -> str:
+        """Name and version of the suite."""
+        return f"{self.data['suite']['name']} {self.data['suite']['version']}"
+
+
+def load_results(path: str | Path) -> Results:
+    """Read the results of an evaluation.
+
+    Args:
+        path: a results folder, or its ``results.json``.
+
+    Raises:
+        ResultsError: there are none, or the file is damaged.
+    """
+    file = Path(path)
+    file = file / "results.json" if file.is_dir() else file
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ResultsError(
+            f"there are no results at '{path}'; give a folder that 'gaitgauge evaluate' wrote"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise ResultsError(f"'{file}' cannot be read as results: {error}") from error
+    if not isinstance(data, dict) or not {"suite", "score", "terrains", "metrics"} <= data.keys():
+        raise ResultsError(f"'{file}' holds no results of an evaluation; give the results.json that it wrote")
+    return Results(path=file, data=data)
+
+
+def load_policy(policy: str | Path, *, robot: str = "go2") -> Policy:
+    """Load a policy: own format, TorchScript, ONNX or an rsl_rl checkpoint.
+
+    Args:
+        policy: a file, or ``latest``, ``best`` or ``pretrained``.
+        robot: name of the robot, or the path of its ``robot.toml``; a foreign file gets its contract from it.
+
+    Raises:
+        PolicyError, ContractError, RobotError: one sentence on what is wrong.
+    """
+    from .policy.loading import load_policy as load
+    from .robots import load_robot
+
+    return load(str(policy), load_robot(robot))
+
+
+def evaluate(
+    policy: str | Path,
+    *,
+    suite: str | Path = "gaitgauge-1",
+    pipeline: str = "stress",
+    backend: str = "mujoco",
+    device: str | None = None,
+    robot: str = "go2",
+    terrains: Sequence[str] = (),
+    level: int | None = None,
+    frictions: Sequence[float] = (),
+    payloads: Sequence[float] = (),
+    seeds: Sequence[int] = (),
+    threads: int | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    watch: Callable[[Any], None] | None = None,
+) -> Results:
+    """Judge a policy, as ``gaitgauge evaluate`` does; writes results, episodes and the report.
+
+    Args:
+        policy: a file, or ``latest``, ``best`` or ``pretrained``.
+        suite: a suite's name, or the path of its file.
+        pipeline: ``base``, ``multi``, ``level`` or ``stress``.
+        backend: the physics engine.
+        device: ``cpu`` or ``cuda``; None for what the engine is made for.
+        robot: name of the robot, or the path of its ``robot.toml``.
+        terrains: names; empty for the suite's own.
+        level: to play at; None to search for the highest.
+        frictions: coefficients; empty for the suite's own.
+        payloads: masses on the base [kg]; empty for the suite's own.
+        seeds: of the quality episodes; empty for the suite's own.
+        threads: CPU threads, None for all cores; they change the time, never the results.
+        out: output folder; None for ``results/<policy>-<suite>-<pipeline>``.
+        resume: go on with what the folder holds.
+        watch: called a few times a second with a ``Status``.
+
+    Raises:
+        SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, StoreError: one sentence.
+    """
+    from .gauge.evaluate import Request
+    from .gauge.evaluate import evaluate as run
+    from .gauge.report import write_report
+
+    folder = Path(out) if out is not None else Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
+    request = Request(
+        policy=str(policy),
+        suite=str(suite),
+        pipeline=pipeline,
+        backend=backend,
+        device=device or "cpu",
+        robot=robot,
+        terrains=tuple(terrains),
+        level=level,
+        frictions=tuple(frictions),
+        payloads=tuple(payloads),
+        seeds=tuple(seeds),
+        threads=threads or os.cpu_count() or 1,
+    )
+    run(request, folder, resume=resume, watch=watch)
+    write_report(folder)
+    return load_results(folder)
+
+
+def train(task: str, *settings: str, seconds: float | None = None, **options: Any) -> tuple[TrainingOutcome, Path]:
+    """Train a policy, as ``gaitgauge train`` does.
+
+    Args:
+        task: name of the task.
+        settings: ``key=value`` settings of the task, such as ``environment.push.linear=0.6``.
+        seconds: wall-clock limit [s].
+        options: fields of ``gaitgauge.training.launch.TrainRequest``.
+
+    Returns:
+        How it ended, and the run directory.
+
+    Raises:
+        TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.
+    """
+    from .training.launch import TrainRequest, prepare
+    from .training.launch import train as run
+
+    plan = prepare(TrainRequest(task=task, overrides=settings, seconds=seconds, **options))
+    return run(plan, began=time.monotonic())
