@@ -8,9 +8,27 @@ import torch
 
 from .contract import PolicyContract
 
+LONGEST_MESSAGE = 1000
+"""Length at which a message is cut."""
+
 
 class PolicyError(ValueError):
-    """A policy cannot be loaded or run; the message says which file, what is wrong and what is allowed."""
+    """A policy cannot be loaded or run; the message says which file, what is wrong and what is allowed.
+
+    Words of the file itself may be part of it: what a terminal would act on is escaped, what is long is cut.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(plain(message))
+
+
+def plain(text: str) -> str:
+    """One line of text without control characters, marks of direction and halves of characters, and not too long."""
+    text = text if len(text) <= LONGEST_MESSAGE else text[: LONGEST_MESSAGE - 2] + " …"
+    # of a printable text nothing is changed; a blank is printable, a line's end is not
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 class PolicySession(ABC):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import re
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +18,8 @@ from .adapters import (
 )
 from .base import PolicyError
 from .contract import ContractError, PolicyContract, check_robot, go2_contract
-from .native import FORMAT, LOAD_ERRORS, FilePolicy, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
+from .fence.archive import LARGEST_FILE, archive_names
+from .native import FORMAT, FilePolicy, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
 
 if TYPE_CHECKING:
     from .onnx_file import OnnxFile
@@ -65,6 +64,12 @@ def find_policy(path_or_name: str | Path, *, log_root: Path = LOG_ROOT) -> Path:
     """
     path = Path(path_or_name)
     name = str(path_or_name)
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:  # a name that is too long, holds a null character, leads in circles
+        raise PolicyError(f"'{name}' cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if name in POLICY_NAMES and not path.is_file():
         return _named(name, log_root)
     if path.is_dir():
@@ -101,11 +106,14 @@ def _named(name: str, log_root: Path) -> Path:
 
 def _read(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(LARGEST_FILE + 1)
     except OSError as error:
         raise PolicyError(f"'{path}' cannot be read: {error.strerror}") from error
     if not data:
         raise PolicyError(f"'{path}' is empty")
+    if len(data) > LARGEST_FILE:
+        raise PolicyError(f"'{path}' is larger than {LARGEST_FILE // 2**20} MiB, the most that is read of a policy")
     return data
 
 
@@ -195,11 +203,7 @@ def file_kind(data: bytes, source: str) -> str:
         PolicyError: anything else; a plain pickle is refused without being opened.
     """
     if data[:4] == b"PK\x03\x04":
-        try:
-            names = zipfile.ZipFile(io.BytesIO(data)).namelist()
-        except LOAD_ERRORS as error:
-            raise PolicyError(f"'{source}' is a damaged or truncated archive") from error
-        inner = {n.partition("/")[2] for n in names}
+        inner = archive_names(data, source=source)
         if "constants.pkl" in inner and any(n.startswith("code/") for n in inner):
             return "torchscript"
         if "data.pkl" in inner:

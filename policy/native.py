@@ -10,6 +10,7 @@ The file is what ``torch.save`` writes of a dictionary of plain data and tensors
 ``network``     ``kind``, ``architecture`` and ``arguments`` (JSON text) for a network of ``networks.py``;
                 ``kind`` (``torchscript`` or ``onnx``) and ``bytes`` (uint8 tensor) for a foreign file carried inside
 ``state_dict``  tensors of the network; absent for a foreign file
+``checksum``    SHA-256 over contract, network and state_dict (``checksum``); files from before it was written lack it
 ==============  =====================================================================================================
 
 Other keys are left alone: a training checkpoint keeps its optimiser there.
@@ -18,10 +19,13 @@ Other keys are left alone: a training checkpoint keeps its optimiser there.
 from __future__ import annotations
 
 import copy
+import hashlib
 import io
 import json
 import os
 import pickle
+import re
+import secrets
 import warnings
 import zipfile
 import zlib
@@ -35,11 +39,21 @@ from torch import nn
 
 from .base import Policy, PolicyError, PolicySession, check_observation, checked_action
 from .contract import ContractError, PolicyContract
+from .fence.archive import packed, read_archive
+from .fence.pickles import REBUILD_TENSOR, check_tensors, read_pickle
 from .networks import ARCHITECTURES
 
 FORMAT = "gaitgauge-policy"
 VERSION = 1
 FOREIGN_KINDS = ("torchscript", "onnx")
+LARGEST_WIDTH = 65_536
+"""Largest number among a network's arguments: of entries, of frames, of neurons in a layer."""
+_LONGEST_ARGUMENTS = 65_536
+
+# What a file of tensors and plain data mentions: names that are called, and classes of storages, which are not.
+_PLAIN_CALLS = frozenset({REBUILD_TENSOR, "torch._utils _rebuild_parameter", "torch Size", "torch device"})
+_PLAIN_CALLS |= {"collections OrderedDict", "builtins set", "__builtin__ set", "_codecs encode"}
+_PLAIN_NAMES = re.compile(r"torch (\w+Storage|u?int\d+|float\d+|bfloat16|complex\d+|bool)")
 
 # What torch raises for damaged or foreign data, from the archive down to the tensors.
 LOAD_ERRORS = (
@@ -54,6 +68,8 @@ LOAD_ERRORS = (
     TypeError,
     AttributeError,
     AssertionError,
+    OverflowError,
+    MemoryError,
     zipfile.BadZipFile,
     zlib.error,
 )
@@ -122,6 +138,7 @@ def save_policy(
             "kind": network.kind,
             "bytes": torch.frombuffer(bytearray(network.data), dtype=torch.uint8),
         }
+    entries["checksum"] = checksum(entries)
     taken = entries.keys() & (extra or {}).keys()
     if taken:
         raise PolicyError(
@@ -129,7 +146,7 @@ def save_policy(
         )
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    partial = target.with_name(f".{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
         # Given a path, torch would write its name, and with it the process id, into the file: equal policies, unequal bytes.
         with partial.open("wb") as file:
@@ -139,6 +156,28 @@ def save_policy(
         os.replace(partial, target)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def checksum(entries: Mapping[str, Any]) -> str:
+    """SHA-256 over a policy file's contract, network and weights, hexadecimal.
+
+    A text counts as its UTF-8 bytes, a tensor as its type, shape and content, each after its name.
+    """
+    digest = hashlib.sha256()
+
+    def add(name: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for key in sorted(value):
+                add(f"{name}.{key}", value[key])
+        elif isinstance(value, torch.Tensor):
+            digest.update(f"{name} {value.dtype} {list(value.shape)}\n".encode())
+            digest.update(memoryview(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()))
+        else:
+            digest.update(f"{name} {value}\n".encode(errors="backslashreplace"))
+
+    for part in ("contract", "network", "state_dict"):
+        add(part, entries.get(part))
+    return digest.hexdigest()
 
 
 def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
@@ -156,6 +195,10 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
             f"'{source}' has version {entries.get('version')!r} of the policy format; this gaitgauge reads {VERSION}"
         )
     text, spec = entries.get("contract"), entries.get("network")
+    if "checksum" in entries and not _intact(entries):
+        raise PolicyError(
+            f"'{source}' is damaged: its contract, network or weights are not those that were written (checksum)"
+        )
     if not isinstance(text, str) or not isinstance(spec, Mapping):
         raise PolicyError(f"'{source}' lacks its contract or network and cannot be used")
     try:
@@ -174,12 +217,22 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
     if not isinstance(state_dict, Mapping) or not all(isinstance(v, torch.Tensor) for v in state_dict.values()):
         raise PolicyError(f"'{source}' has no state_dict of tensors")
     try:
-        arguments = json.loads(spec.get("arguments", ""))
-    except (json.JSONDecodeError, TypeError) as error:
+        arguments_text = spec.get("arguments", "")
+        if len(arguments_text) > _LONGEST_ARGUMENTS:
+            raise PolicyError(f"'{source}' has network arguments of over {_LONGEST_ARGUMENTS:,} characters")
+        arguments = json.loads(arguments_text)
+    except (json.JSONDecodeError, TypeError, RecursionError) as error:
         raise PolicyError(f"'{source}' has malformed network arguments: {first_line(error)}") from error
     architecture = str(spec.get("architecture"))
     stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=state_dict)
     return PolicyFile(contract=contract, network=stored)
+
+
+def _intact(entries: Mapping[str, Any]) -> bool:
+    try:
+        return checksum(entries) == entries["checksum"]
+    except LOAD_ERRORS:  # tensors of a kind that no policy has, names that cannot be sorted
+        return False
 
 
 def load_entries(data: bytes, *, source: str) -> Mapping[str, Any]:
@@ -188,13 +241,27 @@ def load_entries(data: bytes, *, source: str) -> Mapping[str, Any]:
     Raises:
         PolicyError: damaged, or with anything else inside.
     """
+    records = read_archive(data, source=source)
+    if "data.pkl" not in records:
+        raise PolicyError(f"'{source}' is a zip archive, but neither TorchScript nor a torch.save file")
+    reading = read_pickle(records["data.pkl"], source=source)
+    called = {call.function.name for call in reading.calls}
+    # torch itself would allow some more: calls that make what no policy has, of any size
+    if strange := [
+        n for n in reading.names if n not in _PLAIN_CALLS and (n in called or not _PLAIN_NAMES.fullmatch(n))
+    ]:
+        raise PolicyError(
+            f"'{source}' holds more than tensors and plain data ('{strange[0].replace(' ', '.')}'), and was not loaded"
+        )
+    sizes = {name.partition("/")[2]: len(content) for name, content in records.items() if name.startswith("data/")}
+    check_tensors((c for c in reading.calls if c.function.name == REBUILD_TENSOR), sizes, source=source)
     try:
-        entries = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        # torch's message recommends the unsafe way to load it, which is not for the user of a downloaded file to try.
-        raise PolicyError(f"'{source}' holds more than tensors and plain data, and was not loaded") from error
+        # what was checked is what is loaded: the archive is put together again
+        entries = torch.load(io.BytesIO(packed(records)), map_location="cpu", weights_only=True)
     except LOAD_ERRORS as error:
-        raise PolicyError(f"'{source}' is damaged or truncated: {first_line(error)}") from error
+        # torch's message recommends the unsafe way to load it, which is not for the user of a downloaded file to try.
+        reason = "its content is no tensors" if isinstance(error, pickle.UnpicklingError) else first_line(error)
+        raise PolicyError(f"'{source}' is damaged or truncated: {reason}") from error
     if not isinstance(entries, Mapping):
         raise PolicyError(f"'{source}' holds a {type(entries).__name__}, not a policy")
     return entries
@@ -212,7 +279,11 @@ def build_network(stored: StoredNetwork, contract: PolicyContract, *, source: st
         raise PolicyError(
             f"'{source}' names the unknown network '{stored.architecture}'; known are: {', '.join(ARCHITECTURES)}"
         )
+    _check_arguments(stored.arguments, source=source)
     try:
+        # first without memory: widths that the weights do not have are found before they are allocated
+        with torch.device("meta"):
+            make(**stored.arguments).load_state_dict(dict(stored.state_dict), assign=True)
         network = make(**stored.arguments)
         network.load_state_dict(dict(stored.state_dict))
     except LOAD_ERRORS as error:
@@ -229,6 +300,23 @@ def build_network(stored: StoredNetwork, contract: PolicyContract, *, source: st
     session = NativeSession(network, 1, contract, torch.device("cpu"), source)
     session.act(torch.zeros(1, contract.observation_width))
     return network
+
+
+def _check_arguments(arguments: Any, *, source: str) -> None:
+    """Refuse arguments of a network that would take endless time or memory to build."""
+    if not isinstance(arguments, Mapping):
+        raise PolicyError(f"'{source}' has malformed network arguments: a table is needed")
+    pending = list(arguments.values())
+    while pending:
+        value = pending.pop()
+        if isinstance(value, (list, tuple)):
+            pending.extend(value)
+        elif isinstance(value, Mapping):
+            pending.extend(value.values())
+        elif isinstance(value, (int, float)) and not abs(value) <= LARGEST_WIDTH:
+            raise PolicyError(
+                f"'{source}' has {value:.6g} among its network's arguments; at most {LARGEST_WIDTH:,} is allowed"
+            )
 
 
 class FilePolicy(Policy):

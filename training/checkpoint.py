@@ -22,7 +22,7 @@ import torch
 
 from ..policy.base import PolicyError
 from ..policy.contract import PolicyContract
-from ..policy.native import FORMAT, StoredNetwork, load_entries
+from ..policy.native import FORMAT, StoredNetwork, checksum, load_entries
 from ..policy.native import VERSION as POLICY_VERSION
 
 TRAINING_VERSION = 1
@@ -83,7 +83,8 @@ def write_checkpoint(path: str | Path, entries: Mapping[str, Any]) -> None:
         CheckpointError: the file cannot be written, for example because the disk is full.
     """
     buffer = io.BytesIO()
-    torch.save(dict(entries), buffer)
+    policy = entries.get("format") == FORMAT
+    torch.save({**entries, "checksum": checksum(entries)} if policy else dict(entries), buffer)
     write_bytes(path, buffer.getbuffer())
 
 

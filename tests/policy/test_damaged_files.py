@@ -1,0 +1,190 @@
+"""Files of tensors that are damaged, or larger than they look: each ends in one sentence before memory is spent."""
+
+import io
+import json
+import pickle
+import zipfile
+from dataclasses import replace
+
+import pytest
+import torch
+from gaitgauge.policy.base import LONGEST_MESSAGE, PolicyError
+from gaitgauge.policy.fence import archive, pickles
+from gaitgauge.policy.loading import find_policy, load_policy
+from gaitgauge.policy.native import checksum, save_policy
+
+WEIGHT = "encoder.0.weight"
+
+
+def refused(path, named: str) -> str:
+    with pytest.raises(PolicyError, match=named) as caught:
+        load_policy(path)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def rewritten(path, change) -> bytes:
+    """The archive's bytes after ``change`` of its records, put together with right sums."""
+    records = archive.read_archive(path.read_bytes(), source=path.name)
+    change(records)
+    return archive.packed(records)
+
+
+def test_one_flipped_bit_of_a_weight_is_found(cts_file):
+    stored = torch.load(cts_file, weights_only=True)["state_dict"][WEIGHT].numpy().tobytes()
+    data = bytearray(cts_file.read_bytes())
+    data[data.index(stored) + 3] ^= 0x40
+    cts_file.write_bytes(data)
+    assert torch.load(cts_file, weights_only=True)["state_dict"][WEIGHT].abs().max() > 1e30  # torch reads on
+    refused(cts_file, "damaged")
+
+
+def test_weights_of_another_policy_are_found_where_every_sum_is_right(cts_file):
+    entries = torch.load(cts_file, weights_only=True)
+    assert entries["checksum"] == checksum(entries)
+    entries["state_dict"][WEIGHT][0, 0] += 1.0
+    torch.save(entries, cts_file)
+    refused(cts_file, "checksum")
+    del entries["checksum"]  # files from before it was written
+    torch.save(entries, cts_file)
+    load_policy(cts_file)
+
+
+@pytest.mark.parametrize("value", [3, None, "0" * 64, torch.zeros(2)])
+def test_a_checksum_that_is_none_is_wrong(cts_file, value):
+    entries = torch.load(cts_file, weights_only=True)
+    torch.save({**entries, "checksum": value}, cts_file)
+    refused(cts_file, "checksum")
+
+
+def test_an_archive_that_unpacks_to_too_much(cts_file, monkeypatch):
+    records = archive.read_archive(cts_file.read_bytes(), source="")
+    with zipfile.ZipFile(cts_file, "w", zipfile.ZIP_DEFLATED) as made:
+        for name, content in records.items():
+            made.writestr(f"archive/{name}", content)
+        made.writestr("archive/data/9999", bytes(8 * 2**20))
+    size = cts_file.stat().st_size
+    monkeypatch.setattr(archive, "LARGEST_FILE", 4 * 2**20)
+    assert size < archive.LARGEST_FILE
+    refused(cts_file, "unpacks to 8 MiB")
+
+
+def test_an_archive_with_a_record_twice(cts_file):
+    with zipfile.ZipFile(cts_file, "a") as made, pytest.warns(UserWarning, match="Duplicate"):
+        made.writestr(made.infolist()[0].filename, b"other")
+    refused(cts_file, "twice")
+
+
+def test_tensors_that_are_larger_than_their_storage(tmp_path):
+    path = tmp_path / "expanded.pt"
+    torch.save({"model_state_dict": {"actor.0.weight": torch.zeros(1).expand(2**31, 45)}}, path)
+    assert path.stat().st_size < 10_000
+    refused(path, "spelled out")
+
+
+@pytest.mark.parametrize("field", ["count", "shape", "offset"])
+def test_tensors_that_reach_beyond_their_storage(tmp_path, field):
+    path = tmp_path / "beyond.pt"
+    torch.save({"model_state_dict": {"actor.0.weight": torch.zeros(7, 45)}}, path)
+
+    def change(records):
+        text = records["data.pkl"]
+        number = {"count": 315, "shape": 7, "offset": 0}[field]
+        old = {"count": pickle.BININT2 + number.to_bytes(2, "little"), "shape": b"K\x07K\x2d", "offset": b"QK\x00"}[
+            field
+        ]
+        new = {"count": b"J\xff\xff\xff\x7f", "shape": b"J\xff\xff\xff\x7fK\x2d", "offset": b"QJ\xff\xff\xff\x7f"}[
+            field
+        ]
+        assert old in text
+        records["data.pkl"] = text.replace(old, new, 1)
+
+    path.write_bytes(rewritten(path, change))
+    refused(path, "missing or short|reaches beyond")
+
+
+@pytest.mark.parametrize("value", [set, bytearray, torch.zeros(2).to_sparse(), torch.zeros(2, device="meta")])
+def test_what_is_no_plain_tensor_is_named(tmp_path, value):
+    path = tmp_path / "other.pt"
+    torch.save({"model_state_dict": {"actor.0.weight": bytearray(5) if value is bytearray else value}}, path)
+    refused(path, "more than tensors and plain data|no gaitgauge|neither|no tensors")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"encoder_hidden": [30_000, 30_000, 30_000]}, "do not fit"),
+        ({"frame_width": 10**9}, "1e\\+09"),
+        ({"history_length": 65_000}, "do not fit"),
+        ({"actor_hidden": [1] * 40_000}, "characters"),
+    ],
+)
+def test_networks_too_large_are_never_built(cts_file, arguments, named):
+    entries = torch.load(cts_file, weights_only=True)
+    known = json.loads(entries["network"]["arguments"])
+    entries["network"]["arguments"] = json.dumps({**known, **arguments})
+    torch.save({**entries, "checksum": checksum(entries)}, cts_file)
+    refused(cts_file, named)
+
+
+def test_nested_arguments(cts_file):
+    entries = torch.load(cts_file, weights_only=True)
+    entries["network"]["arguments"] = "[" * 60_000
+    torch.save({**entries, "checksum": checksum(entries)}, cts_file)
+    refused(cts_file, "arguments")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b".",
+        b"\x80\x02",
+        b"\x80\x02}q\x00h\x05.",
+        b"\x80\x02(((.",
+        b"\x80\x02" + b"(" * 100_000 + b"t" * 100_000 + b".",
+        b"\x80\x02K\x01K\x01R.",
+        b"\x80\x02K\x01Q.",
+        b"cos\nsystem\n(S'true'\ntR.",
+        pickle.dumps({"a": {1, 2}}, protocol=4),
+        pickle.dumps(pickle.PickleBuffer(b"x"), protocol=5),
+    ],
+)
+def test_reading_a_pickle_never_fails_otherwise(data):
+    """Nor does it run anything: whatever is no tensor stays a name."""
+    try:
+        pickles.read_pickle(data, source="x")
+    except PolicyError as error:
+        assert len(str(error)) < 200
+
+
+def test_names_that_no_system_takes(tmp_path):
+    for name in ("x" * 300, "a\0b", tmp_path / "loop"):
+        if name == tmp_path / "loop":
+            name.symlink_to(name)
+        with pytest.raises(PolicyError, match=r"cannot be read|there is no policy|null"):
+            find_policy(name)
+
+
+def test_a_long_name_can_be_written(tmp_path, contract, cts_stored):
+    path = tmp_path / ("x" * 246 + ".gauge.pt")
+    save_policy(path, contract, cts_stored)
+    assert load_policy(path).contract == contract
+    assert [f.name for f in tmp_path.iterdir()] == [path.name]
+
+
+def test_words_of_a_file_do_not_act_on_the_terminal(tmp_path, contract, cts_stored, cts_file):
+    entries = torch.load(cts_file, weights_only=True)
+    entries["network"]["architecture"] = "nose\x1b[31m\u202e" + "x" * 5000
+    entries["contract"] = replace(contract).to_json()
+    torch.save({**entries, "checksum": checksum(entries)}, cts_file)
+    message = refused(cts_file, "nose")
+    assert "\\x1b" in message and "\\u202e" in message and message.isprintable()
+    assert len(message) < LONGEST_MESSAGE + 200
+
+
+def test_the_shipped_policy_and_a_buffer_are_read_the_same(cts_file):
+    """What is put together again holds what the file holds, to the last byte."""
+    records = archive.read_archive(cts_file.read_bytes(), source="")
+    with zipfile.ZipFile(io.BytesIO(archive.packed(records))) as made:
+        assert {n.partition("/")[2]: made.read(n) for n in made.namelist()} == records
