@@ -11,13 +11,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import Enum
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from pydantic import Field
 
 from ..robots.base import JointParameters, Robot
 from ..terrains.base import Terrain
 
 if TYPE_CHECKING:
     import torch  # only named here: what lists engines, suites and tasks need not wait for it
+
+
+_Iterations = Annotated[int, Field(ge=1, le=10_000)]
 
 
 class BackendError(RuntimeError):
@@ -28,21 +33,21 @@ class BackendError(RuntimeError):
 class PhysicsOptions:
     """How the world is simulated."""
 
-    timestep: float = 0.002
+    timestep: Annotated[float, Field(gt=0.0, le=0.1)] = 0.002
     """Length of one physics step (a substep of the control period) [s]."""
-    substeps: int = 10
+    substeps: Annotated[int, Field(ge=1, le=1000)] = 10
     """Physics steps per control period."""
-    cone: str = "elliptic"
+    cone: Literal["elliptic", "pyramidal"] = "elliptic"
     """Friction cone: ``elliptic`` or ``pyramidal``."""
-    impratio: float = 100.0
+    impratio: Annotated[float, Field(gt=0.0, le=1e6)] = 100.0
     """Ratio of frictional to normal constraint impedance (elliptic cone)."""
-    iterations: int = 100
+    iterations: _Iterations = 100
     """Largest number of solver iterations."""
-    ls_iterations: int = 50
+    ls_iterations: _Iterations = 50
     """Largest number of line-search iterations."""
-    tolerance: float = 1e-8
+    tolerance: Annotated[float, Field(ge=0.0, le=1.0)] = 1e-8
     """Solver tolerance."""
-    foot_condim: int | None = None
+    foot_condim: Annotated[int, Field(ge=1, le=6)] | None = None
     """Contact dimension of the feet (3 sliding, 6 with torsion and rolling); None keeps the robot file's."""
     self_collision: bool = True
     """Whether the robot's own bodies collide with each other."""
@@ -51,11 +56,11 @@ class PhysicsOptions:
     torque_speed_limit: bool = False
     """Whether these limits follow the joint's speed: the torque in the direction of motion falls from the speed of full torque to
     zero at the no-load speed. Needs ``torque_limits`` and a parameter set that knows its motors' speeds."""
-    watch_tilt: float | None = None
+    watch_tilt: Annotated[float, Field(gt=0.0, le=3.1416)] | None = None
     """Tilt of the base's z axis against the world's [rad] whose first substep is recorded in ``PhysicsState.tilt_substep``."""
-    watch_penetration: float | None = None
+    watch_penetration: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     """Depth of the robot in the terrain, floor and walls not counted [m], recorded in ``PhysicsState.penetration_substep``."""
-    contacts_per_world: int | None = None
+    contacts_per_world: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Contact capacity of a world in engines with fixed buffers; None lets the engine choose."""
     deterministic: bool = False
     """Ask for run-to-run identical results on a GPU."""

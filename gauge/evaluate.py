@@ -30,7 +30,7 @@ from .pipelines import PIPELINES, Environment, Plan, make_environments
 from .results import fold, health, rows_csv
 from .runner import Progress
 from .store import RunFolder, write_atomically
-from .suite import Suite, SuiteError, load_suite
+from .suite import Goal, Suite, SuiteError, load_suite
 
 PACKAGES = ("gaitgauge", "mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib")
 _SLOTS = 24
@@ -272,8 +272,9 @@ def _job(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: Pla
 def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -> Callable[[Progress], None] | None:
     if watch is None:
         return None
-    suite, goals = plan.suite, {g.name: g for g in plan.suite.goals}
-    seconds = {
+    suite = plan.suite
+    goals: dict[str, Goal] = {g.name: g for g in suite.goals}
+    seconds: dict[str, float] = {
         name: sum(goal.phases) * len(SUB_COMMANDS[name]) or 0.4 * max(suite.commands.target_time.values(), default=25.0)
         for name, goal in goals.items()
     }

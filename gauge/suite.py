@@ -4,19 +4,41 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
-from difflib import get_close_matches
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_type_hints
+
+from pydantic import Field
 
 from ..backends.base import PhysicsOptions
+from ..files.parsing import (
+    Name,
+    NotNegative,
+    Positive,
+    Seed,
+    Share,
+    Text,
+    build,
+    did_you_mean,
+    one_line,
+    parse_toml,
+    read_text,
+    shown,
+)
 
 SUITE_FOLDER = Path(__file__).parent / "suites"
 
-Limits = tuple[float, float, float]
+_Speed = Annotated[float, Field(ge=0.0, le=100.0)]
+_Time = Annotated[float, Field(gt=0.0, le=3600.0)]
+_Noise = Annotated[float, Field(ge=0.0, le=1000.0)]
+_Tilt = Annotated[float, Field(gt=0.0, le=3.1416)]
+Limits = tuple[_Speed, _Speed, _Speed]
+Friction = Annotated[float, Field(gt=0.0, le=10.0)]
+"""Sliding friction coefficient."""
+Payload = Annotated[float, Field(ge=-5.0, le=50.0)]
+"""Mass added to the base [kg]."""
+GoalName = Literal["diagonal_velocity", "max_velocity", "target_pos_velocity"]
 
 
 class SuiteError(ValueError):
@@ -27,9 +49,8 @@ class SuiteError(ValueError):
 class Goal:
     """One kind of motion, made of sub-commands. The robot goes back to the spawn after each of them."""
 
-    name: str
-    """``diagonal_velocity``, ``max_velocity`` or ``target_pos_velocity``."""
-    phases: tuple[float, ...]
+    name: GoalName
+    phases: tuple[_Time, ...]
     """Length of each phase of a sub-command [s]; empty for the goal that ends at its target."""
 
 
@@ -37,18 +58,18 @@ class Goal:
 class Matrix:
     """The environments of the stress pipeline and the seeds of its episodes."""
 
-    terrains: tuple[str, ...]
-    frictions: tuple[float, ...]
+    terrains: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
+    frictions: Annotated[tuple[Friction, ...], Field(min_length=1, max_length=100)]
     """Sliding friction coefficients."""
-    payloads: tuple[float, ...]
+    payloads: Annotated[tuple[Payload, ...], Field(min_length=1, max_length=100)]
     """Masses added to the base [kg]."""
     crossed: bool
     """True: every payload with every friction. False: payloads other than ``nominal_payload`` only at ``nominal_friction``."""
-    nominal_friction: float
-    nominal_payload: float
-    seeds: tuple[int, ...]
+    nominal_friction: Friction
+    nominal_payload: Payload
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1, max_length=1000)]
     """Seeds of the quality episodes."""
-    search_seeds: tuple[int, ...]
+    search_seeds: Annotated[tuple[Seed, ...], Field(min_length=1, max_length=1000)]
     """Seeds of the level test."""
 
 
@@ -60,17 +81,17 @@ class Commands:
     """Forward, lateral [m/s] and yaw [rad/s] on flat ground."""
     levelled: Limits
     """The same on every other terrain."""
-    target_speed: Mapping[str, float]
+    target_speed: Mapping[str, Annotated[float, Field(gt=0.0, le=100.0)]]
     """Forward speed towards the target by terrain family [m/s]."""
-    target_time: Mapping[str, float]
+    target_time: Mapping[str, _Time]
     """Time allowed to reach the target by terrain family [s]."""
-    target_radius: float
+    target_radius: Annotated[float, Field(gt=0.0, le=10.0)]
     """Distance at which the target counts as reached [m]."""
-    target_distance: str
+    target_distance: Literal["body", "horizontal"]
     """``body``: distance in the base's own x-y plane; ``horizontal``: in the world's."""
-    heading_frame: str
+    heading_frame: Literal["body", "horizontal"]
     """``body``: bearing in the base's own x-y plane; ``horizontal``: in the yawed horizontal frame."""
-    clock_offset: float
+    clock_offset: Annotated[float, Field(ge=0.0, lt=1.0)]
     """Part of a control period by which the goal clock is read early: with 0 a phase ends, and the next sub-command shows,
     one step too soon (the reference); with 0.5 phases have their exact length."""
 
@@ -79,15 +100,15 @@ class Commands:
 class Noise:
     """Uniform observation noise, half widths in physical units, and where the random numbers come from."""
 
-    base_angular_velocity: float
+    base_angular_velocity: _Noise
     """[rad/s]."""
-    joint_position: float
+    joint_position: _Noise
     """[rad]."""
-    joint_velocity: float
+    joint_velocity: _Noise
     """[rad/s]."""
-    latency: int
+    latency: Annotated[int, Field(ge=0)]
     """Largest delay of an action in substeps; drawn anew at every control step, 0 to this, uniformly."""
-    stream: str
+    stream: Literal["reference", "counter"]
     """``reference``: Python's generator in the published order, one stream for each seed; ``counter``: independent for each episode."""
 
 
@@ -95,11 +116,11 @@ class Noise:
 class Events:
     """What interrupts an episode."""
 
-    fall_tilt: float
+    fall_tilt: _Tilt
     """Tilt of the base that counts as a fall [rad]."""
-    fall: str
+    fall: Literal["close-goal", "zero-rest"]
     """``close-goal``: the goal ends, what was sampled counts; ``zero-rest``: the rest of the sub-command scores zero."""
-    penetration: float | None = None
+    penetration: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     """Depth in the terrain [m] at which the goal starts again, once in a run; None: never."""
 
 
@@ -107,11 +128,11 @@ class Events:
 class Settling:
     """How an episode waits for the robot to stand after a reset."""
 
-    speed: float
+    speed: NotNegative
     """Base speed below which the robot stands [m/s]."""
-    shortest: float
+    shortest: Annotated[float, Field(ge=0.0, le=60.0)]
     """[s] since the reset."""
-    longest: float
+    longest: Annotated[float, Field(ge=0.0, le=60.0)]
     """[s] since the reset."""
     sampled: bool
     """Whether samples taken meanwhile count."""
@@ -121,29 +142,29 @@ class Settling:
 class Metrics:
     """Which metrics count, and how they are taken."""
 
-    weights: Mapping[str, float]
+    weights: Annotated[Mapping[str, Annotated[float, Field(gt=0.0, le=1000.0)]], Field(min_length=1)]
     """Exponent of each metric in the quality of a sample; its keys are the suite's metrics."""
-    interval: int
+    interval: Annotated[int, Field(ge=1, le=100_000)]
     """Substeps between samples."""
-    clock: str
+    clock: Literal["run", "reset"]
     """``run``: samples on a grid that runs through resets; ``reset``: the grid starts anew at every reset."""
-    angular_velocity: str
+    angular_velocity: Literal["twice-rotated", "body", "commanded"]
     """``twice-rotated``: the reference's three components; ``body``: the same in the body frame; ``commanded``: yaw alone."""
-    linear_velocity: str
+    linear_velocity: Literal["body", "commanded"]
     """``body``: three components in the body frame; ``commanded``: the two commanded ones, forward and lateral."""
-    smoothness: str
+    smoothness: Literal["samples", "control-steps"]
     """Torque difference between ``samples``, or between consecutive ``control-steps``."""
-    power_scale: float
+    power_scale: Positive
     """RMS joint power that scores zero [W]."""
-    torque_scale: float
+    torque_scale: Positive
     """RMS torque difference that scores zero [N·m]."""
-    soft_limit: float
+    soft_limit: Annotated[float, Field(gt=0.0, le=1.0)]
     """Share of each joint range, around its middle, inside which no limit is exceeded."""
-    soft_limit_joints: tuple[str, ...]
+    soft_limit_joints: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
     """Name parts of the joints that the limit metric watches."""
-    zmp_span: float | None = None
+    zmp_span: Positive | None = None
     """Diagonal stance span that normalizes the ZMP distance [m]; None: that of the robot's default pose."""
-    contact_share: float = 0.05
+    contact_share: Share = 0.05
     """Share of the weight that the ground must carry for the contact metrics to be defined."""
 
 
@@ -151,19 +172,19 @@ class Metrics:
 class Scoring:
     """How samples become scores."""
 
-    level_weight: float
+    level_weight: Share
     """Score of each level passed before the last (0.09)."""
-    quality_weight: float
+    quality_weight: Share
     """Score of the quality at the level reached (0.19)."""
-    pass_rate: float
+    pass_rate: Annotated[float, Field(gt=0.0, le=1.0)]
     """Share of the search seeds that must reach the target."""
-    levels: int
+    levels: Annotated[int, Field(ge=1, le=1000)]
     """Highest level."""
-    decimals: int | None
+    decimals: Annotated[int, Field(ge=0, le=15)] | None
     """Decimals to which run and aggregate values are rounded; None: not at all."""
-    groups: Mapping[str, tuple[str, ...]]
+    groups: Mapping[Name, Annotated[tuple[str, ...], Field(min_length=1, max_length=100)]]
     """Metrics averaged in each group, on their level-weighted mean@50."""
-    bootstrap: int
+    bootstrap: Annotated[int, Field(ge=1, le=100_000)]
     """Number of bootstrap resamples for the confidence intervals."""
 
 
@@ -171,14 +192,14 @@ class Scoring:
 class Suite:
     """Everything that a score depends on."""
 
-    name: str
-    version: str
-    title: str
-    parameters: str
+    name: Name
+    version: Name
+    title: Text
+    parameters: Text
     """Name of the robot's joint-parameter set."""
     physics: PhysicsOptions
     matrix: Matrix
-    goals: tuple[Goal, ...]
+    goals: Annotated[tuple[Goal, ...], Field(min_length=1, max_length=3)]
     """In the order in which an episode runs them."""
     commands: Commands
     noise: Noise
@@ -215,64 +236,70 @@ def load_suite(name: str) -> Suite:
     Raises:
         SuiteError: no such suite, or a malformed file.
     """
-    return _load(name, ())
+    path, data = _tables(name, ())
+    source = f"suite file {one_line(path)}"
+    suite = build(Suite, _none_for_false(Suite, data), source, SuiteError)
+    _check(suite, source)
+    if path.resolve().parent != SUITE_FOLDER.resolve() and suite.name in suite_names():
+        raise SuiteError(f"{source} is called '{suite.name}' as a suite that ships with the project; {_OWN_NAME}")
+    return suite
 
 
-def _load(name: str, behind: tuple[Path, ...]) -> Suite:
-    """Load a suite that the files ``behind`` extend, one after the other."""
+_OWN_NAME = "give it a 'name' of its own, so that results are not taken for that suite's"
+
+
+def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
+    """A suite's file and its tables, laid over those of the suite that it extends; the files ``behind`` extend it."""
     own = name.endswith(".toml")
     path = Path(name) if own else SUITE_FOLDER / f"{name}.toml"
     if own and behind:
         path = behind[-1].parent / path
-    if not path.is_file():
-        close = get_close_matches(name, suite_names(), 1)
-        hint = f"; did you mean '{close[0]}'" if close else ""
-        raise SuiteError(
-            f"there is no suite '{name}'{hint}; choose one of {', '.join(suite_names())}, or give a .toml file"
-        )
-    if path.resolve() in behind:
-        raise SuiteError(f"suite file {path} extends itself; let 'extends' name another suite")
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SuiteError(f"suite file {path} cannot be read: {error}") from error
+    if not own and name not in suite_names():
+        hint = did_you_mean(name, suite_names())
+        known = ", ".join(suite_names())
+        raise SuiteError(f"there is no suite '{one_line(name, 80)}'{hint}; choose one of {known}, or give a .toml file")
+    source = f"suite file {one_line(path)}"
+    data = parse_toml(read_text(path, "suite file", SuiteError), source, SuiteError)
     base = data.pop("extends", None)
     if base is None:
-        suite = _build(Suite, data, str(path))
-    else:
-        suite = _apply(_load(str(base), (*behind, path.resolve())), data, str(path))
-    assert isinstance(suite, Suite)
-    foreign = own and path.resolve().parent != SUITE_FOLDER.resolve()
-    if foreign and ((base is not None and "name" not in data) or suite.name in suite_names()):
-        raise SuiteError(
-            f"suite file {path} is called '{suite.name}' as a suite that ships with the project or that it extends; "
-            "give it a 'name' of its own, so that results are not taken for that suite's"
-        )
-    _check(suite, str(path))
-    return suite
+        return path, data
+    here = path.resolve()
+    if here in behind or len(behind) >= _LONGEST_CHAIN:
+        raise SuiteError(f"{source} extends itself, or through too many others; let 'extends' name another suite")
+    if "name" not in data and here.parent != SUITE_FOLDER.resolve():
+        raise SuiteError(f"{source} is called as the suite that it extends; {_OWN_NAME}")
+    whole = _tables(str(base), (*behind, here))[1]
+    for key, value in data.items():
+        under = whole.get(key)
+        whole[key] = {**under, **value} if isinstance(under, dict) and isinstance(value, dict) else value
+    return path, whole
 
 
-# What may stand in fields that name a rule.
-_CHOICES: Mapping[str, tuple[str, ...]] = {
-    "commands.target_distance": ("body", "horizontal"),
-    "commands.heading_frame": ("body", "horizontal"),
-    "noise.stream": ("reference", "counter"),
-    "events.fall": ("close-goal", "zero-rest"),
-    "metrics.clock": ("run", "reset"),
-    "metrics.angular_velocity": ("twice-rotated", "body", "commanded"),
-    "metrics.linear_velocity": ("body", "commanded"),
-    "metrics.smoothness": ("samples", "control-steps"),
-}
+_LONGEST_CHAIN = 10
 
 
-def _check(suite: Suite, where: str) -> None:
-    """Refuse values that would be ignored or cannot work."""
-    for field, allowed in _CHOICES.items():
-        section, _, key = field.partition(".")
-        value = getattr(getattr(suite, section), key)
-        if value not in allowed:
-            raise SuiteError(f"{where}: {field} is '{value}'; choose one of {', '.join(allowed)}")
-    physics, events, metrics, scoring = suite.physics, suite.events, suite.metrics, suite.scoring
+def _none_for_false(kind: type, data: dict[str, Any]) -> dict[str, Any]:
+    """TOML has no null: ``false`` stands for None where a field may be None."""
+    hints = get_type_hints(kind)
+
+    def value(key: str, given: Any) -> Any:
+        hint = hints.get(key)
+        if isinstance(hint, type) and is_dataclass(hint) and isinstance(given, dict):
+            return _none_for_false(hint, given)
+        return None if given is False and type(None) in get_args(hint) else given
+
+    return {key: value(key, given) for key, given in data.items()}
+
+
+def _check(suite: Suite, source: str) -> None:
+    """Refuse what each field alone allows and all of them together do not.
+
+    Raises:
+        SuiteError: one sentence.
+    """
+    physics, events, metrics, settling = suite.physics, suite.events, suite.metrics, suite.settling
+    goals = [g.name for g in suite.goals]
+    matrix = suite.matrix
     rules = {
         f"events.fall_tilt ({events.fall_tilt}) and physics.watch_tilt ({physics.watch_tilt}) must be the same": (
             events.fall_tilt == physics.watch_tilt
@@ -283,85 +310,23 @@ def _check(suite: Suite, where: str) -> None:
             metrics.interval >= physics.substeps
         ),
         f"noise.latency is {suite.noise.latency} substeps; 0 to physics.substeps ({physics.substeps}) are possible": (
-            0 <= suite.noise.latency <= physics.substeps
+            suite.noise.latency <= physics.substeps
         ),
-        "metrics.weights must be above zero, at least one of them": (
-            len(metrics.weights) > 0 and all(w > 0 for w in metrics.weights.values())
+        f"settling.shortest ({settling.shortest}) must not be above settling.longest ({settling.longest})": (
+            settling.shortest <= settling.longest
         ),
-        f"scoring.pass_rate is {scoring.pass_rate}; it must lie above 0 and not above 1": 0 < scoring.pass_rate <= 1,
-        f"scoring.levels is {scoring.levels}; at least 1 is needed": scoring.levels >= 1,
-        f"scoring.bootstrap is {scoring.bootstrap}; at least 1 resample is needed": scoring.bootstrap >= 1,
-        "matrix needs at least one terrain, friction, payload, seed and search seed": all(
-            (
-                suite.matrix.terrains,
-                suite.matrix.frictions,
-                suite.matrix.payloads,
-                suite.matrix.seeds,
-                suite.matrix.search_seeds,
-            )
-        ),
+        f"goals has a goal twice: {', '.join(goals)}": len(set(goals)) == len(goals),
     }
+    for name in ("terrains", "frictions", "payloads", "seeds", "search_seeds"):
+        values = getattr(matrix, name)
+        rules[f"matrix.{name} has an entry twice: {shown(list(values))}"] = len(set(values)) == len(values)
     for rule, kept in rules.items():
         if not kept:
-            raise SuiteError(f"{where}: {rule}")
-    for group, names in scoring.groups.items():
+            raise SuiteError(f"{source}: {rule}")
+    for group, names in suite.scoring.groups.items():
         missing = [n for n in names if n not in metrics.weights]
         if missing:
+            known = ", ".join(metrics.weights)
             raise SuiteError(
-                f"{where}: scoring.groups.{group} names '{missing[0]}', which has no weight; "
-                f"choose from {', '.join(metrics.weights)}"
+                f"{source}: scoring.groups.{group} names {shown(missing[0])}, which has no weight; choose from {known}"
             )
-
-
-def _apply(item: Any, data: Mapping[str, Any], where: str) -> Any:
-    """A copy of a dataclass with the given (nested) fields replaced."""
-    known = {f.name for f in fields(item)}
-    changes: dict[str, Any] = {}
-    hints = get_type_hints(type(item))
-    for key, value in data.items():
-        if key not in known:
-            raise SuiteError(f"{where} has the unknown key '{key}'; allowed here: {', '.join(sorted(known))}")
-        present, inside = getattr(item, key), f"{where}: {key}"
-        nested = is_dataclass(present) and isinstance(value, dict)
-        changes[key] = _apply(present, value, inside) if nested else _value(hints[key], value, inside)
-    return replace(item, **changes)
-
-
-def _build(kind: type, data: Mapping[str, Any], where: str) -> Any:
-    """Build a dataclass from plain data, recursively."""
-    hints = get_type_hints(kind)
-    unknown = set(data) - set(hints)
-    if unknown:
-        raise SuiteError(f"{where} has the unknown key '{min(unknown)}'; allowed: {', '.join(sorted(hints))}")
-    values = {key: _value(hints[key], value, f"{where}: {key}") for key, value in data.items()}
-    try:
-        return kind(**values)
-    except TypeError as error:
-        missing = [f.name for f in fields(kind) if f.name not in values and f.default is MISSING]
-        raise SuiteError(f"{where} is incomplete; it lacks {', '.join(missing)}") from error
-
-
-def _value(hint: Any, value: Any, where: str) -> Any:
-    """Plain TOML data as the annotated type: nested dataclasses, tuples for lists, and None for ``false`` where allowed."""
-    inner = get_args(hint)
-    if get_origin(hint) in (Union, UnionType):
-        if value is False:
-            return None  # TOML has no null
-        return _value(next(i for i in inner if i is not type(None)), value, where)
-    if is_dataclass(hint) and isinstance(value, dict):
-        return _build(hint, value, where)  # type: ignore[arg-type]
-    if get_origin(hint) is tuple and isinstance(value, list):
-        kinds = inner[:1] * len(value) if inner[-1] is Ellipsis else inner
-        if len(kinds) == len(value):
-            return tuple(_value(k, v, where) for k, v in zip(kinds, value, strict=True))
-    elif get_origin(hint) is Mapping and isinstance(value, dict):
-        return {k: _value(inner[1], v, f"{where}.{k}") for k, v in value.items()}
-    elif hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
-    elif hint in (int, str, bool) and type(value) is hint:
-        return value
-    shape = f" with {len(inner)} entries" if get_origin(hint) is tuple and inner[-1] is not Ellipsis else ""
-    raise SuiteError(f"{where} is {value!r}; a {_KINDS.get(get_origin(hint) or hint, 'table')}{shape} is needed")
-
-
-_KINDS = {float: "number", int: "whole number", str: "text", bool: "true or false", tuple: "list"}

@@ -7,12 +7,12 @@ may be None, text, and tuples as numbers separated by commas.
 
 from __future__ import annotations
 
-import math
-import types
 from collections.abc import Iterable
 from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from ..files.parsing import from_text, one_line, shown
 
 Options = TypeVar("Options")
 
@@ -34,7 +34,7 @@ def apply_overrides(configuration: Options, overrides: Iterable[str]) -> Options
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or not key.strip():
-            raise TaskError(f"'{override}' is no setting; write key=value, for example {_example(configuration)}")
+            raise TaskError(f"{shown(override)} is no setting; write key=value, for example {_example(configuration)}")
         configuration = _set(configuration, key.strip().split("."), value.strip(), key.strip(), configuration)
     return configuration
 
@@ -68,9 +68,11 @@ def _set(node: Any, path: list[str], text: str, key: str, root: Any) -> Any:
             if not _has_children(present):
                 raise _unknown(key, root)
             return _replaced(node, name, _set(present, rest, text, key, root), key)
-        if _has_children(present) and not isinstance(present, tuple) and not _takes_plain(node, name):
+        if _has_children(present) and not _takes_plain(node, name):
             raise _group(key, present)
-        return _replaced(node, name, _convert(text, get_type_hints(type(node))[name], key), key)
+        return _replaced(
+            node, name, from_text(get_type_hints(type(node), include_extras=True)[name], text, key, TaskError), key
+        )
     elements = list(node)
     names = [child for child, _ in _children(node)]
     if name in names:
@@ -89,7 +91,7 @@ def _replaced(node: Any, name: str, value: Any, key: str) -> Any:
     try:
         return replace(node, **{name: value})
     except (ValueError, TypeError) as error:
-        raise TaskError(f"'{key}' cannot be set: {error}") from error
+        raise TaskError(f"'{key}' cannot be set: {one_line(error)}") from error
 
 
 def _takes_plain(node: Any, name: str) -> bool:
@@ -105,7 +107,7 @@ def _group(key: str, value: Any) -> TaskError:
 
 
 def _unknown(key: str, root: Any) -> TaskError:
-    known = override_keys(root)
+    known, key = override_keys(root), one_line(key, 80)
     near = get_close_matches(key, known, n=3, cutoff=0.5)
     last = key.rsplit(".", 1)[-1]
     near += [k for k in known if k.rsplit(".", 1)[-1] == last and k not in near][:3]
@@ -128,54 +130,3 @@ def _example(configuration: Any) -> str:
     for name in key.split("."):
         value = dict(_children(value))[name]
     return f"{key}={value}"
-
-
-def _convert(text: str, hint: Any, key: str) -> Any:
-    """Text as a value of the annotated type."""
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        options = get_args(hint)
-        if type(None) in options and text.lower() in ("none", "null"):
-            return None
-        failures = []
-        for option in sorted((o for o in options if o is not type(None)), key=_strictness):
-            try:
-                return _convert(text, option, key)
-            except TaskError as error:
-                failures.append(error)
-        if type(None) in options:
-            raise TaskError(f"{failures[0]}, or none")
-        raise failures[0]
-    if origin is tuple:
-        return _convert_tuple(text, get_args(hint), key)
-    if hint is bool:
-        if text.lower() in ("true", "false"):
-            return text.lower() == "true"
-        raise TaskError(f"'{key}' is '{text}', but must be true or false")
-    if hint in (int, float):
-        kind = "a whole number" if hint is int else "a finite number"
-        try:
-            number = hint(text)
-        except ValueError:
-            raise TaskError(f"'{key}' is '{text}', but must be {kind}") from None
-        if not math.isfinite(number):
-            raise TaskError(f"'{key}' is '{text}', but must be {kind}")
-        return number
-    if hint is str:
-        return text
-    raise TaskError(f"'{key}' cannot be set to '{text}': it holds a {getattr(hint, '__name__', hint)}")
-
-
-def _strictness(option: Any) -> int:
-    """Order in which the members of a union are tried: text fits everything and comes last."""
-    order = [bool, int, float]
-    return order.index(option) if option in order else len(order) + (option is str)
-
-
-def _convert_tuple(text: str, options: tuple[Any, ...], key: str) -> tuple[Any, ...]:
-    parts = [part.strip() for part in text.strip("()[] ").split(",") if part.strip()]
-    if len(options) == 2 and options[1] is Ellipsis:
-        return tuple(_convert(part, options[0], key) for part in parts)
-    if len(parts) != len(options):
-        raise TaskError(f"'{key}' is '{text}', but must be {len(options)} values separated by commas")
-    return tuple(_convert(part, option, key) for part, option in zip(parts, options, strict=True))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 from ...backends.base import BackendError, PhysicsBackend, PhysicsOptions, Scene, Support
 from ...backends.registry import find_backend, make_backend
+from ...files.parsing import from_text, one_line, shown
 from .errors import ConsistencyError
 from .wrapping import PerturbedBackend, RetimedBackend
 
@@ -103,18 +104,19 @@ def parse_variant(text: str) -> Variant:
     backend, *changes = text.strip().split("@")
     if not backend:
         raise ConsistencyError(
-            f"'{text}' names no engine; write for example mujoco or mujoco@timestep=0.005 (--backends)"
+            f"{shown(text)} names no engine; write for example mujoco or mujoco@timestep=0.005 (--backends)"
         )
-    hints = get_type_hints(PhysicsOptions)
+    hints = get_type_hints(PhysicsOptions, include_extras=True)
     free = [f.name for f in fields(PhysicsOptions) if f.name not in ("substeps", "watch_tilt", "watch_penetration")]
     overrides: dict[str, Value] = {}
     for change in changes:
         name, equals, value = change.partition("=")
         if not equals or name not in free:
             raise ConsistencyError(
-                f"'@{change}' in '{text}' is no physics option; write @option=value with one of {', '.join(free)}"
+                f"'@{one_line(change, 80)}' in {shown(text)} is no physics option; "
+                f"write @option=value with one of {', '.join(free)}"
             )
-        overrides[name] = _read(hints[name], value, change, text)
+        overrides[name] = from_text(hints[name], value, f"@{name}", ConsistencyError)
     return Variant(backend=backend, overrides=tuple(sorted(overrides.items())))
 
 
@@ -140,22 +142,6 @@ def place(variant: Variant, device: str | None) -> Variant:
         wanted = "cuda"
     find_backend(variant.backend, wanted)
     return replace(variant, device=wanted)
-
-
-def _read(hint: Any, value: str, change: str, text: str) -> Value:
-    """A value as the option's type."""
-    kinds = getattr(hint, "__args__", (hint,))
-    if value == "none" and type(None) in kinds:
-        return None
-    kind = next(k for k in kinds if k is not type(None))
-    if kind is bool:
-        if value not in ("true", "false"):
-            raise ConsistencyError(f"'@{change}' in '{text}' must be true or false")
-        return value == "true"
-    try:
-        return kind(value)
-    except ValueError as error:
-        raise ConsistencyError(f"'@{change}' in '{text}' needs a {kind.__name__}, not '{value}'") from error
 
 
 def _shown(value: Value) -> str:

@@ -1,0 +1,288 @@
+"""From text to frozen dataclasses: files are read with limits, and every field is checked against its annotation.
+
+Ranges are declared where a field is (``Annotated[float, Field(gt=0)]``) and checked here alone, by pydantic. Whatever is wrong
+ends in one sentence with the file, the path of the field, its value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import json
+import reprlib
+import tomllib
+from collections.abc import Collection, Mapping
+from dataclasses import is_dataclass
+from difflib import get_close_matches
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+import yaml
+from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+
+Kind = TypeVar("Kind")
+
+LARGEST = 1_000_000
+"""Size of a file that describes something [bytes]."""
+_DEEPEST, _MOST = 32, 100_000
+"""Of nested tables and lists, and of entries in all."""
+_SHOWN = 80
+"""Characters of a value in a sentence."""
+
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$", max_length=100)]
+"""What may become the name of a file or folder."""
+Text = Annotated[str, StringConstraints(min_length=1, max_length=1000, pattern=r"^[^\x00-\x1f\x7f]*$")]
+"""One line for people, or a name inside another file."""
+Positive = Annotated[float, Field(gt=0.0, le=1e9)]
+NotNegative = Annotated[float, Field(ge=0.0, le=1e9)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+
+_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
+
+
+def shown(value: object) -> str:
+    """A value as it stands in a sentence: shortened, control characters escaped."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = short.maxlong = _SHOWN
+    text = short.repr(value)
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def one_line(text: object, longest: int = 300) -> str:
+    """Somebody else's words in a sentence of ours: one line, shortened, control characters escaped."""
+    words = " ".join(str(text).split())
+    safe = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in words)
+    return safe if len(safe) <= longest else safe[: longest - 1] + "…"
+
+
+def did_you_mean(word: object, known: Collection[str]) -> str:
+    """``; did you mean 'a' or 'b'?`` for words of ``known`` close to ``word``, else an empty string."""
+    close = get_close_matches(str(word)[:_SHOWN], list(known), n=3)
+    return "; did you mean " + " or ".join(f"'{c}'" for c in close) + "?" if close else ""
+
+
+# ---- files ----------------------------------------------------------------------------------------------------------
+
+
+def read_text(path: Path, what: str, error: type[Exception], *, largest: int = LARGEST) -> str:
+    """The text of a file.
+
+    Args:
+        path: the file.
+        what: what it is, for the sentence (``suite file``).
+        error: class of the error.
+        largest: size that is not exceeded [bytes].
+
+    Raises:
+        error: no such file, too large, not readable or not UTF-8.
+    """
+    name = one_line(path)
+    try:
+        if not path.is_file():
+            raise error(f"{what} '{name}' {'is not a file' if path.exists() else 'does not exist'}")
+        with path.open("rb") as file:
+            data = file.read(largest + 1)
+    except OSError as problem:
+        raise error(f"{what} '{name}' cannot be read: {problem.strerror}") from problem
+    if len(data) > largest:
+        raise error(f"{what} '{name}' cannot be read: it is larger than {largest / 1e6:g} MB")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as problem:
+        raise error(f"{what} '{name}' is not a UTF-8 text file (byte {problem.start})") from problem
+
+
+def parse_toml(text: str, source: str, error: type[Exception]) -> dict[str, Any]:
+    """Plain data of TOML text.
+
+    Raises:
+        error: no valid TOML, or nested too deep.
+    """
+    try:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{source} is not valid TOML: {_reason(problem)}") from problem
+    return plain(data, source, error)
+
+
+def parse_json(text: str | bytes, source: str, error: type[Exception]) -> Any:
+    """Plain data of JSON text.
+
+    Raises:
+        error: no valid JSON, or nested too deep.
+    """
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{source} is not valid JSON: {_reason(problem)}") from problem
+    return plain(data, source, error)
+
+
+def parse_yaml(text: str, source: str, error: type[Exception]) -> Any:
+    """Plain data of YAML text, without tags of any language's own.
+
+    Raises:
+        error: no valid YAML, nested too deep, or with merge keys.
+    """
+    try:
+        data = yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, OverflowError, AttributeError, TypeError, RecursionError) as problem:
+        raise error(f"{source} is not valid YAML: {_reason(problem)}") from problem
+    return plain(data, source, error)
+
+
+class _Loader(yaml.SafeLoader):
+    """Merging tables multiplies their size at each level; nothing that describes a policy does it."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        for key, _ in node.value:
+            if key.tag == "tag:yaml.org,2002:merge":
+                raise yaml.constructor.ConstructorError(None, None, "merge keys (<<) are not read", key.start_mark)
+
+
+def _reason(problem: BaseException) -> str:
+    return "it is nested too deep" if isinstance(problem, RecursionError) else one_line(problem)
+
+
+def plain(data: Any, source: str, error: type[Exception]) -> Any:
+    """A copy of plain data (tables, lists, texts, numbers, true, false, null) of bounded depth and size.
+
+    Halves of surrogate pairs, which no text file can hold, become their escape sequence.
+
+    Raises:
+        error: anything else is in it, a key that is no text, or too much.
+    """
+    left = _MOST
+
+    def copy(value: Any, path: str, depth: int) -> Any:
+        nonlocal left
+        left -= 1
+        if depth > _DEEPEST or left < 0:
+            raise error(f"{source} is {'nested too deep' if depth > _DEEPEST else 'too long'} at {path[:_SHOWN]}")
+        if isinstance(value, str):
+            return value.encode("utf-8", "backslashreplace").decode()
+        if isinstance(value, list | tuple):
+            return [copy(v, f"{path}[{i}]", depth + 1) for i, v in enumerate(value)]
+        if isinstance(value, Mapping):
+            for key in value:
+                if not isinstance(key, str):
+                    raise error(f"{source}: {path or 'a table'} has the key {shown(key)}; keys must be texts")
+            return {copy(k, path, depth): copy(v, _joined(path, k), depth + 1) for k, v in value.items()}
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise error(f"{source}: {path} is {shown(value)}; it must lie between -2^63 and 2^63")
+        if value is None or isinstance(value, bool | int | float):
+            return value
+        raise error(f"{source}: {path} is {shown(value)}; it must be a text, a number, a list or a table")
+
+    return copy(data, "", 0)
+
+
+def _joined(path: str, key: str) -> str:
+    return f"{path}.{one_line(key, _SHOWN)}" if path else one_line(key, _SHOWN)
+
+
+# ---- dataclasses ----------------------------------------------------------------------------------------------------
+
+
+def build(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
+    """A (nested) frozen dataclass from plain data.
+
+    Args:
+        kind: the dataclass; its annotations are the rules.
+        data: what a parser above gave; lists stand for tuples.
+        source: where the data come from, the beginning of every sentence.
+        error: class of the error.
+
+    Raises:
+        error: an unknown or missing field, a value of another type or out of range, or what ``__post_init__`` refuses.
+    """
+    text = json.dumps([plain(data, source, error)])
+    try:
+        checker: TypeAdapter[tuple[Kind]] = _adapter(kind)  # type: ignore[arg-type]
+        return checker.validate_json(text)[0]
+    except ValidationError as problem:
+        raise error(f"{source}: {_sentence(problem, kind)}") from problem
+
+
+def from_text(hint: Any, text: str, key: str, error: type[Exception]) -> Any:
+    """One setting of the command line as the annotated type; ``none`` where it may be None, commas between a tuple's entries.
+
+    Raises:
+        error: the text does not fit; the sentence names the key.
+    """
+    hint = _without_ranges(hint)
+    options = get_args(hint)
+    if type(None) in options and text.lower() in ("none", "null"):
+        return None
+    try:
+        if get_origin(hint) is tuple:
+            parts = [part.strip() for part in text.strip("()[] ").split(",") if part.strip()]
+            kinds = options[:1] * len(parts) if options[-1] is Ellipsis else options
+            if len(kinds) != len(parts):
+                raise error(f"'{key}' is {shown(text)}; it must be {len(kinds)} values separated by commas")
+            return tuple(from_text(k, part, key, error) for k, part in zip(kinds, parts, strict=True))
+        return _text_adapter(hint).validate_strings(text)
+    except ValidationError as problem:
+        rule = _rule(problem.errors(include_url=False)[-1]) + (", or none" if type(None) in options else "")
+        raise error(f"'{key}' is {shown(text)}; {rule}") from problem
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    # The tuple carries the configuration, which dataclasses of the standard library have no place for.
+    return TypeAdapter(tuple[kind], config=_CONFIG)
+
+
+@cache
+def _text_adapter(hint: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(hint, config=None if is_dataclass(hint) else ConfigDict(allow_inf_nan=False))
+
+
+def _sentence(problem: ValidationError, kind: Any) -> str:
+    """The first of the errors, a misspelt field before one that is missing for it."""
+    errors = problem.errors(include_url=False)
+    order = ("unexpected_keyword_argument", "missing")
+    first = min(errors, key=lambda e: order.index(e["type"]) if e["type"] in order else len(order))
+    path = ""
+    for step in first["loc"][1:]:
+        path = f"{path}[{step}]" if isinstance(step, int) else _joined(path, step)
+    if first["type"] == "missing" and isinstance(first["loc"][-1], int):
+        return f"{path.rpartition('[')[0]} is {shown(first['input'])}; more entries are needed"
+    if first["type"] == "missing":
+        lacking = [str(e["loc"][-1]) for e in errors if e["type"] == "missing" and e["loc"][:-1] == first["loc"][:-1]]
+        return f"{path.rpartition('.')[0] or 'it'} lacks {', '.join(lacking)}"
+    if first["type"] == "unexpected_keyword_argument":
+        known = _fields_at(kind, first["loc"][1:-1])
+        hint = did_you_mean(first["loc"][-1], known) or f"; choose from {', '.join(known)}"
+        return f"unknown field '{path}'{hint}"
+    if first["type"] == "value_error":
+        return f"{path} {first['ctx']['error']}".strip()
+    return f"{path or 'it'} is {shown(first['input'])}; {_rule(first)}"
+
+
+def _rule(error: Mapping[str, Any]) -> str:
+    """Pydantic's words as the end of a sentence."""
+    words = str(error["msg"]).replace("Input should", "it must").replace("a valid array", "a list")
+    words = (
+        words.replace("after validation, not", "and not")
+        .replace("an object", "a table")
+        .replace("Tuple should", "it must")
+    )
+    return words.partition(", unable to parse")[0].replace("a valid boolean", "true or false")
+
+
+def _without_ranges(hint: Any) -> Any:
+    """The type below ``Annotated``, for a look at what it is; ranges of tuples and unions are inside them."""
+    inner = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    return inner if get_origin(inner) is tuple else hint
+
+
+def _fields_at(kind: Any, loc: tuple[int | str, ...]) -> list[str]:
+    """Names of the fields of the dataclass that lies at a path."""
+    for step in loc:
+        if is_dataclass(kind):
+            kind = get_type_hints(kind)[str(step)]
+        elif get_args(kind):
+            kind = get_args(kind)[-1 if isinstance(step, str) else 0]
+        kind = next((k for k in get_args(kind) if is_dataclass(k)), kind) if type(None) in get_args(kind) else kind
+    return list(get_type_hints(kind)) if is_dataclass(kind) else []

@@ -1,0 +1,122 @@
+"""Where a result comes from: programs, machine, command and digests of what was read."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shlex
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distributions, version
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("gaitgauge", "mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib", "onnxruntime")
+_GROUPS = "gaitgauge."
+_ROOT = Path(__file__).resolve().parents[1]
+
+
+def provenance(
+    *,
+    command: Sequence[str],
+    device: str = "cpu",
+    threads: int = 1,
+    digests: Mapping[str, str] | None = None,
+    **measured: Any,
+) -> dict[str, Any]:
+    """Where a result comes from, as plain data.
+
+    Args:
+        command: the command line.
+        device: torch device.
+        threads: CPU threads.
+        digests: SHA-256 by what it is of (``policy``, ``robot``, ``suite``).
+        measured: entries of the caller's own, such as ``seconds``.
+    """
+    return {
+        "versions": versions(),
+        "commit": commit(),
+        "plugins": plugins(),
+        "digests": dict(digests or {}),
+        "command": shlex.join(map(str, command)),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "host": platform.node(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs, {platform.system()} {platform.release()}",
+        "processor": processor(),
+        "device": device_name(device),
+        "threads": threads,
+    } | measured
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of the programs that decide about results."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+@cache
+def commit() -> str | None:
+    """Commit of the source that runs, with ``-dirty`` if it was changed since; None for an installed package."""
+    if not (_ROOT / ".git").exists():
+        return None
+    ask = ["git", "-C", str(_ROOT), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        return subprocess.run(ask, capture_output=True, text=True, timeout=10, check=True).stdout.strip() or None
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def plugins() -> dict[str, str]:
+    """Installed plug-ins: ``value (distribution version)`` by ``group:name``."""
+    found = {
+        f"{entry.group}:{entry.name}": f"{entry.value} ({package.metadata['Name']} {package.version})"
+        for package in distributions()
+        for entry in package.entry_points
+        if entry.group.startswith(_GROUPS)
+    }
+    return dict(sorted(found.items()))
+
+
+@cache
+def processor() -> str:
+    """The CPU's model, as the system names it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def device_name(device: str) -> str:
+    """A torch device's name for people."""
+    if device.startswith("cuda"):
+        import torch
+
+        return torch.cuda.get_device_name(device)
+    return device
+
+
+def digest(paths: Iterable[Path], *more: str) -> str:
+    """SHA-256 over the contents of files in their order, and over texts, hexadecimal.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    total = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            total.update(hashlib.file_digest(file, "sha256").digest())
+    for text in more:
+        total.update(hashlib.sha256(text.encode("utf-8", "backslashreplace")).digest())
+    return total.hexdigest()

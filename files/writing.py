@@ -1,0 +1,118 @@
+"""Files that appear whole or not at all, and folders that one process writes to at a time."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from .parsing import one_line
+
+LOCK = ".lock"
+_PATIENCE = 3.0
+"""How long a lock is waited for [s]: the workers of a process that was killed need a moment to notice."""
+
+
+@contextmanager
+def replacing(path: Path, error: type[Exception], *, durable: bool = True, ending: str = ".partial") -> Iterator[Path]:
+    """A path to write to in place of ``path``, which gets its name at the end; at an error it goes, and ``path`` stays as it was.
+
+    Args:
+        path: the file that is to be.
+        error: class of the error.
+        durable: wait until the disk has it; otherwise it survives the end of the process, not that of the machine.
+        ending: of the name, for libraries that go by it.
+
+    Raises:
+        error: it cannot be written: the disk is full, read-only …
+    """
+    # Of one's own: two processes never share it. Without the name: that may be as long as a name can be.
+    partial = path.with_name(f".{secrets.token_hex(8)}.partial{ending.removeprefix('.partial')}")
+    try:
+        yield partial
+        if durable:
+            _flush(partial)
+        os.replace(partial, path)
+        if durable:
+            _flush(path.parent)
+    except OSError as problem:
+        raise error(write_failure(path, problem)) from problem
+    finally:
+        with suppress(OSError):
+            partial.unlink()
+
+
+def write_atomically(
+    path: Path, data: str | bytes | memoryview, error: type[Exception], *, durable: bool = True
+) -> None:
+    """Write a file, all or nothing.
+
+    Raises:
+        error: it cannot be written.
+    """
+    with replacing(path, error, durable=durable) as partial:
+        partial.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
+
+
+def write_failure(path: Path, problem: OSError) -> str:
+    """One sentence on why a file cannot be written."""
+    reason = (problem.strerror or one_line(problem)).lower()
+    hint = "choose another place"
+    if problem.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        hint = "free some space and run again; what was written before is intact"
+    return f"cannot write '{one_line(path)}': {reason}; {hint}"
+
+
+def json_text(data: Any) -> str:
+    """JSON of plain data, whatever is in it: what JSON cannot hold (NaN, infinity, halves of surrogate pairs) is written as text."""
+    return json.dumps(_writable(data), indent=1, allow_nan=False) + "\n"
+
+
+def _writable(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {_writable(str(k)): _writable(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_writable(v) for v in value]
+    return value
+
+
+def lock_folder(folder: Path, error: type[Exception]) -> FileLock:
+    """Keep a folder for this process, until ``release()`` or its end, and remove what a process that was killed left half written.
+
+    Raises:
+        error: another process has it, or the folder cannot be written to.
+    """
+    lock = FileLock(folder / LOCK, timeout=_PATIENCE)
+    try:
+        lock.acquire()
+    except Timeout as problem:
+        raise error(
+            f"another process is writing to '{one_line(folder)}'; wait until it has ended, or choose another folder"
+        ) from problem
+    except OSError as problem:
+        raise error(write_failure(folder / LOCK, problem)) from problem
+    for partial in folder.rglob(".*.partial*"):
+        with suppress(OSError):
+            partial.unlink()
+    return lock
+
+
+def _flush(path: Path) -> None:
+    """Wait until the disk has a file, or the names in a folder."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

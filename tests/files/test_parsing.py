@@ -1,0 +1,140 @@
+"""What stands between a stranger's text and a dataclass."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import pytest
+from gaitgauge.files.parsing import build, from_text, one_line, parse_json, parse_toml, parse_yaml, read_text, shown
+from pydantic import Field
+
+
+class TextError(ValueError):
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leg:
+    name: str
+    length: Annotated[float, Field(gt=0.0)] = 1.0
+
+    def __post_init__(self):
+        if self.name == "tail":
+            raise TextError("a tail is no leg")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Animal:
+    legs: tuple[Leg, ...]
+    age: int | None = None
+    eyes: tuple[float, float] = (0.0, 0.0)
+
+
+def test_numbers_lists_and_tables_become_fields():
+    made = build(Animal, {"legs": [{"name": "left", "length": 2}], "eyes": [1, 2.5]}, "zoo", TextError)
+    assert made == Animal(legs=(Leg(name="left", length=2.0),), eyes=(1.0, 2.5))
+    assert type(made.legs[0].length) is type(made.eyes[0]) is float
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        ({"legs": [{"name": "a", "lenght": 1}]}, "zoo: unknown field 'legs[0].lenght'; did you mean 'length'?"),
+        ({"legs": [{"name": "a", "length": 0}]}, "zoo: legs[0].length is 0; it must be greater than 0"),
+        ({"legs": [{}]}, "zoo: legs[0] lacks name"),
+        ({}, "zoo: it lacks legs"),
+        ([], "zoo: it is []; it must be a table"),
+        ({"legs": [{"name": "tail"}]}, "zoo: legs[0] a tail is no leg"),
+        ({"legs": [], "age": True}, "zoo: age is True; it must be a valid integer"),
+        ({"legs": [], "age": "3\n\x1b[31m" + "x" * 500}, None),
+        ({"legs": [], "eyes": [float("nan"), 1]}, "zoo: eyes[0] is nan; it must be a finite number"),
+        ({"legs": {1, 2}}, "zoo: legs is {1, 2}; it must be a text, a number, a list or a table"),
+        ({3: 4}, "zoo: a table has the key 3; keys must be texts"),
+    ],
+)
+def test_mistakes_are_sentences_with_place_and_value(data, sentence):
+    with pytest.raises(TextError) as caught:
+        build(Animal, data, "zoo", TextError)
+    assert str(caught.value) == (sentence or str(caught.value))
+    assert len(str(caught.value)) < 200
+    assert str(caught.value).isprintable()
+
+
+LAUGHS = "a0: &a0 [1, 1]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9))
+"""Nine times as many entries with every line."""
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        (parse_json, "[" * 100_000),
+        (parse_json, "[" * 50 + "]" * 50),
+        (parse_json, "9" * 5000),
+        (parse_json, "9" * 100),
+        (parse_json, "{"),
+        (parse_json, "[" + "1," * 200_000 + "1]"),
+        (parse_toml, "a = " + "[" * 10_000),
+        (parse_toml, "a = " + "{b=" * 200 + "1" + "}" * 200),
+        (parse_toml, "a = 1\na = 2"),
+        (parse_yaml, "[" * 10_000),
+        (parse_yaml, "a: &a [*a]"),
+        (parse_yaml, LAUGHS),
+        (parse_yaml, "a: &a {x: 1}\nb: {<<: *a}"),
+        (parse_yaml, "a: !!python/object/apply:os.system [ls]"),
+        (parse_yaml, "a: 2020-99-99"),
+        (parse_yaml, "a: 2020-01-01"),
+        (parse_yaml, "? [1]\n: 2"),
+        (parse_yaml, "a: !!binary x"),
+        (parse_yaml, "a: !!int x"),
+        (parse_yaml, "a: !!timestamp x"),
+        (parse_yaml, "a: b: c"),
+    ],
+)
+def test_hostile_texts_are_refused(parse, text):
+    with pytest.raises(TextError, match=r"^zoo") as caught:
+        parse(text, "zoo", TextError)
+    assert len(str(caught.value)) < 500
+    assert str(caught.value).isprintable()
+
+
+def test_halves_of_surrogate_pairs_become_text():
+    assert parse_json('{"a\\ud800": "\\udfff"}', "zoo", TextError) == {"a\\ud800": "\\udfff"}
+
+
+def test_files_have_a_size(tmp_path):
+    path = tmp_path / "zoo.toml"
+    path.write_bytes(b"\xef\xbb\xbfa = 1")
+    assert read_text(path, "zoo file", TextError) == "a = 1"
+    path.write_bytes(b"a = 1 # " + b"x" * 100)
+    with pytest.raises(TextError, match="larger than"):
+        read_text(path, "zoo file", TextError, largest=100)
+    path.write_bytes(b"a = \xff")
+    with pytest.raises(TextError, match=r"zoo file '.*zoo.toml' is not a UTF-8 text file"):
+        read_text(path, "zoo file", TextError)
+
+
+@pytest.mark.parametrize(
+    ("hint", "text", "value"),
+    [
+        (int, "5", 5),
+        (float | None, "none", None),
+        (tuple[float, ...], "(1, 2)", (1.0, 2.0)),
+        (Annotated[tuple[str, ...], Field(min_length=1)], "a,b", ("a", "b")),
+        (float | Leg, "0.5", 0.5),
+        (bool, "false", False),
+    ],
+)
+def test_settings_take_the_type_of_the_field(hint, text, value):
+    assert from_text(hint, text, "key", TextError) == value
+
+
+@pytest.mark.parametrize("text", ["fast", "nan", "0", "-1", "1e400"])
+def test_settings_out_of_range_name_the_key(text):
+    with pytest.raises(TextError, match=f"'leg.length' is '{text}'; it must be"):
+        from_text(Annotated[float, Field(gt=0.0)], text, "leg.length", TextError)
+
+
+def test_shown_values_are_short_and_printable():
+    for value in ("x" * 10_000, 10**4000, "\x1b[31m", ["x" * 100] * 100, {"a": [[[[[[[1]]]]]]]}, "\ud800"):
+        assert len(shown(value)) <= 80
+        assert shown(value).isprintable()
+    assert one_line("a\nb\x07" + "c" * 400).startswith("a b\\x07cc")

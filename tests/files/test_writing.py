@@ -1,0 +1,92 @@
+"""Files are whole or not there, folders have one writer, and JSON is written whatever is in it."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from gaitgauge.files.writing import json_text, lock_folder, replacing, write_atomically
+
+
+class WriteError(RuntimeError):
+    pass
+
+
+def test_a_failure_keeps_what_was_there_and_leaves_nothing_behind(tmp_path):
+    target = tmp_path / "file.txt"
+    write_atomically(target, "old", WriteError)
+    with (
+        pytest.raises(WriteError, match=r"cannot write '.*file.txt': no space left on device; free some space"),
+        replacing(target, WriteError) as partial,
+    ):
+        partial.write_text("half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert target.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_another_s_error_passes_through_and_leaves_nothing_behind(tmp_path):
+    with pytest.raises(KeyError), replacing(tmp_path / "file", WriteError) as partial:
+        partial.write_text("half")
+        raise KeyError("x")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["missing/file", "x" * 300, "folder"])
+def test_impossible_places_are_one_sentence(tmp_path, name):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(WriteError, match="cannot write '") as caught:
+        write_atomically(tmp_path / name, "text", WriteError)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_name_as_long_as_names_can_be(tmp_path):
+    target = tmp_path / ("x" * 255)
+    write_atomically(target, b"data", WriteError)
+    assert target.read_bytes() == b"data"
+
+
+def test_many_writers_of_one_file_do_not_meet(tmp_path):
+    target = tmp_path / "file"
+    texts = [str(i) * 100_000 for i in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda t: write_atomically(target, t, WriteError, durable=False), texts * 5))
+    assert target.read_text() in texts
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_json_of_what_json_cannot_hold():
+    data = {"nan": float("nan"), "list": [float("inf"), 1.5, None], "half \ud800": "\udcff", 3: (True,)}
+    assert json.loads(json_text(data)) == {
+        "nan": "nan",
+        "list": ["inf", 1.5, None],
+        "half \\ud800": "\\udcff",
+        "3": [True],
+    }
+
+
+def test_a_folder_has_one_writer(tmp_path, monkeypatch):
+    monkeypatch.setattr("gaitgauge.files.writing._PATIENCE", 0.1)
+    hold = (
+        "import sys; from pathlib import Path; from gaitgauge.files.writing import lock_folder\n"
+        "lock = lock_folder(Path(sys.argv[1]), RuntimeError); print('held', flush=True); sys.stdin.read()"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", hold, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert other.stdout.readline() == "held\n"
+    with pytest.raises(WriteError, match="another process is writing to"):
+        lock_folder(tmp_path, WriteError)
+    other.kill()
+    other.wait()
+    stray = tmp_path / "below" / ".0123.partial"
+    stray.parent.mkdir()
+    stray.write_text("half")
+    kept = tmp_path / "kept.partial"
+    kept.write_text("somebody's")
+    lock_folder(tmp_path, WriteError).release()
+    assert not stray.exists()
+    assert kept.exists()
