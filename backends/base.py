@@ -126,6 +126,8 @@ class PhysicsState:
     """Sum over a foot's ground contacts of the magnitude of the tangential force [N], (N, F)."""
     body_contact_force_w: torch.Tensor
     """Net force of the ground on each collision body without its foot geom [N], (N, B, 3)."""
+    trunk_contact_force_w: torch.Tensor
+    """Net force of the ground on the robot's trunk shapes, which the base's entry above holds too [N], (N, 3)."""
     ground_force_w: torch.Tensor
     """Net force of all ground contacts on the robot [N], (N, 3)."""
     ground_moment_w: torch.Tensor

@@ -145,6 +145,8 @@ def add_report_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
         contact(f"each_{foot}", "maxforce", ("force",), FOOT_SLOTS, robot=(geom, foot), other=everything)
     for name in robot.collision_bodies:
         contact(f"body_{name}", "netforce", ("force",), 1, robot=(body, name), other=everything)
+    for name in robot.trunk_shapes:
+        contact(f"trunk_{name}", "netforce", ("force",), 1, robot=(geom, name), other=everything)
     whole = (tree, robot.base_body)
     contact("ground_net", "netforce", ("force", "torque", "pos"), 1, robot=whole, other=everything)
     contact("ground_each", "maxforce", ("found", "force", "pos"), CONTACT_SLOTS, robot=whole, other=everything)

@@ -41,6 +41,7 @@ class StateLayout:
         self.foot_net = np.stack([columns(f"net_{f}") for f in robot.foot_names])
         self.foot_each = np.stack([columns(f"each_{f}") for f in robot.foot_names])
         self.body_net = np.stack([columns(f"body_{b}") for b in robot.collision_bodies])
+        self.trunk_net = np.stack([columns(f"trunk_{shape}") for shape in robot.trunk_shapes])
         self.ground = columns("ground_net")
         self.points = columns("ground_each").reshape(CONTACT_SLOTS, 7)
         watched = scene.physics.watch_penetration is not None
@@ -163,6 +164,7 @@ class BatchState(PhysicsState):
             "foot_normal_force": each[..., 0].sum(-1),
             "foot_tangential_force": np.hypot(each[..., 1], each[..., 2]).sum(-1),
             "body_contact_force_w": bodies,
+            "trunk_contact_force_w": -sensors[:, layout.trunk_net].sum(1),
             "ground_force_w": force,
             "ground_moment_w": -ground[:, 3:6] + np.cross(ground[:, 6:9] - center, force),
             "contact_center_w": center,

@@ -39,6 +39,7 @@ class StateArrays:
     foot_normal_force: wp.array2d[float]
     foot_tangential_force: wp.array2d[float]
     body_contact_force_w: wp.array2d[wp.vec3]
+    trunk_contact_force_w: wp.array[wp.vec3]
     ground_force_w: wp.array[wp.vec3]
     ground_moment_w: wp.array[wp.vec3]
     contact_center_w: wp.array[wp.vec3]
@@ -123,6 +124,8 @@ class Roles:
     """Index of the foot, -1 for other geoms."""
     body: wp.array[int]
     """Index of the collision body, -1 for the ground and bodies that are not reported."""
+    trunk: wp.array[int]
+    """1 for the trunk's shapes."""
     ground: wp.array[int]
     """1 for floor, walls and terrain."""
     slot: wp.array[int]
@@ -236,7 +239,7 @@ def link_arrays(chains: FootChains) -> Links:
 def role_arrays(shared: SharedModel) -> Roles:
     """What each geom is, on the current Warp device."""
     roles = Roles()
-    for name in ("foot", "body", "ground", "slot"):
+    for name in ("foot", "body", "trunk", "ground", "slot"):
         setattr(roles, name, to_warp(getattr(shared, f"geom_{name}"), int))
     return roles
 

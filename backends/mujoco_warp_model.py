@@ -95,6 +95,8 @@ class SharedModel:
     """Index of the foot that a geom is, -1 for others, (G,)."""
     geom_body: Integers
     """Index of the collision body that a geom belongs to, -1 for others, (G,)."""
+    geom_trunk: Integers
+    """1 for the trunk's shapes, (G,)."""
     geom_ground: Integers
     """1 for floor, walls and terrain, (G,)."""
     geom_slot: Integers
@@ -147,6 +149,7 @@ def build_shared_model(scene: Scene) -> SharedModel:
     geom_slot[slot_geom] = np.arange(len(slot_geom))
     bodies = np.array([_body(model, scene, name) for name in robot.collision_bodies], dtype=np.int32)
     index = {int(b): i for i, b in enumerate(bodies)}
+    trunk = [_geom(model, scene, name) for name in scene.robot.trunk_shapes]
     geom_foot = np.full(model.ngeom, -1, dtype=np.int32)
     for i, name in enumerate(robot.foot_names):
         geom_foot[_geom(model, scene, name)] = i
@@ -158,6 +161,7 @@ def build_shared_model(scene: Scene) -> SharedModel:
         has_field=has_field,
         geom_foot=geom_foot,
         geom_body=np.array([index.get(int(b), -1) for b in model.geom_bodyid], dtype=np.int32),
+        geom_trunk=np.isin(np.arange(model.ngeom), trunk).astype(np.int32),
         geom_ground=(model.geom_bodyid == 0).astype(np.int32),
         geom_slot=geom_slot,
         joint_q=np.array([model.joint(j).qposadr[0] for j in robot.joint_names], dtype=np.int32),

@@ -126,6 +126,7 @@ def read_contacts(
         out.foot_tangential_force[world, foot] = 0.0
     for body in range(bodies):
         out.body_contact_force_w[world, body] = wp.vec3(0.0)
+    out.trunk_contact_force_w[world] = wp.vec3(0.0)
     # moments are summed about the base, which is near the contacts, to keep single precision, and then moved
     base = wp.vec3(motion.qpos[world, 0], motion.qpos[world, 1], motion.qpos[world, 2])
     force = wp.vec3(0.0)
@@ -167,6 +168,8 @@ def read_contacts(
                     )
                 elif body >= 0:
                     out.body_contact_force_w[world, body] = out.body_contact_force_w[world, body] + push
+                    if roles.trunk[geom] == 1:
+                        out.trunk_contact_force_w[world] = out.trunk_contact_force_w[world] + push
     if count > 0:
         center = center / float(count)
         moment = moment - wp.cross(center, force)
@@ -205,6 +208,7 @@ def clear_forces(active: wp.array[int], joints: int, feet: int, bodies: int, out
         out.foot_tangential_force[world, foot] = 0.0
     for body in range(bodies):
         out.body_contact_force_w[world, body] = wp.vec3(0.0)
+    out.trunk_contact_force_w[world] = wp.vec3(0.0)
     out.ground_force_w[world] = wp.vec3(0.0)
     out.ground_moment_w[world] = wp.vec3(0.0)
     out.contact_center_w[world] = wp.vec3(0.0)

@@ -55,6 +55,7 @@ def layout_structure(layout: WorldLayout, device: wp.Device) -> Any:
         foot_center=wp.array(layout.foot_center, dtype=wp.vec3, device=device),
         shape_foot=ints(layout.shape_foot, device),
         shape_body=ints(layout.shape_body, device),
+        shape_trunk=ints(layout.shape_trunk, device),
         shape_ground=ints(layout.shape_ground, device),
         shape_slot=ints(layout.shape_slot, device),
     )

@@ -43,6 +43,8 @@ class Layout:
     """Index of the foot that a shape is, -1 for others."""
     shape_body: wp.array[int]
     """Index of the collision body that a shape belongs to, -1 for the ground and others."""
+    shape_trunk: wp.array[int]
+    """1 for the trunk's shapes."""
     shape_ground: wp.array[int]
     """1 for floor, walls and terrain."""
     shape_slot: wp.array[int]
@@ -114,6 +116,7 @@ class StateArrays:
     foot_normal_force: wp.array2d[float]
     foot_tangential_force: wp.array2d[float]
     body_contact_force_w: wp.array2d[wp.vec3]
+    trunk_contact_force_w: wp.array[wp.vec3]
     ground_force_w: wp.array[wp.vec3]
     ground_moment_w: wp.array[wp.vec3]
     contact_center_w: wp.array[wp.vec3]

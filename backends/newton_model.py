@@ -54,6 +54,8 @@ class WorldLayout:
     """(S,)."""
     shape_body: Integers
     """(S,)."""
+    shape_trunk: Integers
+    """(S,)."""
     shape_ground: Integers
     """(S,)."""
     shape_slot: Integers
@@ -318,6 +320,7 @@ def _layout(
     for what, names, known in (
         ("body", (robot.base_body, *robot.collision_bodies), bodies),
         ("foot", robot.foot_names, shapes),
+        ("trunk shape", robot.trunk_shapes, shapes),
     ):
         missing = [name for name in names if name not in known]
         if missing:
@@ -330,9 +333,11 @@ def _layout(
     count = len(world.shape_type)
     body_index = {bodies[name]: i for i, name in enumerate(robot.collision_bodies)}
     foot, body = np.full(count, -1, dtype=np.int32), np.full(count, -1, dtype=np.int32)
-    ground, slot = np.zeros(count, dtype=np.int32), np.full(count, -1, dtype=np.int32)
+    trunk, ground = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.int32)
+    slot = np.full(count, -1, dtype=np.int32)
     for i, name in enumerate(robot.foot_names):
         foot[shapes[name]] = i
+    trunk[[shapes[name] for name in robot.trunk_shapes]] = 1
     for shape in range(robot_shapes):
         body[shape] = body_index.get(world.shape_body[shape], -1)
     ground[robot_shapes:] = 1
@@ -351,6 +356,7 @@ def _layout(
         foot_center=np.array([reference.geom(name).pos for name in robot.foot_names]),
         shape_foot=foot,
         shape_body=body,
+        shape_trunk=trunk,
         shape_ground=ground,
         shape_slot=slot,
         slot_shape=np.array(slot_shapes, dtype=np.int32),

@@ -125,6 +125,7 @@ def clear_forces(select: wp.array[int], value: int, joints: int, feet: int, bodi
         out.foot_tangential_force[world, foot] = 0.0
     for body in range(bodies):
         out.body_contact_force_w[world, body] = wp.vec3(0.0)
+    out.trunk_contact_force_w[world] = wp.vec3(0.0)
     out.ground_force_w[world] = wp.vec3(0.0)
     out.ground_moment_w[world] = wp.vec3(0.0)
     out.contact_center_w[world] = wp.vec3(0.0)
@@ -187,6 +188,8 @@ def add_contacts(
         wp.atomic_add(out.foot_tangential_force, world, foot, across)
     elif body >= 0:
         wp.atomic_add(out.body_contact_force_w, world, body, force)
+        if layout.shape_trunk[shape] == 1:
+            wp.atomic_add(out.trunk_contact_force_w, world, force)
 
 
 @wp.kernel

@@ -54,6 +54,8 @@ class Robot:
     """Name of each foot; both the collision geom and the site at its centre bear it."""
     collision_bodies: tuple[str, ...]
     """Bodies whose contacts with the ground are reported one by one; their foot geoms are reported apart."""
+    trunk_shapes: tuple[str, ...]
+    """Collision geoms of the base body that are its trunk, without head or sensors: what must not touch the ground."""
     imu_site: str
     stand_height: float
     """Height of the base above the ground at which an episode starts [m]."""

@@ -20,7 +20,7 @@ def check_robot(robot: Robot) -> None:
     """Compile the robot's MuJoCo model and check that it has everything that the description names.
 
     That is: the free base, the joints with one motor each, the feet (a geom and a site at its centre), the collision
-    bodies and the imu site; that the default pose is within the joint ranges; that no foot is in the ground at
+    bodies, the trunk's shapes and the imu site; that the default pose is within the joint ranges; that no foot is in the ground at
     ``stand_height``; that the model brings no ground of its own.
 
     Raises:
@@ -135,6 +135,12 @@ class _Check:
     def bodies_and_sites(self) -> None:
         (base,) = self.require([self.robot.base_body], "base_body", "body")
         self.require(self.robot.collision_bodies, "collision_bodies", "body")
+        shapes = self.require(self.robot.trunk_shapes, "trunk_shapes", "geom")
+        for name, geom in zip(self.robot.trunk_shapes, shapes, strict=True):
+            if self.model.geom_bodyid[geom] != base:
+                raise self.error(f"trunk_shapes names '{name}', which is not on the base_body '{self.robot.base_body}'")
+            if not (self.model.geom_contype[geom] or self.model.geom_conaffinity[geom]):
+                raise self.error(f"the trunk shape '{name}' collides with nothing; give it contype or conaffinity 1")
         (imu,) = self.require([self.robot.imu_site], "imu_site", "site")
         if self.model.site_bodyid[imu] != base:
             raise self.error(f"imu_site '{self.robot.imu_site}' must be on the base_body '{self.robot.base_body}'")

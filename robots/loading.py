@@ -95,6 +95,7 @@ class _Reader:
             base_body=self.text(data, "base_body"),
             foot_names=self.names(data, "foot_names"),
             collision_bodies=self.names(data, "collision_bodies"),
+            trunk_shapes=self.names(data, "trunk_shapes"),
             imu_site=self.text(data, "imu_site"),
             stand_height=stand_height,
             default_parameters=default_parameters,

@@ -108,6 +108,7 @@ def feet(bench: Bench) -> str:
             f"a foot of a standing robot carries {force[..., 2].min():.3g} N",
         )
         expect_close("body_contact_force_w of a robot on its feet [N]", state.body_contact_force_w, 0.0, 1e-3)
+        expect_close("trunk_contact_force_w of a robot on its feet [N]", state.trunk_contact_force_w, 0.0, 1e-3)
         expect_close("contact_count on four spheres", state.contact_count, len(bench.robot.foot_names), 0)
     return f"{force[..., 2].min():.1f} to {force[..., 2].max():.1f} N a foot"
 
@@ -158,14 +159,54 @@ def bodies(bench: Bench) -> str:
     return f"the base carries {share.min():.0%} to {share.max():.0%}"
 
 
+@check("contact/trunk", "contact_forces", "plane")
+def trunk(bench: Bench) -> str:
+    """On its back, the trunk's share of the base's force is the trunk's shapes'; nose down it is nothing where others touch."""
+    with bench.worlds(bench.stiff()) as worlds:
+        reference = Reference(bench.robot, bench.stiff())
+        base = bench.robot.collision_bodies.index(bench.robot.base_body)
+        position = np.tile([0.0, 0.0, back_height(reference)], (worlds.count, 1))
+        back = np.tile([0.0, 1.0, 0.0, 0.0], (worlds.count, 1))
+        worlds.reset(base_position=position, base_quaternion=back, held_target=worlds.default_pose)
+        worlds.run(0.3)
+        state = worlds.read()
+        whole, part = state.body_contact_force_w[:, base, 2], state.trunk_contact_force_w[:, 2]
+        expect(bool((part <= whole + 1e-3).all()), "the trunk carries more than the whole base")
+        expect(bool((part > 0.05 * reference.mass * GRAVITY).all()), f"the trunk carries only {part.min():.3g} N")
+        model = reference.model
+        others = [
+            geom
+            for geom in np.flatnonzero(model.geom_bodyid == model.body(bench.robot.base_body).id)
+            if (model.geom_contype[geom] or model.geom_conaffinity[geom])
+            and model.geom(int(geom)).name not in bench.robot.trunk_shapes
+        ]
+        if not others:
+            expect_close("trunk_contact_force_w of a base that is all trunk [N]", part, whole, 1e-3)
+            return "the base is all trunk"
+        nose_down = np.tile(axis_angle((0, 1, 0), np.pi / 2), (worlds.count, 1))
+        position = np.tile([0.0, 0.0, clear_height(reference, nose_down[0])], (worlds.count, 1))
+        worlds.reset(base_position=position, base_quaternion=nose_down, held_target=worlds.default_pose)
+        worlds.run(0.06)
+        state = worlds.read()
+        head = np.linalg.norm(state.body_contact_force_w[:, base], axis=1)
+        expect(bool((head > 1.0).all()), f"the base of a robot on its nose carries only {head.min():.3g} N")
+        expect_close("trunk_contact_force_w of a robot on its nose [N]", state.trunk_contact_force_w, 0.0, 1e-3)
+    return f"{part.min():.0f} N of {whole.min():.0f} N on the back, none on the nose"
+
+
 def back_height(reference: Reference, *, clearance: float = 0.001) -> float:
     """Height of the base origin at which a robot on its back, in its default pose, just clears the ground [m]."""
-    reference.place((0.0, 0.0, 0.0))
+    return clear_height(reference, (0.0, 1.0, 0.0, 0.0), clearance=clearance)
+
+
+def clear_height(reference: Reference, base_quaternion: ArrayLike, *, clearance: float = 0.001) -> float:
+    """Height of the base origin at which a turned robot in its default pose just clears the ground [m]."""
+    reference.place((0.0, 0.0, 0.0), base_quaternion)
     model, data = reference.model, reference.data
-    top = 0.0
+    depth = 0.0
     for geom in range(model.ngeom):
         if model.geom_contype[geom] or model.geom_conaffinity[geom]:
             center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
             up = data.geom_xmat[geom].reshape(3, 3)[2]
-            top = max(top, float(data.geom_xpos[geom, 2] + up @ center + np.abs(up) @ half))
-    return top + clearance
+            depth = max(depth, float(-data.geom_xpos[geom, 2] - up @ center + np.abs(up) @ half))
+    return depth + clearance

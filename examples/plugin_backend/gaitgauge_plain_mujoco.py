@@ -31,6 +31,9 @@ CANNOT = {
 MOTOR_FIELDS = ("stiffness_scale", "damping_scale", "motor_strength", "motor_offset")
 
 
+_BODY_FORCES = ("body_contact_force_w", "trunk_contact_force_w")
+
+
 class PlainMujocoBackend(PhysicsBackend):
     """See ``PhysicsBackend`` for what each method promises."""
 
@@ -258,7 +261,7 @@ class PlainMujocoBackend(PhysicsBackend):
     def _publish_contacts(self, row: int, out: dict[str, np.ndarray]) -> None:
         """Sum up the ground contacts of the step just taken."""
         model, data, feet = self._models[row], self._data[row], self._feet[self._terrain[row]].tolist()
-        for name in ("foot_contact_force_w", "foot_normal_force", "foot_tangential_force", "body_contact_force_w"):
+        for name in ("foot_contact_force_w", "foot_normal_force", "foot_tangential_force", *_BODY_FORCES):
             out[name][row] = 0.0
         points, forces, torques, local = [], [], [], np.zeros(6)
         for i in range(data.ncon):
@@ -278,6 +281,8 @@ class PlainMujocoBackend(PhysicsBackend):
             torques.append(sign * frame.T @ local[3:])
             if geom not in feet:
                 out["body_contact_force_w"][row, self._body_of[int(model.geom_bodyid[geom])]] += force
+                if model.geom(geom).name in self.scene.robot.trunk_shapes:
+                    out["trunk_contact_force_w"][row] += force
             else:
                 foot = feet.index(geom)
                 out["foot_contact_force_w"][row, foot] += force

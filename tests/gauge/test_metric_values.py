@@ -419,6 +419,7 @@ def block(tmp_path_factory):
         base_body="block",
         foot_names=("A", "B", "C", "D"),
         collision_bodies=("block",),
+        trunk_shapes=("A",),
         imu_site="A",
         stand_height=0.05,
         default_parameters="gauge",

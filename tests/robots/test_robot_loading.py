@@ -18,7 +18,7 @@ HOPPER_MJCF = """
   <worldbody>
     <body name="trunk">
       <freejoint/>
-      <geom type="box" size="0.1 0.1 0.05" mass="3"/>
+      <geom name="chest" type="box" size="0.1 0.1 0.05" mass="3"/>
       <site name="imu"/>
       <body name="upper" pos="0 0 -0.05">
         <joint name="hip" axis="0 1 0" range="-1 1"/>
@@ -48,6 +48,7 @@ default_joint_position = [0.3, -0.6]
 base_body = "trunk"
 foot_names = ["foot"]
 collision_bodies = ["trunk", "upper", "lower"]
+trunk_shapes = ["chest"]
 imu_site = "imu"
 stand_height = 0.5
 command_limits = [0.5, 0, 1]
@@ -156,6 +157,7 @@ def test_longest_key_wins(write_hopper):
     [
         ('title = "One leg"\n', "", "missing key title"),
         ('title = "One leg"\n', 'titel = "One leg"\n', "titel is an unknown key; did you mean 'title'?"),
+        ('trunk_shapes = ["chest"]\n', "", "missing key trunk_shapes"),
         ("armature = 0.01\n", "", "missing key parameters.soft.armature"),
         ("armature = 0.01", "amature = 0.01", "parameters.soft.amature is an unknown key; did you mean 'armature'?"),
         ("armature = 0.01", "armature = true", "parameters.soft.armature holds True"),
@@ -225,6 +227,9 @@ def test_unknown_name_offers_close_ones():
         ([('"lower"]', '"lowest"]')], ("", ""), "collision_bodies names 'lowest' but hopper.xml has no body"),
         ([('"trunk"\nfoot', '"upper"\nfoot')], ("", ""), "one free joint, on the base_body 'upper'"),
         ([('"imu"', '"foot"')], ("", ""), "imu_site 'foot' must be on the base_body 'trunk'"),
+        ([('"chest"', '"cheat"')], ("", ""), "trunk_shapes names 'cheat' but hopper.xml has no geom of that name; did"),
+        ([('"chest"', '"foot"')], ("", ""), "trunk_shapes names 'foot', which is not on the base_body 'trunk'"),
+        ([], ('name="chest"', 'name="chest" contype="0" conaffinity="0"'), "the trunk shape 'chest' collides with"),
         ([("[0.3, -0.6]", "[0.3, 0.6]")], ("", ""), "'left_knee_joint' is 0.6 rad, outside its range -2 to 0 rad"),
         ([("stand_height = 0.5", "stand_height = 0.4")], ("", ""), "the foot 'foot' is 0.052 m below the ground"),
         ([], ('<site name="foot" pos="0 0 -0.2"/>', ""), "foot_names names 'foot' but hopper.xml has no site"),
