@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -159,19 +159,18 @@ def print_results(console: Console, results: Mapping[str, Any]) -> None:
     for name, row in results["terrains"].items():
         level = "" if row["level"] is None else f"{row['level']:.2f}".rstrip("0").rstrip(".")
         if "score" in row:
-            low, high = row["interval"]
             table.add_row(
-                name, level, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), f"{low:.4f} to {high:.4f}"
+                name, level, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), _interval(row["interval"])
             )
         else:
             table.add_row(name, level, "", "", "", "")
     console.print(table)
     if results["metrics"]:
         table = Table(title="metrics, weighted by level", title_justify="left")
-        for name in ("metric", "mean", "mean@25", "mean@50"):
+        for name in ("metric", "mean", "mean@25", "mean@50", "95 % interval"):
             table.add_column(name, justify="left" if name == "metric" else "right")
         for name, row in results["metrics"].items():
-            table.add_row(name, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")))
+            table.add_row(name, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), _interval(row["interval"]))
         console.print(table)
         console.print("  ".join(f"{k} {v:.4f}" for k, v in results["groups"].items()), highlight=False)
     health = results["health"]
@@ -179,9 +178,14 @@ def print_results(console: Console, results: Mapping[str, Any]) -> None:
     if troubles:
         console.print(f"in {health['episodes']} quality episodes: {', '.join(troubles)}", highlight=False)
     if results["score"] is not None:
-        low, high = results["score_interval"]
-        console.print(
-            f"[bold]score {results['score']:.4f}[/bold]  (95 % interval {low:.4f} to {high:.4f})", highlight=False
-        )
+        interval = results["score_interval"]
+        note = f"95 % interval {_interval(interval)}" if interval else results["chance"]["note"]
+        console.print(f"[bold]score {results['score']:.4f}[/bold]  ({note})", highlight=False)
     elif results["level"] is not None:
-        console.print(f"[bold]mean level {results['level']:.2f}[/bold]", highlight=False)
+        interval = results["level_interval"]
+        note = f"  (95 % interval {_interval(interval, 2)})" if interval else ""
+        console.print(f"[bold]mean level {results['level']:.2f}[/bold]{note}", highlight=False)
+
+
+def _interval(found: Sequence[float] | None, digits: int = 4) -> str:
+    return f"{found[0]:.{digits}f} to {found[1]:.{digits}f}" if found else "one seed"

@@ -25,6 +25,16 @@ TARGET = "target_pos_velocity"
 LATERAL_SPEED = 1.0
 """Largest lateral speed on the way to the target [m/s]."""
 
+_AXES = ("x", "y", "yaw")
+
+
+def command_name(goal: str, part: int) -> str:
+    """Name of a goal's sub-command for readers: ``max_velocity -x``, ``diagonal_velocity +x+y``."""
+    signs = SUB_COMMANDS[goal][part]
+    axes = "".join(f"{'+' if sign > 0 else '-'}{axis}" for sign, axis in zip(signs, _AXES, strict=True) if sign)
+    return f"{goal} {axes}" if axes else goal
+
+
 Command = tuple[float, float, float]
 
 

@@ -114,6 +114,8 @@ def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
         "score_strip": _score_strip(results["score"], results["score_interval"]),
         "groups": _groups(results),
         "level": results["level"],
+        "level_interval": results["level_interval"],
+        "chance_note": results["chance"]["note"],
         "level_label": "mean maximum level" if searched else "mean level played",
         "counts": _counts(results),
         "warnings": warnings(results),

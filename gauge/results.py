@@ -5,26 +5,35 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from .episodes import Record
+from .goals import SUB_COMMANDS, command_name
+from .intervals import CONFIDENCE, ChanceRules, Evidence
 from .pipelines import Environment
-from .scoring import (
-    STATISTICS,
-    Array,
-    Interval,
-    bootstrap_environment,
-    bootstrap_run,
-    group_values,
-    level_score,
-    rounded,
-    run_statistics,
-)
+from .scoring import STATISTICS, Array, command_statistics, group_values, level_score, rounded, run_statistics
 from .suite import Suite
 
-SCHEMA = 1
+SCHEMA = 2
+ONE_SEED = "no interval: one seed"
+
+
+def chance_rules(suite: Suite, seeds: Sequence[int]) -> ChanceRules:
+    """What a suite says about chance, with the quality seeds that were played."""
+    scoring = suite.scoring
+    return ChanceRules(
+        level_weight=scoring.level_weight,
+        quality_weight=scoring.quality_weight,
+        pass_rate=scoring.pass_rate,
+        levels=scoring.levels,
+        seeds=tuple(seeds),
+        search_seeds=suite.matrix.search_seeds,
+        shared_noise=suite.noise.stream == "reference",
+        resamples=scoring.bootstrap,
+    )
 
 
 def fold(
@@ -41,72 +50,95 @@ def fold(
 
     Returns:
         Plain data. Scores rest on mean@50: an environment's is its quality's (``scoring.level_score``), a terrain's the mean over
-        its environments, the benchmark's the mean over terrains. Every interval is the 95 % bootstrap interval over seeds and
-        sub-commands at the levels reached.
+        its environments, the benchmark's the mean over terrains. Intervals are those of ``intervals``: what other seeds would
+        have changed, the levels included; null where one seed shows no spread.
     """
     scoring, metrics = suite.scoring, list(columns[:-1])
     rows: list[dict[str, Any]] = []
     values: dict[str, dict[str, Array]] = {}
-    draws: dict[str, dict[str, Array]] = {}
     for environment in environments:
-        row, statistics, replicates = _environment(suite, environment, list(columns))
+        row, statistics = _environment(suite, environment, list(columns))
         rows.append(row)
         values[environment.key] = statistics
-        draws[environment.key] = replicates
     if evaluated is None:
         evaluated = any(e.records for e in environments)
-    searched = [e for e in environments if e.terrain != "flat"]
+    seeds = next(([r.episode.seed for r in e.records] for e in environments if e.records), list(suite.matrix.seeds))
+    rules = chance_rules(suite, seeds)
+    evidence = Evidence(rows, rules)
+    weights = environment_weights([e.terrain for e in environments])
+    levelled = np.array([e.terrain != "flat" for e in environments], dtype=np.float64)
     result: dict[str, Any] = {
         "schema": SCHEMA,
-        "suite": {"name": suite.name, "version": suite.version, "title": suite.title},
+        "suite": {"name": suite.name, "version": suite.version, "title": suite.title, "digest": suite.digest},
+        "chance": {"confidence": CONFIDENCE, **asdict(rules), "note": None},
         "score": None,
         "score_interval": None,
         "groups": {},
-        "level": float(np.mean([e.level or 0 for e in searched])) if searched else None,
+        "level": _mean_level(environments) if levelled.any() else None,
+        "level_interval": None,
         "terrains": {},
         "metrics": {},
         "environments": rows,
     }
+    if any(e.searched for e in environments):
+        chance = evidence.level_chance(levelled / levelled.sum())
+        result["level_interval"] = _interval(chance.interval(result["level"], (0.0, scoring.levels)))
     per_terrain: dict[str, Array] = {}
-    spread: dict[str, Array] = {}
     for terrain in dict.fromkeys(e.terrain for e in environments):
-        keys = [e.key for e in environments if e.terrain == terrain]
-        levels = [e.level or 0 for e in environments if e.terrain == terrain]
-        item: dict[str, Any] = {"level": None if terrain == "flat" else float(np.mean(levels))}
+        group = [e for e in environments if e.terrain == terrain]
+        mine = np.array([e.terrain == terrain for e in environments]) / len(group)
+        item: dict[str, Any] = {"level": None, "level_interval": None}
+        if terrain != "flat":
+            item["level"] = _mean_level(group)
+        if any(e.searched for e in group):
+            chance = evidence.level_chance(mine)
+            item["level_interval"] = _interval(chance.interval(item["level"], (0.0, scoring.levels)))
         if evaluated:
-            per_terrain[terrain] = np.mean([values[k]["score"] for k in keys], axis=0)
-            spread[terrain] = np.mean([draws[k]["score"] for k in keys], axis=0)
-            item = {"score": _number(per_terrain[terrain][2]), "interval": _interval(spread[terrain]), **item}
+            per_terrain[terrain] = np.mean([values[e.key]["score"] for e in group], axis=0)
+            score = _number(per_terrain[terrain][2])
+            item = {"score": score, "interval": _interval(evidence.chance(mine).interval(score)), **item}
             item |= {s: _number(v) for s, v in zip(STATISTICS, per_terrain[terrain], strict=True)}
         result["terrains"][terrain] = item
     if not evaluated:
         return result
+    for at, row in enumerate(rows):
+        alone = np.eye(len(rows))[at]
+        row["interval"] = _interval(evidence.chance(alone).interval(row["score"]))
     result["score"] = _number(np.mean([v[2] for v in per_terrain.values()]))
-    result["score_interval"] = _interval(np.mean(list(spread.values()), axis=0))
+    overall = evidence.chance(weights)
+    result["score_interval"] = _interval(overall.interval(result["score"]))
+    result["chance"]["note"] = None if overall.known else ONE_SEED
     weighted: dict[str, Array] = {}
-    weighted_spread: dict[str, Array] = {}
+    even = np.full(len(rows), 1.0 / len(rows))
     for metric in metrics:
         weighted[metric] = np.mean([values[e.key][metric] for e in environments], axis=0)
-        weighted_spread[metric] = np.mean([draws[e.key][metric] for e in environments], axis=0)
+        chance = evidence.chance(even, (metric,))
         result["metrics"][metric] = {s: _number(v) for s, v in zip(STATISTICS, weighted[metric], strict=True)}
-        result["metrics"][metric]["interval"] = _interval(weighted_spread[metric])
-    result["groups"] = {
-        g: _number(v) for g, v in group_values({m: float(v[2]) for m, v in weighted.items()}, scoring).items()
-    }
+        result["metrics"][metric]["interval"] = _interval(chance.interval(float(weighted[metric][2])))
+    groups = group_values({m: float(v[2]) for m, v in weighted.items()}, scoring)
+    result["groups"] = {g: _number(v) for g, v in groups.items()}
     result["groups_interval"] = {
-        g: _interval(np.mean([weighted_spread[m] for m in names], axis=0)) for g, names in scoring.groups.items()
+        g: _interval(evidence.chance(even, names).interval(groups[g])) for g, names in scoring.groups.items()
     }
     return result
 
 
+def environment_weights(terrains: Sequence[str]) -> Array:
+    """Weight of each environment in the benchmark's score: terrains count the same, and so do the environments of one, (E,)."""
+    count = len(set(terrains))
+    return np.array([1.0 / (count * list(terrains).count(t)) for t in terrains])
+
+
+def _mean_level(environments: Sequence[Environment]) -> float:
+    return float(np.mean([e.level or 0 for e in environments if e.terrain != "flat"]))
+
+
 def _environment(
     suite: Suite, environment: Environment, columns: list[str]
-) -> tuple[dict[str, Any], dict[str, Array], dict[str, Array]]:
-    """Row of one environment, its level-weighted statistics and their bootstrap replicates by column and ``score``."""
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Row of one environment, and its level-weighted statistics by column and ``score``."""
     scoring, flat, level = suite.scoring, environment.terrain == "flat", environment.level or 0
-    names = [*columns[:-1], "score"]
-    statistics = {n: np.zeros(3) for n in names}
-    replicates = {n: np.zeros(scoring.bootstrap) for n in names}
+    statistics = {n: np.zeros(3) for n in [*columns[:-1], "score"]}
     row: dict[str, Any] = {
         "terrain": environment.terrain,
         "friction": environment.friction,
@@ -122,16 +154,15 @@ def _environment(
             for level, test in sorted(environment.tests.items())
             if test.passed is not None
         }
+        row["trials"] = {str(level): {} for level in sorted({t.episode.level for t in environment.trials})}
+        for trial in sorted(environment.trials, key=lambda t: t.episode):
+            row["trials"][str(trial.episode.level)][str(trial.episode.seed)] = bool(trial.success)
     if environment.level == 0 and not flat:
         row["score"] = 0.0
     if not environment.records:
-        return row, statistics, replicates
+        return row, statistics
     plain: dict[str, Array] = {}
-    draws = bootstrap_environment(
-        [bootstrap_run(r, range(len(columns)), scoring.bootstrap) for r in environment.records],
-        scoring.bootstrap,
-        name=environment.key,
-    )
+    row["runs"] = {str(r.episode.seed): {} for r in environment.records}
     for index, column in enumerate(columns):
         runs = [rounded(run_statistics(r, index), scoring) for r in environment.records]
         mean = rounded(np.mean(runs, axis=0), scoring)
@@ -140,36 +171,69 @@ def _environment(
         # the reference rounds every run's score before it averages
         weighted = [rounded(np.asarray(level_score(v, level, scoring, flat=flat)), scoring) for v in runs]
         statistics[name] = rounded(np.mean(weighted, axis=0), scoring)
-        replicates[name] = np.asarray(level_score(draws[index], level, scoring, flat=flat))
+        for run, values in zip(row["runs"].values(), runs, strict=True):
+            run[column] = _number(values[2])
+    for record in environment.records:
+        played = command_statistics(record, len(columns) - 1)
+        row["runs"][str(record.episode.seed)]["commands"] = {
+            command_name(name, part): _number(played[goal, part][2]) if (goal, part) in played else 0.0
+            for goal, name in enumerate(record.episode.goals)
+            for part in range(len(SUB_COMMANDS[name]))
+        }
     row["quality"] = {s: _number(v) for s, v in zip(STATISTICS, plain[columns[-1]], strict=True)}
     row["score"] = _number(statistics["score"][2])
-    row["interval"] = _interval(replicates["score"])
     row["metrics"] = {c: {s: _number(v) for s, v in zip(STATISTICS, plain[c], strict=True)} for c in columns[:-1]}
     for name in ("falls",):
         row[name] = sum(getattr(r, name) for r in environment.records)
     for name in ("diverged", "overflowed", "restarted"):
         row[name] = sum(bool(getattr(r, name)) for r in environment.records)
-    return row, statistics, replicates
+    return row, statistics
 
 
 def _number(value: float | np.floating) -> float:
     return float(round(float(value), 6))
 
 
-def _interval(replicates: Array) -> list[float]:
-    found = Interval.of(replicates)
-    return [_number(found.low), _number(found.high)]
+def _interval(found: tuple[float, float] | None) -> list[float] | None:
+    return None if found is None else [_number(found[0]), _number(found[1])]
+
+
+ALL = "all"
+"""Value of the column ``command`` in the row of a whole episode."""
 
 
 def rows_csv(records: Sequence[Record]) -> str:
-    """One line per episode, as CSV text."""
-    rows = [r.summary() for r in sorted(records, key=lambda r: r.episode.key)]
+    """Episodes as CSV text: a row for each (``command`` is ``all``), then one for each of its sub-commands that was played.
+
+    Every metric and the quality have three columns, ``_mean``, ``_mean25`` and ``_mean50``, as measured and without the weight of
+    the level: of the whole episode as its score takes them, averaged over goals; of a sub-command over its samples. They are empty
+    in the rows of level tests, which take no samples.
+    """
     text = io.StringIO()
+    columns = next((r.columns for r in records if r.columns), ())
+    names = [f"{c}_{s}" for c in columns for s in STATISTICS]
+    rows: list[dict[str, Any]] = []
+    for record in sorted(records, key=lambda r: r.episode.key):
+        sampled = range(len(columns)) if len(record.samples) else ()
+        whole = [run_statistics(record, column) for column in sampled]
+        rows.append({**record.summary(), "command": ALL, "samples": len(record.samples), **_numbers(names, whole)})
+        of_columns = [command_statistics(record, column) for column in sampled]
+        for goal, part in of_columns[0] if of_columns else ():
+            name = record.episode.goals[goal]
+            count = int(((record.goal_index == goal) & (record.part_index == part)).sum())
+            row = asdict(record.episode) | {"goals": name, "command": command_name(name, part), "samples": count}
+            rows.append(row | _numbers(names, [values[goal, part] for values in of_columns]))
     if rows:
-        writer = csv.DictWriter(text, list(rows[0]))
+        head = list(dict.fromkeys(key for key in rows[0] if key not in names))
+        writer = csv.DictWriter(text, [*head, *names])
         writer.writeheader()
         writer.writerows(rows)
     return text.getvalue()
+
+
+def _numbers(names: Sequence[str], values: Sequence[Array]) -> dict[str, float]:
+    """The statistics of all columns under their names; nothing where there are no values."""
+    return dict(zip(names, (_number(v) for v in np.ravel(np.asarray(values))), strict=bool(values)))
 
 
 def health(environments: Sequence[Environment]) -> Mapping[str, int]:

@@ -1,6 +1,5 @@
 """From samples to scores: tail means, level scores, the paper's own tables, and the bootstrap."""
 
-import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +8,7 @@ from gaitgauge.gauge.episodes import Episode, Record
 from gaitgauge.gauge.pipelines import Environment
 from gaitgauge.gauge.results import fold
 from gaitgauge.gauge.scoring import (
-    Interval,
-    bootstrap_environment,
-    bootstrap_run,
+    command_statistics,
     group_values,
     level_score,
     rounded,
@@ -207,7 +204,6 @@ def test_a_policy_that_passes_no_level_anywhere_scores_zero():
     environments = [flat_environment([], 0.6, name, 0, True) for name in ("wave", "obstacle")]
     result = fold(suite, environments, (*METRICS, "quality"), evaluated=True)
     assert result["score"] == 0.0
-    assert result["score_interval"] == [0.0, 0.0]
     assert result["groups"] == {"tracking": 0.0, "safety": 0.0, "quality": 0.0}
     assert result["level"] == 0.0
     assert fold(suite, environments, (*METRICS, "quality"), evaluated=False)["score"] is None
@@ -277,102 +273,3 @@ def test_errors_need_every_motion_and_metric():
         aggregate_errors(real, incomplete)
     with pytest.raises(ValidationError, match="the measured values lack lin_vel_err of motion 'angular'"):
         aggregate_errors({k: v for k, v in real.items() if k != "angular"}, real)
-
-
-# ---- the bootstrap ------------------------------------------------------------------------------------------------------
-
-
-def brute_force(run, column, resamples):
-    """The same resamples, each written out as a list of samples."""
-    generator = np.random.default_rng(zlib.crc32(run.episode.key.encode()))
-    goals = range(len(run.episode.goals))
-    out = np.zeros((len(goals), resamples))
-    for goal in goals:
-        mine = run.goal_index == goal
-        labels = np.unique(run.part_index[mine])
-        draws = generator.multinomial(len(labels), np.full(len(labels), 1 / len(labels)), size=resamples)
-        for b, times in enumerate(draws):
-            chosen = [
-                run.samples[mine & (run.part_index == label), column]
-                for label, n in zip(labels, times, strict=True)
-                for _ in range(n)
-            ]
-            out[goal, b] = tail_means(np.concatenate(chosen).astype(np.float64))[2]
-    return out.mean(0)
-
-
-def noisy(seed=0, parts=(5, 4), size=60):
-    generator = np.random.default_rng(7)
-    goals = np.repeat([0, 1], size)
-    part = np.concatenate([generator.integers(0, n, size) for n in parts])
-    # sub-commands differ, samples wander beyond [0, 1], some are not defined
-    samples = 0.2 * part[:, None] + 0.3 * generator.standard_normal((2 * size, 3))
-    samples[generator.random((2 * size, 3)) < 0.1] = np.nan
-    return record(samples, goals, part, seed=seed)
-
-
-def test_the_bootstrap_equals_resampling_written_out():
-    run = noisy()
-    fast = bootstrap_run(run, (0, 2), 300)
-    assert fast[0] == pytest.approx(brute_force(run, 0, 300), abs=1e-12)
-    assert fast[1] == pytest.approx(brute_force(run, 2, 300), abs=1e-12)
-
-
-def test_the_bootstrap_survives_sub_commands_without_defined_samples():
-    samples = np.array([[0.5], [np.nan], [0.7], [np.nan]])
-    run = record(samples, [0, 0, 1, 1], [0, 1, 0, 1])
-    replicates = bootstrap_run(run, (0,), 200)[0]
-    # each goal draws its defined sub-command in three of four resamples, and has nothing otherwise
-    assert set(np.round(replicates, 6)) == {0.0, 0.25, 0.35, 0.6}
-    assert replicates == pytest.approx(brute_force(run, 0, 200))
-
-
-def test_columns_share_their_resamples():
-    run = noisy()
-    run.samples[:, 1] = run.samples[:, 0]
-    first, second = bootstrap_run(run, (0, 1), 50)
-    assert np.array_equal(first, second)
-    both = bootstrap_environment([bootstrap_run(run, (0, 1), 50)], 50, name="e")
-    assert np.array_equal(both[0], both[1])
-
-
-def test_the_bootstrap_is_reproducible_and_differs_between_episodes():
-    assert np.array_equal(bootstrap_run(noisy(), (0,), 50), bootstrap_run(noisy(), (0,), 50))
-    assert not np.array_equal(bootstrap_run(noisy(0), (0,), 50), bootstrap_run(noisy(1), (0,), 50))
-
-
-def test_constant_samples_have_an_interval_of_no_width():
-    runs = [
-        bootstrap_run(record([[0.4]] * 6, [0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 1, 2], seed=s), (0,), 100) for s in (0, 1)
-    ]
-    interval = Interval.of(bootstrap_environment(runs, 100, name="e")[0])
-    assert (interval.low, interval.high) == (pytest.approx(0.4), pytest.approx(0.4))
-
-
-def test_seeds_are_resampled_too():
-    """Two seeds without spread of their own: means of two draws are 0.2, 0.3 or 0.4."""
-    runs = [np.full((1, 500), 0.2), np.full((1, 500), 0.4)]
-    replicates = bootstrap_environment(runs, 500, name="e")[0]
-    values, counts = np.unique(np.round(replicates, 9), return_counts=True)
-    assert values.tolist() == [0.2, 0.3, 0.4]
-    assert counts / 500 == pytest.approx([0.25, 0.5, 0.25], abs=0.08)
-
-
-def test_the_interval_covers_the_truth_about_as_often_as_it_says():
-    """Episodes whose sub-commands have effects of their own; 30 of them, so that percentile intervals are not far too narrow.
-
-    The truth is the mean@50 of a very long episode.
-    """
-    generator = np.random.default_rng(3)
-
-    def run(seed, parts):
-        effect = 0.5 + 0.1 * generator.standard_normal(parts)
-        samples = np.repeat(effect, 20) + 0.05 * generator.standard_normal(20 * parts)
-        return record(samples[:, None], np.zeros(20 * parts), np.repeat(np.arange(parts), 20), names=("g",), seed=seed)
-
-    truth = run_statistics(run(10**6, 4000), 0)[2]
-    hits = 0
-    for seed in range(200):
-        interval = Interval.of(bootstrap_run(run(seed, 30), (0,), 300)[0])
-        hits += interval.low <= truth <= interval.high
-    assert 0.88 <= hits / 200 <= 0.99

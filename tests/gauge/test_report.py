@@ -49,6 +49,20 @@ def played(suite, environment, seed, generator):
     )
 
 
+def crossing(environment, level, seed, success):
+    """An episode of a level test."""
+    episode = Episode(
+        terrain=environment.terrain,
+        level=level,
+        friction=environment.friction,
+        payload=environment.payload,
+        seed=seed,
+        stage="search",
+        goals=("target_pos_velocity",),
+    )
+    return Record(episode=episode, success=success)
+
+
 def search(environment, reached, levels):
     """Fill in the outcomes of a binary search that ends at the level reached."""
     low, high = 0, levels
@@ -56,8 +70,9 @@ def search(environment, reached, levels):
         middle = (low + high + 1) // 2
         test = LevelTest([0, 1, 2, 3, 4], 0.8, all_at_once=True)
         test.next_round()
-        for _ in range(5):
+        for seed in range(5):
             test.record(middle <= reached)
+            environment.trials.append(crossing(environment, middle, seed, middle <= reached))
         environment.tests[middle] = test
         low, high = (middle, high) if middle <= reached else (low, middle - 1)
     environment.level = low

@@ -1,0 +1,204 @@
+"""How sure a score is: what other seeds would have changed, in the levels found and in the quality measured there.
+
+Terrains, frictions, payloads, goals and their sub-commands are the benchmark and stay. Seeds are a sample, twice over: the search
+seeds decide about levels (``level_chance``), the quality seeds about everything that is measured at them. Functions take rows of
+``results.json``, so that a result can be judged long after its episodes are gone.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from .episodes import QUALITY
+from .level_chance import redraw_levels, shared_luck, success_curves
+
+Array = NDArray[np.float64]
+Row = Mapping[str, Any]
+
+CONFIDENCE = 0.95
+_UNKNOWN_QUALITY = 0.5
+"""Quality at the levels that an environment might have reached, where no quality was measured anywhere."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chance:
+    """What chance does to a weighted sum over environments: independent parts whose variances add up."""
+
+    levels: Array
+    """Deviation in each replicate of the level searches, (B,); without any where levels were given, zeros."""
+    seeds: tuple[Array, ...]
+    """Tables of deviations of the quality seeds from their mean, (independent streams, S); a stream's seeds are paired."""
+
+    @property
+    def known(self) -> bool:
+        """Whether it can be estimated: one seed shows no spread."""
+        return all(table.shape[1] > 1 for table in self.seeds)
+
+    def _parts(self) -> tuple[float, Array, Array]:
+        """Variance from levels; variances from seeds, and their degrees of freedom."""
+        tables = [t for t in self.seeds if t.size]
+        variances = [(t**2).sum(1) / (t.shape[1] * (t.shape[1] - 1)) for t in tables]
+        freedom = [np.full(len(t), t.shape[1] - 1.0) for t in tables]
+        empty = np.zeros(0)
+        return float(self.levels.var()), np.concatenate([empty, *variances]), np.concatenate([empty, *freedom])
+
+    @property
+    def error(self) -> float:
+        """Standard error."""
+        levels, seeds, _ = self._parts()
+        return math.sqrt(levels + float(seeds.sum()))
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the standard error (Welch and Satterthwaite); infinite where levels alone are chance."""
+        levels, seeds, freedom = self._parts()
+        uncertain = float((seeds**2 / freedom).sum()) if seeds.size else 0.0
+        return (levels + float(seeds.sum())) ** 2 / uncertain if uncertain > 0.0 else math.inf
+
+    def interval(self, value: float, bounds: tuple[float, float] | None = (0.0, 1.0)) -> tuple[float, float] | None:
+        """Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread."""
+        if not self.known:
+            return None
+        reach = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, self.freedom)) * self.error
+        low, high = bounds or (-math.inf, math.inf)
+        return max(value - reach, low), min(value + reach, high)
+
+    def p_value(self, value: float) -> float | None:
+        """How likely a value at least so far from zero is if it is chance alone, two-sided; None where that is not known."""
+        if not self.known:
+            return None
+        if self.error == 0.0:
+            return 1.0 if value == 0.0 else 0.0
+        return 2.0 * float(stats.t.sf(abs(value) / self.error, self.freedom))
+
+    def minus(self, other: Chance, *, paired: bool) -> Chance:
+        """Chance in a difference.
+
+        Args:
+            other: of the value that is subtracted; its level searches are independent of these.
+            paired: both have the same seeds in the same order, whose differences are the sample.
+        """
+        if paired:
+            seeds = tuple(a - b for a, b in zip(self.seeds, other.seeds, strict=True))
+        else:
+            seeds = (*self.seeds, *other.seeds)
+        return Chance(levels=self.levels - other.levels, seeds=seeds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChanceRules:
+    """What a suite says that decides about chance."""
+
+    level_weight: float
+    quality_weight: float
+    pass_rate: float
+    levels: int
+    seeds: tuple[int, ...]
+    """Of the quality episodes."""
+    search_seeds: tuple[int, ...]
+    shared_noise: bool
+    """Whether the environments of a seed share its random numbers."""
+    resamples: int
+    """Replicates of the level searches."""
+
+
+class Evidence:
+    """Trials and runs of the environments of one evaluation, as arrays.
+
+    Attributes:
+        rows: the environments of ``results.json``.
+        redrawn: maximum levels of the searches done again, (E, B).
+    """
+
+    def __init__(self, rows: Sequence[Row], rules: ChanceRules, *, name: str = "") -> None:
+        """Read the rows and redo the searches.
+
+        Args:
+            rows: environments, with ``trials`` where their level was searched and ``runs`` where quality was measured.
+            rules: the suite's.
+            name: seeds the generator, so that the same rows have the same intervals; evaluations that are compared have two.
+        """
+        self.rows, self._rules = list(rows), rules
+        self._flat = np.array([r["terrain"] == "flat" for r in rows], dtype=bool)
+        self._reached = np.array([r["level"] or 0 for r in rows], dtype=np.int64)
+        self._searched = np.array([bool(r.get("trials")) for r in rows], dtype=bool)
+        self._played = np.array([bool(r.get("runs")) for r in rows], dtype=bool)
+        self.redrawn = np.repeat(self._reached[:, None], rules.resamples, axis=1)
+        self._redraw(np.random.default_rng(zlib.crc32(f"levels {name}".encode())))
+
+    def _redraw(self, generator: np.random.Generator) -> None:
+        searched = np.flatnonzero(self._searched).tolist()
+        if not searched:
+            return
+        searches = [
+            {int(level): {int(s): bool(o) for s, o in outcomes.items()} for level, outcomes in row["trials"].items()}
+            for row in (self.rows[at] for at in searched)
+        ]
+        curves = success_curves(searches, [self.rows[at]["terrain"] for at in searched], self._rules.levels)
+        self.redrawn[searched] = redraw_levels(
+            curves,
+            seeds=len(self._rules.search_seeds),
+            pass_rate=self._rules.pass_rate,
+            luck=shared_luck(searches, curves) if self._rules.shared_noise else 0.0,
+            resamples=self._rules.resamples,
+            generator=generator,
+        )
+
+    def runs(self, columns: Sequence[str]) -> Array:
+        """Mean of some columns in every run, (E, S); zeros where an environment has none.
+
+        Args:
+            columns: metrics, ``quality`` or names of sub-commands, whose column is their quality.
+        """
+        values = np.zeros((len(self.rows), len(self._rules.seeds)))
+        for at in np.flatnonzero(self._played).tolist():
+            for place, seed in enumerate(self._rules.seeds):
+                run = self.rows[at]["runs"][str(seed)]
+                found = {**run, **run["commands"]}
+                values[at, place] = sum(found[c] for c in columns) / len(columns)
+        return values
+
+    def chance(self, weights: Array, columns: Sequence[str] = (QUALITY,)) -> Chance:
+        """Chance in a weighted sum over environments of level-weighted values: of the score, with the column ``quality``.
+
+        Args:
+            weights: (E,).
+            columns: see ``runs``.
+        """
+        rules, values = self._rules, self.runs(columns)
+        means = self._supposed(values.mean(1))
+        at_levels = rules.level_weight * (self.redrawn - 1) + rules.quality_weight * means[:, None]
+        levels = weights @ np.where(self._flat[:, None] | (self.redrawn == 0), 0.0, at_levels)
+        scale = np.where(self._flat, 1.0, rules.quality_weight) * weights
+        deviations = scale[:, None] * (values - values.mean(1, keepdims=True))
+        streams = deviations.sum(0, keepdims=True) if rules.shared_noise else deviations[weights != 0.0]
+        return Chance(levels=levels - levels.mean(), seeds=(streams, self._search_seeds(weights)))
+
+    def level_chance(self, weights: Array) -> Chance:
+        """Chance in a weighted sum of the environments' levels, ``weights`` (E,). Quality seeds play no part."""
+        levels = weights @ self.redrawn
+        return Chance(levels=levels - levels.mean(), seeds=(self._search_seeds(weights),))
+
+    def _search_seeds(self, weights: Array) -> Array:
+        """No deviations, of as many seeds as stand behind the levels; two where the levels were given, and are certain."""
+        return np.zeros((0, len(self._rules.search_seeds) if (self._searched & (weights != 0.0)).any() else 2))
+
+    def _supposed(self, means: Array) -> Array:
+        """Qualities with something in place of what was not measured, because no level was passed: the terrain's mean, or that of
+        all levelled terrains."""
+        levelled = self._played & ~self._flat
+        found = means.copy()
+        for at in np.flatnonzero(~self._played & ~self._flat):
+            terrain = self.rows[at]["terrain"]
+            mine = levelled & np.array([r["terrain"] == terrain for r in self.rows])
+            known = mine if mine.any() else levelled
+            found[at] = means[known].mean() if known.any() else _UNKNOWN_QUALITY
+        return found

@@ -1,0 +1,158 @@
+"""How much of a maximum level is chance: success by level, fitted to the trials of a search, and the search done again.
+
+A search with five seeds a level finds another level with other seeds. How often which one follows from the chance to reach the
+target at each level. That chance is fitted to the trials that were played, and the whole search is redone with successes drawn
+from the fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+Trials = Mapping[int, Mapping[int, bool]]
+"""Whether the target was reached, by level and then by seed; levels and seeds that were not played are absent."""
+
+_CENTRE_STEP, _BEYOND = 0.25, 3.0
+"""Grid of the levels at which half of the seeds may reach the target, all as likely beforehand; it goes on beyond the first and
+the last level, for what is never or always passed."""
+_WIDTHS = np.geomspace(0.1, 2.5, 17)
+"""Levels within which the odds of a success fall by a factor e: from a bar too high for every seed to waves that get a little worse."""
+_USUAL_WIDTH = 0.6
+"""Median of the width beforehand [levels]."""
+_WIDTH_SPREAD, _TERRAIN_SPREAD = 0.4, 0.4
+"""Standard deviations of the logarithm of the width: beforehand of a policy's usual one, and of its terrains' around that."""
+
+
+def success_curves(searches: Sequence[Trials], terrains: Sequence[str], levels: int) -> Array:
+    """Chance to reach the target at every level.
+
+    A logistic curve in the level for each search. Its centre is its own; its width is common to the searches on one terrain, and
+    those of a policy's terrains are alike. Centre and width are their means over what the trials leave possible, so that five
+    successes in five trials are not taken for certainty, nor none in two for impossibility.
+
+    Args:
+        searches: trials of each environment.
+        terrains: their terrains.
+        levels: number of levels.
+
+    Returns:
+        (searches, levels), falling along each row.
+    """
+    grid = np.arange(1.0 - _BEYOND, levels + _BEYOND + 1e-9, _CENTRE_STEP)
+    chance = _logistic((grid[:, None, None] - np.arange(1, levels + 1)) / _WIDTHS[:, None])
+    log_pass, log_fail = np.log(chance), np.log1p(-chance)
+    likelihoods = np.zeros((len(searches), len(grid), len(_WIDTHS)))
+    for at, trials in enumerate(searches):
+        for level, outcomes in trials.items():
+            reached = sum(outcomes.values())
+            likelihoods[at] += reached * log_pass[:, :, level - 1] + (len(outcomes) - reached) * log_fail[:, :, level - 1]
+    centres = _shares(likelihoods, axis=1)
+    names = list(dict.fromkeys(terrains))
+    groups = [np.array([t == name for t in terrains]) for name in names]
+    of_width = np.array([np.logaddexp.reduce(likelihoods[mine], axis=1).sum(0) for mine in groups])
+    log_widths = np.log(_WIDTHS / _USUAL_WIDTH)
+    around = np.log(_shares(-0.5 * ((log_widths - log_widths[:, None]) / _TERRAIN_SPREAD) ** 2, axis=1))
+    told = np.logaddexp.reduce(around + of_width[:, None], axis=2)  # (terrains, usual width): by each terrain of the usual one
+    beforehand = -0.5 * (log_widths / _WIDTH_SPREAD) ** 2
+    curves = np.zeros((len(searches), levels))
+    for terrain, mine in enumerate(groups):
+        usual = beforehand + told.sum(0) - told[terrain]
+        width = _shares(np.logaddexp.reduce(usual[:, None] + around, axis=0) + of_width[terrain], axis=0)
+        centre = np.einsum("ecw,w,c->e", centres[mine], width, grid)
+        spread = math.exp(float(width @ np.log(_WIDTHS)))
+        curves[mine] = _logistic((centre[:, None] - np.arange(1, levels + 1)) / spread)
+    return curves
+
+
+def _shares(logarithms: Array, axis: int) -> Array:
+    """Numbers above zero that add up to one along an axis, from their logarithms up to a constant."""
+    values = np.exp(logarithms - logarithms.max(axis, keepdims=True))
+    return values / values.sum(axis, keepdims=True)
+
+
+def bisect(passed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Level that the search finds for each table of outcomes: the way of ``pipelines``, through all tables at once.
+
+    Args:
+        passed: whether each level is passed, (…, levels).
+
+    Returns:
+        Levels, (…,); 0 where none is passed on the way.
+    """
+    low = np.zeros(passed.shape[:-1], dtype=np.int64)
+    high = np.full_like(low, passed.shape[-1])
+    while (open_ := low < high).any():
+        middle = (low + high + 1) // 2
+        outcome = np.take_along_axis(passed, np.maximum(middle - 1, 0)[..., None], axis=-1)[..., 0]
+        low = np.where(open_ & outcome, middle, low)
+        high = np.where(open_ & ~outcome, middle - 1, high)
+    return low
+
+
+def shared_luck(searches: Sequence[Trials], curves: Array) -> float:
+    """Correlation of the luck that a seed has in different environments, 0 to below 1.
+
+    Where the environments of a seed share its random numbers, a seed may be easy or hard everywhere. The estimate compares the
+    products of residuals of one seed in two environments with what they would be if its luck were the same (method of moments);
+    correlations of outcomes become those of the normal variable behind them.
+
+    Args:
+        searches: trials of each environment.
+        curves: their ``success_curves``, (searches, levels).
+    """
+    residuals: dict[int, list[float]] = {}
+    spreads: dict[int, list[float]] = {}
+    own_products = own_spreads = 0.0
+    for trials, curve in zip(searches, curves, strict=True):
+        of_seed: dict[int, tuple[float, float]] = {}
+        for level, outcomes in trials.items():
+            chance = curve[level - 1]
+            for seed, reached in outcomes.items():
+                residual, spread = of_seed.get(seed, (0.0, 0.0))
+                of_seed[seed] = residual + reached - chance, spread + math.sqrt(chance * (1.0 - chance))
+        for seed, (residual, spread) in of_seed.items():
+            residuals.setdefault(seed, []).append(residual)
+            spreads.setdefault(seed, []).append(spread)
+            own_products += residual**2
+            own_spreads += spread**2
+    most = sum(sum(values) ** 2 for values in spreads.values()) - own_spreads
+    if most <= 1e-9:
+        return 0.0
+    correlation = (sum(sum(values) ** 2 for values in residuals.values()) - own_products) / most
+    return min(math.sin(0.5 * math.pi * min(max(correlation, 0.0), 1.0)), 0.95)
+
+
+def redraw_levels(
+    curves: Array, *, seeds: int, pass_rate: float, luck: float, resamples: int, generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Maximum levels of searches that are done again with other seeds.
+
+    Args:
+        curves: chance of success, (E, levels).
+        seeds: search seeds a level.
+        pass_rate: share of them that must reach the target.
+        luck: correlation of a seed's luck between environments, see ``shared_luck``.
+        resamples: number of replicates B.
+        generator: source of the draws.
+
+    Returns:
+        (E, B).
+    """
+    environments, levels = curves.shape
+    needed = math.ceil(pass_rate * seeds - 1e-9)
+    common = math.sqrt(luck) * generator.standard_normal((resamples, 1, seeds))
+    found = np.zeros((environments, resamples), dtype=np.int64)
+    for at, thresholds in enumerate(stats.norm.ppf(curves)):
+        own = math.sqrt(1.0 - luck) * generator.standard_normal((resamples, levels, seeds))
+        found[at] = bisect((common + own < thresholds[:, None]).sum(-1) >= needed)
+    return found
+
+
+def _logistic(values: Array) -> Array:
+    return np.clip(1.0 / (1.0 + np.exp(-values)), 1e-6, 1.0 - 1e-6)
