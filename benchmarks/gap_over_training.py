@@ -201,7 +201,8 @@ def score(request: Request, folder: Path, engine: str) -> Row:
     if results["score"] is not None:
         row[f"{prefix}_score"] = f"{results['score']:.4f}"
         if results["score_interval"] is not None:  # one seed has none
-            row |= dict(zip((f"{prefix}_low", f"{prefix}_high"), map("{:.4f}".format, results["score_interval"])))
+            low, high = results["score_interval"]
+            row |= {f"{prefix}_low": f"{low:.4f}", f"{prefix}_high": f"{high:.4f}"}
         row[f"{prefix}_fallen"] = f"{health['falls'] / max(health['episodes'], 1):.3f}"
     if results["level"] is not None:
         row[f"{prefix}_level"] = f"{results['level']:.2f}"

@@ -192,8 +192,7 @@ class Evidence:
         return np.zeros((0, len(self._rules.search_seeds) if (self._searched & (weights != 0.0)).any() else 2))
 
     def _supposed(self, means: Array) -> Array:
-        """Qualities with something in place of what was not measured, because no level was passed: the terrain's mean, or that of
-        all levelled terrains."""
+        """Qualities, (E,), and where none was measured, because no level was passed, the mean of the terrain or of all others."""
         levelled = self._played & ~self._flat
         found = means.copy()
         for at in np.flatnonzero(~self._played & ~self._flat):

@@ -51,14 +51,18 @@ def success_curves(searches: Sequence[Trials], terrains: Sequence[str], levels: 
     for at, trials in enumerate(searches):
         for level, outcomes in trials.items():
             reached = sum(outcomes.values())
-            likelihoods[at] += reached * log_pass[:, :, level - 1] + (len(outcomes) - reached) * log_fail[:, :, level - 1]
+            likelihoods[at] += (
+                reached * log_pass[:, :, level - 1] + (len(outcomes) - reached) * log_fail[:, :, level - 1]
+            )
     centres = _shares(likelihoods, axis=1)
     names = list(dict.fromkeys(terrains))
     groups = [np.array([t == name for t in terrains]) for name in names]
     of_width = np.array([np.logaddexp.reduce(likelihoods[mine], axis=1).sum(0) for mine in groups])
     log_widths = np.log(_WIDTHS / _USUAL_WIDTH)
     around = np.log(_shares(-0.5 * ((log_widths - log_widths[:, None]) / _TERRAIN_SPREAD) ** 2, axis=1))
-    told = np.logaddexp.reduce(around + of_width[:, None], axis=2)  # (terrains, usual width): by each terrain of the usual one
+    told = np.logaddexp.reduce(
+        around + of_width[:, None], axis=2
+    )  # (terrains, usual width): by each terrain of the usual one
     beforehand = -0.5 * (log_widths / _WIDTH_SPREAD) ** 2
     curves = np.zeros((len(searches), levels))
     for terrain, mine in enumerate(groups):

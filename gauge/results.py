@@ -133,9 +133,7 @@ def _mean_level(environments: Sequence[Environment]) -> float:
     return float(np.mean([e.level or 0 for e in environments if e.terrain != "flat"]))
 
 
-def _environment(
-    suite: Suite, environment: Environment, columns: list[str]
-) -> tuple[dict[str, Any], dict[str, Array]]:
+def _environment(suite: Suite, environment: Environment, columns: list[str]) -> tuple[dict[str, Any], dict[str, Array]]:
     """Row of one environment, and its level-weighted statistics by column and ``score``."""
     scoring, flat, level = suite.scoring, environment.terrain == "flat", environment.level or 0
     statistics = {n: np.zeros(3) for n in [*columns[:-1], "score"]}

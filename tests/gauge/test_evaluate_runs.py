@@ -12,6 +12,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from gaitgauge.backends.base import BackendError
@@ -136,6 +137,12 @@ def test_a_whole_run(request_for, tmp_path, base):
     lines = list(csv.DictReader((folder / "episodes.csv").open()))
     rows = [r for r in lines if r["command"] == "all"]
     files = {p.stem for p in (folder / "episodes").iterdir()}
+    parts = [r for r in lines if r["command"] != "all"]
+    assert len(parts) == 4 * 14  # eight diagonals and six axes in each quality episode
+    assert {r["command"] for r in parts} >= {"diagonal_velocity -x-y", "max_velocity +yaw"}
+    of_flat = [r for r in rows if r["stage"] == "eval" and r["terrain"] == "flat"]
+    quality = np.mean([float(r["quality_mean50"]) for r in of_flat])
+    assert quality == pytest.approx(flat["score"], abs=2e-4)
     assert len(rows) == len(files) == 4 + 2 + 2
     assert [r["success"] for r in rows if r["stage"] == "search" and r["level"] == "3"] == ["False", "False"]
     assert sum(int(r["physics_steps"]) for r in rows) > 0
@@ -151,6 +158,8 @@ def test_the_same_request_gives_the_same_results(request_for, tmp_path):
 def test_a_level_run_has_levels_and_no_score(request_for, tmp_path):
     results = evaluate(request_for(pipeline="level"), tmp_path / "run")
     assert results["score"] is None
+    low, high = results["terrains"]["slope_fd"].pop("level_interval")
+    assert 0.0 <= low < 2.0 < high <= 3.0
     assert results["terrains"] == {"slope_fd": {"level": 2.0}}
 
 

@@ -71,6 +71,14 @@ def test_a_goal_without_samples_counts_zero():
     assert run_statistics(record(np.zeros((0, 1))), 0) == pytest.approx([0.0] * 3)
 
 
+def test_sub_commands_have_statistics_of_their_own_where_they_were_played():
+    run = record([0.2, 0.4, 0.6, 0.9], [0, 0, 0, 1], [0, 0, 2, 5])
+    found = command_statistics(run, 0)
+    assert set(found) == {(0, 0), (0, 2), (1, 5)}
+    assert found[0, 0] == pytest.approx([0.3, 0.2, 0.2])
+    assert found[1, 5] == pytest.approx([0.9] * 3)
+
+
 # ---- levels ---------------------------------------------------------------------------------------------------------
 
 
@@ -173,7 +181,7 @@ def test_fold_weighs_terrains_the_same_and_counts_unpassed_environments_zero():
     suite = replace(REFERENCE, scoring=replace(REFERENCE.scoring, bootstrap=10))
     environments = [
         flat_environment([0.6, 0.7, 0.8]),
-        flat_environment([0.5], 0.2, "wave", 3, True),
+        flat_environment([0.5, 0.5, 0.5], 0.2, "wave", 3, True),
         flat_environment([], 0.3, "wave", 0, True),
     ]
     result = fold(suite, environments, (*METRICS, "quality"))
