@@ -30,7 +30,6 @@ from .step_program import StepProgram
 from .step_records import (
     AFTER_RESET,
     AFTER_STEP,
-    ENDS,
     METRICS,
     EpisodeStart,
     Observations,
@@ -277,9 +276,10 @@ class TrainingEnvironment(VecEnv):
         )
         memory.last_log.copy_(torch.where(torch.isfinite(values), values, memory.last_log))
         memory.sums.zero_()
-        names = [f"Episode_Reward/{n}" for n in program.rewards.names] + [f"Episode_Termination/{n}" for n in ENDS]
+        ends = program.terminations.names
+        names = [f"Episode_Reward/{n}" for n in program.rewards.names] + [f"Episode_Termination/{n}" for n in ends]
         names += [f"Metrics/{n}" for n in METRICS]
-        assert len(names) == terms + len(ENDS) + len(METRICS)
+        assert len(names) == terms + len(ends) + len(METRICS)
         log = dict(zip(names, memory.last_log.clone().unbind(), strict=True))
         levels = (self._kind_share * memory.level.float()).sum(dim=1)
         log |= {

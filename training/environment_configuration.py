@@ -120,7 +120,7 @@ class RewardConfiguration:
     collision: float = -1.0
     """Number of thighs and calves that touch something."""
     base_collision: float = 0.0
-    """The base touches something; of use where ``TerminationConfiguration.base_force`` lets it live."""
+    """The base touches something; head and chin too."""
     joint_limits: float = -2.0
     """Joint angle beyond the soft limits [rad]."""
     foot_regulation: float = -0.05
@@ -329,10 +329,10 @@ class PushConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class TerminationConfiguration:
-    """What ends an episode early."""
+    """What ends an episode early (``training/terminations.py``)."""
 
-    base_force: float = 1.0
-    """Contact force on the base body [N]."""
+    trunk_contact: float | None = None
+    """Force of the ground on the trunk, head and chin apart, that ends an episode [N]. None for never."""
     tilt: float | None = 1.4
     """Angle between the base's z axis and the world's [rad]; None for no limit."""
     joint_velocity: float = 150.0
@@ -354,6 +354,7 @@ TRAINING_PHYSICS = PhysicsOptions(
     foot_condim=3,
     self_collision=False,
     torque_limits=True,
+    torque_speed_limit=True,
 )
 """Physics of the published training, as far as the engines have it: 200 Hz, four substeps, sliding friction only. Six solver
 iterations are faster than ten, and what ships was trained with them."""

@@ -42,8 +42,8 @@ _WAIT = "training.run.gauge_wait"
 _ENGINE_SETTINGS: Mapping[str, tuple[str, ...]] = {"mujoco": ("environment.physics.iterations=15",)}
 """What an engine needs that others do not, before the settings of the request. MuJoCo's solver has not converged after the tasks' six
 iterations at steps of 5 ms, and throws walking robots over; mujoco_warp's has."""
-_GOING_ON_RATE, _GOING_ON_STD = 3e-4, 0.3
-"""First learning rate and exploration noise of a run that begins with trained networks."""
+_GOING_ON_RATE, _GOING_ON_KL, _GOING_ON_STD = 3e-4, 0.006, 0.3
+"""First learning rate, wanted change of the policy in an update, and exploration noise of a run that begins with trained networks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +135,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         ]
         own = _last_of_each(own)
     elif request.init_from is not None:
-        own = [*_going_on(read_checkpoint(_first_weights(request, task), training_state=False)), *own]
+        own = [*_going_on(task, read_checkpoint(_first_weights(request, task), training_state=False)), *own]
     backend = request.backend or stored.get("backend", DEFAULT_BACKEND)
     own = [*_ENGINE_SETTINGS.get(backend, ()), *own]
     if request.seconds is not None:
@@ -166,12 +166,15 @@ def prepare(request: TrainRequest) -> TrainPlan:
     )
 
 
-def _going_on(entries: Mapping[str, Any]) -> list[str]:
+def _going_on(task: Task, entries: Mapping[str, Any]) -> list[str]:
     """Settings of a run that begins with trained networks, before those of the request: schedules go on where that
-    training left them, steps are smaller, and a policy without its exploration noise gets little.
+    training left them, robots that can walk start on all levels, steps are smaller, and a policy without its
+    exploration noise gets little.
     """
     return [
         f"environment.schedule.begin={reached(entries):g}",
+        f"environment.terrain.highest_start_level={task.environment.terrain.levels - 1}",
+        f"training.algorithm.desired_kl={_GOING_ON_KL}",
         f"training.algorithm.learning_rate={_GOING_ON_RATE}",
         f"training.network.initial_std={_GOING_ON_STD}",
     ]

@@ -1,4 +1,4 @@
-"""Reward terms. Each is a function of ``RewardInputs`` that returns one number per world, unweighted;
+"""Reward terms. Each is a function of ``StepInputs`` that returns one number per world, unweighted;
 ``REWARD_TERMS`` names them.
 
 Formulas follow the paper's table of rewards in the reading of the published code; where they differ,
@@ -8,92 +8,36 @@ Formulas follow the paper's table of rewards in the reading of the published cod
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import torch
 
 from ..robots.rotation import projected_gravity
 from .environment_configuration import Ramp, RewardConfiguration
 from .schedules import RampTable
+from .step_inputs import StepInputs
 
 SLOWEST_COMMAND = 0.1
 """Commanded speed below which nothing is asked of a robot's progress [m/s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RewardInputs:
-    """What the terms look at, after a control step and before any reset. N worlds, J joints, H hips, F feet."""
-
-    base_linear_velocity_b: torch.Tensor
-    """[m/s], (N, 3)."""
-    base_angular_velocity_b: torch.Tensor
-    """[rad/s], (N, 3)."""
-    base_quaternion_w: torch.Tensor
-    """wxyz, (N, 4)."""
-    base_height: torch.Tensor
-    """Height of the base over the mean ground below the trunk [m], (N,)."""
-    command: torch.Tensor
-    """Forward, lateral [m/s] and yaw [rad/s] speed, (N, 3)."""
-    sigma: torch.Tensor
-    """Tracking width of each command axis, (N, 3)."""
-    joint_position: torch.Tensor
-    """[rad], (N, J)."""
-    joint_velocity: torch.Tensor
-    """[rad/s], (N, J)."""
-    joint_acceleration: torch.Tensor
-    """Change of velocity over the control step [rad/s²], (N, J)."""
-    joint_torque: torch.Tensor
-    """Of the last substep [N·m], (N, J)."""
-    previous_joint_torque: torch.Tensor
-    """The same, one control step earlier."""
-    default_joint_position: torch.Tensor
-    """Standing pose [rad], (J,)."""
-    soft_lower: torch.Tensor
-    """Lower soft joint limit [rad], (J,)."""
-    soft_upper: torch.Tensor
-    """Upper soft joint limit [rad], (J,)."""
-    hip_joints: torch.Tensor
-    """Indices of the hip joints FL, FR, RL, RR, (4,) int64."""
-    action: torch.Tensor
-    """Raw action of this step, (N, J)."""
-    previous_action: torch.Tensor
-    """Raw action one step earlier; zeros after a reset."""
-    second_previous_action: torch.Tensor
-    """Raw action two steps earlier; zeros after a reset."""
-    foot_height: torch.Tensor
-    """Height of the foot centres over the ground [m], (N, F)."""
-    foot_velocity_w: torch.Tensor
-    """[m/s], (N, F, 3)."""
-    touching_bodies: torch.Tensor
-    """Number of thighs and calves in contact, (N,)."""
-    base_touching: torch.Tensor
-    """1 where the base touches something, (N,)."""
-    fallen: torch.Tensor
-    """Worlds whose episode ends by a fall, (N,) bool."""
-    base_height_target: float
-    """[m]."""
-    foot_height_length: float
-    """Height over which foot regulation fades by a factor e [m]."""
-
-
-def linear_tracking(inputs: RewardInputs) -> torch.Tensor:
+def linear_tracking(inputs: StepInputs) -> torch.Tensor:
     """exp(−(Δvx²/σx + Δvy²/σy)), body frame. The paper multiplies by sigma; the code divides, and so does this."""
     error = (inputs.command[:, :2] - inputs.base_linear_velocity_b[:, :2]).square() / inputs.sigma[:, :2]
     return torch.exp(-error.sum(dim=1))
 
 
-def yaw_tracking(inputs: RewardInputs) -> torch.Tensor:
+def yaw_tracking(inputs: StepInputs) -> torch.Tensor:
     """exp(−Δωz²/σw)."""
     error = inputs.command[:, 2] - inputs.base_angular_velocity_b[:, 2]
     return torch.exp(-error.square() / inputs.sigma[:, 2])
 
 
-def progress(inputs: RewardInputs) -> torch.Tensor:
+def progress(inputs: StepInputs) -> torch.Tensor:
     """Velocity along the commanded direction over the commanded speed, within ±1; 0 below ``SLOWEST_COMMAND``."""
     return torch.where(commanded_to_move(inputs.command), progress_share(inputs), 0.0)
 
 
-def progress_share(inputs: RewardInputs) -> torch.Tensor:
+def progress_share(inputs: StepInputs) -> torch.Tensor:
     """Share of the commanded speed that the robot has along the command, within ±1; without a meaning below
     ``SLOWEST_COMMAND``.
     """
@@ -107,58 +51,58 @@ def commanded_to_move(command: torch.Tensor) -> torch.Tensor:
     return command[:, :2].square().sum(dim=1) >= SLOWEST_COMMAND**2
 
 
-def vertical_velocity(inputs: RewardInputs) -> torch.Tensor:
+def vertical_velocity(inputs: StepInputs) -> torch.Tensor:
     """vz² in the body frame [m²/s²]."""
     return inputs.base_linear_velocity_b[:, 2].square()
 
 
-def roll_pitch_rate(inputs: RewardInputs) -> torch.Tensor:
+def roll_pitch_rate(inputs: StepInputs) -> torch.Tensor:
     """ωx² + ωy² [rad²/s²]."""
     return inputs.base_angular_velocity_b[:, :2].square().sum(dim=1)
 
 
-def joint_acceleration(inputs: RewardInputs) -> torch.Tensor:
+def joint_acceleration(inputs: StepInputs) -> torch.Tensor:
     """Sum of squared joint accelerations [rad²/s⁴]."""
     return inputs.joint_acceleration.square().sum(dim=1)
 
 
-def joint_power(inputs: RewardInputs) -> torch.Tensor:
+def joint_power(inputs: StepInputs) -> torch.Tensor:
     """Sum of absolute mechanical powers [W]."""
     return (inputs.joint_torque * inputs.joint_velocity).abs().sum(dim=1)
 
 
-def torque(inputs: RewardInputs) -> torch.Tensor:
+def torque(inputs: StepInputs) -> torch.Tensor:
     """Sum of squared torques [N²·m²]."""
     return inputs.joint_torque.square().sum(dim=1)
 
 
-def base_height(inputs: RewardInputs) -> torch.Tensor:
+def base_height(inputs: StepInputs) -> torch.Tensor:
     """Squared error of the base's height [m²]."""
     return (inputs.base_height - inputs.base_height_target).square()
 
 
-def action_rate(inputs: RewardInputs) -> torch.Tensor:
+def action_rate(inputs: StepInputs) -> torch.Tensor:
     """Sum of squared first differences of the raw actions."""
     return (inputs.action - inputs.previous_action).square().sum(dim=1)
 
 
-def action_smoothness(inputs: RewardInputs) -> torch.Tensor:
+def action_smoothness(inputs: StepInputs) -> torch.Tensor:
     """Sum of squared second differences of the raw actions."""
     change = torch.sub(inputs.action, inputs.previous_action, alpha=2.0) + inputs.second_previous_action
     return change.square().sum(dim=1)
 
 
-def collision(inputs: RewardInputs) -> torch.Tensor:
+def collision(inputs: StepInputs) -> torch.Tensor:
     """Number of thighs and calves in contact."""
     return inputs.touching_bodies
 
 
-def base_collision(inputs: RewardInputs) -> torch.Tensor:
+def base_collision(inputs: StepInputs) -> torch.Tensor:
     """1 while the base touches something."""
     return inputs.base_touching
 
 
-def joint_limits(inputs: RewardInputs) -> torch.Tensor:
+def joint_limits(inputs: StepInputs) -> torch.Tensor:
     """Sum of the angles beyond the soft limits [rad]. The paper counts joints; the code's angle has a slope to
     follow.
     """
@@ -167,20 +111,20 @@ def joint_limits(inputs: RewardInputs) -> torch.Tensor:
     return (below + above).sum(dim=1)
 
 
-def foot_regulation(inputs: RewardInputs) -> torch.Tensor:
+def foot_regulation(inputs: StepInputs) -> torch.Tensor:
     """Sum over the feet of squared horizontal speed times exp(−height/length)."""
     speed = inputs.foot_velocity_w[..., :2].square().sum(dim=-1)
     height = inputs.foot_height.clamp_min(0.0)
     return (speed * torch.exp(height * (-1.0 / inputs.foot_height_length))).sum(dim=1)
 
 
-def hip_regulation(inputs: RewardInputs) -> torch.Tensor:
+def hip_regulation(inputs: StepInputs) -> torch.Tensor:
     """Sum of absolute hip deviations from the standing pose [rad]."""
     deviation = inputs.joint_position - inputs.default_joint_position
     return deviation[:, inputs.hip_joints].abs().sum(dim=1)
 
 
-def hip_symmetry(inputs: RewardInputs) -> torch.Tensor:
+def hip_symmetry(inputs: StepInputs) -> torch.Tensor:
     """|vx*| / ‖command‖ · (|FL + FR| + |RL + RR|) of the hip angles [rad]; 0 for the zero command."""
     hips = inputs.joint_position[:, inputs.hip_joints]
     asymmetry = (hips[:, 0::2] + hips[:, 1::2]).abs().sum(dim=1)
@@ -188,28 +132,28 @@ def hip_symmetry(inputs: RewardInputs) -> torch.Tensor:
     return share * asymmetry
 
 
-def roll(inputs: RewardInputs) -> torch.Tensor:
+def roll(inputs: StepInputs) -> torch.Tensor:
     """Squared sideways component of gravity."""
     return projected_gravity(inputs.base_quaternion_w)[:, 1].square()
 
 
-def torque_change(inputs: RewardInputs) -> torch.Tensor:
+def torque_change(inputs: StepInputs) -> torch.Tensor:
     """Sum of squared torque changes since the last control step [N²·m²]."""
     return (inputs.joint_torque - inputs.previous_joint_torque).square().sum(dim=1)
 
 
-def stand_still(inputs: RewardInputs) -> torch.Tensor:
+def stand_still(inputs: StepInputs) -> torch.Tensor:
     """Sum of absolute deviations from the standing pose [rad], under the zero command alone."""
     still = inputs.command.abs().sum(dim=1) < 1e-6
     return (inputs.joint_position - inputs.default_joint_position).abs().sum(dim=1) * still
 
 
-def termination(inputs: RewardInputs) -> torch.Tensor:
-    """1 for a fall."""
-    return inputs.fallen.float()
+def termination(inputs: StepInputs) -> torch.Tensor:
+    """1 for an episode that ends as a failure."""
+    return inputs.failed.float()
 
 
-RewardTerm = Callable[[RewardInputs], torch.Tensor]
+RewardTerm = Callable[[StepInputs], torch.Tensor]
 
 REWARD_TERMS: Mapping[str, RewardTerm] = {
     f.__name__: f
@@ -254,7 +198,7 @@ class RewardFunction:
         period = [1.0 if name == "termination" else control_period for name in self.names]
         self._period = torch.tensor(period, device=device)
 
-    def __call__(self, inputs: RewardInputs, progress: torch.Tensor) -> torch.Tensor:
+    def __call__(self, inputs: StepInputs, progress: torch.Tensor) -> torch.Tensor:
         """Weighted rewards of every term, (N, terms), at a fraction of the run (scalar tensor)."""
         values = torch.stack([term(inputs) for term in self._terms], dim=1)
         return values * (self._weights.at(progress) * self._period)

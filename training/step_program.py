@@ -25,11 +25,10 @@ from .environment_memory import EnvironmentMemory
 from .height_scan import HeightRasters, heading, heading_and_upright, place_pattern, scan_pattern
 from .observations import add_noise, height_entries, noise_amplitude, privileged_state, push_history
 from .randomness import UniformColumns
-from .rewards import RewardFunction, RewardInputs, commanded_to_move, progress_share
-from .step_records import ENDS, METRICS, EpisodeStart, Observations, Verdict
-
-STUCK_SHORTFALL = 0.9
-"""Share of the commanded speed that is missing of late from which a robot counts as stuck."""
+from .rewards import RewardFunction, commanded_to_move, progress_share
+from .step_inputs import StepInputs
+from .step_records import METRICS, EpisodeStart, Observations, Verdict
+from .terminations import STUCK_SHORTFALL, Terminations
 
 
 def joint_ranges(robot: Robot) -> torch.Tensor:
@@ -76,6 +75,7 @@ class StepProgram:
         self._tile_index = palette.index.to(device)
         self._builder = ObservationBuilder(contract, robot, num_envs, device)
         self.rewards = RewardFunction(configuration.rewards, self.period, device)
+        self.terminations = Terminations(configuration.termination)
         self.commands = CommandGenerator(
             configuration.commands,
             terrain_limits=[tile.command_limits for tile in palette.tiles],
@@ -91,7 +91,7 @@ class StepProgram:
             history=configuration.observations.history_length,
             frame=contract.frame_width,
             terms=len(self.rewards.names),
-            ends=len(ENDS),
+            ends=len(self.terminations.names),
             metrics=len(METRICS),
             device=device,
         )
@@ -215,24 +215,13 @@ class StepProgram:
         # Both comparisons are false for NaN.
         sound = (total.abs() < math.inf) & (fast <= settings.termination.joint_velocity)
         diverged = state.diverged | ~sound
-        base_contact = touching[:, self._base] > settings.termination.base_force
-        if settings.termination.tilt is None:
-            tilted = torch.zeros_like(diverged)
-        else:
-            tilted = upright < math.cos(settings.termination.tilt)
-        fallen = base_contact | tilted | diverged
-        place = state.base_position_w[:, :2].abs().amax(dim=1)
-        too_long = memory.episode_length >= self.max_episode_length
-        left = place > self._leave
-        time_out = (too_long | left) & ~fallen
-        inputs = self._reward_inputs(velocity_b, heading_xy, touching, fallen)
-        stuck = self._stuck(inputs, progress) & ~fallen
-        time_out &= ~stuck
-        done = fallen | stuck | time_out
+        inputs = self._step_inputs(velocity_b, heading_xy, upright, touching, diverged, progress)
+        self._remember_shortfall(inputs)
+        ends = self.terminations(inputs)
+        done = ends.failed | ends.time_out
 
         terms = self.rewards(inputs, progress).masked_fill(diverged[:, None], 0.0)
-        ends = torch.stack((too_long & time_out, left & time_out, base_contact, tilted, stuck, diverged), dim=1)
-        self._record(terms, inputs, ends, done, diverged)
+        self._record(terms, inputs, ends.by_rule, done, diverged)
 
         memory.previous_action.copy_(memory.action)
         memory.action.copy_(self.action)
@@ -240,27 +229,29 @@ class StepProgram:
         memory.joint_velocity.copy_(state.joint_velocity)
         memory.joint_torque.copy_(state.joint_torque)
         memory.foot_force.copy_(state.foot_contact_force_w.norm(dim=-1))
-        self._follow_commands(place, heading_xy)
+        self._follow_commands(inputs.distance, heading_xy)
         push, push_linear, push_angular = self._push(done)
         # A diverged world is the engine's failure: it moves no level.
-        start = self.begin_episodes(done, (fallen & ~diverged) | stuck, progress)
+        start = self.begin_episodes(done, ends.failed & ~diverged, progress)
         return Verdict(
             reward=terms.sum(dim=1),
             done=done,
-            time_out=time_out,
+            time_out=ends.time_out,
             start=start,
             push=push,
             push_linear_velocity=push_linear,
             push_angular_velocity=push_angular,
         )
 
-    def _reward_inputs(
+    def _step_inputs(
         self,
         velocity_b: torch.Tensor,
         heading_xy: torch.Tensor,
+        upright: torch.Tensor,
         touching: torch.Tensor,
-        fallen: torch.Tensor,
-    ) -> RewardInputs:
+        diverged: torch.Tensor,
+        progress: torch.Tensor,
+    ) -> StepInputs:
         state, memory, settings = self.inputs, self.memory, self.configuration.rewards
         base = state.base_position_w
         points = torch.cat(
@@ -270,7 +261,7 @@ class StepProgram:
         trunk = len(self._trunk_points)
         below_base = ground[:, :trunk].mean(dim=1)
         below_feet = ground[:, trunk:] if settings.foot_height_over == "foot" else below_base[:, None]
-        return RewardInputs(
+        return StepInputs(
             base_linear_velocity_b=velocity_b,
             base_angular_velocity_b=state.base_angular_velocity_b,
             base_quaternion_w=state.base_quaternion_w,
@@ -293,24 +284,32 @@ class StepProgram:
             foot_velocity_w=state.foot_velocity_w,
             touching_bodies=(touching[:, self._touching] > settings.collision_force).sum(dim=1).float(),
             base_touching=(touching[:, self._base] > settings.collision_force).float(),
-            fallen=fallen,
+            upright=upright,
+            trunk_contact_force_w=state.trunk_contact_force_w,
+            distance=base[:, :2].abs().amax(dim=1),
+            leave_distance=self._leave,
+            episode_length=memory.episode_length,
+            max_episode_length=self.max_episode_length,
+            shortfall=memory.shortfall,
+            diverged=diverged,
+            progress=progress,
+            state=state,
+            failed=diverged,
             base_height_target=settings.base_height_target,
             foot_height_length=settings.foot_height_scale * settings.base_height_target,
         )
 
-    def _stuck(self, inputs: RewardInputs, progress: torch.Tensor) -> torch.Tensor:
-        """Robots that have not done what they were told for too long, (N,) bool; how much is missing is remembered."""
-        settings = self.configuration.termination
-        if settings.stuck is None:
-            return torch.zeros_like(inputs.fallen)
+    def _remember_shortfall(self, inputs: StepInputs) -> None:
+        """How much of what robots are told to do they have not done of late; ``stuck`` judges it."""
+        patience = self.configuration.termination.stuck
+        if patience is None:
+            return
         missing = torch.where(commanded_to_move(inputs.command), 1.0 - progress_share(inputs), 0.0).nan_to_num(0.0)
         # After this much time at a standstill an average that began at 0 has come to STUCK_SHORTFALL.
-        rate = 1.0 - (1.0 - STUCK_SHORTFALL) ** (self.period / settings.stuck)
-        self.memory.shortfall.lerp_(missing, rate)
-        return (self.memory.shortfall > STUCK_SHORTFALL) & (progress >= settings.stuck_from)
+        self.memory.shortfall.lerp_(missing, 1.0 - (1.0 - STUCK_SHORTFALL) ** (self.period / patience))
 
     def _record(
-        self, terms: torch.Tensor, inputs: RewardInputs, ends: torch.Tensor, done: torch.Tensor, diverged: torch.Tensor
+        self, terms: torch.Tensor, inputs: StepInputs, ends: torch.Tensor, done: torch.Tensor, diverged: torch.Tensor
     ) -> None:
         """Add to the sums that logs are made of."""
         memory = self.memory

@@ -8,9 +8,6 @@ import torch
 
 from ..backends.base import PhysicsState
 
-ENDS = ("time_out", "left_tile", "base_contact", "tilt", "stuck", "diverged")
-"""Ways to end an episode, in the order of ``EnvironmentMemory.finished_ends``; the first two are time-outs to the
-learner."""
 METRICS = ("linear_velocity_error", "yaw_rate_error")
 """Averages over all worlds and steps, in the order of ``EnvironmentMemory.metric_sums``."""
 
@@ -26,6 +23,7 @@ AFTER_STEP = (
     "foot_velocity_w",
     "foot_contact_force_w",
     "body_contact_force_w",
+    "trunk_contact_force_w",
     "diverged",
 )
 """Physics state that ``after_physics`` reads."""

@@ -61,22 +61,22 @@ class _Settings:
 
 _MIRRORED = AlgorithmConfiguration(symmetry="augment", student_period=2)
 _ALL_TERRAINS = EnvironmentConfiguration(
+    num_envs=16384,
     rewards=RewardConfiguration(
         yaw_tracking=0.75,
         progress=1.5,
-        collision=-0.5,
-        base_collision=-1.0,
+        collision=-0.25,
         foot_regulation=-0.1,
         foot_height_scale=0.05,
     ),
     commands=CommandConfiguration(straight_probability=0.5),
-    termination=TerminationConfiguration(base_force=80.0, stuck=2.5),
+    termination=TerminationConfiguration(stuck=8.0),
 )
 _ALL_TERRAINS_LEARNING = AlgorithmConfiguration(
     symmetry="alternate",
     student_period=2,
     # Exploration is worth more while the robot learns to walk and to climb than once it is to be precise.
-    entropy_coefficient=Ramp(start=0.01, end=0.003, begin=0.3, until=0.5),
+    entropy_coefficient=Ramp(start=0.01, end=0.002, begin=0.3, until=0.5),
 )
 
 

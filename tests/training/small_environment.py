@@ -11,6 +11,7 @@ from gaitgauge.training.environment_configuration import (
     EnvironmentConfiguration,
     PushConfiguration,
     ResetConfiguration,
+    TerminationConfiguration,
     TerrainConfiguration,
 )
 
@@ -28,13 +29,14 @@ STAIRS = TerrainConfiguration(
     variants=1,
     spread_probability=0.0,
 )
+FALLS_END = TerminationConfiguration(trunk_contact=1.0)  # the scripted robot falls on its trunk
 STILL = ResetConfiguration(velocity=0.0, joint_scale=(1.0, 1.0))
 NO_PUSH = PushConfiguration(interval=0.0)
 
 
 def make(num_envs=8, *, script=None, physics=None, seed=0, **settings):
     """An environment of ``num_envs`` worlds; without other settings flat, at rest and never pushed."""
-    settings = {"terrain": FLAT, "reset": STILL, "push": NO_PUSH, **settings}
+    settings = {"terrain": FLAT, "reset": STILL, "push": NO_PUSH, "termination": FALLS_END, **settings}
     configuration = EnvironmentConfiguration(num_envs=num_envs, seed=seed, **settings)
     if physics is not None:
         configuration = replace(configuration, physics=replace(configuration.physics, **physics))

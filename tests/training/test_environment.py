@@ -102,7 +102,7 @@ def test_falls_and_divergence_end_episodes_without_time_out():
         assert reward.isfinite().all()
     assert finished.tolist() == [1.0, 1.0, 0.0, 0.0]
     log = extras["log"]
-    assert float(log["Episode_Termination/base_contact"]) == pytest.approx(0.5)
+    assert float(log["Episode_Termination/trunk_contact"]) == pytest.approx(0.5)
     assert float(log["Episode_Termination/diverged"]) == pytest.approx(0.5)
     assert float(log["Physics/nan_resets"]) == 1.0
 
@@ -120,6 +120,18 @@ def test_tilt_ends_an_episode():
     assert not any(
         bool(idle(make(script=rolling, termination=TerminationConfiguration(tilt=None)))[2].any()) for _ in range(4)
     )
+
+
+def test_the_trunk_ends_an_episode_only_where_it_is_told_to():
+    """A robot that is stopped by its head, or rests on its trunk, has not fallen unless the task says so."""
+    lying = FakeScript(fall_time=times(0.04, 0.04))
+    for newtons, ends in ((None, False), (1.0, True), (1000.0, False)):
+        environment = make(2, script=lying, termination=TerminationConfiguration(trunk_contact=newtons, tilt=None))
+        done = [bool(idle(environment)[2].any()) for _ in range(4)]
+        assert any(done) == ends, newtons
+        weight = environment.backend.state.trunk_contact_force_w[:, 2]
+        assert ends or (weight > 100.0).all()
+        assert ("trunk_contact" in environment.program.terminations.names) == (newtons is not None)
 
 
 def test_impossible_joint_speed_counts_as_divergence():

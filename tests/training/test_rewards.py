@@ -6,14 +6,15 @@ from dataclasses import fields, replace
 import pytest
 import torch
 from gaitgauge.training.environment_configuration import Ramp, RewardConfiguration
-from gaitgauge.training.rewards import REWARD_TERMS, RewardFunction, RewardInputs
+from gaitgauge.training.rewards import REWARD_TERMS, RewardFunction
+from gaitgauge.training.step_inputs import StepInputs
 
 
 @pytest.fixture
 def quiet():
     """Two worlds in which nothing happens: every penalty is zero and tracking is perfect."""
     joints = torch.zeros(2, 12)
-    return RewardInputs(
+    return StepInputs(
         base_linear_velocity_b=torch.zeros(2, 3),
         base_angular_velocity_b=torch.zeros(2, 3),
         base_quaternion_w=torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
@@ -36,7 +37,17 @@ def quiet():
         foot_velocity_w=torch.zeros(2, 4, 3),
         touching_bodies=torch.zeros(2),
         base_touching=torch.zeros(2),
-        fallen=torch.zeros(2, dtype=torch.bool),
+        upright=torch.ones(2),
+        trunk_contact_force_w=torch.zeros(2, 3),
+        distance=torch.zeros(2),
+        leave_distance=torch.full((2,), math.inf),
+        episode_length=torch.ones(2, dtype=torch.int64),
+        max_episode_length=1250,
+        shortfall=torch.zeros(2),
+        diverged=torch.zeros(2, dtype=torch.bool),
+        progress=torch.tensor(0.5),
+        state=None,
+        failed=torch.zeros(2, dtype=torch.bool),
         base_height_target=0.38,
         foot_height_length=0.0095,
     )
@@ -123,7 +134,7 @@ CASES = {
     "roll": ({"base_quaternion_w": one_world([0.8, 0.6, 0.0, 0.0], 4)}, 0.96**2, 0.0),
     "torque_change": ({"joint_torque": joints(2.0, 1.0), "previous_joint_torque": joints(0.0, 4.0)}, 13.0, 0.0),
     "stand_still": ({"joint_position": joints(0.5, -0.25)}, 0.75, 0.0),
-    "termination": ({"fallen": torch.tensor([True, False])}, 1.0, 0.0),
+    "termination": ({"failed": torch.tensor([True, False])}, 1.0, 0.0),
 }
 
 
@@ -146,7 +157,7 @@ def test_stand_still_counts_under_the_zero_command_only(quiet):
 def test_weights_are_per_second_but_for_falls(quiet):
     settings = RewardConfiguration(termination=-5.0)
     rewards = RewardFunction(settings, 0.02, "cpu")
-    inputs = replace(quiet, fallen=torch.tensor([True, False]), base_height=torch.tensor([0.48, 0.38]))
+    inputs = replace(quiet, failed=torch.tensor([True, False]), base_height=torch.tensor([0.48, 0.38]))
     values = dict(zip(rewards.names, rewards(inputs, torch.tensor(0.0))[0].tolist(), strict=True))
     assert values["linear_tracking"] == pytest.approx(0.02)
     assert values["termination"] == pytest.approx(-5.0)
