@@ -6,10 +6,12 @@ A name may carry a variant after a colon (``newton:steel``); the variant is hand
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 
+from ..files.parsing import one_line, shown
+from ..files.plugins import guarded, load_plugin, origin, plugins
 from .base import BackendError, PhysicsBackend, Scene, Support
 
 GROUP = "gaitgauge.backends"
@@ -53,21 +55,20 @@ _ABOUT: dict[str, tuple[str, tuple[str, ...], str]] = {
 
 def backend_names() -> list[str]:
     """Names of all engines that can be asked for, the project's own first; ``fake`` is for tests and left out."""
-    plugins = sorted({e.name for e in entry_points(group=GROUP)} - set(_OWN))
-    return [n for n in _OWN if n != "fake"] + plugins
+    return [n for n in _OWN if n != "fake"] + sorted(set(plugins(GROUP)) - set(_OWN))
 
 
 def list_backends() -> list[BackendListing]:
     """What is known of each of ``backend_names()``, quickly: no engine is imported."""
-    plugins = {e.name: e for e in entry_points(group=GROUP)}
+    found = plugins(GROUP)
     listings = []
     for name in backend_names():
         if name in _ABOUT:
             device, packages, note = _ABOUT[name]
         else:
-            entry = plugins[name]
-            device, packages, note = "?", (entry.module.partition(".")[0],), f"plug-in, {entry.value}"
-        missing = tuple(p for p in packages if find_spec(p) is None)
+            value = one_line(found[name].value, 80)
+            device, packages, note = "?", (value.partition(":")[0].partition(".")[0],), f"plug-in, {value}"
+        missing = tuple(p for p in packages if not p.isidentifier() or find_spec(p) is None)
         listings.append(BackendListing(name=name, device=device, note=note, missing=missing))
     return listings
 
@@ -84,10 +85,16 @@ def backend_class(name: str) -> type[PhysicsBackend]:
             module, _, attribute = _OWN[engine].partition(":")
             found = getattr(import_module(module, __package__), attribute)
         else:
-            plugin = next((e for e in entry_points(group=GROUP) if e.name == engine), None)
+            plugin = plugins(GROUP).get(engine)
             if plugin is None:
-                raise BackendError(f"unknown backend '{name}'; choose one of: {', '.join(backend_names())}")
-            found = plugin.load()
+                known = ", ".join(backend_names())
+                raise BackendError(f"unknown backend '{one_line(name, 80)}'; choose one of: {known}")
+            found = load_plugin(plugin, BackendError)
+            if not (isinstance(found, type) and issubclass(found, PhysicsBackend)):
+                raise BackendError(
+                    f"{origin(plugin)} gave {shown(type(found).__name__)}; it must be a subclass of PhysicsBackend"
+                )
+            guarded(plugin, BackendError, found.capabilities)
     except ImportError as error:
         raise BackendError(
             f"backend '{name}' needs the package '{error.name}', which is not installed: pip install {error.name}"
@@ -113,7 +120,9 @@ def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int =
     Raises:
         BackendError: unknown engine, missing package, or something the engine cannot do.
     """
-    return _with_variant(name)(scene, device=device, threads=threads)
+    found, plugin = _with_variant(name), plugins(GROUP).get(name.partition(":")[0])
+    build = partial(found, scene, device=device, threads=threads)
+    return build() if plugin is None or name.partition(":")[0] in _OWN else guarded(plugin, BackendError, build)
 
 
 def _with_variant(name: str) -> type[PhysicsBackend]:

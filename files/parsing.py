@@ -7,6 +7,7 @@ ends in one sentence with the file, the path of the field, its value and what is
 from __future__ import annotations
 
 import json
+import re
 import reprlib
 import tomllib
 from collections.abc import Collection, Mapping
@@ -28,10 +29,15 @@ _DEEPEST, _MOST = 32, 100_000
 _SHOWN = 80
 """Characters of a value in a sentence."""
 
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$", max_length=100)]
+_NAME, _LINE = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$", r"^[^\x00-\x1f\x7f]*$"
+Name = Annotated[str, StringConstraints(pattern=_NAME, max_length=100)]
 """What may become the name of a file or folder."""
-Text = Annotated[str, StringConstraints(min_length=1, max_length=1000, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Text = Annotated[str, StringConstraints(min_length=1, max_length=1000, pattern=_LINE)]
 """One line for people, or a name inside another file."""
+_PATTERNS = {
+    _NAME: "it must be letters, digits and _ . + -, and begin with a letter, digit or _",
+    _LINE: "it must be one line without control characters",
+}
 Positive = Annotated[float, Field(gt=0.0, le=1e9)]
 NotNegative = Annotated[float, Field(ge=0.0, le=1e9)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -262,12 +268,11 @@ def _sentence(problem: ValidationError, kind: Any) -> str:
 
 def _rule(error: Mapping[str, Any]) -> str:
     """Pydantic's words as the end of a sentence."""
-    words = str(error["msg"]).replace("Input should", "it must").replace("a valid array", "a list")
-    words = (
-        words.replace("after validation, not", "and not")
-        .replace("an object", "a table")
-        .replace("Tuple should", "it must")
-    )
+    if error["type"] == "string_pattern_mismatch":
+        return _PATTERNS[error["ctx"]["pattern"]]
+    words = re.sub(r"^(Input|String|Tuple|Dictionary) should", "it must", str(error["msg"]))
+    words = words.replace("a valid array", "a list").replace("an object", "a table")
+    words = words.replace(" after validation, not", ", not")
     return words.partition(", unable to parse")[0].replace("a valid boolean", "true or false")
 
 

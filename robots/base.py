@@ -5,6 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from ..files.parsing import Name, NotNegative, Text
+
+_Angle = Annotated[float, Field(ge=-12.6, le=12.6)]
+_Speed = Annotated[float, Field(ge=0.0, le=100.0)]
+_PerJoint = Annotated[tuple[NotNegative, ...], Field(min_length=1)]
+_Names = Annotated[tuple[Text, ...], Field(min_length=1, max_length=1000)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,23 +26,23 @@ class JointParameters:
     in the direction of motion falls from ``driving_torque_limit`` at ``full_torque_speed`` to zero at ``no_load_speed``.
     """
 
-    stiffness: tuple[float, ...]
+    stiffness: _PerJoint
     """Proportional gain kp of the motor [N·m/rad]."""
-    damping: tuple[float, ...]
+    damping: _PerJoint
     """Derivative gain kd of the motor [N·m·s/rad]."""
-    torque_limit: tuple[float, ...]
+    torque_limit: _PerJoint
     """Largest motor torque [N·m]."""
-    armature: tuple[float, ...]
+    armature: _PerJoint
     """Rotor inertia seen at the joint [kg·m²]."""
-    joint_damping: tuple[float, ...]
+    joint_damping: _PerJoint
     """Passive viscous damping of the joint [N·m·s/rad]."""
-    friction_loss: tuple[float, ...]
+    friction_loss: _PerJoint
     """Dry friction of the joint [N·m]."""
-    driving_torque_limit: tuple[float, ...] | None = None
+    driving_torque_limit: _PerJoint | None = None
     """Largest motor torque in the direction of motion [N·m]; None where it is ``torque_limit``, as against it."""
-    full_torque_speed: tuple[float, ...] | None = None
+    full_torque_speed: _PerJoint | None = None
     """Joint speed up to which the driving torque is there [rad/s]; None where it is not known."""
-    no_load_speed: tuple[float, ...] | None = None
+    no_load_speed: _PerJoint | None = None
     """Joint speed from which the motor drives no more [rad/s]; None where it is not known."""
 
 
@@ -40,30 +50,30 @@ class JointParameters:
 class Robot:
     """A legged robot as data. Joint, foot and body orders given here hold in every room of the project."""
 
-    name: str
-    title: str
+    name: Name
+    title: Text
     """Name for people, for example ``Unitree Go2``."""
     mjcf: Path
     """MuJoCo model of the robot alone: one free base, hinge joints, no ground."""
-    joint_names: tuple[str, ...]
-    default_joint_position: tuple[float, ...]
+    joint_names: _Names
+    default_joint_position: tuple[_Angle, ...]
     """Standing pose [rad]."""
-    base_body: str
+    base_body: Text
     """Body that carries the free joint; its origin is the base position."""
-    foot_names: tuple[str, ...]
+    foot_names: _Names
     """Name of each foot; both the collision geom and the site at its centre bear it."""
-    collision_bodies: tuple[str, ...]
+    collision_bodies: _Names
     """Bodies whose contacts with the ground are reported one by one; their foot geoms are reported apart."""
-    trunk_shapes: tuple[str, ...]
+    trunk_shapes: _Names
     """Collision geoms of the base body that are its trunk, without head or sensors: what must not touch the ground."""
-    imu_site: str
-    stand_height: float
+    imu_site: Text
+    stand_height: Annotated[float, Field(gt=0.0, le=10.0)]
     """Height of the base above the ground at which an episode starts [m]."""
-    default_parameters: str
+    default_parameters: Text
     """Name of the parameter set used where none is asked for."""
-    parameters: Mapping[str, JointParameters]
+    parameters: Annotated[Mapping[Name, JointParameters], Field(min_length=1)]
     """Named parameter sets (``gauge``, ``training`` …)."""
-    command_limits: tuple[float, float, float]
+    command_limits: tuple[_Speed, _Speed, _Speed]
     """Largest commanded forward, lateral [m/s] and yaw [rad/s] speed that the robot is meant for."""
 
     @property

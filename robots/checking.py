@@ -6,41 +6,55 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from ..files.parsing import did_you_mean, one_line
 from .base import Robot
-from .loading import RobotError, did_you_mean
+from .loading import RobotError, robot_digest
 
 if TYPE_CHECKING:
     import mujoco
 
 _SITE_TOLERANCE = 1e-4
 """Largest distance between a foot's site and its geom's centre [m]."""
+_DEPTH_TOLERANCE = 1e-3
+"""Depth to which a robot that is put on the ground may reach into it [m]."""
+_GRAVITY = (0.0, 0.0, -9.81)
+_checked: set[str] = set()
+"""Digests of the robots that this process has found sound."""
 
 
 def check_robot(robot: Robot) -> None:
-    """Compile the robot's MuJoCo model and check that it has everything that the description names.
+    """Compile the robot's MuJoCo model and check that it has everything that the description names, and nothing that would
+    carry the robot.
 
-    That is: the free base, the joints with one motor each, the feet (a geom and a site at its centre), the collision
-    bodies, the trunk's shapes and the imu site; that the default pose is within the joint ranges; that no foot is in the ground at
-    ``stand_height``; that the model brings no ground of its own.
+    That is: the free base and nothing outside it; no welds, forces or options that spare it its weight; the joints with one
+    motor each; the feet (a geom and a site at its centre); the collision bodies and the trunk's shapes, which must meet the ground; the imu site;
+    that the default pose is within the joint ranges; that nothing is in the ground at ``stand_height``. A robot whose files
+    have not changed is checked once in a process.
 
     Raises:
         RobotError: the first disagreement found.
     """
+    digest = robot_digest(robot)
+    if digest in _checked:
+        return
     import mujoco
 
     try:
-        model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
-    except ValueError as error:
+        spec = mujoco.MjSpec.from_file(str(robot.mjcf))
+        model = spec.compile()
+    except (ValueError, RuntimeError, TypeError, MemoryError, OSError, mujoco.FatalError) as error:
         raise RobotError(
-            f"'{robot.mjcf}' is not a model that MuJoCo can compile: {' '.join(str(error).split())}"
+            f"'{one_line(robot.mjcf)}' is not a model that MuJoCo can compile: {one_line(error)}"
         ) from error
     check = _Check(robot, model)
     check.base()
+    check.weight()
     check.joints()
     check.motors()
     check.feet()
     check.bodies_and_sites()
-    check.standing_pose()
+    check.standing_pose(spec)
+    _checked.add(digest)
 
 
 class _Check:
@@ -54,7 +68,7 @@ class _Check:
         self.model = model
 
     def error(self, problem: str) -> RobotError:
-        return RobotError(f"robot '{self.robot.name}': {problem}")
+        return RobotError(f"robot '{self.robot.name}': {one_line(problem, 400)}")
 
     def require(self, names: Iterable[str], key: str, kind: str) -> list[int]:
         """Ids of named model objects (``joint``, ``body``, ``geom``, ``site``); those of ``key`` must all exist."""
@@ -82,8 +96,45 @@ class _Check:
         free = [j for j in range(model.njnt) if model.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_FREE]
         if [model.jnt_bodyid[j] for j in free] != [base]:
             raise self.error(f"{robot.mjcf.name} must have one free joint, on the base_body '{robot.base_body}'")
-        if any(model.geom_bodyid == 0):
-            raise self.error(f"{robot.mjcf.name} has geoms in its worldbody; it must hold the robot alone")
+        if any(model.geom_bodyid == 0) or any(model.site_bodyid == 0):
+            raise self.error(f"{robot.mjcf.name} has geoms or sites in its worldbody; it must hold the robot alone")
+        outside = [i for i in range(1, model.nbody) if model.body_rootid[i] != base]
+        if outside:
+            name = self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_BODY, outside[0]) or f"body {outside[0]}"
+            raise self.error(
+                f"{robot.mjcf.name} has the body '{name}' outside '{robot.base_body}'; it must hold the robot alone"
+            )
+
+    def weight(self) -> None:
+        """Nothing but the ground may carry the robot."""
+        model, option, file = self.model, self.model.opt, self.robot.mjcf.name
+        free = slice(0, 6)  # the base's joint comes first: it is the root of the only tree
+        passive = model.dof_damping[free].any() or model.dof_frictionloss[free].any() or model.dof_armature[free].any()
+        held = (int(self.mujoco.mjtEq.mjEQ_WELD), int(self.mujoco.mjtEq.mjEQ_CONNECT))
+        by_world = [
+            e
+            for e in range(model.neq)
+            if int(model.eq_type[e]) in held
+            and 0 in (self._body_of(e, model.eq_obj1id[e]), self._body_of(e, model.eq_obj2id[e]))
+        ]
+        rules = {
+            "ties the robot to the world with an equality": not by_world,
+            "has damping, friction or armature on the base's free joint": not passive and not model.jnt_stiffness[0],
+            f"has a gravity of {option.gravity.tolist()}, not {list(_GRAVITY)}": tuple(option.gravity) == _GRAVITY,
+            "has gravity compensation (gravcomp)": not model.body_gravcomp.any(),
+            "has a medium or wind": not (option.density or option.viscosity or option.wind.any()),
+            "disables or overrides parts of the physics (option flag)": not option.disableflags
+            and not option.enableflags & self.mujoco.mjtEnableBit.mjENBL_OVERRIDE,
+            "uses engine plug-ins": model.nplugin == 0,
+        }
+        for problem, kept in rules.items():
+            if not kept:
+                raise self.error(f"{file} {problem}; take that out")
+
+    def _body_of(self, equality: int, thing: int) -> int:
+        """The body at one end of an equality; 0 is the world."""
+        site = int(self.model.eq_objtype[equality]) == int(self.mujoco.mjtObj.mjOBJ_SITE)
+        return int(self.model.site_bodyid[thing]) if site else int(thing)
 
     def joints(self) -> None:
         model, robot = self.model, self.robot
@@ -129,35 +180,54 @@ class _Check:
             apart = math.dist(model.geom_pos[geom], model.site_pos[site])
             if model.geom_bodyid[geom] != model.site_bodyid[site] or apart > _SITE_TOLERANCE:
                 raise self.error(f"the site '{name}' must be at the centre of the foot geom '{name}', on the same body")
-            if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
-                raise self.error(f"the foot geom '{name}' collides with nothing; give it contype or conaffinity 1")
+            if not self.solid(geom):
+                raise self.error(f"the foot geom '{name}' does not meet the ground; give it contype or conaffinity 1")
+
+    def solid(self, geom: int) -> bool:
+        """Whether a geom meets the ground, whose contype and conaffinity are 1."""
+        return bool((self.model.geom_contype[geom] | self.model.geom_conaffinity[geom]) & 1)
 
     def bodies_and_sites(self) -> None:
         (base,) = self.require([self.robot.base_body], "base_body", "body")
-        self.require(self.robot.collision_bodies, "collision_bodies", "body")
+        model = self.model
+        bodies = self.require(self.robot.collision_bodies, "collision_bodies", "body")
+        for name, body in zip(self.robot.collision_bodies, bodies, strict=True):
+            first = model.body_geomadr[body]
+            if not any(self.solid(g) for g in range(first, first + model.body_geomnum[body])):
+                raise self.error(
+                    f"no geom of the body '{name}' (collision_bodies) meets the ground; give one contype 1"
+                )
         shapes = self.require(self.robot.trunk_shapes, "trunk_shapes", "geom")
         for name, geom in zip(self.robot.trunk_shapes, shapes, strict=True):
-            if self.model.geom_bodyid[geom] != base:
+            if model.geom_bodyid[geom] != base:
                 raise self.error(f"trunk_shapes names '{name}', which is not on the base_body '{self.robot.base_body}'")
-            if not (self.model.geom_contype[geom] or self.model.geom_conaffinity[geom]):
-                raise self.error(f"the trunk shape '{name}' collides with nothing; give it contype or conaffinity 1")
+            if not self.solid(geom):
+                raise self.error(f"the trunk shape '{name}' does not meet the ground; give it contype or conaffinity 1")
         (imu,) = self.require([self.robot.imu_site], "imu_site", "site")
         if self.model.site_bodyid[imu] != base:
             raise self.error(f"imu_site '{self.robot.imu_site}' must be on the base_body '{self.robot.base_body}'")
 
-    def standing_pose(self) -> None:
-        model, robot = self.model, self.robot
+    def standing_pose(self, spec: mujoco.MjSpec) -> None:
+        """Put the robot on a floor at ``stand_height``: nothing may be in it."""
+        robot, height = self.robot, self.robot.stand_height
+        spec.worldbody.add_geom(
+            type=self.mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1, margin=0.0
+        )
+        model = spec.compile()
         data = self.mujoco.MjData(model)
-        joints = self.require(robot.joint_names, "joint_names", "joint")
+        data.qpos[:7] = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
+        joints = [self.mujoco.mj_name2id(model, self.mujoco.mjtObj.mjOBJ_JOINT, n) for n in robot.joint_names]
         data.qpos[model.jnt_qposadr[joints]] = robot.default_joint_position
-        self.mujoco.mj_kinematics(model, data)
-        (base,) = self.require([robot.base_body], "base_body", "body")
-        for name, geom in zip(robot.foot_names, self.require(robot.foot_names, "foot_names", "geom"), strict=True):
-            # Of feet that are no balls only the centre is checked: their lowest point depends on the shape.
-            is_ball = model.geom_type[geom] == self.mujoco.mjtGeom.mjGEOM_SPHERE
-            reach = data.xpos[base][2] - data.geom_xpos[geom][2] + (model.geom_size[geom][0] if is_ball else 0.0)
-            if reach > robot.stand_height:
-                raise self.error(
-                    f"at stand_height {robot.stand_height:g} m the foot '{name}' is {reach - robot.stand_height:.3f} m "
-                    f"below the ground; raise it to {reach:.3f} m or more"
-                )
+        self.mujoco.mj_fwdPosition(model, data)
+        contacts = [data.contact[i] for i in range(data.ncon) if 0 in model.geom_bodyid[data.contact[i].geom]]
+        deepest = min(contacts, key=lambda c: c.dist, default=None)
+        if deepest is not None and deepest.dist < -_DEPTH_TOLERANCE:
+            geom = next(int(g) for g in deepest.geom if model.geom_bodyid[g] != 0)
+            part, kind = self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_GEOM, geom), "geom"
+            if part is None:
+                body = int(model.geom_bodyid[geom])
+                part, kind = self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_BODY, body) or str(body), "body"
+            raise self.error(
+                f"at stand_height {height:g} m the {kind} '{part}' is {-deepest.dist:.3f} m below the ground; "
+                f"raise it to {height - deepest.dist:.3f} m or more"
+            )

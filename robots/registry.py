@@ -7,11 +7,13 @@ name.
 from __future__ import annotations
 
 import os
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
+from ..files.parsing import one_line, shown
+from ..files.plugins import guarded, load_plugin, origin, plugins
 from .base import Robot
-from .loading import ROBOT_FILE, RobotError, did_you_mean, load_robot_file
+from .checking import check_robot
+from .loading import ROBOT_FILE, RobotError, checked_fields, did_you_mean, load_robot_file
 
 GROUP = "gaitgauge.robots"
 _OWN_FOLDER = Path(__file__).parent
@@ -20,55 +22,55 @@ _OWN_FOLDER = Path(__file__).parent
 def robot_names() -> list[str]:
     """Names of all installed robots, the project's own first."""
     own = _own()
-    return [*own, *sorted(set(_plugins()) - set(own))]
+    return [*own, *sorted(set(plugins(GROUP)) - set(own))]
 
 
-def load_robot(name_or_path: str | Path) -> Robot:
+def load_robot(name_or_path: str | Path, *, check: bool = True) -> Robot:
     """Load a robot.
 
     Args:
         name_or_path: a name out of ``robot_names()``, the path of a ``robot.toml``, or a folder that holds one. A text
             is a path if it contains a path separator or ends in ``.toml``, else a name.
+        check: compare it with its MuJoCo model (``check_robot``), which takes MuJoCo.
 
     Raises:
-        RobotError: there is no such robot, its description is wrong, or a plug-in's entry point does not give a robot.
+        RobotError: there is no such robot, its description is wrong or does not fit its model, or a plug-in's entry point
+            does not give a robot.
     """
+    robot = _load(name_or_path)
+    if check:
+        check_robot(robot)
+    return robot
+
+
+def _load(name_or_path: str | Path) -> Robot:
     text = os.fspath(name_or_path)
     if isinstance(name_or_path, Path) or "/" in text or os.sep in text or text.endswith(".toml"):
         return load_robot_file(text)
     own = _own()
     if text in own:
         return load_robot_file(own[text])
-    plugin = _plugins().get(text)
+    plugin = plugins(GROUP).get(text)
     if plugin is None:
         known = robot_names()
         hint = did_you_mean(text, known)
         raise RobotError(
-            f"unknown robot '{text}'{hint} (installed: {', '.join(known)}; or give the path of a {ROBOT_FILE})"
+            f"unknown robot '{one_line(text, 80)}'{hint} (installed: {', '.join(known)}; or give the path of a {ROBOT_FILE})"
         )
-    return _from_plugin(plugin)
+    found = load_plugin(plugin, RobotError)
+    if callable(found):
+        found = guarded(plugin, RobotError, found)
+    if isinstance(found, str | Path):
+        found = load_robot_file(found)
+    source = origin(plugin)
+    if not isinstance(found, Robot):
+        raise RobotError(f"{source} gave {type(found).__name__}; it must be a path or a callable that returns a Robot")
+    if found.name != plugin.name:
+        raise RobotError(
+            f"{source} gave a robot named {shown(found.name)}; entry point and robot must bear the same name"
+        )
+    return checked_fields(found, source)
 
 
 def _own() -> dict[str, Path]:
     return {file.parent.name: file for file in sorted(_OWN_FOLDER.glob(f"*/{ROBOT_FILE}"))}
-
-
-def _plugins() -> dict[str, EntryPoint]:
-    return {e.name: e for e in entry_points(group=GROUP)}
-
-
-def _from_plugin(plugin: EntryPoint) -> Robot:
-    source = f"entry point '{plugin.name} = {plugin.value}' of the group {GROUP}"
-    try:
-        found = plugin.load()
-    except (ImportError, AttributeError) as error:
-        raise RobotError(f"{source} cannot be loaded: {error}") from error
-    if callable(found):
-        found = found()
-    if isinstance(found, str | Path):
-        found = load_robot_file(found)
-    if not isinstance(found, Robot):
-        raise RobotError(f"{source} gave {type(found).__name__}; it must be a path or a callable that returns a Robot")
-    if found.name != plugin.name:
-        raise RobotError(f"{source} gave a robot named '{found.name}'; entry point and robot must bear the same name")
-    return found

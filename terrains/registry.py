@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from difflib import get_close_matches
 from functools import partial
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 
+from ..files.parsing import one_line
+from ..files.plugins import guarded, load_plugin, origin, plugins
 from .base import Terrain
 from .gauge_terrains import LEVELS, flat, obstacle, slope, stairs, wave
 
@@ -39,7 +41,7 @@ def gauge_terrain_names() -> list[str]:
 def terrain_names() -> list[str]:
     """Names of all terrains that can be asked for: the gauge's own first, then installed plug-ins."""
     own = gauge_terrain_names()
-    return own + sorted(set(_plugins()) - set(own))
+    return own + sorted(set(plugins(GROUP)) - set(own))
 
 
 def make_terrain(name: str, level: int | None = None) -> Terrain:
@@ -65,7 +67,7 @@ def make_terrain(name: str, level: int | None = None) -> Terrain:
         if level not in LEVELS:
             raise TerrainError(f"terrain '{name}' has levels {LEVELS[0]} to {LEVELS[-1]}, not {level}")
         return _LEVELLED[name](level)
-    plugin = _plugins().get(name)
+    plugin = plugins(GROUP).get(name)
     if plugin is None:
         close = get_close_matches(name, terrain_names(), n=3)
         hint = (
@@ -73,25 +75,12 @@ def make_terrain(name: str, level: int | None = None) -> Terrain:
             if close
             else f"choose one of: {', '.join(terrain_names())}"
         )
-        raise TerrainError(f"unknown terrain '{name}'; {hint}")
+        raise TerrainError(f"unknown terrain '{one_line(name, 80)}'; {hint}")
     return _from_plugin(plugin, 0 if level is None else level)
 
 
-def _plugins() -> dict[str, EntryPoint]:
-    return {plugin.name: plugin for plugin in entry_points(group=GROUP)}
-
-
 def _from_plugin(plugin: EntryPoint, level: int) -> Terrain:
-    try:
-        build = plugin.load()
-    except (ImportError, AttributeError) as error:
-        raise TerrainError(
-            f"terrain '{plugin.name}' comes from '{plugin.value}', which cannot be loaded: {error}"
-        ) from error
-    terrain = build(level)
+    terrain = guarded(plugin, TerrainError, load_plugin(plugin, TerrainError), level)
     if not isinstance(terrain, Terrain):
-        kind = type(terrain).__name__
-        raise TerrainError(
-            f"terrain '{plugin.name}' comes from '{plugin.value}', which must return a Terrain, not {kind}"
-        )
+        raise TerrainError(f"{origin(plugin)} must return a Terrain, not {type(terrain).__name__}")
     return terrain

@@ -7,8 +7,8 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+from gaitgauge.files import plugins as plugins_module
 from gaitgauge.robots import JointParameters, Robot, RobotError, check_robot, load_robot, robot_names
-from gaitgauge.robots import registry as registry_module
 
 LEGS = ("FL", "FR", "RL", "RR")
 
@@ -155,15 +155,19 @@ def test_longest_key_wins(write_hopper):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('title = "One leg"\n', "", "missing key title"),
-        ('title = "One leg"\n', 'titel = "One leg"\n', "titel is an unknown key; did you mean 'title'?"),
-        ('trunk_shapes = ["chest"]\n', "", "missing key trunk_shapes"),
-        ("armature = 0.01\n", "", "missing key parameters.soft.armature"),
-        ("armature = 0.01", "amature = 0.01", "parameters.soft.amature is an unknown key; did you mean 'armature'?"),
-        ("armature = 0.01", "armature = true", "parameters.soft.armature holds True"),
-        ("armature = 0.01", "armature = nan", "parameters.soft.armature holds nan"),
-        ("armature = 0.01", 'armature = "0.01"', "parameters.soft.armature holds '0.01'"),
-        ("armature = 0.01", "armature = -0.01", "parameters.soft.armature is -0.01 for hip but must not be negative"),
+        ('title = "One leg"\n', "", "it lacks title"),
+        ('title = "One leg"\n', 'titel = "One leg"\n', "unknown field 'titel'; did you mean 'title'?"),
+        ('trunk_shapes = ["chest"]\n', "", "it lacks trunk_shapes"),
+        ("armature = 0.01\n", "", "parameters.soft lacks armature"),
+        ("armature = 0.01", "amature = 0.01", "unknown field 'parameters.soft.amature'; did you mean 'armature'?"),
+        ("armature = 0.01", "armature = true", "parameters.soft.armature[0] is True; it must be a valid number"),
+        ("armature = 0.01", "armature = nan", "parameters.soft.armature[0] is nan; it must be a finite number"),
+        ("armature = 0.01", 'armature = "0.01"', "parameters.soft.armature[0] is '0.01'; it must be a valid number"),
+        (
+            "armature = 0.01",
+            "armature = -0.01",
+            "parameters.soft.armature[0] is -0.01; it must be greater than or equal to 0",
+        ),
         ("[40, 50]", "[40, 50, 60]", "parameters.soft.torque_limit has 3 values but there are 2 joints"),
         (
             "armature = 0.01",
@@ -184,14 +188,24 @@ def test_longest_key_wins(write_hopper):
         ("knee = 2.0", "left_kne = 2.0", "did you mean 'left_knee'?"),
         (", knee = 2.0", "", "no value for the joint 'left_knee_joint'"),
         ("[0.3, -0.6]", "[0.3]", "default_joint_position has 1 values but there are 2 joints"),
-        ('"hip", "left_knee_joint"', '"hip", "hip"', "joint_names names 'hip' twice"),
-        ('["foot"]', "[]", "foot_names must be a list of one or more names"),
-        ('"trunk"\nfoot', "3\nfoot", "base_body is 3 but must be a text"),
-        ("stand_height = 0.5", "stand_height = 0", "stand_height is 0 but must be above 0"),
-        ("[0.5, 0, 1]", "[0.5, 1]", "command_limits must be three numbers"),
-        ("[0.5, 0, 1]", "[0.5, -1, 1]", "command_limits is [0.5, -1, 1] but its entries must not be negative"),
-        ('= "soft"', '= "hard"', "default_parameters is 'hard' but the parameter sets are: soft"),
+        ('"hip", "left_knee_joint"', '"hip", "hip"', "joint_names must hold names, each once"),
+        ('["foot"]', "[]", "foot_names is []; it must have at least 1 item"),
+        ('"trunk"\nfoot', "3\nfoot", "base_body is 3; it must be a valid string"),
+        ("stand_height = 0.5", "stand_height = 0", "stand_height is 0; it must be greater than 0"),
+        ("[0.5, 0, 1]", "[0.5, 1]", "command_limits is [0.5, 1]; more entries are needed"),
+        ("[0.5, 0, 1]", "[0.5, -1, 1]", "command_limits[1] is -1; it must be greater than or equal to 0"),
+        ('= "soft"', '= "hard"', "default_parameters is 'hard'; the parameter sets are: soft"),
         ("model/hopper.xml", "hopper.xml", "which does not exist; the path is relative to the robot file"),
+        ("stand_height = 0.5", "stand_height = inf", "stand_height is inf; it must be a finite number"),
+        (
+            "stand_height = 0.5",
+            "stand_height = 1e9",
+            "stand_height is 1000000000.0; it must be less than or equal to 10",
+        ),
+        ("[0.3, -0.6]", "[0.3, 99]", "default_joint_position[1] is 99; it must be less than or equal to 12.6"),
+        ('name = "hopper"', 'name = "../hopper"', "name is '../hopper'; it must be letters, digits and"),
+        ('name = "hopper"', f'name = "{"x" * 300}"', "it must have at most 100 characters"),
+        ('"trunk", "upper"', '"trunk", "trunk"', "collision_bodies names 'trunk' twice"),
         ("stand_height = 0.5", "stand_height = ", "is not valid TOML"),
     ],
 )
@@ -229,12 +243,16 @@ def test_unknown_name_offers_close_ones():
         ([('"imu"', '"foot"')], ("", ""), "imu_site 'foot' must be on the base_body 'trunk'"),
         ([('"chest"', '"cheat"')], ("", ""), "trunk_shapes names 'cheat' but hopper.xml has no geom of that name; did"),
         ([('"chest"', '"foot"')], ("", ""), "trunk_shapes names 'foot', which is not on the base_body 'trunk'"),
-        ([], ('name="chest"', 'name="chest" contype="0" conaffinity="0"'), "the trunk shape 'chest' collides with"),
+        (
+            [],
+            ('name="chest" type', 'size="0.1" mass="1"/><geom name="chest" contype="0" conaffinity="0" type'),
+            "the trunk shape 'chest' does not meet the ground",
+        ),
         ([("[0.3, -0.6]", "[0.3, 0.6]")], ("", ""), "'left_knee_joint' is 0.6 rad, outside its range -2 to 0 rad"),
-        ([("stand_height = 0.5", "stand_height = 0.4")], ("", ""), "the foot 'foot' is 0.052 m below the ground"),
+        ([("stand_height = 0.5", "stand_height = 0.4")], ("", ""), "the geom 'foot' is 0.052 m below the ground"),
         ([], ('<site name="foot" pos="0 0 -0.2"/>', ""), "foot_names names 'foot' but hopper.xml has no site"),
         ([], ('<site name="foot" pos="0 0 -0.2"/>', '<site name="foot"/>'), "must be at the centre of the foot geom"),
-        ([], ('size="0.02" pos', 'size="0.02" contype="0" conaffinity="0" pos'), "collides with nothing"),
+        ([], ('size="0.02" pos', 'size="0.02" contype="0" conaffinity="0" pos'), "does not meet the ground"),
         ([], ('<position joint="hip"/>', ""), "has 0 actuators on 'hip'; it must have one"),
         ([], ('<position joint="hip"/>', '<position joint="hip"/>' * 2), "has 2 actuators on 'hip'; it must have one"),
         ([], ("<worldbody>", '<worldbody><geom type="plane" size="1 1 1"/>'), "must hold the robot alone"),
@@ -245,12 +263,29 @@ def test_unknown_name_offers_close_ones():
         ),
         ([], ('<joint name="hip"', '<joint name="hip" type="slide"'), "'hip', which is not a hinge"),
         ([], ('type="box"', 'type="bix"'), "is not a model that MuJoCo can compile"),
+        ([], ("</mujoco>", "<equality><weld body1='trunk'/></equality></mujoco>"), "ties the robot to the world"),
+        ([], ("</mujoco>", "<equality><connect body1='lower' anchor='0 0 0'/></equality></mujoco>"), "ties the robot"),
+        ([], ("<worldbody>", "<option gravity='0 0 -1'/><worldbody>"), "has a gravity of [0.0, 0.0, -1.0]"),
+        ([], ("<worldbody>", "<option><flag contact='disable'/></option><worldbody>"), "disables or overrides"),
+        ([], ("<worldbody>", "<option density='1000'/><worldbody>"), "has a medium or wind"),
+        ([], ("<worldbody>", "<worldbody><body name='crane'/>"), "has the body 'crane' outside 'trunk'"),
+        ([], ("<worldbody>", "<worldbody><site name='hook'/>"), "has geoms or sites in its worldbody"),
+        ([], ('<body name="trunk">', '<body name="trunk" gravcomp="1">'), "has gravity compensation"),
+        ([], ("<freejoint/>", "<joint type='free' damping='100'/>"), "on the base's free joint"),
+        ([], ('size="0.02" mass', 'contype="2" conaffinity="2" size="0.02" mass'), "no geom of the body 'upper'"),
+        (
+            [],
+            ('<geom name="chest"', '<geom pos="0 0 -0.6" name="chest"'),
+            "the geom 'chest' is 0.150 m below the ground",
+        ),
+        ([("stand_height = 0.5", "stand_height = 0.436")], ("", ""), "the geom 'foot' is 0.016 m below the ground"),
     ],
 )
 def test_description_that_the_model_contradicts(write_hopper, changes, mjcf, message):
-    robot = load_robot(write_hopper(*changes, mjcf=mjcf))
+    path = write_hopper(*changes, mjcf=mjcf)
+    load_robot(path, check=False)
     with pytest.raises(RobotError) as caught:
-        check_robot(robot)
+        load_robot(path)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -267,6 +302,18 @@ def plugin_nonsense() -> int:
     return 3
 
 
+def plugin_that_exits() -> Robot:
+    raise SystemExit(3)
+
+
+def plugin_that_raises() -> Robot:
+    raise KeyError("x")
+
+
+def plugin_out_of_range() -> Robot:
+    return replace(GO2, name="plugged", stand_height=-1)
+
+
 @pytest.fixture
 def install_plugin(monkeypatch):
     """Pretends that a package with one entry point is installed."""
@@ -274,7 +321,7 @@ def install_plugin(monkeypatch):
     def install(name: str, value: str) -> None:
         monkeypatch.setitem(sys.modules, "robot_plugin", sys.modules[__name__])
         found = [EntryPoint(name=name, value=value, group="gaitgauge.robots")]
-        monkeypatch.setattr(registry_module, "entry_points", lambda group: [e for e in found if e.group == group])
+        monkeypatch.setattr(plugins_module, "entry_points", lambda group: [e for e in found if e.group == group])
 
     return install
 
@@ -300,8 +347,16 @@ def test_plugin_does_not_replace_an_own_robot(install_plugin):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("plugged", "no_such_module_anywhere:robot", "cannot be loaded: No module named 'no_such_module_anywhere'"),
-        ("plugged", "robot_plugin:no_such_attribute", "cannot be loaded"),
+        (
+            "plugged",
+            "no_such_module_anywhere:robot",
+            "failed: ModuleNotFoundError: No module named 'no_such_module_anywhere'",
+        ),
+        ("plugged", "robot_plugin:no_such_attribute", "failed: AttributeError"),
+        ("plugged", "robot_plugin:plugin_that_exits", "failed: SystemExit: 3; mend or uninstall it"),
+        ("plugged", "robot_plugin:plugin_that_raises", "failed: KeyError: 'x'"),
+        ("plugged", "robot_plugin:plugin_out_of_range", "stand_height is -1; it must be greater than 0"),
+        ("plugged", "not an entry point", "failed: AttributeError"),
         ("plugged", "robot_plugin:plugin_nonsense", "gave int; it must be a path or a callable"),
         (
             "other",
@@ -320,7 +375,7 @@ def test_broken_plugin(install_plugin, name, value, message):
 def test_listing_and_loading_import_no_engine():
     code = (
         "import sys; from gaitgauge.robots import load_robot, robot_names\n"
-        "[load_robot(n) for n in robot_names()]\n"
+        "[load_robot(n, check=False) for n in robot_names()]\n"
         "print(sorted({'mujoco', 'torch', 'warp', 'numpy'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -4,12 +4,13 @@ import subprocess
 import sys
 
 import pytest
-from gaitgauge.terrains import Terrain, TerrainError, gauge_terrain_names, make_terrain, registry, terrain_names
+from gaitgauge.files import plugins as plugins_module
+from gaitgauge.terrains import Terrain, TerrainError, gauge_terrain_names, make_terrain, terrain_names
 
 
 class FakeEntryPoint:
     def __init__(self, name, loaded):
-        self.name, self.value, self._loaded = name, f"somewhere:{name}", loaded
+        self.name, self.value, self.dist, self._loaded = name, f"somewhere:{name}", None, loaded
 
     def load(self):
         if isinstance(self._loaded, Exception):
@@ -20,7 +21,7 @@ class FakeEntryPoint:
 @pytest.fixture
 def plugins(monkeypatch):
     found = []
-    monkeypatch.setattr(registry, "entry_points", lambda group: found if group == "gaitgauge.terrains" else [])
+    monkeypatch.setattr(plugins_module, "entry_points", lambda group: found if group == "gaitgauge.terrains" else [])
     return found
 
 
@@ -68,16 +69,26 @@ def test_plugin_terrain(plugins):
 
 
 def test_broken_plugins_are_reported(plugins):
+    def raises(level):
+        raise KeyError("level")
+
     plugins += [
         FakeEntryPoint("missing", ImportError("no module 'gone'")),
         FakeEntryPoint("wrong", lambda level: level),
+        FakeEntryPoint("raises", raises),
+        FakeEntryPoint("exits", sys.exit),
+        FakeEntryPoint("number", 3),
     ]
-    with pytest.raises(
-        TerrainError, match="'missing' comes from 'somewhere:missing', which cannot be loaded: no module 'gone'"
+    assert terrain_names()[-1] == "wrong"
+    for name, message in (
+        ("missing", r"plug-in 'missing' \(somewhere:missing\) failed: ImportError: no module 'gone'"),
+        ("wrong", "must return a Terrain, not int"),
+        ("raises", "failed: KeyError: 'level'; mend or uninstall it"),
+        ("exits", "failed: SystemExit: 1"),
+        ("number", "failed: TypeError"),
     ):
-        make_terrain("missing", 1)
-    with pytest.raises(TerrainError, match="must return a Terrain, not int"):
-        make_terrain("wrong", 1)
+        with pytest.raises(TerrainError, match=message):
+            make_terrain(name, 1)
 
 
 def test_the_room_needs_no_engine():

@@ -1,0 +1,46 @@
+"""Installed plug-ins: somebody else's code, which may do anything when it is loaded, and must then break nothing but itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
+
+from .parsing import one_line, shown
+
+Kind = TypeVar("Kind")
+
+
+def plugins(group: str) -> dict[str, EntryPoint]:
+    """Installed entry points of a group by name."""
+    return {entry.name: entry for entry in entry_points(group=group)}
+
+
+def load_plugin(entry: EntryPoint, error: type[Exception]) -> Any:
+    """What an entry point refers to.
+
+    Raises:
+        error: it cannot be loaded; the sentence names it.
+    """
+    return guarded(entry, error, entry.load)
+
+
+def guarded(entry: EntryPoint, error: type[Exception], call: Callable[..., Kind], *arguments: Any) -> Kind:
+    """Call a plug-in's code. Whatever it raises, and its wish to end the program, becomes one sentence.
+
+    Raises:
+        error: anything went wrong; the sentence names the entry point.
+    """
+    try:
+        return call(*arguments)
+    except error:
+        raise
+    except (Exception, SystemExit) as problem:
+        reason = f"{type(problem).__name__}: {one_line(problem)}".rstrip(": ")
+        raise error(f"{origin(entry)} failed: {reason}; mend or uninstall it") from problem
+
+
+def origin(entry: EntryPoint) -> str:
+    """How a sentence names a plug-in."""
+    package = f" of {entry.dist.name}" if entry.dist else ""
+    return f"plug-in {shown(entry.name)} ({one_line(entry.value, 80)}{package})"
