@@ -156,8 +156,9 @@ def modules(network) -> dict[str, nn.Module]:
     }
 
 
-BATCHED = ("history", "in place", "nested", "recurrent", "plain")
-COPIED = ("normalized", "fixed", "counting")
+REBUILT = ("history", "in place", "nested", "plain", "normalized", "fixed")
+BATCHED = (*REBUILT, "recurrent")
+COPIED = ("counting",)
 
 
 @pytest.mark.parametrize("name", BATCHED + COPIED)
@@ -167,6 +168,7 @@ def test_batch_equals_single_modules(tmp_path, cts_network, observations, name, 
     policy = load_policy(path)
     session = policy.session(EPISODES)
     assert policy.batched == session.batched == (name in BATCHED)
+    assert (policy.program is not None) == (name in REBUILT)
     actions = run(session, observations)
     with warnings.catch_warnings(), torch.no_grad(), torch.jit.optimized_execution(False):
         warnings.simplefilter("ignore", DeprecationWarning)
