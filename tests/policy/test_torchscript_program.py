@@ -3,6 +3,7 @@
 import io
 import warnings
 import zipfile
+from itertools import pairwise
 
 import pytest
 import torch
@@ -23,7 +24,7 @@ def script(module: nn.Module) -> bytes:
 
 def layers(*widths: int, last: nn.Module | None = None) -> nn.Sequential:
     made: list[nn.Module] = []
-    for a, b in zip(widths, widths[1:], strict=False):
+    for a, b in pairwise(widths):
         made += [nn.Linear(a, b), nn.ELU()]
     return nn.Sequential(*made[:-1], *([last] if last else []))
 
@@ -94,9 +95,7 @@ class ListOfExperts(Published):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         history = self.remember(x)
-        outputs = []
-        for expert in self.experts:
-            outputs.append(expert(history))
+        outputs = [expert(history) for expert in self.experts]
         latent = torch.sum(self.gate(history).unsqueeze(-1) * torch.stack(outputs, dim=1), dim=1)
         return self.actor(torch.cat([latent / latent.norm(2, dim=-1, keepdim=True), x], dim=1))
 
