@@ -94,7 +94,7 @@ class ObservationTerm:
 @dataclass(frozen=True, kw_only=True)
 class History:
     """Past observations that the network expects in its input. A network that keeps its own history has length 1
-    here.
+    here; ``start`` holds for its history too.
     """
 
     length: int = 1
@@ -104,7 +104,8 @@ class History:
     frames of the first term, oldest first, then the next term.
     """
     start: str = "zeros"
-    """What fills the frames before the first one: ``zeros``, or ``repeat`` for copies of the first frame."""
+    """What fills the frames before the first one: ``zeros``, as in the published training, or ``repeat`` for copies of
+    the first frame, as the robot's own controller does it."""
 
     def __post_init__(self) -> None:
         if isinstance(self.length, bool) or not isinstance(self.length, int) or self.length < 1:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import os
 import warnings
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from torch.nn import functional
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, SDK_JOINTS, SDK_LEGS, deploy_contract, matching_joint
 from .base import Policy, PolicyError
-from .contract import TERM_WIDTH, History, PolicyContract, difference
+from .contract import TERM_WIDTH, PolicyContract, difference
 from .loading import load_policy
 from .native import NativePolicy
 from .networks import CtsNetwork, MlpNetwork, MoeCtsNetwork
@@ -70,19 +71,24 @@ class _LatentOutput(nn.Module):
 
 
 class _WithMemory(nn.Module):
-    """Keeps the history of one robot, zero at the start, in a tensor that ``forward`` changes."""
+    """Keeps the history of one robot in a tensor that ``forward`` changes. At the start its frames are zero, or NaN where
+    the first observation is to take their place.
+    """
 
-    def __init__(self, traced: nn.Module, history: torch.Tensor) -> None:
+    def __init__(self, traced: nn.Module, start: torch.Tensor) -> None:
         super().__init__()
         self.network = traced
-        self.history = history.clone()
+        self.history = start.clone()
+        self.unseen: float = float(start[0, 0, 0])
 
     @torch.jit.export
     def reset(self) -> None:
-        self.history = torch.zeros_like(self.history)
+        self.history = torch.full_like(self.history, self.unseen)
 
     def remember(self, observation: torch.Tensor) -> torch.Tensor:
-        self.history = torch.cat((self.history[:, 1:], observation.unsqueeze(1)), dim=1)
+        newest = observation.unsqueeze(1)
+        history = torch.cat((self.history[:, 1:], newest), dim=1)
+        self.history = torch.where(torch.isnan(history), newest, history)
         return self.history
 
 
@@ -164,13 +170,14 @@ def export_torchscript(policy: Policy, path: str | Path) -> float:
     network = _network(policy)
     contract = policy.contract
     history = torch.zeros(1, int(network.history_length), int(network.frame_width))  # type: ignore[arg-type]
+    start = torch.full_like(history, math.nan) if contract.history.start == "repeat" else history
     core = network if isinstance(network, MlpNetwork) else _LatentOutput(network)
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # torch announces TorchScript's retirement; the published evaluation and many deployments read nothing else.
         warnings.simplefilter("ignore", DeprecationWarning)
         traced = torch.jit.trace(core.eval(), history, check_trace=False)
-        script = torch.jit.script(_SCRIPTS[type(network)](traced, history).eval())
+        script = torch.jit.script(_SCRIPTS[type(network)](traced, start).eval())
         torch.jit.save(script, buffer, _extra_files={CONTRACT_FILE: contract.to_json()})
     return _write_checked(Path(path), buffer.getvalue(), lambda written: _largest_difference(policy, written))
 
@@ -220,8 +227,8 @@ def export_onnx(policy: Policy, path: str | Path) -> float:
 def export_deploy(policy: Policy, path: str | Path, robot: Robot) -> None:
     """Write the ``deploy.yaml`` with which the robot's C++ runtime runs the ONNX file; it is read back and compared.
 
-    The runtime fills the history with the first observation where training had zeros; this lasts as many steps as the
-    history.
+    The runtime fills the history with the first observation. A policy whose contract begins it with zeros acts a little
+    differently for as many steps as the history has frames.
 
     Args:
         policy: one of the project's own.
@@ -266,7 +273,8 @@ def export_policy(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path
 
 def stacked_contract(contract: PolicyContract, frames: int) -> PolicyContract:
     """The contract of a network that is handed its whole history, term by term."""
-    return replace(contract, history=History(length=frames, order="term-major" if frames > 1 else "frame-major"))
+    order = "term-major" if frames > 1 else "frame-major"
+    return replace(contract, history=replace(contract.history, length=frames, order=order))
 
 
 def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
@@ -380,6 +388,7 @@ def _largest_difference(policy: Policy, written: Path) -> float:
     ours, theirs = policy.session(1), exported.session(1)
     generator = torch.Generator().manual_seed(0)
     history = torch.zeros(1, frames, contract.frame_width)
+    repeat = contract.history.start == "repeat"
     largest = 0.0
     for step in range(CHECK_STEPS):
         if step in (0, CHECK_STEPS // 2):
@@ -387,7 +396,8 @@ def _largest_difference(policy: Policy, written: Path) -> float:
             theirs.reset()
             history.zero_()
         frame = torch.randn(1, contract.frame_width, generator=generator)
-        history = torch.cat((history[:, 1:], frame[:, None]), dim=1)
+        begins = repeat and step in (0, CHECK_STEPS // 2)
+        history = torch.cat((history[:, 1:], frame[:, None]), dim=1) if not begins else frame.expand_as(history).clone()
         given = torch.empty(1, history.numel())
         given[:, order] = history.flatten(1)
         difference_now = (ours.act(frame) - theirs.act(given if frames > 1 else frame)).abs().max()

@@ -22,6 +22,7 @@ import copy
 import hashlib
 import io
 import json
+import math
 import os
 import pickle
 import re
@@ -400,27 +401,32 @@ class NativeSession(PolicySession):
         self._contract = contract
         self._source = source
         frames, width = self._network.history_length, self._network.frame_width
-        self._history = torch.zeros(num_episodes, frames, width, device=device)
+        # A frame that has not been seen is NaN where the first one takes its place.
+        self._unseen = math.nan if contract.history.start == "repeat" else 0.0
+        self._history = torch.full((num_episodes, frames, width), self._unseen, device=device)
         self._initial: torch.Tensor | None = None
         if hasattr(network, "initial_state"):
             self._initial = self._network.initial_state(num_episodes).to(device)
             self._state = self._initial.clone()
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
-        """See ``PolicySession``: the history becomes zero, the state initial."""
+        """See ``PolicySession``: the history becomes unseen, the state initial."""
         if episodes is None:
-            self._history = torch.zeros_like(self._history)
+            self._history = torch.full_like(self._history, self._unseen)
             if self._initial is not None:
                 self._state = self._initial.clone()
             return
-        self._history = self._history.masked_fill(episodes[:, None, None], 0.0)
+        self._history = self._history.masked_fill(episodes[:, None, None], self._unseen)
         if self._initial is not None:
             self._state = torch.where(episodes[:, None], self._initial, self._state)
 
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         check_observation(observation, self._num_episodes, self._contract, self._source)
-        self._history = torch.cat((self._history[:, 1:], observation[:, None]), dim=1)
+        newest = observation[:, None]
+        self._history = torch.cat((self._history[:, 1:], newest), dim=1)
+        if self._unseen != 0.0:
+            self._history = torch.where(self._history.isnan(), newest, self._history)
         with torch.no_grad():
             try:
                 if self._initial is None and rows is not None:

@@ -5,7 +5,7 @@ included) and ``frame_width`` (width of its input at one step; the contract's ``
 interfaces:
 
 - ``forward(history) -> action`` for ``history`` (N, H, F), oldest frame first and the current one last, and ``action``
-  (N, J). The session keeps the history; it is zero at the start of an episode.
+  (N, J). The session keeps the history; the contract says how it starts.
 - with a memory of its own, in addition ``initial_state(n) -> (n, S)`` and ``forward(history, state) -> (action,
   state)``. The session keeps the state, and resets rows of it.
 

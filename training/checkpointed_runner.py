@@ -175,7 +175,7 @@ class CheckpointedRunner(OnPolicyRunner):
         """
         entries = read_checkpoint(path, training_state=False)
         theirs = PolicyContract.from_json(entries["contract"])
-        for name in ("joint_names", "observation", "history", "action_scale", "default_joint_position"):
+        for name in ("joint_names", "observation", "action_scale", "default_joint_position"):
             if getattr(theirs, name) != getattr(self.contract, name):
                 raise CheckpointError(
                     f"Cannot start from '{path}': its {name} is {getattr(theirs, name)}, this run's is "

@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from ..backends.base import PhysicsBackend, Scene
 from ..backends.registry import make_backend
-from ..policy.contract import PolicyContract, go2_contract
+from ..policy.contract import History, PolicyContract, go2_contract
 from ..robots.base import JointParameters, Robot
 from ..robots.registry import load_robot
 from .configuration import ConfigurationError
@@ -401,7 +401,7 @@ def training_contract(
     training.
     """
     return replace(
-        go2_contract(robot),
+        go2_contract(robot, history=History(start=configuration.observations.history_start)),
         stiffness=parameters.stiffness,
         damping=parameters.damping,
         control_period=configuration.physics.control_period,

@@ -75,6 +75,9 @@ class ObservationConfiguration:
 
     history_length: int = 5
     """Frames in the student's history, the current one included."""
+    history_start: str = "repeat"
+    """What the history holds at the start of an episode: ``repeat`` for copies of the first frame, as the robot's own
+    controller fills it, or ``zeros`` as published. It becomes part of the policy contract."""
     noise: NoiseConfiguration = NoiseConfiguration()
     scan_length: float = 1.6
     """Extent of the height scan along the heading [m]."""

@@ -41,16 +41,21 @@ def add_noise(frame: torch.Tensor, signed: torch.Tensor, amplitude: torch.Tensor
     return frame + signed * amplitude
 
 
-def push_history(history: torch.Tensor, frame: torch.Tensor, forget: torch.Tensor) -> torch.Tensor:
-    """History with one more frame at its end and the oldest gone; masked worlds have zeros before the new frame.
+def push_history(history: torch.Tensor, frame: torch.Tensor, forget: torch.Tensor, *, start: str) -> torch.Tensor:
+    """History with one more frame at its end and the oldest gone.
 
     Args:
         history: (N, H, width), oldest first.
         frame: (N, width).
         forget: worlds whose episode has just begun, (N,) bool.
+        start: what stands before their new frame: ``zeros``, or ``repeat`` for copies of it.
     """
-    kept = history[:, 1:].masked_fill(forget[:, None, None], 0.0)
-    return torch.cat((kept, frame[:, None]), dim=1)
+    newest, begins = frame[:, None], forget[:, None, None]
+    if start == "repeat":
+        kept = torch.where(begins, newest, history[:, 1:])
+    else:
+        kept = history[:, 1:].masked_fill(begins, 0.0)
+    return torch.cat((kept, newest), dim=1)
 
 
 def height_entries(base_height: torch.Tensor, ground: torch.Tensor) -> torch.Tensor:

@@ -123,6 +123,7 @@ class StepProgram:
         settings, device = self.configuration, self.device
         seen = settings.observations
         self.scan = scan_pattern(seen.scan_length, seen.scan_width, seen.scan_spacing, device)
+        self._history_start = contract.history.start
         near = (self.scan[:, 0].abs() <= 0.2 + 1e-4) & (self.scan[:, 1].abs() <= 0.15 + 1e-4)
         self._trunk_points = self.scan[near]
         self._footprint = scan_pattern(0.5, 0.4, 0.1, device)
@@ -420,7 +421,7 @@ class StepProgram:
         state, memory = self.inputs, self.memory
         frame = self._builder.build(state, memory.command, memory.action)
         noisy = add_noise(frame, self.uniform.signed("noise"), self.noise)
-        memory.history.copy_(push_history(memory.history, noisy, memory.just_reset))
+        memory.history.copy_(push_history(memory.history, noisy, memory.just_reset, start=self._history_start))
         points = place_pattern(self.scan, state.base_position_w[:, :2], heading(state.base_quaternion_w))
         ground = self.rasters.height(memory.terrain_index, points)
         privileged = privileged_state(

@@ -10,7 +10,7 @@ import torch
 import yaml
 from gaitgauge.policy import export
 from gaitgauge.policy.adapters import deploy_contract
-from gaitgauge.policy.contract import PolicyContract, go2_contract
+from gaitgauge.policy.contract import History, PolicyContract, go2_contract
 from gaitgauge.policy.export import (
     ExportError,
     export_deploy,
@@ -57,9 +57,56 @@ def make_policy(kind: str, contract: PolicyContract | None = None) -> NativePoli
     return NativePolicy(contract, stored, path=f"{kind}.pt")
 
 
+def starting_with(start: str) -> PolicyContract:
+    provenance = {"run": "2026-01-01_00-00-00"}
+    return go2_contract(load_robot("go2"), history=History(start=start), provenance=provenance)
+
+
+def test_a_history_that_starts_with_copies_of_the_first_frame(tmp_path):
+    """The same network: its first action is that of a history full of the first frame, in every export and session."""
+    policy = make_policy("moe", starting_with("repeat"))
+    first, second = torch.randn(1, 45), torch.randn(1, 45)
+    full, next_full = first[:, None].expand(1, 5, 45), torch.cat((first[:, None].expand(1, 4, 45), second[:, None]), 1)
+    export_torchscript(policy, tmp_path / "policy.pt")
+    script = torch.jit.load(tmp_path / "policy.pt")
+    sessions = [policy.session(1), load_policy(tmp_path / "policy.pt").session(1)]
+    for again in range(2):
+        for history, frame in ((full, first), (next_full, second)):
+            expected = policy.network(history)
+            assert torch.allclose(script(frame)[0], expected, atol=1e-6), again
+            for session in sessions:
+                assert torch.allclose(session.act(frame), expected, atol=1e-6), again
+        script.reset()
+        for session in sessions:
+            session.reset(torch.tensor([True]))
+    zeros = make_policy("moe", starting_with("zeros")).session(1).act(first)
+    assert not torch.allclose(zeros, policy.network(full), atol=1e-3)
+
+
+def test_rows_start_their_history_each_for_itself():
+    policy = make_policy("moe", starting_with("repeat"))
+    frames = torch.randn(4, 3, 45)
+    batch, alone = policy.session(3), policy.session(1)
+    for step, frame in enumerate(frames):
+        if step == 2:
+            batch.reset(torch.tensor([False, True, False]))
+            alone.reset()
+        actions, single = batch.act(frame), alone.act(frame[1:2])
+        assert torch.allclose(actions[1:2], single, atol=1e-6), step
+
+
+def test_deploy_file_is_exact_for_a_history_that_starts_with_copies(tmp_path):
+    policy = make_policy("moe", starting_with("repeat"))
+    export_policy(policy, tmp_path, load_robot("go2"))
+    runtime = deploy_contract(tmp_path / "deploy.yaml", load_robot("go2"))
+    assert (runtime.history.length, runtime.history.start) == (5, "repeat")
+    assert load_policy(tmp_path / "policy.onnx").contract.history == runtime.history
+
+
+@pytest.mark.parametrize("start", ["zeros", "repeat"])
 @pytest.mark.parametrize("kind", list(NETWORKS))
-def test_torchscript_runs_step_by_step_like_the_policy(kind, tmp_path):
-    policy = make_policy(kind)
+def test_torchscript_runs_step_by_step_like_the_policy(kind, start, tmp_path):
+    policy = make_policy(kind, starting_with(start))
     assert export_torchscript(policy, tmp_path / "policy.pt") <= 1e-5
     module = torch.jit.load(tmp_path / "policy.pt")
     session = policy.session(1)

@@ -30,9 +30,12 @@ def wiggle(environment, steps, seed=0):
     return result
 
 
-def test_frames_and_history_are_those_of_the_policy_room_s_builder():
-    environment = make(5, script=gliding(0.3, 0.1, 0.5), observations=ObservationConfiguration(noise=SILENT))
-    contract = replace(environment.contract, history=History(length=5))
+@pytest.mark.parametrize("start", ["zeros", "repeat"])
+def test_frames_and_history_are_those_of_the_policy_room_s_builder(start):
+    seen = ObservationConfiguration(noise=SILENT, history_start=start)
+    environment = make(5, script=gliding(0.3, 0.1, 0.5), observations=seen)
+    assert environment.contract.history == History(start=start)
+    contract = replace(environment.contract, history=History(length=5, start=start))
     builder = ObservationBuilder(contract, load_robot("go2"), 5)
     program = environment.program
     expected = builder.build(environment.backend.state, program.memory.command, program.memory.action)
@@ -66,12 +69,13 @@ def test_noise_amplitudes_and_where_there_is_none():
     assert torch.equal(observations["history"][:, 180:], observations["policy"]), "a frame keeps its noise"
 
 
-def test_history_is_oldest_first_and_starts_with_zeros():
+@pytest.mark.parametrize(("start", "first"), [("zeros", 0.0), ("repeat", 3.0)])
+def test_history_is_oldest_first_and_starts_as_the_contract_says(start, first):
     history = torch.zeros(2, 3, 1)
     for value in (1.0, 2.0, 3.0, 4.0):
         forget = torch.tensor([False, value == 3.0])
-        history = push_history(history, torch.full((2, 1), value), forget)
-    assert history[:, :, 0].tolist() == [[2.0, 3.0, 4.0], [0.0, 3.0, 4.0]]
+        history = push_history(history, torch.full((2, 1), value), forget, start=start)
+    assert history[:, :, 0].tolist() == [[2.0, 3.0, 4.0], [first, 3.0, 4.0]]
 
 
 def test_privileged_layout():
