@@ -20,6 +20,7 @@ from .base import PolicyError
 from .contract import ContractError, PolicyContract, check_robot, go2_contract
 from .fence.archive import LARGEST_FILE, archive_names
 from .native import FORMAT, FilePolicy, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
+from .rebuilt import rebuilt
 
 if TYPE_CHECKING:
     from .onnx_file import OnnxFile
@@ -50,7 +51,7 @@ def load_policy(path_or_name: str | Path, robot: Robot | None = None, *, log_roo
     path = find_policy(path_or_name, log_root=log_root)
     data = _read(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
-    policy = _load(data, path, str(path_or_name), stand_in)
+    policy = rebuilt(_load(data, path, str(path_or_name), stand_in))
     if robot is not None:
         check_robot(policy.contract, robot)
     return policy

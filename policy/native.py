@@ -325,6 +325,8 @@ class FilePolicy(Policy):
 
     stored: StoredNetwork | ForeignFile
     """Its network, for ``save_policy``."""
+    not_rebuilt: str = ""
+    """Why a foreign file's own code is run in each step, which is slow; empty where it is not."""
 
 
 class NativePolicy(FilePolicy):

@@ -1,8 +1,5 @@
 """TorchScript policies, batched over episodes even where the file was exported for a batch of one.
 
-A file whose code is understood from end to end is rebuilt (``torchscript_program.py``), and the rebuilt network is compared
-with the file's own over several steps. What follows is for the others.
-
 An export with a history inside keeps it in tensors that ``forward`` changes, with an axis of length one for the batch.
 Such tensors are found by watching a run, and given one row per episode. Whether the file can be run that way is proved
 at load time: a batch is compared with as many copies of the module, over several steps and through a reset of some
@@ -26,8 +23,6 @@ import torch
 from .base import PolicyError, PolicySession, check_observation, checked_action
 from .contract import PolicyContract
 from .native import LOAD_ERRORS, FilePolicy, ForeignFile, first_line
-from .program import NotUnderstoodError, Program, ProgramSession
-from .torchscript_program import torchscript_program
 
 CONTRACT_FILE = "contract.json"
 PROBE_EPISODES = 3
@@ -143,42 +138,24 @@ class TorchscriptPolicy(FilePolicy):
         """
         self.contract = contract
         self.path = path
-        self.stored: ForeignFile = ForeignFile(kind="torchscript", data=data)
+        self.stored = ForeignFile(kind="torchscript", data=data)
         self._module = module
         self._attributes = _declared_attributes(data, source=path)
         check = CopiesSession(module, 1, contract, torch.device("cpu"), path)
         check.act(torch.zeros(1, contract.observation_width))
-        self.not_rebuilt = ""
-        """Why the file's own code is run in each step; empty if it was rebuilt."""
-        self.program = self._rebuilt()
-        self.memories = self._find_memories() if self.program is None else None
+        self.memories = self._find_memories()
 
     @property
     def batched(self) -> bool:
-        """Whether one run of the network serves all episodes."""
-        return self.program is not None or self.memories is not None
+        """Whether one run of the module serves all episodes."""
+        return self.memories is not None
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes, with a copy of the module."""
         where = torch.device(device)
-        if self.program is not None:
-            return ProgramSession(self.program, num_episodes, self.contract, where)
         if self.memories is None:
             return CopiesSession(self._module, num_episodes, self.contract, where, self.path)
         return BatchSession(self._module, num_episodes, self.contract, where, self.path, self.memories)
-
-    def _rebuilt(self) -> Program | None:
-        """The file's network without its code, if that is understood and the network acts as the file does."""
-        try:
-            program = torchscript_program(self.stored.data, self.contract.observation_width, source=self.path)
-            session = ProgramSession(program, PROBE_EPISODES, self.contract, torch.device("cpu"))
-        except NotUnderstoodError as reason:
-            self.not_rebuilt = str(reason)
-            return None
-        if self._proved(session):
-            return program
-        self.not_rebuilt = "what was rebuilt of it acts differently"
-        return None
 
     def _find_memories(self) -> tuple[Memory, ...] | None:
         """The module's memories, such that a batch proves equal to single runs; None if there is no such way."""
@@ -186,18 +163,14 @@ class TorchscriptPolicy(FilePolicy):
         if changed is None:
             return None
         if not changed:
-            return () if self._proved(self._batch(())) else None
+            return () if self._proved(()) else None
         # All memories of a file have their batch on one axis: the first for histories, the second for recurrent states.
         for axis in range(max(value.dim() for _, _, value in changed)):
             if all(axis < value.dim() and value.shape[axis] == 1 for _, _, value in changed):
                 memories = tuple(Memory(module=m, name=n, axis=axis) for m, n, _ in changed)
-                if self._proved(self._batch(memories)):
+                if self._proved(memories):
                     return memories
         return None
-
-    def _batch(self, memories: tuple[Memory, ...]) -> PolicySession:
-        cpu = torch.device("cpu")
-        return BatchSession(self._module, PROBE_EPISODES, self.contract, cpu, self.path, memories)
 
     def _changed_tensors(self) -> list[tuple[str, str, torch.Tensor]] | None:
         """Tensors that a run changes, with their initial values; None if it changes anything else."""
@@ -231,9 +204,11 @@ class TorchscriptPolicy(FilePolicy):
                     found[path, name] = repr(value)
         return found
 
-    def _proved(self, batch: PolicySession) -> bool:
-        """Whether a session of several episodes acts as single copies of the module do."""
-        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, torch.device("cpu"), self.path)
+    def _proved(self, memories: tuple[Memory, ...]) -> bool:
+        """Whether a batch acts as single copies do."""
+        cpu = torch.device("cpu")
+        batch = BatchSession(self._module, PROBE_EPISODES, self.contract, cpu, self.path, memories)
+        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, cpu, self.path)
         generator = torch.Generator().manual_seed(0)
         for step in range(PROBE_STEPS):
             if step == PROBE_STEPS // 2:

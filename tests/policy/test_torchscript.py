@@ -11,6 +11,7 @@ from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import History
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
+from gaitgauge.policy.rebuilt import RebuiltPolicy
 from gaitgauge.policy.torchscript import CopiesSession
 from torch import nn
 
@@ -168,7 +169,7 @@ def test_batch_equals_single_modules(tmp_path, cts_network, observations, name, 
     policy = load_policy(path)
     session = policy.session(EPISODES)
     assert policy.batched == session.batched == (name in BATCHED)
-    assert (policy.program is not None) == (name in REBUILT)
+    assert isinstance(policy, RebuiltPolicy) == (name in REBUILT)
     actions = run(session, observations)
     with warnings.catch_warnings(), torch.no_grad(), torch.jit.optimized_execution(False):
         warnings.simplefilter("ignore", DeprecationWarning)
