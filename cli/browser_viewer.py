@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import trimesh
 import viser
-from rich.console import Console
 
+from .console import Terminal
 from .errors import UserError
 from .play_session import Command, PlaySession
 from .scenery import COLLISION_GROUP, show, visual_model
@@ -149,8 +149,8 @@ def serve(session: PlaySession, command: Command | None, seconds: float | None, 
 
     server.initial_camera.position = middle + np.array([-1.2, -1.8, 0.9])
     server.initial_camera.look_at = middle
-    console = Console(highlight=False)
-    console.print(f"open http://localhost:{server.get_port()} in a browser; Ctrl-C ends", soft_wrap=True)
+    console = Terminal()
+    console.say(f"open http://localhost:{server.get_port()} in a browser; Ctrl-C ends")
     due, sent = time.monotonic(), 0.0
     try:
         while seconds is None or session.time < seconds:

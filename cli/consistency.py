@@ -4,28 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
-from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.text import Text
 
 from ..gauge.consistency.page import FIELD_LABELS, TESTS, verdict, write_page
 from ..gauge.consistency.study import Request, Status, prepare_study, study
-
-_LOG_EVERY = 10.0
-"""Time between two lines where there is no terminal [s]."""
-_REFRESH = 0.5
-"""Shortest time between two updates of the display [s]."""
-_WIDE = 150
-"""Columns of the tables where there is no terminal."""
+from .console import Terminal, make_table, shell_command
+from .progress import ProgressDisplay
 
 
 def run_consistency(
@@ -45,68 +35,42 @@ def run_consistency(
         threads=threads or os.cpu_count() or 1,
         **choices,
     )
-    console = Console(stderr=True)
+    console = Terminal(stderr=True)
     prepared = prepare_study(request)  # all that can be wrong with the request is said before anything is written
     for engine in prepared.skipped:
-        console.print(f"{engine['backend']} is left out: {engine['reason']}", highlight=False, soft_wrap=True)
+        console.say(f"{engine['backend']} is left out: {engine['reason']}")
     names = "-".join(Path(p).name.partition(".")[0] for p in request.policies[:3])
     folder = out or Path("results") / f"{names}-{Path(request.suite).stem}-consistency"
     try:
-        with _display(console) as watch:
-            results = study(request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=watch)
+        with ProgressDisplay(console, "comparing") as display:
+            results = study(
+                request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=_shower(display)
+            )
     except KeyboardInterrupt:
-        again = shlex.join(["gaitgauge", *[a for a in sys.argv[1:] if a != "--resume"], "--resume"])
-        console.print(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}", highlight=False)
+        again = shell_command(None, "--resume")
+        console.say(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}")
         raise typer.Exit(130) from None
     page = write_page(folder)
     if json_output:
         print(json.dumps(results, indent=1))
         return
-    # tables squeezed into the 80 columns that a pipe pretends to have cannot be read
-    print_study(Console() if sys.stdout.isatty() else Console(width=_WIDE), results)
-    print(f"results  {folder / 'consistency.json'}\npage     {page}")
+    console = Terminal()
+    print_study(console, results)
+    console.say(f"results  {folder / 'consistency.json'}\npage     {page}")
 
 
-class _display:  # noqa: N801  (reads as a verb where it is used)
-    """Context manager that shows ``Status``: a live bar on a terminal, plain lines elsewhere."""
+def _shower(display: ProgressDisplay) -> Callable[[Status], None]:
+    """What a study is watched with."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._last = time.monotonic()
-        self._live: Progress | Live | None = None
-        self._run = ""
-
-    def __enter__(self) -> Callable[[Status], None]:
-        if self._console.is_terminal:
-            self._bar = Progress(
-                TextColumn("[bold]{task.description}"),
-                BarColumn(),
-                TextColumn("{task.fields[text]}"),
-                TimeElapsedColumn(),
-            )
-            self._task = self._bar.add_task("comparing", total=1.0, text="")
-            self._live = Live(self._bar, console=self._console, refresh_per_second=4)
-            self._live.__enter__()
-        return self._update
-
-    def __exit__(self, *details: Any) -> None:
-        if self._live is not None:
-            self._live.__exit__(*details)
-
-    def _update(self, status: Status) -> None:
-        now = time.monotonic()
-        if now - self._last < (_REFRESH if self._live else _LOG_EVERY):
-            return
-        self._last = now
+    def show(status: Status) -> None:
+        share = (status.part - 1 + status.done / status.episodes) / status.parts
         text = f"run {status.part} of {status.parts}, {status.variant}: {status.done} of {status.episodes} episodes"
-        if self._live:
-            share = (status.part - 1 + status.done / status.episodes) / status.parts
-            self._bar.update(self._task, completed=share, text=text)
-        else:
-            self._console.print(f"{status.seconds:.0f} s: {status.policy}, {text}", highlight=False, soft_wrap=True)
+        display.update(share, text, {"policy": status.policy})
+
+    return show
 
 
-def print_study(console: Console, results: Mapping[str, Any]) -> None:
+def print_study(console: Terminal, results: Mapping[str, Any]) -> None:
     """Tables of every layer, the gap last."""
     for policy in results["policies"]:
         if len(results["policies"]) > 1:
@@ -118,7 +82,7 @@ def print_study(console: Console, results: Mapping[str, Any]) -> None:
         _print_attribution(console, policy["attribution"])
         _print_gaps(console, policy)
         for label, pair in policy["pairs"].items():
-            console.print(f"[bold]{label}[/bold]: {verdict(pair['overall'])}", highlight=False, soft_wrap=True)
+            console.say(Text.assemble((label, "bold"), f": {verdict(pair['overall'])}"))
         for label, health in policy["health"].items():
             troubles = [
                 f"{health[k]} {word}"
@@ -126,23 +90,17 @@ def print_study(console: Console, results: Mapping[str, Any]) -> None:
                 if health[k]
             ]
             if troubles:
-                console.print(
-                    f"[red]{label}[/red]: of {health['episodes']} episodes {' and '.join(troubles)}", highlight=False
-                )
+                words = f": of {health['episodes']} episodes {' and '.join(troubles)}"
+                console.say(Text.assemble((label, "red"), words))
 
 
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for i, name in enumerate(columns):
-        table.add_column(name, justify="left" if i == 0 else "right")
-    return table
-
-
-def _print_models(console: Console, models: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+def _print_models(console: Terminal, models: Mapping[str, Any], results: Mapping[str, Any]) -> None:
     labels = results["compared"]
-    table = _table(f"models: largest relative difference from {models['reference']}", "field", *labels)
+    table = make_table(
+        f"models: largest relative difference from {models['reference']}", "field", *labels, numbers=True
+    )
     for key, row in models["fields"].items():
-        cells = []
+        cells: list[str | Text] = []
         for label in labels:
             found = row["variants"].get(label)
             if found is None:
@@ -151,17 +109,18 @@ def _print_models(console: Console, models: Mapping[str, Any], results: Mapping[
                 cells.append("same")
             else:
                 relative = found["relative"]
-                cells.append(f"[red]{'–' if relative is None else f'{relative:.2g}'} ({found['entry']})[/red]")
-        table.add_row(FIELD_LABELS[key].replace("[", r"\["), *cells)
+                shown = "–" if relative is None else f"{relative:.2g}"
+                cells.append(Text(f"{shown} ({found['entry']})", "red"))
+        table.add_row(FIELD_LABELS[key], *cells)
     if models["fields"]:
         console.print(table)
     if models["not_described"]:
-        console.print(f"models not described by {', '.join(models['not_described'])}", highlight=False)
+        console.say(f"models not described by {', '.join(models['not_described'])}")
 
 
-def _print_open_loop(console: Console, block: Mapping[str, Any]) -> None:
+def _print_open_loop(console: Terminal, block: Mapping[str, Any]) -> None:
     columns = ("engine", "test", "bases apart", "joints apart", "energy", "1 cm apart after", "weight at rest")
-    table = _table("open loop: after the same joint targets", *columns)
+    table = make_table("open loop: after the same joint targets", *columns, numbers=True)
     for label, tests in block["differences"].items():
         for test in TESTS:
             row = tests[test]
@@ -179,9 +138,11 @@ def _print_open_loop(console: Console, block: Mapping[str, Any]) -> None:
     console.print(table)
 
 
-def _print_pair(console: Console, reference: str, label: str, pair: Mapping[str, Any]) -> None:
+def _print_pair(console: Terminal, reference: str, label: str, pair: Mapping[str, Any]) -> None:
     columns = ("terrain", reference, label, "gap", "floor", "difference", "95 % interval", "same fall", "same reach")
-    table = _table(f"closed loop: quality (mean@50) of the same episodes, {label} against {reference}", *columns)
+    table = make_table(
+        f"closed loop: quality (mean@50) of the same episodes, {label} against {reference}", *columns, numbers=True
+    )
     for place, row in {**pair["terrains"], "overall": pair["overall"]}.items():
         low, high = row["difference"]["interval"]
         outcomes = [row["outcomes"][k] for k in ("fell", "reached")]
@@ -196,7 +157,9 @@ def _print_pair(console: Console, reference: str, label: str, pair: Mapping[str,
             *("" if o is None else f"{100 * o['same']:.0f} %" for o in outcomes),
         )
     console.print(table)
-    table = _table("metrics, overall", "metric", reference, label, "difference", "95 % interval", "effect size")
+    table = make_table(
+        "metrics, overall", "metric", reference, label, "difference", "95 % interval", "effect size", numbers=True
+    )
     for name, row in pair["overall"]["metrics"].items():
         low, high = row["difference"]["interval"]
         size = row["effect_size"]
@@ -211,13 +174,12 @@ def _print_pair(console: Console, reference: str, label: str, pair: Mapping[str,
     console.print(table)
 
 
-def _print_attribution(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
+def _print_attribution(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
     if not rows:
         return
     engines = list(dict.fromkeys(label for row in rows for label in row.get("to", {})))
-    table = _table(
-        "attribution: one thing switched", "switched", "in", "score", "95 % interval", *(f"gap to {e}" for e in engines)
-    )
+    columns = ("switched", "in", "score", "95 % interval", *(f"gap to {e}" for e in engines))
+    table = make_table("attribution: one thing switched", *columns, numbers=True)
     for row in rows:
         if row["not_run"] is not None:
             table.add_row(row["title"], row["engine"], "not run")
@@ -231,16 +193,18 @@ def _print_attribution(console: Console, rows: Sequence[Mapping[str, Any]]) -> N
     console.print(table)
     for row in rows:
         if row["not_run"] is not None:
-            console.print(f"{row['title']} in {row['engine']}: {row['not_run']}", highlight=False, soft_wrap=True)
+            console.say(f"{row['title']} in {row['engine']}: {row['not_run']}")
 
 
-def _print_gaps(console: Console, policy: Mapping[str, Any]) -> None:
-    table = _table("gap: mean |difference| of an episode's quality", "engines", "gap", "95 % interval")
+def _print_gaps(console: Terminal, policy: Mapping[str, Any]) -> None:
+    table = make_table(
+        "gap: mean |difference| of an episode's quality", "engines", "gap", "95 % interval", numbers=True
+    )
     for row in policy["gaps"]:
         low, high = row["overall"]["gap"]["interval"]
         table.add_row(
             " – ".join(row["pair"]),
-            f"[bold]{_small(row['overall']['gap']['value'])}[/bold]",
+            Text(_small(row["overall"]["gap"]["value"]), "bold"),
             f"{_small(low)} to {_small(high)}",
         )
     floor = policy["floor"]["overall"]["gap"]

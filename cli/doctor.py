@@ -21,10 +21,9 @@ from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 
-from .inspect import table_console
+from .console import Terminal, make_table
 
 OK, WARNING, PROBLEM = "ok", "warning", "problem"
 _STYLES = {OK: "green", WARNING: "yellow", PROBLEM: "bold red"}
@@ -54,17 +53,14 @@ def examine() -> bool:
     Returns:
         False if there is a problem.
     """
-    console = table_console()
-    table = Table(title="gaitgauge doctor", title_justify="left")
-    for name in ("check", "status", "found", "what to do"):
-        table.add_column(name, overflow="fold")
+    console = Terminal()
+    table = make_table("gaitgauge doctor", "check", "status", "found", "what to do")
     findings = []
     with console.status("checking …"):
         for check in CHECKS:
             findings += list(check())
     for each in findings:
-        status = f"[{_STYLES[each.status]}]{each.status}[/]"
-        table.add_row(each.what, status, escape(each.found), escape(each.advice))
+        table.add_row(each.what, Text(each.status, _STYLES[each.status]), each.found, each.advice)
     console.print(table)
     counts = {s: sum(f.status == s for f in findings) for s in (WARNING, PROBLEM)}
     words = [f"{n} {s}{'s' if n > 1 else ''}" for s, n in counts.items() if n]

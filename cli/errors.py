@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import functools
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import typer
+
+from .console import printable
 
 
 class UserError(ValueError):
@@ -20,17 +24,51 @@ def report_errors(command: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(command)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
-            return command(*args, **kwargs)
+            result = command(*args, **kwargs)
+            sys.stdout.flush()  # a full disk shows here at the latest
+            return result
         except KeyboardInterrupt:
-            print("stopped", file=sys.stderr)
+            complain("stopped")
             raise typer.Exit(130) from None
         except (ValueError, RuntimeError, OSError) as error:
-            if not _is_ours(error):
+            if _is_ours(error):
+                complain(f"gaitgauge: {error}")
+            elif isinstance(error, OSError):
+                complain(f"gaitgauge: {system_failure(error)}")
+            else:
                 raise
-            print(f"gaitgauge: {error}", file=sys.stderr)
             raise typer.Exit(2) from None
 
     return wrapper
+
+
+@contextmanager
+def output_failures() -> Iterator[None]:
+    """Around the whole program: what commands do not see, help and version on a full disk, ends with exit code 2, too."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except OSError as error:
+        complain(f"gaitgauge: {system_failure(error)}")
+        sys.exit(2)
+
+
+def complain(sentence: str) -> None:
+    """Print one line on standard error."""
+    print(printable(sentence.replace("\n", " ")), file=sys.stderr)
+
+
+def system_failure(error: OSError) -> str:
+    """One sentence on what the operating system refused. A refusal without a file's name was of standard output."""
+    reason = (error.strerror or str(error)).lower()
+    if error.filename is not None:
+        return f"'{os.fsdecode(error.filename)}': {reason}"
+    # What is left in the buffer of standard output would fail again when the interpreter ends.
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return f"output cannot be written: {reason}"
 
 
 def _is_ours(error: BaseException) -> bool:

@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
-from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.text import Text
 
 from ..gauge.evaluate import Request, Status, evaluate, prepare
 from ..gauge.report import write_report
+from .console import Terminal, make_table, shell_command
 from .errors import UserError
-
-_REFRESH = 0.5
-"""Shortest time between two updates of the display [s]."""
-_LOG_EVERY = 10.0
-"""Time between two lines where there is no terminal [s]."""
+from .progress import ProgressDisplay, duration
 
 
 def run_evaluation(
@@ -52,24 +44,23 @@ def run_evaluation(
     )
     prepare(request)  # all that can be wrong with the request is said before anything is written
     folder = out or Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
-    console = Console(stderr=True)
+    console = Terminal(stderr=True)
     try:
-        with _display(console) as watch:
-            results = evaluate(request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=watch)
+        with ProgressDisplay(console, "gauging") as display:
+            results = evaluate(
+                request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=_shower(display)
+            )
     except KeyboardInterrupt:
-        again = shlex.join(["gaitgauge", *[a for a in sys.argv[1:] if a != "--resume"], "--resume"])
-        console.print(
-            f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}",
-            highlight=False,
-            soft_wrap=True,
-        )
+        again = shell_command(None, "--resume")
+        console.say(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}")
         raise typer.Exit(130) from None
     report = write_report(folder)
     if json_output:
         print(json.dumps(results, indent=1))
         return
-    print_results(Console(), results)
-    print(f"results  {folder / 'results.json'}\nepisodes {folder / 'episodes.csv'}\nreport   {report}")
+    console = Terminal()
+    print_results(console, results)
+    console.say(f"results  {folder / 'results.json'}\nepisodes {folder / 'episodes.csv'}\nreport   {report}")
 
 
 def default_device(backend: str) -> str:
@@ -89,73 +80,28 @@ def default_device(backend: str) -> str:
     )
 
 
-class _display:  # noqa: N801  (reads as a verb where it is used)
-    """Context manager that shows ``Status``: a live bar on a terminal, plain lines elsewhere."""
+def _shower(display: ProgressDisplay) -> Callable[[Status], None]:
+    """What an evaluation is watched with."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._last = 0.0
-        self._live: Live | None = None
-        self._rate: tuple[float, float] | None = None
-
-    def __enter__(self) -> Callable[[Status], None]:
-        self._last = time.monotonic()
-        if self._console.is_terminal:
-            self._bar = Progress(
-                TextColumn("[bold]{task.description}"),
-                BarColumn(),
-                TextColumn("{task.fields[text]}"),
-                TimeElapsedColumn(),
-            )
-            self._task = self._bar.add_task("gauging", total=1.0, text="")
-            self._live = Live(self._bar, console=self._console, refresh_per_second=4)
-            self._live.__enter__()
-        return self._update
-
-    def __exit__(self, *details: Any) -> None:
-        if self._live is not None:
-            self._live.__exit__(*details)
-
-    def _update(self, status: Status) -> None:
-        now = time.monotonic()
-        if now - self._last < (_REFRESH if self._live else _LOG_EVERY):
-            return
-        self._last = now
+    def show(status: Status) -> None:
         done = 1.0 - status.remaining_work
-        left = status.seconds * status.remaining_work / done if done > 0.02 else None
-        text = f"{status.done} of about {status.expected} episodes"
+        left = (
+            f"about {duration(status.seconds * status.remaining_work / done)} left"
+            if done > 0.02
+            else "estimating time"
+        )
         places = sorted({f"{e.terrain} L{e.level}" if e.level else e.terrain for e in status.active})
         running = ", ".join(places[:5]) + (f" and {len(places) - 5} more" if len(places) > 5 else "")
-        remaining = f"about {_duration(left)} left" if left is not None else "estimating time"
-        if self._live:
-            self._bar.update(self._task, completed=done, text=f"{text}, {remaining}\n  now: {running}")
-        else:
-            self._console.print(
-                f"{_duration(status.seconds)}: {text}, {remaining}; now: {running}", highlight=False, soft_wrap=True
-            )
+        display.update(done, f"{status.done} of about {status.expected} episodes, {left}", {"now:": running})
+
+    return show
 
 
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
-
-
-def print_results(console: Console, results: Mapping[str, Any]) -> None:
+def print_results(console: Terminal, results: Mapping[str, Any]) -> None:
     """Tables of terrains and metrics, then the score."""
     suite = results["suite"]
-    table = Table(
-        title=f"{suite['name']} {suite['version']}, {results['pipeline']}, on {results['backend']}",
-        title_justify="left",
-    )
-    for name, right in (
-        ("terrain", False),
-        ("level", True),
-        ("mean", True),
-        ("mean@25", True),
-        ("mean@50", True),
-        ("95 % interval", True),
-    ):
-        table.add_column(name, justify="right" if right else "left")
+    title = f"{suite['name']} {suite['version']}, {results['pipeline']}, on {results['backend']}"
+    table = make_table(title, "terrain", "level", "mean", "mean@25", "mean@50", "95 % interval", numbers=True)
     for name, row in results["terrains"].items():
         level = "" if row["level"] is None else f"{row['level']:.2f}".rstrip("0").rstrip(".")
         if "score" in row:
@@ -166,25 +112,24 @@ def print_results(console: Console, results: Mapping[str, Any]) -> None:
             table.add_row(name, level, "", "", "", "")
     console.print(table)
     if results["metrics"]:
-        table = Table(title="metrics, weighted by level", title_justify="left")
-        for name in ("metric", "mean", "mean@25", "mean@50", "95 % interval"):
-            table.add_column(name, justify="left" if name == "metric" else "right")
+        columns = ("metric", "mean", "mean@25", "mean@50", "95 % interval")
+        table = make_table("metrics, weighted by level", *columns, numbers=True)
         for name, row in results["metrics"].items():
             table.add_row(name, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), _interval(row["interval"]))
         console.print(table)
-        console.print("  ".join(f"{k} {v:.4f}" for k, v in results["groups"].items()), highlight=False)
+        console.say("  ".join(f"{k} {v:.4f}" for k, v in results["groups"].items()))
     health = results["health"]
     troubles = [f"{v} {k}" for k, v in health.items() if k != "episodes" and v]
     if troubles:
-        console.print(f"in {health['episodes']} quality episodes: {', '.join(troubles)}", highlight=False)
+        console.say(f"in {health['episodes']} quality episodes: {', '.join(troubles)}")
     if results["score"] is not None:
         interval = results["score_interval"]
         note = f"95 % interval {_interval(interval)}" if interval else results["chance"]["note"]
-        console.print(f"[bold]score {results['score']:.4f}[/bold]  ({note})", highlight=False)
+        console.say(Text.assemble((f"score {results['score']:.4f}", "bold"), f"  ({note})"))
     elif results["level"] is not None:
         interval = results["level_interval"]
         note = f"  (95 % interval {_interval(interval, 2)})" if interval else ""
-        console.print(f"[bold]mean level {results['level']:.2f}[/bold]{note}", highlight=False)
+        console.say(Text.assemble((f"mean level {results['level']:.2f}", "bold"), note))
 
 
 def _interval(found: Sequence[float] | None, digits: int = 4) -> str:

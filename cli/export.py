@@ -6,12 +6,11 @@ from collections.abc import Callable
 from difflib import get_close_matches
 from pathlib import Path
 
-from rich.console import Console
-
 from ..policy.base import Policy
 from ..policy.export import ExportError, export_deploy, export_onnx, export_policy, export_torchscript
 from ..policy.loading import load_policy
 from ..robots import Robot, load_robot
+from .console import Terminal
 from .errors import UserError
 from .policies import policy_file
 
@@ -65,9 +64,9 @@ def run_export(choice: str, *, out: Path | None, form: str) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ExportError(f"cannot create folder '{folder}': {error.strerror}; choose another --out") from error
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"policy {path}, contract {policy.contract.hash[:12]}")
+    console = Terminal()
+    console.say(f"policy {path}, contract {policy.contract.hash[:12]}")
     for written, largest in FORMATS[form](policy, folder, robot).items():
         actions = f"actions differ by at most {largest:.1e}" if largest else "actions are the same"
         check = "reads back the same" if written.suffix == ".yaml" else actions
-        console.print(f"{written}  {written.stat().st_size / 1e6:.2f} MB  {_ABOUT[written.suffix]}; {check}")
+        console.say(f"{written}  {written.stat().st_size / 1e6:.2f} MB  {_ABOUT[written.suffix]}; {check}")

@@ -8,25 +8,16 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
+from .console import Terminal, make_table
 from .errors import UserError
 
 if TYPE_CHECKING:
     from ..policy.contract import PolicyContract
 
-_PLAIN_WIDTH = 160
-"""Columns of a table where there is no terminal to ask."""
 _HASH = 12
 """Digits of a contract's hash that are shown in lists; enough to tell policies apart by eye."""
-
-
-def table_console() -> Console:
-    """Standard output, wide enough for tables to stay whole where it is a file or a pipe."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=_PLAIN_WIDTH)
 
 
 # ---- import ---------------------------------------------------------------------------------------------------------
@@ -63,8 +54,8 @@ def import_file(source: str, destination: Path, *, force: bool, trainable: bool 
         from ..policy.importing import import_policy
 
         contract = import_policy(source, destination)
-    console = table_console()
-    console.print(f"wrote {escape(str(destination))}", soft_wrap=True)
+    console = Terminal()
+    console.say(f"wrote {destination}")
     console.print(contract_table(contract))
 
 
@@ -93,7 +84,7 @@ def contract_table(contract: PolicyContract) -> Table:
         "contract hash": contract.hash,
     }
     for name, value in rows.items():
-        table.add_row(name, escape(value))
+        table.add_row(name, value)
     return table
 
 
@@ -117,27 +108,20 @@ def list_things(what: str) -> None:
         close = get_close_matches(what, LISTS, 1)
         hint = f"did you mean '{close[0]}'? " if close else ""
         raise UserError(f"cannot list '{what}'; {hint}choose one of: {', '.join(LISTS)}")
-    table_console().print(make())
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column, overflow="fold")
-    return table
+    Terminal().print(make())
 
 
 def _robots() -> Table:
     from ..robots import RobotError, load_robot, robot_names
 
-    table = _table(
+    table = make_table(
         "robots (--robot NAME, or a robot.toml)", "name", "title", "joints", "parameter sets", "speed limits"
     )
     for name in robot_names():
         try:
             robot = load_robot(name, check=False)
         except RobotError as error:
-            table.add_row(name, escape(f"unusable: {error}"), "", "", "")
+            table.add_row(name, f"unusable: {error}", "", "", "")
             continue
         sets = ", ".join(f"{s} (default)" if s == robot.default_parameters else s for s in robot.parameters)
         forward, lateral, yaw = robot.command_limits
@@ -162,7 +146,7 @@ def _terrains() -> Table:
     from ..terrains.gauge_terrains import LEVELS
     from ..terrains.registry import gauge_terrain_names, terrain_names
 
-    table = _table("terrains (--terrain NAME, --level N)", "name", "levels", "what it is")
+    table = make_table("terrains (--terrain NAME, --level N)", "name", "levels", "what it is")
     own = gauge_terrain_names()
     for name in terrain_names():
         levels = "none" if name == "flat" else f"{LEVELS[0]} to {LEVELS[-1]}" if name in own else "its own"
@@ -173,7 +157,7 @@ def _terrains() -> Table:
 def _backends() -> Table:
     from ..backends.registry import list_backends
 
-    table = _table("backends (--backend NAME)", "name", "available here", "runs on", "what it is")
+    table = make_table("backends (--backend NAME)", "name", "available here", "runs on", "what it is")
     for each in list_backends():
         available = (
             "yes" if not each.missing else "no: pip install " + " ".join(p.replace("_", "-") for p in each.missing)
@@ -185,7 +169,7 @@ def _backends() -> Table:
 def _suites() -> Table:
     from ..gauge.suite import load_suite, suite_names
 
-    table = _table("suites (--suite NAME, or a .toml file)", "name", "version", "title", "metrics", "environments")
+    table = make_table("suites (--suite NAME, or a .toml file)", "name", "version", "title", "metrics", "environments")
     for name in suite_names():
         suite = load_suite(name)
         matrix = suite.matrix
@@ -202,7 +186,7 @@ def _suites() -> Table:
 def _tasks() -> Table:
     from ..training.tasks import TASKS
 
-    table = _table("tasks (gaitgauge train NAME)", "name", "title", "worlds", "iterations", "experiment folder")
+    table = make_table("tasks (gaitgauge train NAME)", "name", "title", "worlds", "iterations", "experiment folder")
     for task in TASKS.values():
         run = task.training.run
         table.add_row(task.name, task.title, str(task.environment.num_envs), str(run.iterations), run.experiment)
@@ -213,7 +197,7 @@ def _policies() -> Table:
     from ..policy.base import PolicyError
     from ..policy.loading import LOG_ROOT, POLICY_NAMES, find_policy
 
-    table = _table("policies (a name, or any policy file)", "name", "file", "robot", "contract", "saved")
+    table = make_table("policies (a name, or any policy file)", "name", "file", "robot", "contract", "saved")
     for name in POLICY_NAMES:
         try:
             path = find_policy(name)
@@ -244,8 +228,8 @@ def _policy_row(path: Path) -> tuple[str, str, str, str]:
     try:
         contract = load_policy(path).contract
     except (PolicyError, ContractError) as error:
-        return escape(str(shown)), escape(f"unusable: {error}"), "", saved
-    return escape(str(shown)), contract.robot, contract.hash[:_HASH], saved
+        return str(shown), f"unusable: {error}", "", saved
+    return str(shown), contract.robot, contract.hash[:_HASH], saved
 
 
 LISTS: dict[str, Callable[[], Table]] = {

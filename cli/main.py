@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from .errors import report_errors
+from .errors import output_failures, report_errors
 
 app = typer.Typer(
     name="gaitgauge",
@@ -372,7 +372,8 @@ def doctor() -> None:
 
 def main() -> None:
     """Entry point of the ``gaitgauge`` command."""
-    app(args=[_kebab(a) for a in sys.argv[1:]])
+    with output_failures():
+        app(args=[_kebab(a) for a in sys.argv[1:]])
 
 
 def _kebab(argument: str) -> str:

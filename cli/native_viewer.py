@@ -6,8 +6,8 @@ import time
 
 import mujoco
 import mujoco.viewer
-from rich.console import Console
 
+from .console import Terminal
 from .errors import UserError
 from .gamepad import Gamepad
 from .play_session import Command, PlaySession
@@ -79,8 +79,8 @@ def watch(session: PlaySession, command: Command | None, seconds: float | None, 
         )
     except (RuntimeError, mujoco.FatalError) as error:
         raise UserError(f"the window cannot be opened: {error}; use --viewer viser, or --out FILE.mp4") from error
-    console = Console(highlight=False)
-    console.print(KEYS, soft_wrap=True)
+    console = Terminal()
+    console.say(KEYS)
     with viewer:
         viewer.opt.geomgroup[COLLISION_GROUP] = 0
         viewer.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
@@ -104,6 +104,6 @@ def watch(session: PlaySession, command: Command | None, seconds: float | None, 
                     if told is None
                     else "forward {:+.1f} m/s, left {:+.1f} m/s, turn {:+.2f} rad/s".format(*told)
                 )
-                console.print(words, soft_wrap=True)
+                console.say(words)
             due = max(due + session.period, time.monotonic() - session.period)
             time.sleep(max(0.0, due - time.monotonic()))

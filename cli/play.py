@@ -7,10 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import Progress
-
+from .console import Terminal
 from .errors import UserError
+from .progress import ProgressDisplay
 from .video import check_video_path, choose_renderer
 
 if TYPE_CHECKING:
@@ -84,7 +83,7 @@ def run_play(
     )
     session = PlaySession(policy, robot, ground, settings)
     where = terrain if not ground.level else f"{terrain} level {ground.level}"
-    Console(highlight=False).print(f"{path} on {where}, {backend}, friction {friction:g}", soft_wrap=True)
+    Terminal().say(f"{path} on {where}, {backend}, friction {friction:g}")
     try:
         if chosen == "video":
             _record(session, video, seconds or _VIDEO_SECONDS, command)
@@ -131,19 +130,18 @@ def _record(session: PlaySession, out: Path, seconds: float, command: tuple[floa
     steps = max(1, round(_FRAME_TIME / session.period))
     between = steps * session.period
     frames = max(1, round(seconds / between))
-    console = Console(highlight=False)
+    console = Terminal()
     try:
         with (
             Video(out, fps=1.0 / between, width=_WIDTH, height=_HEIGHT) as video,
-            Progress(console=console, transient=True, disable=not console.is_terminal) as bar,
+            ProgressDisplay(console, "recording") as display,
         ):
-            task = bar.add_task("recording", total=frames)
-            for _ in range(frames):
+            for frame in range(frames):
                 for _ in range(steps):
                     session.step(command or session.autopilot())
                 video.add(picture.draw(session.position(), between))
-                bar.advance(task)
+                display.update((frame + 1) / frames, f"{(frame + 1) * between:.1f} of {seconds:g} s")
     finally:
         picture.close()
     told = [f"{n} {what}" for n, what in ((session.falls, "falls"), (session.arrivals, "times at the target")) if n]
-    console.print(f"wrote {out}, {seconds:g} s" + (f", {', '.join(told)}" if told else ""), soft_wrap=True)
+    console.say(f"wrote {out}, {seconds:g} s" + (f", {', '.join(told)}" if told else ""))

@@ -34,6 +34,14 @@ Name = Annotated[str, StringConstraints(pattern=_NAME, max_length=100)]
 """What may become the name of a file or folder."""
 Text = Annotated[str, StringConstraints(min_length=1, max_length=1000, pattern=_LINE)]
 """One line for people, or a name inside another file."""
+_WORDS = {
+    "a valid array": "a list",
+    "an object": "a table",
+    "a valid integer": "a whole number",
+    "a valid number": "a number",
+    "a valid string": "a text",
+    "a valid boolean": "true or false",
+}
 _PATTERNS = {
     _NAME: "it must be letters, digits and _ . + -, and begin with a letter, digit or _",
     _LINE: "it must be one line without control characters",
@@ -271,9 +279,10 @@ def _rule(error: Mapping[str, Any]) -> str:
     if error["type"] == "string_pattern_mismatch":
         return _PATTERNS[error["ctx"]["pattern"]]
     words = re.sub(r"^(Input|String|Tuple|Dictionary) should", "it must", str(error["msg"]))
-    words = words.replace("a valid array", "a list").replace("an object", "a table")
+    for theirs, ours in _WORDS.items():
+        words = words.replace(theirs, ours)
     words = words.replace(" after validation, not", ", not")
-    return words.partition(", unable to parse")[0].replace("a valid boolean", "true or false")
+    return words.partition(", unable to parse")[0]
 
 
 def _without_ranges(hint: Any) -> Any:

@@ -26,10 +26,10 @@ def check_robot(robot: Robot) -> None:
     """Compile the robot's MuJoCo model and check that it has everything that the description names, and nothing that would
     carry the robot.
 
-    That is: the free base and nothing outside it; no welds, forces or options that spare it its weight; the joints with one
-    motor each; the feet (a geom and a site at its centre); the collision bodies and the trunk's shapes, which must meet the ground; the imu site;
-    that the default pose is within the joint ranges; that nothing is in the ground at ``stand_height``. A robot whose files
-    have not changed is checked once in a process.
+    That is: the free base and nothing outside it; no welds, forces or options that spare it its weight; the joints with
+    one motor each; the feet (a geom and a site at its centre); the collision bodies and the trunk's shapes, which must meet
+    the ground; the imu site; that the default pose is within the joint ranges; that nothing is in the ground at
+    ``stand_height``. A robot whose files have not changed is checked once in a process.
 
     Raises:
         RobotError: the first disagreement found.

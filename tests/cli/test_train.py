@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.cli.errors import UserError
-from gaitgauge.cli.train import duration
+from gaitgauge.cli.train import parse_duration
 from gaitgauge.training import checkpoint as checkpoint_module
 from gaitgauge.training.gauging import gauge_scorer, scores_of
 from gaitgauge.training.launch import TrainRequest, prepare
@@ -251,13 +251,13 @@ def test_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
     ("text", "seconds"), [("90", 90.0), ("1.5", 1.5), ("20s", 20.0), ("9m", 540.0), ("2h", 7200.0), ("1h30m", 5400.0)]
 )
 def test_durations(text, seconds):
-    assert duration(text) == seconds
+    assert parse_duration(text) == seconds
 
 
 @pytest.mark.parametrize("text", ["", "m", "-5", "9 m", "9d", "1e3", "0s"])
 def test_impossible_durations(text):
     with pytest.raises(UserError, match="--time"):
-        duration(text)
+        parse_duration(text)
 
 
 def test_options_are_overrides_and_settings_win():

@@ -44,7 +44,7 @@ def test_numbers_lists_and_tables_become_fields():
         ({}, "zoo: it lacks legs"),
         ([], "zoo: it is []; it must be a table"),
         ({"legs": [{"name": "tail"}]}, "zoo: legs[0] a tail is no leg"),
-        ({"legs": [], "age": True}, "zoo: age is True; it must be a valid integer"),
+        ({"legs": [], "age": True}, "zoo: age is True; it must be a whole number"),
         ({"legs": [], "age": "3\n\x1b[31m" + "x" * 500}, None),
         ({"legs": [], "eyes": [float("nan"), 1]}, "zoo: eyes[0] is nan; it must be a finite number"),
         ({"legs": {1, 2}}, "zoo: legs is {1, 2}; it must be a text, a number, a list or a table"),

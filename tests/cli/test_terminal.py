@@ -1,0 +1,93 @@
+"""What the terminal shows: names as they are, one line for each mistake, whatever the file system does."""
+
+import io
+import subprocess
+import sys
+
+import pytest
+from gaitgauge.cli.console import Terminal, make_table, shell_command
+from gaitgauge.cli.progress import ProgressDisplay, duration
+
+PROGRAM = "from gaitgauge.cli.main import main; main()"
+
+
+def shown(show):
+    terminal = Terminal()
+    terminal.file = io.StringIO()
+    show(terminal)
+    return terminal.file.getvalue()
+
+
+@pytest.mark.parametrize("name", ["[/x]", "runs[v2]", "[bold]", ":smile:", "[link=file:///etc]x[/link]"])
+def test_names_are_no_markup(name):
+    table = make_table(name, name)
+    table.add_row(name)
+    assert shown(lambda t: t.say(f"folder {name}")) == f"folder {name}\n"
+    assert shown(lambda t: t.print(table)).count(name) == 3
+
+
+def test_control_characters_are_escaped():
+    table = make_table("a\x1b]0;title\x07", "b\x1b[2J")
+    table.add_row("c\x9b31m\r")
+    assert shown(lambda t: t.say("x\x1b[31m\r\x00")) == "x\\x1b[31m\\r\\x00\n"
+    assert not set("\x1b\x07\x9b\r") & set(shown(lambda t: t.print(table)))
+
+
+def test_commands_can_be_pasted_into_a_shell(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["gaitgauge", "evaluate", "a b.pt", "--out", "runs[v2]", "--resume"])
+    assert shell_command(None, "--resume") == "gaitgauge evaluate 'a b.pt' --out 'runs[v2]' --resume"
+    assert shell_command(["train", "$(x)"]) == "gaitgauge train '$(x)'"
+
+
+def test_progress_is_plain_lines_without_a_terminal(monkeypatch):
+    clock = iter([0.0, 5.0, 12.0, 13.0, 14.0])
+    monkeypatch.setattr("gaitgauge.cli.progress.time.monotonic", lambda: next(clock))
+
+    def show(terminal):
+        with ProgressDisplay(terminal, "gauging") as display:
+            display.update(0.1, "1 of 9")
+            display.update(0.2, "2 of 9", {"now:": "[/flat]"})
+            display.update(0.3, "3 of 9")
+            display.update(1.0, "9 of 9", last=True)
+
+    assert shown(show) == "12 s: gauging, 2 of 9, now: [/flat]\n14 s: gauging, 9 of 9\n"
+
+
+def test_progress_is_a_block_on_a_terminal():
+    terminal = Terminal()
+    terminal.file, terminal._force_terminal = io.StringIO(), True
+    with ProgressDisplay(terminal, "gau[/x]ging") as display:
+        display.update(0.5, "1 of 2", {"now:": "[bold]"})
+    text = terminal.file.getvalue()
+    assert "gau[/x]ging" in text and "[bold]" in text and "1 of 2" in text
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(30.4, "30 s"), (127, "2 min 07 s"), (3901, "1 h 05 min")])
+def test_durations_for_people(seconds, text):
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize("arguments", [("list", "suites"), ("--version",), ("list", "robots")])
+def test_a_full_disk_behind_standard_output_is_one_sentence(arguments):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, timeout=120
+        )
+    assert done.returncode == 2
+    assert done.stderr == "gaitgauge: output cannot be written: no space left on device\n"
+
+
+def test_a_reader_that_left_is_no_error():
+    done = subprocess.run(
+        f"{sys.executable} -c '{PROGRAM}' list suites | true",
+        shell=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+def test_a_folder_s_name_that_is_too_long_is_one_sentence(refused, policy):
+    assert "file name too long" in refused("evaluate", policy, "--pipeline", "base", "--out", "x" * 300).lower()
+    assert "file name too long" in refused("evaluate", "x" * 300 + ".pt").lower()
