@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..backends.base import PhysicsOptions
+from ..backends.base import TRAINING_PHYSICS, PhysicsOptions
 from ..terrains.training_tiles import DEFAULT_SHAPE, NUM_TILE_LEVELS, TileShape
 
 Range = tuple[float, float]
@@ -345,22 +345,6 @@ class TerminationConfiguration:
     the level down. None for never."""
     stuck_from: float = 0.1
     """Fraction of the run from which being stuck ends episodes: a robot that cannot walk yet is always stuck."""
-
-
-TRAINING_PHYSICS = PhysicsOptions(
-    timestep=0.005,
-    substeps=4,
-    cone="pyramidal",
-    iterations=6,
-    ls_iterations=20,
-    tolerance=1e-6,
-    foot_condim=3,
-    self_collision=False,
-    torque_limits=True,
-    torque_speed_limit=True,
-)
-"""Physics of the published training, as far as the engines have it: 200 Hz, four substeps, sliding friction only. Six solver
-iterations are faster than ten, and what ships was trained with them."""
 
 
 @dataclass(frozen=True, kw_only=True)

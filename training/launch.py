@@ -39,9 +39,6 @@ DEFAULT_BACKEND = "mujoco-warp"
 QUICK_SUITE = "quick"
 _HORIZON = "environment.schedule.horizon_steps"
 _WAIT = "training.run.gauge_wait"
-_ENGINE_SETTINGS: Mapping[str, tuple[str, ...]] = {"mujoco": ("environment.physics.iterations=15",)}
-"""What an engine needs that others do not, before the settings of the request. MuJoCo's solver has not converged after the tasks' six
-iterations at steps of 5 ms, and throws walking robots over; mujoco_warp's has."""
 _GOING_ON_RATE, _GOING_ON_KL, _GOING_ON_STD = 3e-4, 0.006, 0.3
 """First learning rate, wanted change of the policy in an update, and exploration noise of a run that begins with trained networks."""
 
@@ -137,7 +134,6 @@ def prepare(request: TrainRequest) -> TrainPlan:
     elif request.init_from is not None:
         own = [*_going_on(task, read_checkpoint(_first_weights(request, task), training_state=False)), *own]
     backend = request.backend or stored.get("backend", DEFAULT_BACKEND)
-    own = [*_ENGINE_SETTINGS.get(backend, ()), *own]
     if request.seconds is not None:
         # The limit is for the whole command: by default nothing is waited for beyond it.
         task = find_task(request.task, [f"{_WAIT}=0", *own])
