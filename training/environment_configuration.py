@@ -197,8 +197,9 @@ class CommandConfiguration:
     turn."""
     extreme_probability: float = 0.2
     """Share of draws with every axis at a limit or zero."""
-    extreme_zero_probability: float = 1.0 / 3.0
-    """Chance of each axis of an extreme command to be zero. Published: forward and lateral never are."""
+    extreme_zero_probability: tuple[float, float, float] = (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)
+    """Chance of the forward, lateral and yaw speed of an extreme command to be zero. Published: 0, 0 and 1/3, and 0, 1
+    and 1/3 for the fast task."""
     flip_probability: float = 0.2
     """Chance that an extreme command is followed by its opposite."""
     stationary_probability: Ramp = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
