@@ -12,7 +12,6 @@ import argparse
 import json
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -21,6 +20,7 @@ from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.cts import CTS
 from gaitgauge.training.algorithms.symmetry import build_mirror
 from gaitgauge.training.configuration import AlgorithmConfiguration, RunConfiguration, TrainingConfiguration
+from gaitgauge.training.environment_configuration import ObservationConfiguration
 from tensordict import TensorDict
 
 WIDTHS = {"policy": 45, "history": 225, "privileged": 263}
@@ -58,14 +58,10 @@ def measure(settings: dict[str, Any], *, num_envs: int, steps: int, repeat: int,
         algorithm=AlgorithmConfiguration(**settings), run=RunConfiguration(steps_per_iteration=steps)
     )
     robot = load_robot("go2")
-    arguments = configuration.to_rsl_rl() | {
-        "mirror": build_mirror(go2_contract(robot), robot, history_length=5),
-        "multi_gpu": None,
-    }
+    mirror = build_mirror(ObservationConfiguration(), contract=go2_contract(robot), robot=robot)
     groups = {name: torch.randn(num_envs, width, device=device) for name, width in WIDTHS.items()}
     observations = TensorDict(groups, batch_size=[num_envs])
-    environment: Any = SimpleNamespace(num_envs=num_envs, num_actions=robot.num_joints)
-    algorithm = CTS.construct_algorithm(observations, environment, arguments, device)
+    algorithm = CTS.build(observations, configuration, num_actions=robot.num_joints, mirror=mirror, device=device)
     rewards, dones = torch.randn(num_envs, device=device), torch.zeros(num_envs, dtype=torch.bool, device=device)
     on_gpu = torch.device(device).type == "cuda"
     times = {"rollout": 0.0, "update": 0.0}
@@ -76,7 +72,7 @@ def measure(settings: dict[str, Any], *, num_envs: int, steps: int, repeat: int,
                 with torch.inference_mode():
                     for _ in range(steps):
                         algorithm.act(observations)
-                        algorithm.process_env_step(observations, rewards, dones, {"time_outs": dones})
+                        algorithm.store_outcome(rewards, dones, {"time_outs": dones})
                     algorithm.compute_returns(observations)
             elif part == "update":
                 algorithm.update()

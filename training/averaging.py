@@ -47,11 +47,10 @@ class WeightAverage:
             torch._foreach_lerp_(means, self._now, share)
 
     def state_dict(self) -> dict[str, Any]:
-        """What ``load_state_dict`` takes, on the CPU: the averaged modules' state dictionaries, and of how many iterations they
-        are averages.
+        """What ``load_state_dict`` takes: the averaged modules' state dictionaries, which later updates change, and of how many
+        iterations they are averages.
         """
-        states = {name: {k: v.to("cpu") for k, v in state.items()} for name, state in self._states.items()}
-        return {"iterations": self._count, **states}
+        return {"iterations": self._count, **self._states}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:
         """Continue from what ``state_dict`` returned; None begins with the present weights."""

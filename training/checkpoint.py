@@ -8,18 +8,18 @@ only and is read without the ability to run code.
 
 from __future__ import annotations
 
-import errno
 import io
 import json
-import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from ..files.writing import replacing
 from ..policy.base import PolicyError
 from ..policy.contract import PolicyContract
 from ..policy.native import FORMAT, StoredNetwork, checksum, load_entries
@@ -76,48 +76,17 @@ def _require_plain(name: str, value: Any) -> None:
         )
 
 
-def write_checkpoint(path: str | Path, entries: Mapping[str, Any]) -> None:
+def write_checkpoint(path: Path, entries: Mapping[str, Any]) -> None:
     """Write a file that appears whole or not at all; whatever was there before survives a failure.
 
     Raises:
         CheckpointError: the file cannot be written, for example because the disk is full.
     """
-    buffer = io.BytesIO()
     policy = entries.get("format") == FORMAT
+    buffer = io.BytesIO()
     torch.save({**entries, "checksum": checksum(entries)} if policy else dict(entries), buffer)
-    write_bytes(path, buffer.getbuffer())
-
-
-def write_bytes(path: str | Path, data: bytes | memoryview) -> None:
-    """Write a file beside its destination, flush it to the disk and rename it into place.
-
-    Raises:
-        CheckpointError: the file cannot be written.
-    """
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, target)
-        # The rename itself is durable only once the folder is.
-        folder = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise CheckpointError(_write_failure(target, len(data), error)) from error
-
-
-def _write_failure(target: Path, size: int, error: OSError) -> str:
-    message = f"Cannot write '{target}' ({size / 1e6:.1f} MB): {error.strerror or error}"
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        message += "; free some space and resume with --resume latest"
-    return message + ". Files written before are intact."
+    with _whole(path) as partial:
+        partial.write_bytes(buffer.getbuffer())
 
 
 def copy_checkpoint(source: Path, target: Path) -> None:
@@ -126,15 +95,22 @@ def copy_checkpoint(source: Path, target: Path) -> None:
     Raises:
         CheckpointError: it cannot be read or written.
     """
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
+    with _whole(target) as partial:
         shutil.copyfile(source, partial)
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(partial, target)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise CheckpointError(_write_failure(target, source.stat().st_size if source.exists() else 0, error)) from error
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    try:
+        with replacing(path, CheckpointError) as partial:
+            yield partial
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}; a training goes on with --resume latest") from error
+
+
+def rank_file(path: Path, rank: int) -> Path:
+    """Where process ``rank`` of a run keeps its part of a checkpoint."""
+    return path.with_suffix(f".rank{rank}{path.suffix}")
 
 
 def read_checkpoint(path: str | Path, *, training_state: bool = True) -> dict[str, Any]:
@@ -193,7 +169,7 @@ def student_state(actor: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return {n.removeprefix("student."): value for n, value in actor.items() if n.startswith("student.")}
 
 
-def trim_checkpoint(source: str | Path, destination: str | Path, *, raw: bool = False) -> None:
+def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False) -> None:
     """Write a checkpoint's networks without what only resuming needs: a policy file from which training can begin anew
     (``--init-from``), with its teacher and its critic.
 

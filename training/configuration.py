@@ -15,10 +15,10 @@ from typing import Any
 from .environment_configuration import Ramp
 
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
-SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "alternate", "loss")
-LOAD_BALANCE_FORMS: tuple[str, ...] = ("sum", "mean")
+SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "alternate")
 PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
-COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default", "max-autotune-no-cudagraphs")
+LOGGERS: tuple[str, ...] = ("tensorboard", "wandb", "neptune")
+COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default")
 
 
 class ConfigurationError(ValueError):
@@ -85,8 +85,6 @@ class AlgorithmConfiguration:
     """Lambda of generalized advantage estimation."""
     clip: float = 0.2
     """Clip range of the probability ratio and of the value update."""
-    clip_value_loss: bool = True
-    """Whether the value update is clipped."""
     value_coefficient: float = 1.0
     """Weight of the value loss."""
     entropy_coefficient: Ramp | float = 0.01
@@ -98,34 +96,26 @@ class AlgorithmConfiguration:
     desired_kl: float | None = 0.01
     """KL divergence that the learning rate is adapted to after every minibatch; None keeps the rate fixed."""
     max_gradient_norm: float = 1.0
-    """Gradient norm limit, of each optimizer."""
-    joint_gradient_clip: bool = True
-    """Whether actor side and critic share one gradient norm (published) or are clipped apart (as rsl_rl does)."""
+    """Gradient norm limit, of each optimizer; actor side and critic share one norm."""
     student_learning_rate: float = 1e-3
     """Learning rate of the student encoder's own Adam."""
     load_balance_coefficient: float = 0.01
-    """Weight of the load balancing loss of the Mixture of Experts."""
-    load_balance: str = "sum"
-    """``sum`` over the experts (the paper's equation) or ``mean`` (the published code, K times weaker). With the
-    mean, all samples collapsing onto one of 8 experts costs 0.0011 beside a latent error of the order of 0.01, which
-    hardly counters a collapse."""
+    """Weight of the load balancing loss of the Mixture of Experts, a sum over the experts (the paper's equation). The published
+    code takes the mean: a collapse of all samples onto one of 8 experts would then cost 0.0011 beside a latent error of the
+    order of 0.01."""
     symmetry: str = "none"
-    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image), ``alternate`` (half of a minibatch
-    is replaced by its mirror image, the other half in the next pass: half of the work of ``augment``) or ``loss`` (the actor is
-    pulled towards acting alike in mirrored states)."""
-    symmetry_coefficient: float = 1.0
-    """Weight of the mirror loss (``symmetry="loss"``)."""
+    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image) or ``alternate`` (half of a minibatch
+    is replaced by its mirror image, the other half in the next pass: half of the work of ``augment``)."""
     precision: str = "tf32"
     """Matrix products on a GPU: ``float32``, ``tf32`` or ``bfloat16`` (autocast; losses stay in float32)."""
     cuda_graphs: bool | None = None
-    """Replay a minibatch step as one CUDA graph; single GPU only. None: wherever that is possible."""
+    """Replay a minibatch step as CUDA graphs. None: on a GPU."""
     compile_mode: str = "auto"
     """Mode of ``torch.compile`` for the loss functions: ``none``, ``default``, ``max-autotune-no-cudagraphs``, or
     ``auto``: ``default`` on a GPU, ``none`` elsewhere. Compiling takes about half a minute at the start."""
 
     def __post_init__(self) -> None:
         _choose("symmetry", self.symmetry, SYMMETRY_MODES)
-        _choose("load_balance", self.load_balance, LOAD_BALANCE_FORMS)
         _choose("precision", self.precision, PRECISIONS)
         _choose("compile_mode", self.compile_mode, COMPILE_MODES)
         _positive(self, "epochs", "minibatches", "learning_rate", "student_learning_rate", "max_gradient_norm", "clip")
@@ -152,6 +142,12 @@ class RunConfiguration:
     """Updates of the whole run."""
     save_interval: int = 500
     """Updates between two checkpoints."""
+    logger: str = "tensorboard"
+    """``tensorboard``, or a service beside it: ``wandb`` or ``neptune``."""
+    logger_project: str = "gaitgauge"
+    """Name of the service's project."""
+    video_interval: int = 0
+    """Updates between two videos of the student; 0 for none. Each writes a checkpoint."""
     gauge_interval: int = 500
     """Updates between two gaugings of the student; 0 for none. Each writes a checkpoint."""
     gauge_score: str = "score"
@@ -179,8 +175,10 @@ class RunConfiguration:
             raise ConfigurationError(f"bootstrap_iterations is {self.bootstrap_iterations}; it must be at least 1.")
         if not 0.0 <= self.average_age <= 0.5:
             raise ConfigurationError(f"average_age is {self.average_age:g}; it must be between 0 (no average) and 0.5.")
-        if self.gauge_interval < 0:
-            raise ConfigurationError(f"gauge_interval is {self.gauge_interval}; it must be 0 (never) or positive.")
+        _choose("logger", self.logger, LOGGERS)
+        for name in ("gauge_interval", "video_interval"):
+            if getattr(self, name) < 0:
+                raise ConfigurationError(f"{name} is {getattr(self, name)}; it must be 0 (never) or positive.")
         if not self.experiment or PurePath(self.experiment).name != self.experiment:
             raise ConfigurationError(f"experiment is {self.experiment!r}; it must be a plain folder name.")
 
@@ -192,21 +190,6 @@ class TrainingConfiguration:
     network: NetworkConfiguration = NetworkConfiguration()
     algorithm: AlgorithmConfiguration = AlgorithmConfiguration()
     run: RunConfiguration = RunConfiguration()
-
-    def to_rsl_rl(self) -> dict[str, Any]:
-        """The dictionary that rsl_rl's runner and logger expect."""
-        return {
-            "num_steps_per_env": self.run.steps_per_iteration,
-            "save_interval": self.run.save_interval,
-            "run_name": self.run.run_name,
-            "experiment_name": self.run.experiment,
-            "seed": self.run.seed,
-            "logger": "tensorboard",
-            "check_for_nan": False,
-            "obs_groups": {"actor": ["policy"], "critic": ["privileged"]},
-            "algorithm": {"class_name": "gaitgauge.training.algorithms.cts:CTS", "configuration": self.algorithm},
-            "network": self.network,
-        }
 
 
 def to_plain(value: Any) -> Any:

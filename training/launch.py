@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -13,13 +14,18 @@ from typing import Any
 import torch
 
 from ..backends.registry import find_backend, list_backends
+from ..files.parsing import build
 from ..gauge.suite import load_suite
 from ..policy.loading import find_policy
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, reached, read_checkpoint
-from .configuration import ConfigurationError
+from .configuration import ConfigurationError, TrainingConfiguration, to_plain
 from .environment import TrainingEnvironment
-from .gauging import gauge_scorer
+from .environment_configuration import FLAT_TILE, EnvironmentConfiguration
+from .filming import Filmer
+from .logger import check_logger
+from .processes import Processes, ProcessLostError
+from .resuming import begin_with, resume_run
 from .run_directory import (
     LOG_ROOT,
     describe_run,
@@ -37,8 +43,10 @@ from .tasks import Task, find_task
 
 DEFAULT_BACKEND = "mujoco-warp"
 QUICK_SUITE = "quick"
-_HORIZON = "environment.schedule.horizon_steps"
 _WAIT = "training.run.gauge_wait"
+_ENGINE_SETTINGS: Mapping[str, tuple[str, ...]] = {"mujoco": ("environment.physics.iterations=15",)}
+"""What an engine needs that others do not, before the settings of the request. MuJoCo's solver has not converged after the tasks' six
+iterations at steps of 5 ms, and throws walking robots over; mujoco_warp's has."""
 _GOING_ON_RATE, _GOING_ON_KL, _GOING_ON_STD = 3e-4, 0.006, 0.3
 """First learning rate, wanted change of the policy in an update, and exploration noise of a run that begins with trained networks."""
 
@@ -73,6 +81,10 @@ class TrainRequest:
     """CUDA graphs in the environment; None: on a GPU."""
     fuse: bool = False
     """Compile the environment's torch parts."""
+    logger: str | None = None
+    """``tensorboard``, ``wandb`` or ``neptune``."""
+    video_every: int | None = None
+    """Iterations between two videos."""
     score_suite: str | None = QUICK_SUITE
     """Suite that scores checkpoints in a side process, None for no scores."""
     score_every: int | None = None
@@ -94,7 +106,7 @@ class TrainPlan:
     run: Path | None
     """Run directory that is continued, None to make a new one."""
     settings: Mapping[str, Any]
-    """What a later resume needs to build the same run: backend and overrides, kept in every checkpoint."""
+    """What a later resume needs to build the same run, kept in every checkpoint: backend and the resolved configuration."""
 
 
 def prepare(request: TrainRequest) -> TrainPlan:
@@ -109,66 +121,88 @@ def prepare(request: TrainRequest) -> TrainPlan:
         )
     own = _own_overrides(request)
     task = find_task(request.task, own)
-    stored: Mapping[str, Any] = {}
-    checkpoint, run, training = None, None, None
+    checkpoint, run, kept_backend = None, None, None
     if request.resume is not None:
         checkpoint = find_checkpoint(
             request.resume, experiment=task.training.run.experiment, root=request.log_root
         ).absolute()
-        training = read_checkpoint(checkpoint)["training"]
-        if training["task"] != request.task:
-            raise CheckpointError(
-                f"Cannot resume from '{checkpoint}': it is of task '{training['task']}', this run trains "
-                f"'{request.task}'; write gaitgauge train {training['task']}."
-            )
-        stored = training.get("settings", {})
         # A checkpoint carried here without its run directory continues in a new one.
         run = checkpoint.parent if read_run_json(checkpoint.parent).get("task") == request.task else None
-        own = [
-            *stored.get("overrides", ()),
-            f"environment.num_envs={training['num_envs']}",
-            *([f"{_HORIZON}={stored['horizon_steps']}"] if "horizon_steps" in stored else []),
-            *own,
-        ]
-        own = _last_of_each(own)
-    elif request.init_from is not None:
-        own = [*_going_on(task, read_checkpoint(_first_weights(request, task), training_state=False)), *own]
-    backend = request.backend or stored.get("backend", DEFAULT_BACKEND)
-    if request.seconds is not None:
-        # The limit is for the whole command: by default nothing is waited for beyond it.
-        task = find_task(request.task, [f"{_WAIT}=0", *own])
+        kept, kept_backend = _kept(checkpoint, request.task)
+        backend = request.backend or kept_backend
+        task = kept.with_overrides([*(_ENGINE_SETTINGS.get(backend, ()) if backend != kept_backend else ()), *own])
+        if task.environment.num_envs != kept.environment.num_envs:
+            raise CheckpointError(
+                f"Cannot resume from '{checkpoint}': it has {kept.environment.num_envs} environments, this run "
+                f"{task.environment.num_envs}; leave --num-envs out, or begin a new run with --init-from."
+            )
     else:
-        task = find_task(request.task, own)
-    if training is not None and task.environment.num_envs != training["num_envs"]:
-        raise CheckpointError(
-            f"Cannot resume from '{checkpoint}': it has {training['num_envs']} environments, this run "
-            f"{task.environment.num_envs}; leave --num-envs out, or begin a new run with --init-from."
-        )
-    if request.score_suite is None:
-        task = replace(task, training=replace(task.training, run=replace(task.training.run, gauge_interval=0)))
-    else:
-        load_suite(request.score_suite)
+        backend = request.backend or DEFAULT_BACKEND
+        begun = _going_on(task, _first_weights(request, task)) if request.init_from is not None else []
+        task = find_task(request.task, [*_ENGINE_SETTINGS.get(backend, ()), *begun, *own])
+    check_logger(task.training.run.logger)
     device = _device(request.device, backend)
     find_backend(backend, device)
     if request.capture and not device.startswith("cuda"):
         raise ConfigurationError(f"--capture replays CUDA graphs and the device is '{device}'; leave it out")
     settings = {
         "backend": backend,
-        "overrides": own,
-        "horizon_steps": task.environment.schedule.horizon_steps,
+        "environment": to_plain(task.environment),
+        "training": to_plain(task.training),
     }
+    # What is for this command alone is not kept.
+    run_settings = task.training.run
+    if request.seconds is not None and not any(o.startswith(f"{_WAIT}=") for o in own):
+        # The limit is for the whole command: nothing is waited for beyond it.
+        run_settings = replace(run_settings, gauge_wait=0.0)
+    if request.score_suite is None:
+        run_settings = replace(run_settings, gauge_interval=0)
+    else:
+        load_suite(request.score_suite)
     return TrainPlan(
-        request=request, task=task, backend=backend, device=device, checkpoint=checkpoint, run=run, settings=settings
+        request=request,
+        task=replace(task, training=replace(task.training, run=run_settings)),
+        backend=backend,
+        device=device,
+        checkpoint=checkpoint,
+        run=run,
+        settings=settings,
     )
 
 
-def _going_on(task: Task, entries: Mapping[str, Any]) -> list[str]:
+def _kept(checkpoint: Path, name: str) -> tuple[Task, str]:
+    """The task as a checkpoint's run has it, and its backend.
+
+    Raises:
+        CheckpointError: it is of another task, or its settings are not those of this version.
+    """
+    training = read_checkpoint(checkpoint)["training"]
+    if training["task"] != name:
+        raise CheckpointError(
+            f"Cannot resume from '{checkpoint}': it is of task '{training['task']}', this run trains "
+            f"'{name}'; write gaitgauge train {training['task']}."
+        )
+    stored, source = training.get("settings", {}), f"Cannot resume from '{checkpoint}'"
+    if "environment" not in stored:
+        raise CheckpointError(
+            f"{source}: an earlier version wrote it, without all of its settings; begin a new run with its networks: "
+            f"--init-from {checkpoint}"
+        )
+    task = replace(
+        find_task(name),
+        environment=build(EnvironmentConfiguration, stored["environment"], source, CheckpointError),
+        training=build(TrainingConfiguration, stored["training"], source, CheckpointError),
+    )
+    return task, stored["backend"]
+
+
+def _going_on(task: Task, weights: Path) -> list[str]:
     """Settings of a run that begins with trained networks, before those of the request: schedules go on where that
     training left them, robots that can walk start on all levels, steps are smaller, and a policy without its
     exploration noise gets little.
     """
     return [
-        f"environment.schedule.begin={reached(entries):g}",
+        f"environment.schedule.begin={reached(read_checkpoint(weights, training_state=False)):g}",
         f"environment.terrain.highest_start_level={task.environment.terrain.levels - 1}",
         f"training.algorithm.desired_kl={_GOING_ON_KL}",
         f"training.algorithm.learning_rate={_GOING_ON_RATE}",
@@ -198,13 +232,10 @@ def _own_overrides(request: TrainRequest) -> list[str]:
         ("training.run.iterations", request.iterations),
         ("training.run.run_name", request.run_name),
         ("training.run.gauge_interval", request.score_every),
+        ("training.run.video_interval", request.video_every),
+        ("training.run.logger", request.logger),
     ]
     return [f"{key}={value}" for key, value in options if value is not None] + list(request.overrides)
-
-
-def _last_of_each(overrides: Sequence[str]) -> list[str]:
-    """Overrides without those that a later one of the same key replaces."""
-    return list({override.partition("=")[0].strip(): override for override in overrides}.values())
 
 
 def _device(asked: str | None, backend: str) -> str:
@@ -226,8 +257,26 @@ def _device(asked: str | None, backend: str) -> str:
         raise ConfigurationError(
             f"device '{asked}' was asked for and this machine has no CUDA device; use --device cpu"
         )
-    # rsl_rl wants each process of a run on several GPUs to name its own.
-    return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if asked == "cuda" else asked
+    if asked != "cuda":
+        return asked
+    place, gpus = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+    if place >= gpus:
+        raise ConfigurationError(
+            f"torchrun started more processes than this machine has GPUs ({gpus}); give --nproc-per-node {gpus}"
+        )
+    return f"cuda:{place}"
+
+
+def idle_gpus(device: str) -> str:
+    """A sentence on GPUs that no process of a run uses, empty if there are none."""
+    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "0"))
+    gpus = torch.cuda.device_count() if device.startswith("cuda") else 0
+    if not 0 < processes < gpus:
+        return ""
+    return (
+        f"{processes} of {gpus} GPUs are used; --nproc-per-node {gpus} uses all, and CUDA_VISIBLE_DEVICES says which are "
+        "meant."
+    )
 
 
 def train(
@@ -251,7 +300,8 @@ def train(
         How it ended, and the run directory.
 
     Raises:
-        ConfigurationError, BackendError, CheckpointError, TrainingDivergedError: one sentence on what went wrong.
+        ConfigurationError, BackendError, CheckpointError, TrainingDivergedError, ProcessLostError: one sentence on what
+        went wrong.
     """
     request, task, device = plan.request, plan.task, plan.device
     rank = int(os.environ.get("RANK", "0"))
@@ -260,63 +310,81 @@ def train(
     if rank == 0:
         run = plan.run or new_run_directory(request.log_root, run_settings.experiment, run_settings.run_name)
         started(run)
+        if idle := idle_gpus(device):
+            message(idle)
     seed_everything(run_settings.seed + rank)
     environment = replace(task.environment, seed=task.environment.seed + rank)
-    try:
-        env = TrainingEnvironment(
-            environment,
-            backend=plan.backend,
-            device=device,
-            threads=request.threads,
-            capture=device.startswith("cuda") if request.capture is None else request.capture,
-            fuse=request.fuse,
-        )
-        if run is not None:
-            _describe(plan, run, env)
-        symmetric = task.training.algorithm.symmetry != "none"
-        scorer: Scorer | None = None
-        if request.score_suite is not None and run_settings.gauge_interval > 0 and run is not None:
-            scorer = gauge_scorer(run, suite=request.score_suite, threads=request.score_threads)
-        runner = TrainingRunner(
-            env,
-            task.training,
-            contract=env.contract,
-            task=task.name,
-            log_dir=run,
-            device=device,
-            mirror=build_mirror(env.contract, env.robot, history_length=5) if symmetric else None,
-            scorer=scorer,
-            settings=plan.settings,
-            progress=progress if rank == 0 else None,
-            message=message if rank == 0 else None,
-        )
-    except torch.OutOfMemoryError as error:
-        raise ConfigurationError(
-            f"{environment.num_envs} environments do not fit into the memory of {device}; use a smaller --num-envs"
-        ) from error
-    run = runner.log_dir = _shared_directory(runner, run)
-    try:
-        if plan.checkpoint is not None:
-            runner.load(str(plan.checkpoint))
-        elif request.init_from is not None:
-            runner.load_weights(_first_weights(request, task))
-        left = run_settings.iterations - runner.current_learning_iteration
-        if left <= 0:
-            raise ConfigurationError(
-                f"the run has done {runner.current_learning_iteration} of {run_settings.iterations} iterations; to go "
-                "on, give a larger --iterations"
+    with ExitStack() as closing:
+        try:
+            env = TrainingEnvironment(
+                environment,
+                backend=plan.backend,
+                device=device,
+                threads=request.threads,
+                capture=device.startswith("cuda") if request.capture is None else request.capture,
+                fuse=request.fuse,
             )
-        seconds = None if request.seconds is None else max(request.seconds - (time.monotonic() - began), 0.0)
-        outcome = runner.learn(left, max_seconds=seconds)
-    except torch.OutOfMemoryError as error:
-        raise ConfigurationError(
-            f"learning with {environment.num_envs} environments does not fit into the memory of {device}; use a "
-            "smaller --num-envs, or more training.algorithm.minibatches"
-        ) from error
-    finally:
-        runner.close()
-        env.close()
+            closing.callback(env.close)
+            if run is not None:
+                _describe(plan, run, env)
+            processes = Processes.join(device)
+            scorer = filmer = None
+            if run is not None and request.score_suite is not None and run_settings.gauge_interval > 0:
+                scorer = Scorer(run, suite=request.score_suite, threads=request.score_threads)
+            if run is not None and run_settings.video_interval > 0:
+                level_ground = all(tile.name == FLAT_TILE.name for tile in environment.terrain.tiles)
+                filmer = Filmer(run, terrain="flat" if level_ground else "stairs_fd")
+            run = Path(processes.firsts(str(run)))
+            mirrored = task.training.algorithm.symmetry != "none"
+            runner = TrainingRunner(
+                env,
+                task.training,
+                contract=env.contract,
+                task=task.name,
+                log_dir=run,
+                device=device,
+                processes=processes,
+                mirror=build_mirror(environment.observations, contract=env.contract, robot=env.robot)
+                if mirrored
+                else None,
+                scorer=scorer,
+                filmer=filmer,
+                settings=plan.settings,
+                progress=progress if rank == 0 else None,
+                message=message if rank == 0 else None,
+            )
+            closing.callback(runner.close)
+        except torch.OutOfMemoryError as error:
+            raise ConfigurationError(
+                f"{environment.num_envs} environments do not fit into the memory of {device}; use a smaller --num-envs"
+            ) from error
+        try:
+            outcome = _learn(plan, runner, began)
+        except torch.OutOfMemoryError as error:
+            raise ConfigurationError(
+                f"learning with {environment.num_envs} environments does not fit into the memory of {device}; use a "
+                "smaller --num-envs, or more training.algorithm.minibatches"
+            ) from error
+        except ProcessLostError:
+            closing.pop_all()  # closing would wait for the lost process
+            raise
+        processes.leave()
     return outcome, run
+
+
+def _learn(plan: TrainPlan, runner: TrainingRunner, began: float) -> TrainingOutcome:
+    """Continue or begin, and train."""
+    request, iterations = plan.request, plan.task.training.run.iterations
+    if plan.checkpoint is not None:
+        resume_run(runner, plan.checkpoint)
+    elif request.init_from is not None:
+        begin_with(runner, _first_weights(request, plan.task))
+    if (left := iterations - runner.iteration) <= 0:
+        raise ConfigurationError(
+            f"the run has done {runner.iteration} of {iterations} iterations; to go on, give a larger --iterations"
+        )
+    seconds = None if request.seconds is None else max(request.seconds - (time.monotonic() - began), 0.0)
+    return runner.learn(left, max_seconds=seconds)
 
 
 def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment) -> None:
@@ -337,7 +405,7 @@ def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment) -> None:
         note = {
             "started": now,
             "checkpoint": plan.checkpoint.name if plan.checkpoint else "",
-            "argv": description["argv"],
+            "command": description["command"],
         }
         update_run_json(run, {"resumed": [*earlier.get("resumed", []), note]})
         return
@@ -345,12 +413,3 @@ def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment) -> None:
     update_run_json(
         run, description | {"settings": plan.settings, "begun_with": str(begun_with) if begun_with else None}
     )
-
-
-def _shared_directory(runner: TrainingRunner, run: Path | None) -> Path:
-    """The first process's run directory, in every process."""
-    shared: list[str | None] = [str(run) if run is not None else None]
-    if runner.is_distributed:
-        torch.distributed.broadcast_object_list(shared, src=0, device=torch.device(runner.device))
-    assert shared[0] is not None
-    return Path(shared[0])

@@ -1,71 +1,125 @@
-"""rsl_rl's logger without a wait for the device in every step, and with teacher and student told apart."""
+"""What a run logs: rsl_rl's scalars under rsl_rl's names, collected on the device, through rsl_rl's writers."""
 
 from __future__ import annotations
 
-import contextlib
-import io
+import importlib
+import importlib.util
+import os
 import statistics
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import is_dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
-from rsl_rl.utils.logger import Logger
+
+from .configuration import ConfigurationError, TrainingConfiguration, to_plain
 
 WINDOW = 100
 """Number of finished episodes that ``Train/*`` averages over, as rsl_rl does."""
+_SERVICES: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "wandb": ("WandbLogWriter", ()),
+    "neptune": ("NeptuneLogWriter", ("NEPTUNE_API_TOKEN", "NEPTUNE_USERNAME")),
+}
+"""rsl_rl's writer of each service, which write TensorBoard's files too, and the environment variables that it needs."""
 
 
-class RunLogger(Logger):
-    """Writes the scalars that users of rsl_rl know, under the same names, and prints nothing.
+def check_logger(name: str) -> None:
+    """Refuse a logger that cannot work here.
 
-    rsl_rl's own logger copies finished episodes to the host in every step and every ``log`` entry of every step on
-    its own. Here both stay on the device until the iteration ends.
+    Raises:
+        ConfigurationError: its package is not installed, or it does not know whose account to use.
     """
+    if name not in _SERVICES:
+        return
+    if importlib.util.find_spec(name) is None:
+        raise ConfigurationError(
+            f"--logger {name} needs the package '{name}', which is not installed: pip install {name}"
+        )
+    for variable in _SERVICES[name][1]:
+        if variable not in os.environ:
+            raise ConfigurationError(f"--logger {name} needs the environment variable {variable}; set it and try again")
 
-    writer: Any
 
-    def __init__(self, *, num_steps: int, student_period: int, **arguments: Any) -> None:
-        """See rsl_rl's logger for ``arguments``.
+def make_writer(configuration: TrainingConfiguration, log_dir: Path, environment: Any) -> Any:
+    """Start the configured writer in a run directory.
+
+    Raises:
+        ConfigurationError: the service cannot be reached or refuses the account.
+    """
+    name = configuration.run.logger
+    if name not in _SERVICES:
+        from torch.utils.tensorboard import SummaryWriter
+
+        return SummaryWriter(log_dir=str(log_dir), flush_secs=10)  # type: ignore[no-untyped-call]
+    module = importlib.import_module(f"rsl_rl.utils.{name}_log_writer")
+    service = importlib.import_module(name)
+    refused = (OSError, RuntimeError, ValueError, getattr(getattr(service, "errors", None), "Error", OSError))
+    try:
+        writer = getattr(module, _SERVICES[name][0])(
+            log_dir=str(log_dir), project_name=configuration.run.logger_project
+        )
+        if is_dataclass(environment):
+            writer.store_config(environment, to_plain(configuration))
+    except refused as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigurationError(f"--logger {name} cannot start: {reason}") from error
+    return writer
+
+
+class RunLogger:
+    """Collects on the device until an iteration ends, then writes; prints nothing."""
+
+    def __init__(self, configuration: TrainingConfiguration, *, num_envs: int, processes: int, device: str) -> None:
+        """Without a writer nothing is written.
 
         Args:
-            num_steps: environment steps per iteration.
-            student_period: environment i is a student's if i is a multiple of it.
-            arguments: of rsl_rl's logger.
+            configuration: steps of an iteration, and every which environment is a student's.
+            num_envs: environments of this process.
+            processes: of the run.
+            device: of the environments' rewards.
         """
-        super().__init__(**arguments)
-        device = self.device
-        self._finished = torch.zeros(num_steps, self.num_envs, dtype=torch.bool, device=device)
-        self._returns = torch.zeros(num_steps, self.num_envs, device=device)
-        self._lengths = torch.zeros(num_steps, self.num_envs, device=device)
-        self._step = 0
-        self._student_period = student_period
-        self._entries: list[tuple[tuple[str, ...], torch.Tensor]] = []
+        steps = configuration.run.steps_per_iteration
+        self.writer: Any = None
+        self.total_steps = 0
+        """Environment steps of the run, all processes together."""
+        self.total_time = 0.0
+        """Time of all iterations [s]."""
+        self.returns: deque[float] = deque(maxlen=WINDOW)
+        """Sums of rewards of the last episodes."""
+        self.lengths: deque[float] = deque(maxlen=WINDOW)
+        """Their lengths [control steps]."""
         self.group_returns: dict[str, deque[float]] = {name: deque(maxlen=WINDOW) for name in ("teacher", "student")}
         self.scalars: dict[str, float] = {}
         """What the last iteration wrote, by key."""
+        self.reward_sum = torch.zeros(num_envs, device=device)
+        self.episode_length = torch.zeros(num_envs, device=device)
+        self._finished = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
+        self._returns = torch.zeros(steps, num_envs, device=device)
+        self._lengths = torch.zeros(steps, num_envs, device=device)
+        self._step = 0
+        self._samples = steps * num_envs * processes
+        self._student_period = configuration.algorithm.student_period
+        self._entries: list[tuple[tuple[str, ...], torch.Tensor]] = []
+        self._latest = 0
 
-    def process_env_step(
-        self,
-        rewards: torch.Tensor,
-        dones: torch.Tensor,
-        extras: dict[str, Any],
-        intrinsic_rewards: torch.Tensor | None = None,
-    ) -> None:
-        """Note one step of all environments, in environment order."""
-        self.cur_reward_sum += rewards
-        self.cur_episode_length += 1
+    def add_step(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, Any]) -> None:
+        """Note one step of all environments, in environment order; ``extras["log"]`` has scalars by name."""
+        self.reward_sum += rewards
+        self.episode_length += 1
         done = dones > 0
         self._finished[self._step] = done
-        self._returns[self._step] = self.cur_reward_sum
-        self._lengths[self._step] = self.cur_episode_length
-        self.cur_reward_sum.masked_fill_(done, 0.0)
-        self.cur_episode_length.masked_fill_(done, 0.0)
+        self._returns[self._step] = self.reward_sum
+        self._lengths[self._step] = self.episode_length
+        self.reward_sum.masked_fill_(done, 0.0)
+        self.episode_length.masked_fill_(done, 0.0)
         self._step = (self._step + 1) % len(self._finished)
-        if entries := extras.get("log", extras.get("episode")):
+        if entries := extras.get("log"):
             values = [v if isinstance(v, torch.Tensor) else torch.tensor(float(v)) for v in entries.values()]
             values = [v if v.dim() == 0 else v.float().mean() for v in values]
-            self._entries.append((tuple(entries), torch.stack([v.to(self.device, torch.float32) for v in values])))
+            device = self.reward_sum.device
+            self._entries.append((tuple(entries), torch.stack([v.to(device, torch.float32) for v in values])))
 
     def collect(self) -> dict[str, float]:
         """Take the iteration's finished episodes and mean ``log`` entries to the host; entries that are NaN in a step
@@ -77,8 +131,8 @@ class RunLogger(Logger):
         ).cpu()
         self._finished.zero_()
         for value, length, index in finished.tolist():
-            self.rewbuffer.append(value)
-            self.lenbuffer.append(length)
+            self.returns.append(value)
+            self.lengths.append(length)
             self.group_returns["student" if int(index) % self._student_period == 0 else "teacher"].append(value)
         groups: dict[tuple[str, ...], list[torch.Tensor]] = {}
         for keys, values in self._entries:
@@ -93,90 +147,94 @@ class RunLogger(Logger):
 
     def log(
         self,
-        it: int,
-        start_it: int,
-        total_it: int,
+        iteration: int,
+        *,
         collect_time: float,
         learn_time: float,
-        loss_dict: dict[str, float],
+        losses: Mapping[str, float],
         learning_rate: float,
         action_std: torch.Tensor,
-        rnd_weight: float | None = None,
-        print_minimal: bool = False,
-        width: int = 80,
-        pad: int = 40,
     ) -> None:
-        """Write one iteration's scalars and keep them in ``scalars``."""
-        samples = self.cfg["num_steps_per_env"] * self.num_envs * self.gpu_world_size
+        """Write one iteration's scalars and keep them in ``scalars``; times in seconds."""
         seconds = collect_time + learn_time
-        self.tot_timesteps += samples
-        self.tot_time += seconds
+        self.total_steps += self._samples
+        self.total_time += seconds
         scalars = self.collect()
-        scalars |= {f"Loss/{name}": value for name, value in loss_dict.items()}
+        scalars |= {f"Loss/{name}": value for name, value in losses.items()}
         scalars |= {
             "Loss/learning_rate": learning_rate,
             "Policy/mean_std": float(action_std.mean().item()),
-            "Perf/total_fps": samples / seconds,
+            "Perf/total_fps": self._samples / seconds,
             "Perf/collection_time": collect_time,
             "Perf/learning_time": learn_time,
-            "Perf/total_steps": float(self.tot_timesteps),
+            "Perf/total_steps": float(self.total_steps),
         }
-        if self.rewbuffer:
-            scalars["Train/mean_reward"] = statistics.fmean(self.rewbuffer)
-            scalars["Train/mean_episode_length"] = statistics.fmean(self.lenbuffer)
+        if self.returns:
+            scalars["Train/mean_reward"] = statistics.fmean(self.returns)
+            scalars["Train/mean_episode_length"] = statistics.fmean(self.lengths)
         for name, returns in self.group_returns.items():
             if returns:
                 scalars[f"Train/mean_reward_{name}"] = statistics.fmean(returns)
         self.scalars = scalars
-        self.write(scalars, it)
-        if self.writer is not None and self.rewbuffer:
-            self.writer.add_scalar("Train/mean_reward/time", scalars["Train/mean_reward"], int(self.tot_time))
+        self.write(scalars, iteration)
+        if self.returns and not self._in_order:
+            self.write({"Train/mean_reward/time": scalars["Train/mean_reward"]}, int(self.total_time))
+
+    @property
+    def _in_order(self) -> bool:
+        """Whether the writer's service takes steps in rising order only."""
+        return hasattr(self.writer, "save_model")
 
     def write(self, scalars: Mapping[str, float], iteration: int) -> None:
-        """Write scalars if there is a writer."""
+        """Write scalars if there is a writer. What comes late, such as a score, is at the present iteration where the
+        service drops what is behind it.
+        """
+        if self._in_order:
+            iteration = self._latest = max(iteration, self._latest)
         if self.writer is not None:
             for name, value in scalars.items():
                 self.writer.add_scalar(name, value, iteration)
 
+    def send(self, path: Path, iteration: int) -> None:
+        """Give a checkpoint (``.pt``) or a video to the writer's service, if it has one."""
+        if self._in_order:
+            if path.suffix == ".pt":
+                self.writer.save_model(str(path), iteration)
+            else:
+                self.writer.save_video(path, max(iteration, self._latest))
+
     def flush(self) -> None:
-        """Bring what was written to the disk, as far as the writer can."""
-        flush = getattr(self.writer, "flush", None)
-        if flush is not None:
-            flush()
+        """Bring what was written to the disk."""
+        if self.writer is not None:
+            self.writer.flush()
 
     def close(self) -> None:
         """Close the writer; nothing is written any more."""
-        # rsl_rl stops its own writers only, TensorBoard's has to be closed.
-        self.stop_logging_writer()
-        close = getattr(self.writer, "close", None)
-        if close is not None:
-            close()
+        if self.writer is not None:
+            self.writer.close()
+            if self._in_order:
+                self.writer.stop()
         self.writer = None
-
-    def _store_code_state(self) -> list[str]:
-        # rsl_rl reports on standard output, which belongs to the command line.
-        with contextlib.redirect_stdout(io.StringIO()):
-            return super()._store_code_state()
 
     def state_dict(self) -> dict[str, Any]:
         """What continues across a resume: totals, running episodes and the window of finished ones."""
         return {
-            "total_steps": self.tot_timesteps,
-            "total_time": float(self.tot_time),
-            "returns": list(self.rewbuffer),
-            "lengths": list(self.lenbuffer),
+            "total_steps": self.total_steps,
+            "total_time": self.total_time,
+            "returns": list(self.returns),
+            "lengths": list(self.lengths),
             "group_returns": {name: list(values) for name, values in self.group_returns.items()},
-            "reward_sum": self.cur_reward_sum.cpu(),
-            "episode_length": self.cur_episode_length.cpu(),
+            "reward_sum": self.reward_sum.cpu(),
+            "episode_length": self.episode_length.cpu(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take over what ``state_dict`` returned; running episodes only if the number of environments is the same."""
-        self.tot_timesteps = state["total_steps"]
-        self.tot_time = state["total_time"]
-        self.rewbuffer = deque(state["returns"], maxlen=WINDOW)
-        self.lenbuffer = deque(state["lengths"], maxlen=WINDOW)
+        self.total_steps = state["total_steps"]
+        self.total_time = state["total_time"]
+        self.returns = deque(state["returns"], maxlen=WINDOW)
+        self.lengths = deque(state["lengths"], maxlen=WINDOW)
         self.group_returns = {name: deque(values, maxlen=WINDOW) for name, values in state["group_returns"].items()}
-        if state["reward_sum"].shape == self.cur_reward_sum.shape:
-            self.cur_reward_sum.copy_(state["reward_sum"])
-            self.cur_episode_length.copy_(state["episode_length"])
+        if state["reward_sum"].shape == self.reward_sum.shape:
+            self.reward_sum.copy_(state["reward_sum"])
+            self.episode_length.copy_(state["episode_length"])

@@ -10,9 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
-from tensordict import TensorDict
 from torch import nn
 from torch.nn import functional
 
@@ -67,12 +65,7 @@ def student_architecture(
 
 
 class CtsActor(nn.Module):
-    """Teacher encoder, student network (encoder and the shared actor) and exploration noise.
-
-    It has the surface of rsl_rl's actor models as far as its runner, its logger and PPO use it.
-    """
-
-    is_recurrent = False
+    """Teacher encoder, student network (encoder and the shared actor) and exploration noise."""
 
     def __init__(
         self,
@@ -122,33 +115,10 @@ class CtsActor(nn.Module):
         """Mean actions (N, J) of the shared actor for latents (N, L) and current frames (N, F)."""
         return _last_in_float32(self.student.actor, torch.cat((latent, policy), dim=-1))
 
-    def forward(
-        self,
-        observations: TensorDict,
-        masks: torch.Tensor | None = None,
-        hidden_state: None = None,
-        stochastic_output: bool = False,
-    ) -> torch.Tensor:
-        """Actions (N, J) of the student in every row; sampled if ``stochastic_output``."""
-        mean = self.action_mean(self.student_latent(observations["history"])[0], observations["policy"])
-        if not stochastic_output:
-            return mean
-        self.distribution.update(mean)
-        return self.distribution.sample()
-
     @property
     def output_std(self) -> torch.Tensor:
         """Present standard deviation of the exploration noise, (J,)."""
         return self.distribution.std_param.detach().clamp(*self.distribution.std_range)
-
-    def reset(self, dones: torch.Tensor | None = None, hidden_state: None = None) -> None:
-        """Nothing to forget: the history is part of the observation."""
-
-    def get_hidden_state(self) -> None:
-        """There is none."""
-
-    def update_normalization(self, observations: TensorDict) -> None:
-        """Observations are not normalized."""
 
     def policy_parameters(self) -> list[nn.Parameter]:
         """What reinforcement learning trains: teacher encoder, actor and exploration noise."""
@@ -159,18 +129,13 @@ class CtsActor(nn.Module):
         return list(self.student.encoder.parameters())
 
 
-class CtsCritic(MLPModel):
-    """rsl_rl's perceptron on ``[latent, privileged]``; callers pass the latent detached, so that values never train
-    the encoders.
-    """
+class CtsCritic(nn.Module):
+    """A perceptron on ``[latent, privileged]``; callers pass the latent detached, so that values never train the encoders."""
 
     def __init__(self, configuration: NetworkConfiguration, *, privileged_width: int) -> None:
-        example = TensorDict(
-            {"latent": torch.zeros(1, configuration.latent_width), "privileged": torch.zeros(1, privileged_width)},
-            batch_size=[1],
-        )
-        groups = {"critic": ["latent", "privileged"]}
-        super().__init__(example, groups, "critic", 1, hidden_dims=configuration.critic_hidden, activation="elu")
+        super().__init__()
+        inputs = configuration.latent_width + privileged_width
+        self.mlp = multilayer_perceptron((inputs, *configuration.critic_hidden, 1))
 
     def value(self, latent: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         """Values (N, 1) for detached latents (N, L) and privileged observations (N, P)."""

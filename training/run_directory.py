@@ -7,23 +7,21 @@ the gauge's score), ``params/env.yaml`` and ``params/agent.yaml``, ``run.json`` 
 from __future__ import annotations
 
 import json
-import platform
 import sys
 from collections.abc import Mapping
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 
+from ..files.provenance import provenance
+from ..files.writing import json_text, write_atomically
 from ..policy.contract import PolicyContract
-from .checkpoint import CheckpointError, write_bytes
+from .checkpoint import CheckpointError
 from .configuration import to_plain
 
 LOG_ROOT = Path("logs/rsl_rl")
-RECORDED_PACKAGES = ("gaitgauge", "torch", "rsl-rl-lib", "mujoco", "mujoco-warp", "newton", "warp-lang", "numpy")
 
 
 def new_run_directory(root: Path, experiment: str, run_name: str = "", now: datetime | None = None) -> Path:
@@ -98,32 +96,21 @@ def write_parameters(run: Path, *, environment: Any, agent: Any) -> None:
         raise CheckpointError(f"Cannot create '{folder}': {error.strerror}.") from error
     for name, configuration in (("env", environment), ("agent", agent)):
         text = yaml.safe_dump(to_plain(configuration), sort_keys=False, allow_unicode=True)
-        write_bytes(folder / f"{name}.yaml", text.encode())
+        write_atomically(folder / f"{name}.yaml", text, CheckpointError)
 
 
 def describe_run(
     *, task: str, backend: str, num_envs: int, seed: int, device: str, contract: PolicyContract
 ) -> dict[str, Any]:
     """What ``run.json`` says about where and with what a run was made."""
-    versions: dict[str, str | None] = {}
-    for package in RECORDED_PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = None
-    on_gpu = torch.device(device).type == "cuda"
     return {
         "task": task,
         "backend": backend,
         "num_envs": num_envs,
         "seed": seed,
-        "device": torch.cuda.get_device_name(device) if on_gpu else platform.processor() or platform.machine(),
-        "argv": sys.argv,
         "started": f"{datetime.now().astimezone():%Y-%m-%dT%H:%M:%S%z}",
-        "python": platform.python_version(),
-        "versions": versions,
         "contract_hash": contract.hash,
-    }
+    } | provenance(command=sys.argv, device=device)
 
 
 def read_run_json(run: Path) -> dict[str, Any]:
@@ -148,4 +135,4 @@ def update_run_json(run: Path, changes: Mapping[str, Any]) -> None:
         CheckpointError: it is damaged or cannot be written.
     """
     data = read_run_json(run) | to_plain(changes)
-    write_bytes(run / "run.json", (json.dumps(data, indent=2) + "\n").encode())
+    write_atomically(run / "run.json", json_text(data), CheckpointError)

@@ -1,5 +1,4 @@
-"""The training loop: rsl_rl's runner with checkpoints that resume exactly, orderly stops, a guard against NaN, and
-the gauge in the loop.
+"""The training loop, with checkpoints that resume exactly, orderly stops, a guard against NaN, and the gauge in the loop.
 
 Iterations are counted when they are complete: ``model_500.pt`` is the state after 500 updates, and a run resumed from
 it goes on with the 501st.
@@ -10,27 +9,31 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
-from torch import nn
 
 from ..policy.contract import TERM_WIDTH, PolicyContract
+from .algorithms.cts import CTS
 from .algorithms.symmetry import Mirror
 from .averaging import WeightAverage
 from .checkpoint import copy_checkpoint
-from .checkpointed_runner import CheckpointedRunner, TrainingDivergedError
 from .configuration import TrainingConfiguration
-from .logger import RunLogger
-from .run_directory import update_run_json
+from .filming import Filmer
+from .keepsake import Keepsake
+from .logger import RunLogger, make_writer
+from .processes import Processes, ProcessLostError
+from .resuming import TrainingDivergedError, save_run, write_learned
+from .run_directory import read_run_json, update_run_json
 from .scoring import Scorer, ScoreReport
 from .stopping import Progress, StopSignals, TrainingOutcome
 
 
-class TrainingRunner(CheckpointedRunner):
+class TrainingRunner:
     """Trains on a vectorized environment.
 
     An environment with schedules has ``progress``, the fraction of the run that they are at, a scalar tensor; one that can be
@@ -47,8 +50,10 @@ class TrainingRunner(CheckpointedRunner):
         task: str,
         log_dir: Path | None = None,
         device: str = "cpu",
+        processes: Processes | None = None,
         mirror: Mirror | None = None,
         scorer: Scorer | None = None,
+        filmer: Filmer | None = None,
         settings: Mapping[str, Any] | None = None,
         progress: Callable[[Progress], None] | None = None,
         message: Callable[[str], None] | None = None,
@@ -62,8 +67,10 @@ class TrainingRunner(CheckpointedRunner):
             task: name of the task, kept in checkpoints.
             log_dir: run directory, None to leave nothing behind.
             device: where to learn.
+            processes: of the run, None for this one alone.
             mirror: left-right mirror maps, needed if the algorithm uses symmetry.
             scorer: gauges the student every ``run.gauge_interval`` iterations.
+            filmer: makes a video every ``run.video_interval`` iterations.
             settings: plain data kept in every checkpoint, so that a resumed run can be built like this one.
             progress: called after every iteration.
             message: called with a sentence now and then.
@@ -71,51 +78,50 @@ class TrainingRunner(CheckpointedRunner):
         Raises:
             ConfigurationError: environment and settings do not fit together.
         """
-        arguments = configuration.to_rsl_rl() | {"mirror": mirror, "command_entries": command_entries(contract)}
-        super().__init__(env, arguments, str(log_dir) if log_dir else None, device)
+        self.env = env
         self.configuration = configuration
         self.contract = contract
         self.task = task
         self.log_dir = log_dir
+        self.device = device
+        self.processes = processes or Processes()
         self.scorer = scorer
+        self.filmer = filmer
         self.settings = dict(settings or {})
-        self.logger = RunLogger(
-            num_steps=configuration.run.steps_per_iteration,
-            student_period=configuration.algorithm.student_period,
-            log_dir=self.logger.log_dir,
-            cfg=self.cfg,
-            env_cfg=env.cfg,
-            num_envs=env.num_envs,
-            is_distributed=self.is_distributed,
-            gpu_world_size=self.gpu_world_size,
-            gpu_global_rank=self.gpu_global_rank,
+        self.message = message or (lambda _: None)
+        self.alg = CTS.build(
+            env.get_observations(),
+            configuration,
+            num_actions=env.num_actions,
+            command_entries=command_entries(contract),
+            mirror=mirror,
             device=device,
+            processes=self.processes,
         )
-        networks: dict[str, nn.Module] = {"actor_state_dict": self.alg.actor, "critic_state_dict": self.alg.critic}
+        networks: dict[str, torch.nn.Module] = {
+            "actor_state_dict": self.alg.actor,
+            "critic_state_dict": self.alg.critic,
+        }
         self.average = WeightAverage(networks, age=configuration.run.average_age)
+        self.logger = RunLogger(configuration, num_envs=env.num_envs, processes=self.processes.count, device=device)
+        self.iteration = 0
+        """Completed iterations of the whole run."""
+        self.fresh = True
+        """Whether the environment is at the beginning of its first episodes."""
         self.best_score: float | None = None
         self.best_iteration: int | None = None
         self._progress = progress or (lambda _: None)
-        self._message = message or (lambda _: None)
         self._nonfinite = torch.zeros((), dtype=torch.int64, device=device)
         self._submitted = -1
-        self._fresh = True
+        self._kept = Keepsake()
 
     # The loop
 
-    def learn(
-        self,
-        num_learning_iterations: int,
-        init_at_random_ep_len: bool | None = None,
-        *,
-        max_seconds: float | None = None,
-    ) -> TrainingOutcome:
+    def learn(self, iterations: int, *, max_seconds: float | None = None) -> TrainingOutcome:
         """Train.
 
         Args:
-            num_learning_iterations: how many iterations to add to those done.
-            init_at_random_ep_len: start episodes at random ages; None for the configuration's choice. A resumed run
-                never does.
+            iterations: how many to add to those done.
             max_seconds: stop in an orderly way after this wall-clock time [s], None for no limit.
 
         Returns:
@@ -124,61 +130,56 @@ class TrainingRunner(CheckpointedRunner):
         Raises:
             TrainingDivergedError: too much of an iteration was not finite.
             CheckpointError: a checkpoint cannot be written.
+            ProcessLostError: another process of the run has gone; a checkpoint of the last iteration has been written.
+            ConfigurationError: the logger cannot start.
         """
         run, begin = self.configuration.run, time.monotonic()
-        randomize = run.random_episode_start if init_at_random_ep_len is None else init_at_random_ep_len
-        if randomize and self._fresh:
-            self.env.episode_length_buf = torch.randint_like(
-                self.env.episode_length_buf, high=int(self.env.max_episode_length)
-            )
-        self._fresh = False
+        speaks = self.processes.rank == 0
+        if run.random_episode_start and self.fresh:
+            ages = torch.randint_like(self.env.episode_length_buf, high=int(self.env.max_episode_length))
+            self.env.episode_length_buf = ages
+        self.fresh = False
         obs = self.env.get_observations().to(self.device)
-        self.alg.train_mode()
-        if self.is_distributed:
-            self.alg.broadcast_parameters()
-        if self.logger.writer is None:
-            self.logger.init_logging_writer()
-        start = self.current_learning_iteration
-        total, reason, written = start + num_learning_iterations, "finished", None
-        with StopSignals(self._message) as signals:
-            while self.current_learning_iteration < total:
-                obs = self._iterate(obs, start, total)
-                done = self.current_learning_iteration
-                stop = self._agreed_stop(signals, begin, max_seconds)
-                gauge_due = run.gauge_interval > 0 and done % run.gauge_interval == 0
-                if done % run.save_interval == 0 or gauge_due or stop or done == total:
-                    written = self._save_numbered()
-                if gauge_due or (done == total and run.gauge_interval > 0):
-                    self._submit(written)
-                self._take_reports(self.scorer.poll() if self.scorer else [])
-                self._progress(self._snapshot(total, time.monotonic() - begin))
-                if stop:
-                    reason = stop
-                    break
+        self.alg.share()
+        if self.logger.writer is None and self.log_dir is not None and speaks:
+            self.logger.writer = make_writer(self.configuration, self.log_dir, self.env.cfg)
+        self._submitted = self.iteration
+        if self.log_dir is not None and speaks:
+            update_run_json(self.log_dir, {"outcome": "running"})
+        total, reason, written = self.iteration + iterations, "finished", None
+        with StopSignals(self.message) as signals:
+            try:
+                while self.iteration < total:
+                    obs = self._iterate(obs, lambda: signals.received is not None)
+                    stop = self._agreed_stop(signals, begin, max_seconds)
+                    written = self._save_and_show(written, last=bool(stop) or self.iteration == total)
+                    self._progress(self._snapshot(total, time.monotonic() - begin))
+                    if stop:
+                        reason = stop
+                        break
+            except ProcessLostError as error:
+                raise self._rescue(error, begin) from error
         if self.scorer is not None and reason != "signal":
             self._submit(written)
             if self.scorer.pending:
-                self._message("Waiting for the gauge.")
+                self.message("Waiting for the gauge.")
             self._take_reports(self.scorer.drain(run.gauge_wait))
-        if self.logger.writer is not None:
-            self.logger.flush()
+        if reason != "signal":
+            self._take_videos(run.gauge_wait)
+        self.logger.flush()
         code = 128 + signals.received if reason == "signal" and signals.received else 0
-        outcome = TrainingOutcome(
-            reason=reason, iteration=self.current_learning_iteration, checkpoint=written, exit_code=code
-        )
+        outcome = TrainingOutcome(reason=reason, iteration=self.iteration, checkpoint=written, exit_code=code)
         self._record(outcome)
         return outcome
 
     def close(self) -> None:
-        """Stop the gauge and close the log."""
-        if self.scorer is not None:
-            self.scorer.close()
-        if self.logger.writer is not None:
-            self.logger.close()
-        if self.is_distributed and torch.distributed.is_initialized():
-            torch.distributed.destroy_process_group()
+        """Stop what runs beside and close the log."""
+        for side in (self.scorer, self.filmer):
+            if side is not None:
+                side.close()
+        self.logger.close()
 
-    def _iterate(self, obs: TensorDict, start: int, total: int) -> TensorDict:
+    def _iterate(self, obs: TensorDict, stopping: Callable[[], bool]) -> TensorDict:
         """One rollout and one update; returns the next observations."""
         begin = time.perf_counter()
         self._nonfinite.zero_()
@@ -187,8 +188,8 @@ class TrainingRunner(CheckpointedRunner):
                 actions = self.alg.act(obs)
                 obs, rewards, dones, extras = self.env.step(actions.to(self.env.device))
                 obs, rewards, dones = self._guard(obs.to(self.device), rewards.to(self.device), dones.to(self.device))
-                self.alg.process_env_step(obs, rewards, dones, extras)
-                self.logger.process_env_step(rewards, dones, extras)
+                self.alg.store_outcome(rewards, dones, extras)
+                self.logger.add_step(rewards, dones, extras)
             if torch.device(self.device).type == "cuda":
                 # Only so that the two times below are told apart.
                 torch.cuda.synchronize(self.device)
@@ -196,22 +197,21 @@ class TrainingRunner(CheckpointedRunner):
             self.alg.compute_returns(obs)
         if (progress := getattr(self.env, "progress", None)) is not None:
             self.alg.follow(progress)
-        losses = self.alg.update()
+        losses = self.alg.update(lambda: self.processes.wait_for(self.device, stopping=stopping))
         self.average.update()
         finished = time.perf_counter()
-        iteration = self.current_learning_iteration
-        self.current_learning_iteration += 1
+        self.iteration += 1
         self.logger.log(
-            it=iteration,
-            start_it=start,
-            total_it=total,
+            self.iteration - 1,
             collect_time=collected - begin,
             learn_time=finished - collected,
-            loss_dict=losses,
+            losses=losses,
             learning_rate=self.alg.learning_rate,
-            action_std=self.alg.get_policy().output_std,
+            action_std=self.alg.actor.output_std,
         )
-        self._check_finite(iteration, losses)
+        self._check_finite(losses)
+        if self.processes.several:
+            self._kept.keep(self.learned(), self.iteration, self.device)
         return obs
 
     def _guard(
@@ -229,8 +229,8 @@ class TrainingRunner(CheckpointedRunner):
         clean = TensorDict(groups, batch_size=obs.batch_size)
         return clean, torch.where(broken, 0.0, rewards), torch.where(broken, torch.ones_like(dones), dones)
 
-    def _check_finite(self, iteration: int, losses: Mapping[str, float]) -> None:
-        run, algorithm = self.configuration.run, self.configuration.algorithm
+    def _check_finite(self, losses: Mapping[str, float]) -> None:
+        run, algorithm, iteration = self.configuration.run, self.configuration.algorithm, self.iteration - 1
         broken = int(self._nonfinite.item())
         samples = run.steps_per_iteration * self.env.num_envs
         minibatches = 2 * algorithm.epochs * algorithm.minibatches
@@ -241,18 +241,17 @@ class TrainingRunner(CheckpointedRunner):
         if broken > run.nonfinite_limit * samples:
             raise TrainingDivergedError(
                 f"Iteration {iteration}: {broken} of {samples} environment samples are not finite "
-                "(run.nonfinite_limit is "
-                f"{run.nonfinite_limit:g}); the physics or a reward has diverged.{survives}"
+                f"(run.nonfinite_limit is {run.nonfinite_limit:g}); the physics or a reward has diverged.{survives}"
             )
         if skipped > run.nonfinite_limit * minibatches or not all(map(math.isfinite, losses.values())):
             raise TrainingDivergedError(
-                f"Iteration {iteration}: the gradients of {skipped:.0f} of {minibatches} minibatches are not finite "
+                f"Iteration {iteration}: {skipped:.0f} of {minibatches} minibatches had gradients that are not finite "
                 f"(run.nonfinite_limit is {run.nonfinite_limit:g}); lower algorithm.learning_rate or look at the "
                 f"rewards.{survives}"
             )
 
     def _agreed_stop(self, signals: StopSignals, begin: float, max_seconds: float | None) -> str:
-        """Why to stop now, an empty text to go on; the same answer on every rank, or they would wait for each other
+        """Why to stop now, an empty text to go on; the same answer in every process, or they would wait for each other
         forever.
         """
         code = 0
@@ -260,31 +259,78 @@ class TrainingRunner(CheckpointedRunner):
             code = 1
         if signals.received is not None:
             code = 2
-        if self.is_distributed:
-            shared = torch.tensor(code, device=self.device)
-            torch.distributed.all_reduce(shared, op=torch.distributed.ReduceOp.MAX)
-            code = int(shared.item())
-        return ("", "time", "signal")[code]
+        return ("", "time", "signal")[self.processes.largest(code)]
+
+    # Checkpoints
+
+    def learned(self) -> dict[str, Any]:
+        """What has been learned: networks, optimizers and averages, on the device."""
+        return self.alg.save() | {"average": self.average.state_dict()}
+
+    def _save_and_show(self, written: Path | None, *, last: bool) -> Path | None:
+        """Write a checkpoint where one is due, have it gauged and filmed; returns the last one."""
+        run = self.configuration.run
+
+        def due(interval: int) -> bool:
+            return interval > 0 and self.iteration % interval == 0
+
+        if self.log_dir is not None and (
+            last or any(map(due, (run.save_interval, run.gauge_interval, run.video_interval)))
+        ):
+            written = self.log_dir / f"model_{self.iteration}.pt"
+            save_run(self, written)
+        if due(run.gauge_interval):
+            self._submit(written)
+        self._take_reports(self.scorer.poll() if self.scorer else [])
+        if self.filmer is not None and written is not None and due(run.video_interval):
+            self.filmer.submit(written, self.iteration)
+        self._take_videos()
+        return written
+
+    def _take_videos(self, seconds: float = 0.0) -> None:
+        """Log finished videos, after a wait of at most ``seconds``."""
+        if self.filmer is not None:
+            videos, sentence = self.filmer.take(seconds)
+            for video, iteration in videos:
+                self.logger.send(video, iteration)
+            if sentence:
+                self.message(sentence)
+
+    def _rescue(self, error: ProcessLostError, begin: float) -> ProcessLostError:
+        """Write what the last complete iteration had learned; the first process that is left does it and speaks."""
+        time.sleep(float(self.processes.rank))
+        learned = self._kept.take()
+        if learned is None or self.log_dir is None:
+            return ProcessLostError(f"{error}; no iteration was complete, so there is no checkpoint")
+        self.iteration = self._kept.iteration
+        path = self.log_dir / f"model_{self.iteration}.pt"
+        sentence = f"{error}; iteration {self.iteration} is in '{path}', go on with --resume {self.log_dir}"
+        if read_run_json(self.log_dir).get("outcome") != "running":
+            raise SystemExit(2)  # another one has done it
+        self._record(TrainingOutcome(reason="lost a process", iteration=self.iteration, checkpoint=path, exit_code=2))
+        if path.exists() and time.time() - path.stat().st_mtime < time.monotonic() - begin:
+            return ProcessLostError(sentence)
+        # The device's own stream may wait for the lost process forever; the environment is not touched by that.
+        aside = torch.cuda.stream(torch.cuda.Stream()) if torch.device(self.device).type == "cuda" else nullcontext()
+        with aside:
+            local = {"num_envs": self.env.num_envs, "log": self.logger.state_dict(), "world_size": 0}
+            write_learned(self, path, learned, local)
+        return ProcessLostError(sentence)
 
     # The gauge
 
     def _submit(self, checkpoint: Path | None) -> None:
-        if (
-            self.scorer is None
-            or checkpoint is None
-            or self._submitted == self.current_learning_iteration
-            or self.gpu_global_rank
-        ):
+        if self.scorer is None or checkpoint is None or self._submitted == self.iteration or self.processes.rank:
             return
-        self._submitted = self.current_learning_iteration
-        self.scorer.submit(checkpoint, self.current_learning_iteration)
+        self._submitted = self.iteration
+        self.scorer.submit(checkpoint, self.iteration)
 
     def _take_reports(self, reports: list[ScoreReport]) -> None:
         """Log scores at the iteration they belong to, and keep the best checkpoint."""
         for report in reports:
             assert self.scorer is not None
             if report.failure:
-                self._message(f"No gauge score for iteration {report.iteration}: {report.failure}.")
+                self.message(f"No gauge score for iteration {report.iteration}: {report.failure}.")
                 continue
             scalars = {f"Gauge/{self.scorer.suite}/{name}": value for name, value in report.scores.items()}
             self.logger.write(scalars, report.iteration)
@@ -292,7 +338,7 @@ class TrainingRunner(CheckpointedRunner):
             score = report.scores.get(self.configuration.run.gauge_score)
             if score is None:
                 names = ", ".join(report.scores) or "nothing"
-                self._message(
+                self.message(
                     f"The gauge reports no {self.configuration.run.gauge_score!r} (run.gauge_score) but {names}."
                 )
             elif math.isfinite(score) and (self.best_score is None or score > self.best_score):
@@ -302,11 +348,11 @@ class TrainingRunner(CheckpointedRunner):
                 if self.log_dir is not None:
                     best = {"best_score": self.best_score, "best_iteration": self.best_iteration}
                     update_run_json(self.log_dir, best)
-                self._message(f"Best gauge score so far: {score:.4f} at iteration {report.iteration}.")
+                self.message(f"Best gauge score so far: {score:.4f} at iteration {report.iteration}.")
 
     def _snapshot(self, total: int, elapsed: float) -> Progress:
         return Progress(
-            iteration=self.current_learning_iteration,
+            iteration=self.iteration,
             total_iterations=total,
             elapsed=elapsed,
             scalars=dict(self.logger.scalars),
@@ -315,25 +361,16 @@ class TrainingRunner(CheckpointedRunner):
         )
 
     def _record(self, outcome: TrainingOutcome) -> None:
-        if self.log_dir is not None and self.gpu_global_rank == 0:
+        if self.log_dir is not None and (self.processes.rank == 0 or outcome.exit_code == 2):
             changes = {
                 "outcome": outcome.reason,
                 "iteration": outcome.iteration,
-                "environment_steps": self.logger.tot_timesteps,
-                "training_seconds": float(self.logger.tot_time),
+                "environment_steps": self.logger.total_steps,
+                "training_seconds": float(self.logger.total_time),
                 "best_score": self.best_score,
                 "best_iteration": self.best_iteration,
             }
             update_run_json(self.log_dir, changes)
-
-    # Checkpoints
-
-    def _save_numbered(self) -> Path | None:
-        if self.log_dir is None:
-            return None
-        path = self.log_dir / f"model_{self.current_learning_iteration}.pt"
-        self.save(str(path))
-        return path
 
 
 def command_entries(contract: PolicyContract) -> tuple[int, ...]:

@@ -1,6 +1,7 @@
 """``gaitgauge train``: one run on the fake engine, how it goes on, and one clear sentence for whatever is wrong."""
 
 import errno
+import importlib.util
 import json
 import os
 import signal
@@ -11,9 +12,12 @@ import pytest
 import torch
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.train import parse_duration
-from gaitgauge.training import checkpoint as checkpoint_module
-from gaitgauge.training.gauging import gauge_scorer, scores_of
-from gaitgauge.training.launch import TrainRequest, prepare
+from gaitgauge.files import writing
+from gaitgauge.training.configuration import ConfigurationError
+from gaitgauge.training.launch import TrainRequest, idle_gpus, prepare
+from gaitgauge.training.overrides import override_keys
+from gaitgauge.training.scoring import Scorer, scores_of
+from gaitgauge.training.tasks import TASKS
 
 SMALL = (
     "training.algorithm.minibatches=1",
@@ -51,8 +55,9 @@ def test_run_directory_and_settings(trained):
     description = json.loads((trained / "run.json").read_text())
     assert (description["task"], description["backend"], description["num_envs"]) == ("go2-flat", "fake", 8)
     settings = torch.load(trained / "model_2.pt", weights_only=True)["training"]["settings"]
-    assert settings["horizon_steps"] == 8
-    assert "training.network.actor_hidden=8" in settings["overrides"]
+    assert settings["environment"]["schedule"]["horizon_steps"] == 8
+    assert settings["training"]["network"]["actor_hidden"] == [8]
+    assert settings["backend"] == "fake"
 
 
 def test_resume_keeps_settings_directory_and_horizon(run, trained):
@@ -60,7 +65,7 @@ def test_resume_keeps_settings_directory_and_horizon(run, trained):
     assert result.exit_code == 0, result.output
     entries = torch.load(trained / "model_3.pt", weights_only=True)
     assert entries["iter"] == 3
-    assert entries["training"]["settings"]["horizon_steps"] == 8
+    assert entries["training"]["settings"]["environment"]["schedule"]["horizon_steps"] == 8
     assert entries["training"]["log"]["total_steps"] == 3 * 4 * 8
     (trained / "model_3.pt").unlink()
 
@@ -110,7 +115,7 @@ def test_trained_networks_go_on_where_their_schedules_stood(trained):
     torch.save(entries, trained / "quarter.pt")
     quarter = plan(trained / "quarter.pt")
     assert quarter.task.environment.schedule.begin == 0.25
-    assert "environment.schedule.begin=0.25" in quarter.settings["overrides"]
+    assert quarter.settings["environment"]["schedule"]["begin"] == 0.25
     (trained / "quarter.pt").unlink()
     new = prepare(TrainRequest(task="go2-moe-cts", backend="fake", device="cpu")).task
     assert (new.environment.schedule.begin, new.training.network.initial_std) == (0.0, 1.0)
@@ -165,6 +170,7 @@ def test_time_limit_ends_with_success(run, tmp_path):
         (("go2-flat", "--resume", "latest", "--init-from", "x.pt"), ("--resume", "--init-from")),
         (("go2-flat", "--backend", "fake", "environment.joints.parameters=nope"), ("'nope'", "training")),
         (("go2-flat", "--backend", "fake", "training.run.experiment=a/b"), ("a/b", "folder name")),
+        (("go2-flat", "--backend", "fake", "--logger", "paper"), ("'paper'", "tensorboard, wandb, neptune")),
     ],
 )
 def test_bad_request(refused, arguments, named):
@@ -221,19 +227,19 @@ def test_finished_run_says_what_to_give(refused, trained):
 
 
 def test_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
-    real = os.fsync
+    real = os.replace
 
-    def fsync(descriptor: int) -> None:
-        if "model_2.pt" in os.readlink(f"/proc/self/fd/{descriptor}"):
+    def replaces(source: Path, target: Path) -> None:
+        if target.name == "model_2.pt":
             raise OSError(errno.ENOSPC, "No space left on device")
-        real(descriptor)
+        real(source, target)
 
-    monkeypatch.setattr(checkpoint_module.os, "fsync", fsync)
+    monkeypatch.setattr(writing.os, "replace", replaces)
     result = run("train", "go2-flat", *FAKE, *SMALL, "--iterations", 3, "training.run.save_interval=1")
     assert result.exit_code == 2
     (sentence,) = result.stderr.splitlines()
     assert "model_2.pt" in sentence
-    assert "No space left on device" in sentence
+    assert "no space left on device" in sentence
     assert "--resume latest" in sentence
     (run_directory,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
     assert [f.name for f in run_directory.iterdir() if "model" in f.name] == ["model_1.pt"]
@@ -260,6 +266,95 @@ def test_impossible_durations(text):
         parse_duration(text)
 
 
+@pytest.mark.parametrize("name", TASKS)
+def test_a_resumed_run_has_the_settings_of_its_checkpoint_whatever_the_task_says_today(trained, name, monkeypatch):
+    """All of them, also those that nobody had spelled out."""
+    from gaitgauge.training import launch
+
+    entries = torch.load(trained / "model_2.pt", weights_only=True)
+    made = prepare(TrainRequest(task=name, backend="fake", device="cpu", num_envs=8, seed=3, iterations=70))
+    entries["training"] |= {"task": name, "settings": dict(made.settings)}
+    path = trained / "other.pt"
+    torch.save(entries, path)
+    elsewhere = prepare(
+        TrainRequest(task=name, backend="fake", device="cpu", overrides=("training.algorithm.clip=0.9",))
+    )
+    monkeypatch.setattr(launch, "find_task", lambda *_: elsewhere.task)
+    resumed = prepare(TrainRequest(task=name, device="cpu", resume=str(path)))
+    assert resumed.task.environment == made.task.environment
+    assert resumed.task.training == made.task.training
+    assert resumed.backend == "fake" and resumed.settings == made.settings
+    changed = prepare(TrainRequest(task=name, device="cpu", resume=str(path), iterations=90)).task
+    assert changed.training.run.iterations == 90
+    assert changed.environment == made.task.environment, "the horizon of the schedules stays"
+    path.unlink()
+
+
+def test_a_checkpoint_without_its_settings_begins_a_new_run(refused, trained):
+    entries = torch.load(trained / "model_2.pt", weights_only=True)
+    entries["training"]["settings"] = {"backend": "fake", "overrides": []}
+    torch.save(entries, trained / "early.pt")
+    message = refused("train", "go2-flat", "--resume", trained / "early.pt", "--device", "cpu")
+    assert f"--init-from {trained / 'early.pt'}" in message
+    (trained / "early.pt").unlink()
+
+
+@pytest.mark.parametrize("name", ["wandb", "neptune"])
+def test_a_logger_that_is_not_there(refused, tmp_path, name):
+    if importlib.util.find_spec(name) is not None:
+        pytest.skip(f"{name} is installed")
+    message = refused("train", "go2-flat", "--backend", "fake", "--logger", name)
+    assert f"pip install {name}" in message
+    assert not (tmp_path / "logs").exists()
+
+
+def test_idle_gpus_are_named(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    assert idle_gpus("cuda:0") == "" and idle_gpus("cpu") == ""
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
+    assert idle_gpus("cuda:0").startswith("3 of 4 GPUs are used; --nproc-per-node 4 uses all")
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    assert idle_gpus("cuda:0") == ""
+
+
+def test_more_processes_than_gpus(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setenv("LOCAL_RANK", "2")
+    with pytest.raises(ConfigurationError, match="give --nproc-per-node 2"):
+        prepare(TrainRequest(task="go2-flat", backend="fake", device="cuda"))
+
+
+def test_settings_are_listed_with_default_unit_and_meaning(run):
+    result = run("train", "--list-settings", "go2-flat", "environment.num_envs=64")
+    assert result.exit_code == 0, result.output
+    lines = result.output.splitlines()
+    assert max(map(len, lines)) <= 80
+    group = lines.index(next(line for line in lines if line == "environment.observations"))
+    assert lines[group + 1] == "  What the networks see"
+    scan = lines.index("  scan_length = 1.6", group)
+    assert lines[scan + 1] == "      Extent of the height scan along the heading [m]."
+    assert "  num_envs = 64" in lines
+    keys = set(override_keys(TASKS["go2-flat"].environment))
+    listed, head = set(), ""
+    for line in lines[2:]:
+        if line and not line.startswith(" "):
+            head = line.partition(" ")[0]
+        elif " = " in line and line.startswith("  ") and line[2] != " ":
+            listed.add(f"{head}.{line.strip().partition(' = ')[0]}")
+    missing = {f"environment.{key}" for key in keys} - listed
+    assert not missing
+
+
+def test_every_setting_says_what_it_means():
+    from gaitgauge.cli.settings import _groups
+
+    for root in ("environment", "training"):
+        for group, _, entries in _groups(root, getattr(TASKS["go2-moe-cts"], root)):
+            for name, _, text in entries:
+                assert text, f"{group}.{name}"
+
+
 def test_options_are_overrides_and_settings_win():
     request = TrainRequest(
         task="go2-flat", backend="fake", num_envs=16, seed=7, overrides=("environment.num_envs=24",), score_every=50
@@ -268,6 +363,18 @@ def test_options_are_overrides_and_settings_win():
     assert task.environment.num_envs == 24
     assert task.environment.seed == task.training.run.seed == 7
     assert task.training.run.gauge_interval == 50
+
+
+def test_mujoco_gets_the_solver_iterations_that_it_needs_unless_told():
+    """With six of them it throws walking robots over; mujoco_warp does not."""
+
+    def iterations(backend, *overrides):
+        request = TrainRequest(task="go2-moe-cts", backend=backend, device="cpu", overrides=overrides)
+        return prepare(request).task.environment.physics.iterations
+
+    assert iterations("mujoco") == 15
+    assert iterations("mujoco", "environment.physics.iterations=8") == 8
+    assert iterations("fake") == 6
 
 
 def test_time_limit_waits_for_no_score_unless_asked():
@@ -281,7 +388,7 @@ def test_time_limit_waits_for_no_score_unless_asked():
 
 
 def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):
-    from gaitgauge.training import scoring
+    from gaitgauge.training import side_process
 
     started = []
 
@@ -292,11 +399,11 @@ def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):
         def poll(self):
             return None
 
-    monkeypatch.setattr(scoring.subprocess, "Popen", Process)
+    monkeypatch.setattr(side_process.subprocess, "Popen", Process)
     old = tmp_path / "gauge" / "quick" / "model_5" / "results.json"
     old.parent.mkdir(parents=True)
     old.write_text("{}")
-    scorer = gauge_scorer(tmp_path, suite="quick", threads=3)
+    scorer = Scorer(tmp_path, suite="quick", threads=3)
     for iteration in (5, 6, 7):
         scorer.submit(tmp_path / f"model_{iteration}.pt", iteration)
     ((command, environment),) = started

@@ -3,36 +3,37 @@ from itertools import pairwise
 
 import pytest
 import torch
-from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.cts import CTS
 from gaitgauge.training.algorithms.gradients import clip_gradients
-from gaitgauge.training.algorithms.symmetry import build_mirror, passes
+from gaitgauge.training.algorithms.symmetry import passes
 from gaitgauge.training.configuration import ConfigurationError, NetworkConfiguration
 from gaitgauge.training.environment_configuration import Ramp
 from gaitgauge.training.networks import CtsActor, CtsCritic, student_architecture
 from gaitgauge.training.runner import TrainingRunner, command_entries
 from rsl_rl.modules.distribution import GaussianDistribution
-from toy_training import ACTIONS, FRAME, PRIVILEGED, ToyEnv, toy_configuration, toy_contract
+from toy_training import ACTIONS, FRAME, PRIVILEGED, ToyEnv, toy_configuration, toy_contract, toy_mirror
 
 
 def build(encoder: str = "moe", steps: int = 8, **algorithm) -> tuple[CTS, ToyEnv]:
     torch.manual_seed(0)
     env = ToyEnv()
     configuration = toy_configuration(encoder=encoder, steps=steps, algorithm=algorithm)
-    cfg = configuration.to_rsl_rl() | {
-        "mirror": build_mirror(toy_contract(), load_robot("go2"), history_length=5),
-        "command_entries": (6, 7, 8),
-        "multi_gpu": None,
-    }
-    return CTS.construct_algorithm(env.get_observations(), env, cfg, "cpu"), env
+    algorithm = CTS.build(
+        env.get_observations(),
+        configuration,
+        num_actions=env.num_actions,
+        command_entries=(6, 7, 8),
+        mirror=toy_mirror(),
+    )
+    return algorithm, env
 
 
 def rollout(algorithm: CTS, env: ToyEnv) -> None:
     obs = env.get_observations()
     with torch.inference_mode():
-        for _ in range(algorithm.storage.num_transitions_per_env):
+        for _ in range(algorithm.storage.num_steps):
             obs, rewards, dones, extras = env.step(algorithm.act(obs))
-            algorithm.process_env_step(obs, rewards, dones, extras)
+            algorithm.store_outcome(rewards, dones, extras)
         algorithm.compute_returns(obs)
 
 
@@ -84,13 +85,12 @@ def test_split_and_storage_order():
     frames = obs["policy"].clone()
     with torch.inference_mode():
         actions = algorithm.act(obs)
-        stored = algorithm.transition.actions.clone()
-        assert torch.equal(actions[split.order], stored)
-        result = env.step(actions)  # overwrites the observation buffers in place
-        algorithm.process_env_step(*result)
-    assert torch.equal(algorithm.storage.observations["policy"][0], frames[split.order])
+        assert torch.equal(actions[split.order], algorithm.storage.actions[0])
+        _, rewards, dones, extras = env.step(actions)  # overwrites the observation buffers in place
+        algorithm.store_outcome(rewards, dones, extras)
+    assert torch.equal(algorithm.storage.policy[0], frames[split.order])
     assert torch.equal(algorithm.storage.student_history[0, :, -FRAME:], frames[[0, 4]])
-    assert torch.equal(algorithm.storage.dones[0, :, 0].bool(), result[2][split.order])
+    assert torch.equal(algorithm.storage.dones[0].bool(), dones[split.order])
 
 
 def test_time_outs_are_bootstrapped():
@@ -98,13 +98,13 @@ def test_time_outs_are_bootstrapped():
     obs = env.get_observations()
     with torch.inference_mode():
         algorithm.act(obs)
-        values = algorithm.transition.values.squeeze(1).clone()
+        values = algorithm.storage.values[0].clone()
         time_outs = torch.zeros(8, dtype=torch.bool)
         time_outs[5] = True
-        algorithm.process_env_step(obs, torch.zeros(8), time_outs, {"time_outs": time_outs})
+        algorithm.store_outcome(torch.zeros(8), time_outs, {"time_outs": time_outs})
     expected = torch.zeros(8)
     expected[3] = 0.99 * values[3]  # environment 5 is block row 3
-    assert torch.allclose(algorithm.storage.rewards[0, :, 0], expected)
+    assert torch.allclose(algorithm.storage.rewards[0], expected)
 
 
 def test_minibatches_are_stratified_and_complete():
@@ -133,10 +133,10 @@ def test_gradient_flow(part):
     storage = algorithm.storage
     split, actor, critic = storage.split, algorithm.actor, algorithm.critic
     if part == "latent":
-        loss, _ = algorithm._compute_student_loss(torch.arange(8))
+        loss, _ = algorithm.losses.student(torch.arange(8))
     else:
-        algorithm.configuration = replace(algorithm.configuration, value_coefficient=float(part == "value"))
-        algorithm._entropy_coefficient.zero_()
+        algorithm.losses.settings = replace(algorithm.losses.settings, value_coefficient=float(part == "value"))
+        algorithm.losses.entropy_coefficient.zero_()
         advantages = storage.advantages
         if part == "value":
             advantages.zero_()
@@ -145,7 +145,7 @@ def test_gradient_flow(part):
         else:
             advantages[:, : split.num_teacher] = 0.0
         teacher, student = storage.minibatch_rows(1)
-        loss, _ = algorithm._compute_policy_loss(teacher[0], student[0])
+        loss, _ = algorithm.losses.policy(teacher[0], student[0])
     loss.backward()
     expected = {
         #                    teacher encoder, student encoder, actor, critic
@@ -167,16 +167,17 @@ def test_optimizers_share_no_parameter_and_miss_none():
 
 
 def test_first_minibatch_has_ratio_one_and_matches_a_plain_calculation():
-    algorithm, env = build("mlp", clip_value_loss=False)
+    algorithm, env = build("mlp")
     rollout(algorithm, env)
     storage = algorithm.storage
     teacher, student = (rows[0] for rows in storage.minibatch_rows(2))
-    loss, metrics = algorithm._compute_policy_loss(teacher, student)
+    loss, metrics = algorithm.losses.policy(teacher, student)
     value, surrogate, entropy, kl, _ = metrics.tolist()
     advantages = storage.advantages.flatten()
     assert surrogate == pytest.approx(-float(advantages[teacher].mean() + advantages[student].mean()), abs=1e-5)
     assert kl == pytest.approx(0.0, abs=1e-6)
     rows = torch.cat((teacher, student))
+    # Values have not moved, so that clipping their step changes nothing.
     errors = (storage.values.flatten() - storage.returns.flatten())[rows]
     assert value == pytest.approx(float(errors.square().mean()), rel=1e-4)
     assert entropy == pytest.approx(ACTIONS * 1.4189385, rel=1e-5)
@@ -189,27 +190,21 @@ def test_entropy_bonus_follows_the_run():
     teacher, student = (rows[0] for rows in algorithm.storage.minibatch_rows(2))
     for progress, expected in ((0.0, 0.01), (0.75, 0.006), (2.0, 0.002)):
         algorithm.follow(torch.tensor(progress))
-        loss, metrics = algorithm._compute_policy_loss(teacher, student)
+        loss, metrics = algorithm.losses.policy(teacher, student)
         value, surrogate, entropy, _, _ = metrics.tolist()
         assert float(loss.detach()) == pytest.approx(surrogate + value - expected * entropy, rel=1e-4)
 
 
-def test_load_balance_forms():
+def test_load_balance_is_a_sum_over_the_experts():
     algorithm, env = build("moe")
     rollout(algorithm, env)
     algorithm.update()
     rows = torch.arange(8)
-    losses = {}
-    for form in ("sum", "mean"):
-        algorithm.configuration = replace(algorithm.configuration, load_balance=form)
-        loss, metrics = algorithm._compute_student_loss(rows)
-        losses[form] = float(metrics[1])
-        assert float(loss.detach()) == pytest.approx(float(metrics[0]) + 0.01 * float(metrics[1]), rel=1e-5)
-    weights = (
-        algorithm.actor.student_latent(algorithm.storage.student_history.flatten(0, 1)[rows])[1].detach().mean(dim=0)
-    )
-    assert losses["sum"] == pytest.approx(float((weights - 0.25).square().sum()), rel=1e-4)
-    assert losses["mean"] == pytest.approx(losses["sum"] / 4, rel=1e-5)
+    loss, metrics = algorithm.losses.student(rows)
+    assert float(loss.detach()) == pytest.approx(float(metrics[0]) + 0.01 * float(metrics[1]), rel=1e-5)
+    history = algorithm.storage.student_history.flatten(0, 1)[rows]
+    weights = algorithm.actor.student_latent(history)[1].detach().mean(dim=0)
+    assert float(metrics[1]) == pytest.approx(float((weights - 0.25).square().sum()), rel=1e-4)
 
 
 def test_learning_rate_follows_the_divergence():
@@ -238,9 +233,8 @@ def test_gradient_clip_and_non_finite_gradients():
     assert float(skipped) == 1.0 and all(bool((p.grad == 0).all()) for p in parameters)
 
 
-@pytest.mark.parametrize("joint", [True, False])
-def test_non_finite_minibatches_are_counted_and_leave_the_weights_finite(joint):
-    algorithm, env = build("moe", joint_gradient_clip=joint)
+def test_non_finite_minibatches_are_counted_and_leave_the_weights_finite():
+    algorithm, env = build("moe")
     rollout(algorithm, env)
     algorithm.storage.advantages[0, 0] = float("nan")
     losses = algorithm.update()
@@ -252,7 +246,7 @@ def test_non_finite_minibatches_are_counted_and_leave_the_weights_finite(joint):
 def test_actions_and_values_are_float32_in_any_precision():
     algorithm, env = build("mlp", precision="bfloat16")
     groups = env.get_observations()
-    with algorithm._autocast():
+    with algorithm.losses.autocast():
         latent = algorithm.actor.teacher_latent(groups["privileged"])
         mean, value = (
             algorithm.actor.action_mean(latent, groups["policy"]),
@@ -265,29 +259,29 @@ def test_actions_and_values_are_float32_in_any_precision():
 def test_two_alternate_passes_see_what_an_augmented_one_sees():
     algorithm, env = build("mlp", symmetry="augment")
     rollout(algorithm, env)
-    storage, mirror = algorithm.storage, algorithm.mirror
+    storage, mirror = algorithm.storage, algorithm.losses.mirror
     history = storage.student_history.flatten(0, 1)
     with torch.no_grad():
-        algorithm._mirrored_latent.copy_(algorithm.actor.student_latent(mirror.history(history))[0])
-        algorithm._targets.normal_()
-        algorithm._mirrored_targets.normal_()
+        algorithm.losses.mirrored_latent.copy_(algorithm.actor.student_latent(mirror.history(history))[0])
+        algorithm.losses.targets.normal_()
+        algorithm.losses.mirrored_targets.normal_()
     teacher, student = (rows[0] for rows in storage.minibatch_rows(2))
     in_history = storage.student_rows(student)
-    whole = algorithm._compute_policy_loss(teacher, student)[1][:2]
-    error = algorithm._compute_student_loss(in_history)[0]
-    algorithm.configuration = replace(algorithm.configuration, symmetry="alternate")
+    whole = algorithm.losses.policy(teacher, student)[1][:2]
+    error = algorithm.losses.student(in_history)[0]
+    algorithm.losses.settings = replace(algorithm.losses.settings, symmetry="alternate")
     halves, errors = [], []
     for turned in passes(2, alternate=True):
-        value, surrogate, _, kl, _ = algorithm._compute_policy_loss(turned(teacher), turned(student))[1]
+        value, surrogate, _, kl, _ = algorithm.losses.policy(turned(teacher), turned(student))[1]
         halves.append(torch.stack((value, surrogate)))
-        errors.append(algorithm._compute_student_loss(turned(in_history))[0])
+        errors.append(algorithm.losses.student(turned(in_history))[0])
         assert float(kl) == pytest.approx(0.0, abs=1e-6)
     assert not torch.allclose(halves[0], halves[1])
     torch.testing.assert_close((halves[0] + halves[1]) / 2, whole)
     torch.testing.assert_close((errors[0] + errors[1]) / 2, error)
 
 
-@pytest.mark.parametrize("symmetry", ["none", "augment", "alternate", "loss"])
+@pytest.mark.parametrize("symmetry", ["none", "augment", "alternate"])
 @pytest.mark.parametrize("encoder", ["mlp", "moe", "moe_ng"])
 def test_update_runs_and_reports(encoder, symmetry):
     algorithm, env = build(encoder, symmetry=symmetry)
@@ -296,9 +290,7 @@ def test_update_runs_and_reports(encoder, symmetry):
     losses = algorithm.update()
     after = (*algorithm.actor.parameters(), *algorithm.critic.parameters())
     assert all(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
-    assert ("load_balance" in losses) == (encoder != "mlp") and ("symmetry" in losses) == (
-        symmetry in ("augment", "loss")
-    )
+    assert ("load_balance" in losses) == (encoder != "mlp") and ("symmetry" in losses) == (symmetry == "augment")
     assert losses["skipped_minibatches"] == 0 and algorithm.storage.step == 0
 
 
@@ -310,29 +302,10 @@ def test_augmentation_of_a_symmetric_policy_changes_nothing():
         torch.nn.init.zeros_(module[-1].bias)
     rollout(algorithm, env)
     teacher, student = (rows[0] for rows in algorithm.storage.minibatch_rows(2))
-    both = algorithm._compute_policy_loss(teacher, student)[1]
-    algorithm.mirror, algorithm.configuration = None, replace(algorithm.configuration, symmetry="none")
-    plain = algorithm._compute_policy_loss(teacher, student)[1]
+    both = algorithm.losses.policy(teacher, student)[1]
+    algorithm.losses.mirror, algorithm.losses.settings = None, replace(algorithm.configuration, symmetry="none")
+    plain = algorithm.losses.policy(teacher, student)[1]
     assert torch.allclose(both, plain, atol=1e-6)
-
-
-def test_mirror_loss_makes_the_actor_symmetric():
-    configuration = toy_configuration(
-        encoder="mlp", algorithm={"symmetry": "loss", "symmetry_coefficient": 20.0, "epochs": 2, "desired_kl": None}
-    )
-    torch.manual_seed(0)
-    mirror = build_mirror(toy_contract(), load_robot("go2"), history_length=5)
-    seen = []
-    runner = TrainingRunner(
-        ToyEnv(16),
-        configuration,
-        contract=toy_contract(),
-        task="toy",
-        mirror=mirror,
-        progress=lambda p: seen.append(p.scalars["Loss/symmetry"]),
-    )
-    runner.learn(10)
-    assert seen[-1] < 0.3 * max(seen)
 
 
 @pytest.mark.parametrize("encoder", ["mlp", "moe"])
@@ -350,7 +323,8 @@ def test_learns_the_toy_task(encoder):
 
     def student_error() -> float:
         with torch.no_grad():
-            actions = runner.alg.actor(test_env.get_observations())
+            seen = test_env.get_observations()
+            actions = runner.alg.actor.student(seen["history"].unflatten(1, (5, FRAME)))
         return float((actions[:, :3] - test_env.command).square().mean())
 
     before = student_error()
@@ -377,7 +351,7 @@ def test_saved_state_restores_both_optimizers():
     algorithm.learning_rate = 3e-4
     state = algorithm.save()
     other, _ = build()
-    other.load(state, None, True)
+    other.load(state)
     assert other.learning_rate == pytest.approx(3e-4)
     assert other.optimizer.param_groups[0]["lr"] is other._rate
     for a, b in ((algorithm.optimizer, other.optimizer), (algorithm.student_optimizer, other.student_optimizer)):
@@ -394,14 +368,13 @@ def test_own_gaussian_is_rsl_rls():
 def test_bad_settings_are_refused():
     with pytest.raises(ConfigurationError, match="allowed are mlp, moe, moe_ng"):
         NetworkConfiguration(student_encoder="lstm")
-    with pytest.raises(ConfigurationError, match="needs a single CUDA device"):
+    with pytest.raises(ConfigurationError, match="needs a CUDA device"):
         build(cuda_graphs=True)
-    env = ToyEnv()
-    cfg = toy_configuration(algorithm={"symmetry": "augment"}).to_rsl_rl()
+    seen, configuration = ToyEnv().get_observations(), toy_configuration(algorithm={"symmetry": "augment"})
     with pytest.raises(ConfigurationError, match="no mirror maps"):
-        CTS.construct_algorithm(env.get_observations(), env, cfg, "cpu")
+        CTS.build(seen, configuration, num_actions=ACTIONS)
     with pytest.raises(ConfigurationError, match="'history'"):
-        CTS.construct_algorithm(env.get_observations().exclude("history"), env, cfg, "cpu")
+        CTS.build(seen.exclude("history"), configuration, num_actions=ACTIONS)
 
 
 def test_command_entries_and_widths():

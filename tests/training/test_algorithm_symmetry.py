@@ -4,16 +4,16 @@ from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.symmetry import (
     MirrorMap,
     SymmetryError,
-    build_mirror,
     mirror_by_name,
-    mirror_grid,
+    mirror_points,
 )
-from toy_training import toy_contract
+from gaitgauge.training.height_scan import scan_pattern
+from toy_training import toy_mirror
 
 
 @pytest.fixture(scope="module")
 def mirror():
-    return build_mirror(toy_contract(), load_robot("go2"), history_length=5)
+    return toy_mirror()
 
 
 @pytest.mark.parametrize("group, width", [("policy", 45), ("history", 225), ("privileged", 263), ("action", 12)])
@@ -62,9 +62,15 @@ def test_privileged_layout(mirror):
     assert torch.equal(image[76:].view(17, 11), state[76:].view(17, 11).flip(1))
 
 
-def test_grid_keeps_the_middle_column():
-    grid = mirror_grid(3, 5)(torch.arange(15.0)).view(3, 5)
-    assert grid[:, 2].tolist() == [2, 7, 12] and grid[0].tolist() == [4, 3, 2, 1, 0]
+def test_a_scan_keeps_its_middle_line():
+    scan = mirror_points(scan_pattern(0.2, 0.4, 0.1, "cpu"))
+    image = scan(torch.arange(15.0)).view(3, 5)
+    assert image[:, 2].tolist() == [2, 7, 12] and image[0].tolist() == [4, 3, 2, 1, 0]
+
+
+def test_points_without_an_image_are_refused():
+    with pytest.raises(SymmetryError, match=r"point \[0\.0, 0\.5\d*\] has no mirror image"):
+        mirror_points(torch.tensor([[0.0, 0.5], [0.0, 0.0]]))
 
 
 def test_unpaired_names_are_refused():

@@ -6,6 +6,7 @@ from gaitgauge.policy.loading import load_policy
 from gaitgauge.training.averaging import WeightAverage
 from gaitgauge.training.checkpoint import learned_networks, read_checkpoint, trim_checkpoint
 from gaitgauge.training.configuration import ConfigurationError
+from gaitgauge.training.resuming import begin_with, resume_run, stored_network
 from gaitgauge.training.runner import TrainingRunner
 from gaitgauge.training.seeding import seed_everything
 from torch import nn
@@ -76,12 +77,12 @@ def test_a_new_run_and_a_trimmed_policy_begin_with_the_average(tmp_path):
     trim_checkpoint(tmp_path / "model_3.pt", tmp_path / "raw.pt", raw=True)
     for file, raw in (("model_3.pt", False), ("mean.pt", False), ("raw.pt", True)):
         begun = runner(seed=5)
-        begun.load_weights(tmp_path / file)
+        begin_with(begun, tmp_path / file)
         expected = learned_networks(entries, raw=raw)
         for part, module in (("actor_state_dict", begun.alg.actor), ("critic_state_dict", begun.alg.critic)):
             for name, value in module.state_dict().items():
                 assert torch.equal(value, expected[part][name]), (file, name)
-        for name, value in begun.stored_network().state_dict.items():
+        for name, value in stored_network(begun).state_dict.items():
             assert torch.equal(value, begun.alg.actor.student.state_dict()[name]), "the average begins anew"
     assert load_policy(tmp_path / "raw.pt").contract.provenance["weights"] == "last update"
     assert "weights" not in load_policy(tmp_path / "mean.pt").contract.provenance
@@ -95,7 +96,7 @@ def test_a_checkpoint_without_an_average_is_continued(tmp_path):
     torch.save(entries, tmp_path / "old.pt")
     said = []
     resumed = runner(seed=5, message=said.append)
-    resumed.load(str(tmp_path / "old.pt"))
+    resume_run(resumed, tmp_path / "old.pt")
     assert said == [f"'{tmp_path / 'old.pt'}' holds no average of weights: it begins here."]
     raw = entries["actor_state_dict"]["student.actor.0.weight"]
-    assert torch.equal(resumed.stored_network().state_dict["actor.0.weight"], raw)
+    assert torch.equal(stored_network(resumed).state_dict["actor.0.weight"], raw)

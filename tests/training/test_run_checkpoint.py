@@ -12,7 +12,6 @@ from gaitgauge.training.checkpoint import (
     CheckpointError,
     checkpoint_entries,
     read_checkpoint,
-    write_bytes,
     write_checkpoint,
 )
 from gaitgauge.training.run_directory import (
@@ -47,8 +46,8 @@ def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path):
 
 
 def test_a_missing_folder_is_one_sentence(tmp_path):
-    with pytest.raises(CheckpointError, match="No such file"):
-        write_bytes(tmp_path / "gone" / "model_1.pt", b"x")
+    with pytest.raises(CheckpointError, match="no such file"):
+        write_checkpoint(tmp_path / "gone" / "model_1.pt", {})
 
 
 def test_checkpoints_hold_plain_data_only():

@@ -6,8 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.robots import load_robot
-from gaitgauge.training.algorithms.symmetry import build_mirror
 from gaitgauge.training.checkpoint import (
     CheckpointError,
     checkpoint_entries,
@@ -15,10 +13,11 @@ from gaitgauge.training.checkpoint import (
     trim_checkpoint,
     write_checkpoint,
 )
-from gaitgauge.training.runner import TrainingDivergedError, TrainingRunner
-from gaitgauge.training.scoring import FunctionScorer
+from gaitgauge.training.resuming import TrainingDivergedError, begin_with, resume_run, save_run, stored_network
+from gaitgauge.training.runner import TrainingRunner
+from gaitgauge.training.scoring import ScoreReport
 from gaitgauge.training.seeding import seed_everything
-from toy_training import HISTORY, ToyEnv, toy_configuration, toy_contract
+from toy_training import ToyEnv, toy_configuration, toy_contract, toy_mirror
 
 
 def make(
@@ -75,12 +74,12 @@ def test_continuing_equals_never_having_stopped(tmp_path, encoder):
     make(first, configuration=configuration).learn(2)
     # Another seed: everything that matters must come from the checkpoint.
     resumed = make(second, seed=7, configuration=configuration)
-    resumed.load(str(first / "model_2.pt"))
+    resume_run(resumed, first / "model_2.pt")
     resumed.learn(2)
     a, b = read_checkpoint(whole / "model_4.pt"), read_checkpoint(second / "model_4.pt")
     assert a["iter"] == b["iter"] == 4
     # Wall-clock time and the run's name are all that may differ.
-    assert_same(a, b, skip=("total_time", "contract"))
+    assert_same(a, b, skip=("total_time", "contract", "checksum"))  # the checksum is of the contract too
 
 
 def test_a_checkpoint_is_a_policy(tmp_path):
@@ -132,14 +131,14 @@ def test_logged_reward_is_the_mean_of_finished_episodes():
         done = dones.clone()
         done[3] = step == 1
         done[4] = step == 3
-        runner.logger.process_env_step(
+        runner.logger.add_step(
             rewards, done, {"log": {"a": torch.tensor(float(step)), "b": torch.tensor(float("nan"))}}
         )
     assert runner.logger.collect() == {"Episode/a": 3.5}
-    assert list(runner.logger.rewbuffer) == [6.0, 16.0]
+    assert list(runner.logger.returns) == [6.0, 16.0]
     assert list(runner.logger.group_returns["student"]) == [16.0]
     assert list(runner.logger.group_returns["teacher"]) == [6.0]
-    assert runner.logger.cur_episode_length.tolist() == [8.0, 8.0, 8.0, 6.0, 4.0, 8.0, 8.0, 8.0]
+    assert runner.logger.episode_length.tolist() == [8.0, 8.0, 8.0, 6.0, 4.0, 8.0, 8.0, 8.0]
 
 
 def test_sigterm_writes_a_checkpoint(tmp_path):
@@ -182,13 +181,39 @@ def test_broken_weights_are_never_written(tmp_path):
     with torch.no_grad():
         runner.alg.actor.student.actor[0].weight[0, 0] = float("nan")
     with pytest.raises(TrainingDivergedError, match="not finite"):
-        runner.save(str(tmp_path / "model_1.pt"))
+        save_run(runner, tmp_path / "model_1.pt")
     assert (tmp_path / "model_1.pt").read_bytes() == before
 
 
+class SlowScorer:
+    """Gives each checkpoint's score back one call later."""
+
+    suite = "quick"
+
+    def __init__(self, scores):
+        self.scores, self.waiting = scores, []
+
+    def submit(self, path, iteration):
+        scores = {"score": self.scores[iteration], "velocity": 0.1}
+        self.waiting.append(ScoreReport(path=path, iteration=iteration, scores=scores))
+
+    def drain(self, seconds):
+        reports, self.waiting = self.waiting, []
+        return reports
+
+    def poll(self):
+        return self.drain(0.0)
+
+    @property
+    def pending(self):
+        return len(self.waiting)
+
+    def close(self):
+        pass
+
+
 def test_best_is_chosen_by_the_gauge(tmp_path):
-    scores = {1: 0.2, 2: 0.6, 3: 0.4}
-    scorer = FunctionScorer(lambda path, iteration: {"score": scores[iteration], "velocity": 0.1}, suite="quick")
+    scorer = SlowScorer({1: 0.2, 2: 0.6, 3: 0.4})
     seen = []
     configuration = toy_configuration(run={"gauge_interval": 1})
     runner = make(tmp_path, scorer=scorer, configuration=configuration, progress=seen.append)
@@ -200,28 +225,28 @@ def test_best_is_chosen_by_the_gauge(tmp_path):
         load_policy("best", log_root=tmp_path.parent.parent).contract == load_policy(tmp_path / "model_2.pt").contract
     )
     resumed = make(tmp_path, seed=1)
-    resumed.load(str(tmp_path / "model_3.pt"))
+    resume_run(resumed, tmp_path / "model_3.pt")
     assert resumed.best_score == 0.6
     # The score of iteration 2 came back before checkpoint 1 was resumed from: the same run directory remembers it.
-    resumed.load(str(tmp_path / "model_1.pt"))
+    resume_run(resumed, tmp_path / "model_1.pt")
     assert (resumed.best_score, resumed.best_iteration) == (0.6, 2)
 
 
 def test_resume_refuses_what_does_not_fit(tmp_path):
     make(tmp_path).learn(1)
-    path = str(tmp_path / "model_1.pt")
+    path = tmp_path / "model_1.pt"
     with pytest.raises(CheckpointError, match="of task 'toy', this run trains 'other'"):
-        make(task="other").load(path)
+        resume_run(make(task="other"), path)
     with pytest.raises(CheckpointError, match="--num-envs 8"):
-        make(env=ToyEnv(num_envs=16)).load(path)
+        resume_run(make(env=ToyEnv(num_envs=16)), path)
     with pytest.raises(CheckpointError, match="network"):
-        make(configuration=toy_configuration(encoder="mlp")).load(path)
+        resume_run(make(configuration=toy_configuration(encoder="mlp")), path)
     damaged = tmp_path / "damaged.pt"
-    damaged.write_bytes(Path(path).read_bytes()[:2000])
+    damaged.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(CheckpointError, match="damaged"):
-        make().load(str(damaged))
+        resume_run(make(), damaged)
     with pytest.raises(CheckpointError, match="Cannot read"):
-        make().load(str(tmp_path / "none.pt"))
+        resume_run(make(), tmp_path / "none.pt")
 
 
 @pytest.mark.parametrize("symmetry", ["none", "augment"])
@@ -230,21 +255,21 @@ def test_beginning_with_a_bare_policy(tmp_path, symmetry):
     settings = toy_configuration(
         algorithm={"symmetry": symmetry, "epochs": 20}, run={"bootstrap_iterations": 6, "nonfinite_limit": 0.5}
     )
-    mirror = build_mirror(toy_contract(), load_robot("go2"), history_length=HISTORY) if symmetry != "none" else None
+    mirror = toy_mirror() if symmetry != "none" else None
     trained = make(configuration=settings, mirror=mirror)
     trained.learn(2)
-    network = trained.stored_network()
+    network = stored_network(trained)
     write_checkpoint(tmp_path / "policy.pt", checkpoint_entries(toy_contract(), network, {}))
 
     runner = make(seed=5, configuration=settings, mirror=mirror)
-    runner.load_weights(tmp_path / "policy.pt")
+    begin_with(runner, tmp_path / "policy.pt")
     for name, value in network.state_dict.items():
-        assert torch.equal(runner.stored_network().state_dict[name], value)
+        assert torch.equal(stored_network(runner).state_dict[name], value)
     observations = runner.env.get_observations()
     alg, order = runner.alg, runner.alg.storage.split.order
     with torch.inference_mode():
         alg.act(observations)
-        mean = alg.transition.distribution_params[0]
+        mean = alg.storage.action_mean[0]
         history, frame = observations["history"][order], observations["policy"][order]
         assert torch.allclose(mean, alg.actor.action_mean(alg.actor.student_latent(history)[0], frame), atol=1e-6)
 
@@ -261,12 +286,12 @@ def test_beginning_with_a_bare_policy(tmp_path, symmetry):
         runner.learn(1)
         assert {"Loss/teacher_latent", "Loss/value"} <= runner.logger.scalars.keys()
         for name, value in network.state_dict.items():
-            assert torch.equal(runner.stored_network().state_dict[name], value)
+            assert torch.equal(stored_network(runner).state_dict[name], value)
         assert torch.equal(runner.alg.actor.output_std, std)
     assert runner.alg.bootstrap is None and error() < 0.5 * before
     runner.learn(1)
     assert "Loss/surrogate" in runner.logger.scalars
-    changed = runner.stored_network().state_dict
+    changed = stored_network(runner).state_dict
     assert not torch.equal(changed["actor.0.weight"], network.state_dict["actor.0.weight"])
 
 
@@ -277,8 +302,8 @@ def test_slim_checkpoints_keep_weights_and_progress(tmp_path):
     assert entries["training"]["environment"] is None  # the toy has no progress of its own
     said = []
     resumed = make(seed=7, configuration=configuration, message=said.append)
-    resumed.load(str(tmp_path / "model_1.pt"))
-    assert "episodes start anew" in said[0] and resumed.current_learning_iteration == 1
+    resume_run(resumed, tmp_path / "model_1.pt")
+    assert "episodes start anew" in said[0] and resumed.iteration == 1
     assert_same(resumed.alg.save(), {k: entries[k] for k in resumed.alg.save()})
     resumed.learn(1)
 
@@ -294,10 +319,10 @@ def test_a_trimmed_checkpoint_begins_training_with_its_teacher(tmp_path):
     assert bias.data_ptr() == trimmed["state_dict"]["actor.0.bias"].data_ptr()
     assert load_policy(str(tmp_path / "trimmed.pt")).contract.provenance["iteration"] == 2
     runner = make(seed=3)
-    runner.load_weights(tmp_path / "trimmed.pt")
+    begin_with(runner, tmp_path / "trimmed.pt")
     assert runner.alg.bootstrap is None
     assert_same(runner.alg.actor.state_dict(), average["actor_state_dict"])
     assert_same(runner.alg.critic.state_dict(), average["critic_state_dict"])
     assert trimmed["training"]["progress"] == whole["training"]["progress"]
     with pytest.raises(CheckpointError, match="holds networks only; begin a new run with them: --init-from"):
-        runner.load(str(tmp_path / "trimmed.pt"))
+        resume_run(runner, tmp_path / "trimmed.pt")

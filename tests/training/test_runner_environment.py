@@ -5,16 +5,17 @@ import torch
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.training.algorithms.symmetry import build_mirror
 from gaitgauge.training.checkpoint import reached, read_checkpoint
-from gaitgauge.training.environment_configuration import Ramp
+from gaitgauge.training.environment_configuration import ObservationConfiguration, Ramp
+from gaitgauge.training.resuming import resume_run
 from gaitgauge.training.runner import TrainingRunner
 from gaitgauge.training.seeding import seed_everything
 from small_environment import STAIRS, make
 from toy_training import toy_configuration
 
 
-def build(folder, seed=0, **algorithm):
+def build(folder, seed=0, observations=None, **algorithm):
     seed_everything(seed)
-    environment = make(num_envs=8, terrain=STAIRS, seed=0)
+    environment = make(num_envs=8, terrain=STAIRS, seed=0, observations=observations or ObservationConfiguration())
     configuration = toy_configuration(steps=6, algorithm=algorithm, run={"random_episode_start": True})
     return TrainingRunner(
         environment,
@@ -22,7 +23,9 @@ def build(folder, seed=0, **algorithm):
         contract=environment.contract,
         task="toy",
         log_dir=folder,
-        mirror=build_mirror(environment.contract, environment.robot, history_length=5),
+        mirror=build_mirror(
+            environment.configuration.observations, contract=environment.contract, robot=environment.robot
+        ),
     )
 
 
@@ -33,7 +36,7 @@ def test_resumes_exactly_with_the_training_environment(tmp_path):
     build(whole).learn(4)
     build(first).learn(2)
     resumed = build(second, seed=5)
-    resumed.load(str(first / "model_2.pt"))
+    resume_run(resumed, first / "model_2.pt")
     resumed.learn(2)
     a, b = (read_checkpoint(folder / "model_4.pt") for folder in (whole, second))
     for name, value in a["actor_state_dict"].items():
@@ -47,15 +50,23 @@ def test_the_algorithm_and_checkpoints_know_where_schedules_are(tmp_path):
     runner = build(tmp_path, entropy_coefficient=Ramp(start=0.5, end=0.1, begin=0.0, until=0.5))
     runner.env.program.memory.step.fill_(runner.env.configuration.schedule.horizon_steps // 4 - 6)
     runner.learn(1)
-    assert float(runner.alg._entropy_coefficient) == pytest.approx(0.3)
+    assert float(runner.alg.losses.entropy_coefficient) == pytest.approx(0.3)
     assert reached(read_checkpoint(tmp_path / "model_1.pt")) == pytest.approx(0.25)
 
 
-def test_symmetry_fits_the_training_environment(tmp_path):
-    runner = build(None, symmetry="augment")
+@pytest.mark.parametrize(
+    "observations",
+    [
+        ObservationConfiguration(),
+        ObservationConfiguration(history_length=3),
+        ObservationConfiguration(scan_length=1.0, scan_width=0.6, scan_spacing=0.2),
+    ],
+)
+def test_symmetry_fits_the_training_environment(observations):
+    runner = build(None, symmetry="augment", observations=observations)
     runner.learn(1)
     groups = runner.env.get_observations()
-    mirror = runner.alg.mirror
+    mirror = runner.alg.losses.mirror
     assert [mirror.policy.width, mirror.history.width, mirror.privileged.width] == [
         groups[name].shape[1] for name in ("policy", "history", "privileged")
     ]

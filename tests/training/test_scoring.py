@@ -1,54 +1,92 @@
+"""Commands beside a training: their order, failures, and how the slow ones are given up."""
+
 import sys
 import time
 from pathlib import Path
 
-from gaitgauge.training.scoring import ProcessScorer, flat_numbers
+import pytest
+from gaitgauge.policy.loading import PRETRAINED
+from gaitgauge.training.filming import Filmer
+from gaitgauge.training.scoring import Scorer
+from gaitgauge.training.side_process import Job, SideProcess
 
 
-def scorer(tmp_path: Path, code: str, **arguments) -> ProcessScorer:
-    return ProcessScorer(
-        lambda path: [sys.executable, "-c", code, str(path)], suite="s", folder=tmp_path / "g", **arguments
+def job(folder: Path, number: int, *command: str) -> Job:
+    return Job(
+        command=command,
+        checkpoint=Path(f"model_{number}.pt"),
+        iteration=number,
+        output=folder / "side" / f"{number}.txt",
+        log=folder / "side" / f"{number}.log",
     )
 
 
-def test_scores_come_back_in_order(tmp_path):
-    code = 'import sys; print(\'{"score": %s, "terrain": {"wave": 2}}\' % len(sys.argv[1]))'
-    side = scorer(tmp_path, code)
-    side.submit(Path("ab"), 1)
-    side.submit(Path("abcd"), 2)
+def python(folder: Path, number: int, code: str) -> Job:
+    return job(folder, number, sys.executable, "-c", code)
+
+
+def test_jobs_run_in_order_and_not_on_the_gpu(tmp_path):
+    side = SideProcess(max_waiting=2)
+    code = "import os; print(repr(os.environ['CUDA_VISIBLE_DEVICES']))"
+    for number in (1, 2):
+        side.submit(python(tmp_path, number, code))
     assert side.pending == 2
-    reports = side.drain(30.0)
-    assert [(r.iteration, dict(r.scores)) for r in reports] == [
-        (1, {"score": 2.0, "terrain.wave": 2.0}),
-        (2, {"score": 4.0, "terrain.wave": 2.0}),
-    ]
-    assert side.pending == 0 and not any(r.failure for r in reports)
+    finished = side.drain(30.0)
+    assert [(f.job.iteration, f.failure) for f in finished] == [(1, ""), (2, "")]
+    assert (tmp_path / "side" / "2.txt").read_text() == "''\n"
+    assert side.pending == 0
 
 
 def test_failures_are_reported(tmp_path):
-    side = scorer(tmp_path, "import sys; print('oops', file=sys.stderr); sys.exit(3)")
-    side.submit(Path("a"), 7)
-    (report,) = side.drain(30.0)
-    assert "exit code 3" in report.failure and not report.scores
-    assert (tmp_path / "g" / "model_7.log").read_text() == "oops\n"
-    side = scorer(tmp_path, "print('no json')")
-    side.submit(Path("a"), 8)
-    assert "cannot be read" in side.drain(30.0)[0].failure
-    missing = ProcessScorer(lambda path: ["/no/such/program"], suite="s", folder=tmp_path)
-    missing.submit(Path("a"), 9)
-    assert "cannot start /no/such/program" in missing.poll()[0].failure
+    side = SideProcess()
+    side.submit(python(tmp_path, 7, "import sys; print('oops', file=sys.stderr); sys.exit(3)"))
+    (finished,) = side.drain(30.0)
+    assert finished.failure == f"exit code 3; see {tmp_path / 'side' / '7.log'}"
+    assert (tmp_path / "side" / "7.log").read_text() == "oops\n"
+    side.submit(job(tmp_path, 8, "/no/such/program"))
+    assert side.poll()[0].failure == "cannot start /no/such/program: No such file or directory"
 
 
-def test_a_slow_gauge_skips_the_oldest_and_can_be_stopped(tmp_path):
-    side = scorer(tmp_path, "import time; time.sleep(60)", max_waiting=2)
-    for iteration in range(4):
-        side.submit(Path("a"), iteration)
-    skipped = side.poll()
-    assert [r.iteration for r in skipped] == [1] and "slower than training" in skipped[0].failure
+def test_the_oldest_waiting_job_is_given_up_and_a_running_one_can_be_stopped(tmp_path):
+    side = SideProcess(max_waiting=2)
+    for number in range(4):
+        side.submit(python(tmp_path, number, "import time; time.sleep(60)"))
+    assert [(f.job.iteration, f.failure) for f in side.poll()] == [(1, "skipped")]
     start = time.monotonic()
     side.close()
     assert time.monotonic() - start < 5.0 and side.pending == 0
 
 
-def test_flat_numbers():
-    assert flat_numbers({"a": 1, "b": {"c": 2.5, "d": "x", "e": True}, "f": [1]}) == {"a": 1.0, "b.c": 2.5}
+def test_a_gauge_that_cannot_play_says_why(tmp_path):
+    """The gauge itself runs; the checkpoint is none."""
+    (tmp_path / "model_3.pt").write_bytes(b"nothing of the kind")
+    scorer = Scorer(tmp_path, suite="quick", threads=1)
+    scorer.submit(tmp_path / "model_3.pt", 3)
+    (report,) = scorer.drain(60.0)
+    assert (report.iteration, dict(report.scores)) == (3, {})
+    log = tmp_path / "gauge" / "quick" / "model_3.log"
+    assert report.failure == f"exit code 2; see {log}" and "model_3.pt" in log.read_text()
+
+
+def test_a_machine_that_cannot_draw_is_told_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    filmer = Filmer(tmp_path, terrain="flat")
+    filmer.submit(PRETRAINED, 20)
+    videos, sentence = filmer.take(120.0)
+    assert videos == []
+    assert sentence.startswith("No video of iteration 20, and none from here on; training goes on: ")
+    assert "MUJOCO_GL=nonsense does not draw" in sentence and "\n" not in sentence
+    filmer.submit(PRETRAINED, 40)
+    assert filmer.take(5.0) == ([], "")
+
+
+@pytest.mark.slow
+def test_a_video_of_a_checkpoint(tmp_path):
+    filmer = Filmer(tmp_path, terrain="flat")
+    filmer.submit(PRETRAINED, 20)
+    videos, sentence = filmer.take(600.0)
+    if "does not draw" in sentence or "neither EGL nor OSMesa" in sentence:
+        pytest.skip(sentence)
+    assert (videos, sentence) == ([(tmp_path / "videos" / f"{PRETRAINED.stem}.mp4", 20)], "")
+    assert videos[0][0].stat().st_size > 10_000
+    assert [f.name for f in (tmp_path / "videos").iterdir()] == [videos[0][0].name]

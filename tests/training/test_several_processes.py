@@ -27,12 +27,13 @@ TRAIN = (
 )
 SCRIPT = """
 import torch
+from gaitgauge.training.processes import Processes
 from gaitgauge.training.runner import TrainingRunner
 from toy_training import ToyEnv, toy_configuration, toy_contract
 import os
 rank = int(os.environ["RANK"])
 torch.manual_seed(rank)
-runner = TrainingRunner(ToyEnv(seed=rank), toy_configuration(), contract=toy_contract(), task="toy")
+runner = TrainingRunner(ToyEnv(seed=rank), toy_configuration(), contract=toy_contract(), task="toy", processes=Processes.join("cpu"))
 runner.learn(3)
 mine = torch.cat([p.detach().flatten() for p in (*runner.alg.actor.parameters(), *runner.alg.critic.parameters())])
 both = [torch.zeros_like(mine) for _ in range(2)]
@@ -43,12 +44,17 @@ assert not torch.equal(*seen), "both processes saw the same"
 assert torch.equal(*both), "the networks drifted apart"
 assert runner.alg.learning_rate != 1e-3
 runner.close()
+runner.processes.leave()
 """
 
 
 def start(folder: Path, *command: str) -> subprocess.Popen[str]:
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *command]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": os.pathsep.join((str(Path(__file__).parent), *sys.path)),
+    }
     return subprocess.Popen(
         launcher, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
@@ -96,3 +102,40 @@ def test_a_signal_ends_both_with_a_checkpoint(tmp_path):
     assert description["outcome"] == "signal"
     last = run / f"model_{description['iteration']}.pt"
     assert last.is_file() and last.with_suffix(".rank1.pt").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_run_that_loses_a_process_ends_with_a_checkpoint_and_a_sentence(tmp_path, lost):
+    process = start(tmp_path, *TRAIN, "--iterations", "1000000", "training.run.save_interval=1000000")
+    deadline = time.monotonic() + 120.0
+    while not (found := list(tmp_path.rglob("events.out.tfevents.*"))) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    time.sleep(3.0)
+    (number,) = [n for n in children(process.pid) if rank(n) == str(lost)]
+    os.kill(number, signal.SIGKILL)
+    output, _ = process.communicate(timeout=60)
+    run = found[0].parent
+    description = json.loads((run / "run.json").read_text())
+    last = run / f"model_{description['iteration']}.pt"
+    assert description["outcome"] == "lost a process" and description["iteration"] > 0
+    (sentence,) = [line for line in output.splitlines() if line.startswith("gaitgauge: ")]
+    assert "another process has gone: " in sentence
+    here = last.relative_to(tmp_path)
+    assert f"iteration {description['iteration']} is in '{here}', go on with --resume {here.parent}" in sentence
+    resumed = start(tmp_path, *TRAIN, "--resume", "latest", "--iterations", str(description["iteration"] + 1))
+    output, _ = resumed.communicate(timeout=300)
+    assert resumed.returncode == 0, output
+    assert "was written by what was left of several processes, not 2: episodes start anew" in output
+    assert (run / f"model_{description['iteration'] + 1}.rank1.pt").is_file()
+
+
+def children(parent: int) -> list[int]:
+    """Processes that a process has started."""
+    return [int(n) for n in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
+
+
+def rank(number: int) -> str:
+    """Rank of a process of a run."""
+    entries = dict(e.partition("=")[::2] for e in Path(f"/proc/{number}/environ").read_text().split("\0"))
+    return entries.get("RANK", "")

@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 from gaitgauge.policy.contract import PolicyContract, go2_contract
 from gaitgauge.robots import load_robot
+from gaitgauge.training.algorithms.symmetry import Mirror, build_mirror
 from gaitgauge.training.configuration import (
     AlgorithmConfiguration,
     NetworkConfiguration,
     RunConfiguration,
     TrainingConfiguration,
 )
+from gaitgauge.training.environment_configuration import ObservationConfiguration
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
@@ -85,6 +87,10 @@ class ToyEnv(VecEnv):
 
 def toy_contract() -> PolicyContract:
     return go2_contract(load_robot("go2"))
+
+
+def toy_mirror() -> Mirror:
+    return build_mirror(ObservationConfiguration(), contract=toy_contract(), robot=load_robot("go2"))
 
 
 def toy_configuration(

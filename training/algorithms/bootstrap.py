@@ -10,7 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from rsl_rl.utils import reduce_gradients_in_buckets
+
+from .gradients import FlatGradients
 
 if TYPE_CHECKING:
     from .cts import CTS
@@ -25,6 +26,7 @@ class Bootstrap:
         self._left = iterations
         actor = algorithm.actor
         self._parameters = [*actor.teacher_encoder.parameters(), *algorithm.critic.parameters()]
+        self._gradients = FlatGradients(self._parameters)
         self._optimizer = torch.optim.Adam(self._parameters, lr=1e-3)
 
     @property
@@ -47,14 +49,11 @@ class Bootstrap:
                 losses = self._losses(teacher, student)
                 self._optimizer.zero_grad(set_to_none=True)
                 losses.sum().backward()
-                if algorithm.is_multi_gpu:
-                    reduce_gradients_in_buckets(
-                        self._parameters, algorithm.gpu_world_size, algorithm.grad_reduce_bucket_mb
-                    )
-                torch.nn.utils.clip_grad_norm_(self._parameters, algorithm.max_grad_norm)
+                self._gradients.gather()
+                algorithm.processes.average(self._gradients.values)
+                torch.nn.utils.clip_grad_norm_(self._parameters, settings.max_gradient_norm)
                 self._optimizer.step()
                 sums += losses.detach()
-        storage.clear()
         self._left -= 1
         latent, value = (sums / (settings.epochs * settings.minibatches)).tolist()
         return {"teacher_latent": latent, "value": value, "skipped_minibatches": 0.0}
@@ -62,8 +61,8 @@ class Bootstrap:
     def _losses(self, teacher: torch.Tensor, student: torch.Tensor) -> torch.Tensor:
         """Latent error on the student's samples and value error on all, (2,)."""
         algorithm = self._algorithm
-        actor, storage, mirror = algorithm.actor, algorithm.storage, algorithm.mirror
-        states = storage.observations["privileged"].flatten(0, 1)
+        actor, storage, mirror = algorithm.actor, algorithm.storage, algorithm.losses.mirror
+        states = storage.privileged.flatten(0, 1)
         in_history = storage.student_rows(student)
         privileged = states[student]
         target = storage.student_latent.flatten(0, 1)[in_history]
@@ -77,5 +76,5 @@ class Bootstrap:
         with torch.no_grad():
             critic_latent = actor.teacher_latent(states[rows])
         values = algorithm.critic.value(critic_latent, states[rows]).squeeze(-1)
-        returns = storage.returns.flatten(0, 1)[rows].squeeze(-1)
+        returns = storage.returns.flatten(0, 1)[rows]
         return torch.stack(((latent - target).square().mean(), (values - returns).square().mean()))

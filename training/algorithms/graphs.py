@@ -34,7 +34,8 @@ class GraphedStep:
             static.copy_(argument)
         if self._graph is None:
             self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph):
+            # Other threads may talk to the device meanwhile: that of the processes' messages does.
+            with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
                 self._step(*self._inputs)
         self._graph.replay()
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from rsl_rl.storage import RolloutStorage
-from tensordict import TensorDict
 
 
 @dataclass(frozen=True)
@@ -44,8 +42,8 @@ class EnvironmentSplit:
         return cls(num_teacher=num_envs - num_student, num_student=num_student, order=order, inverse=inverse)
 
 
-class StratifiedStorage(RolloutStorage):
-    """rsl_rl's storage, its environment axis in block order, with what the student needs beside.
+class RolloutStorage:
+    """One rollout: T steps of N environments in block order, in memory that stays where it is (CUDA graphs rely on it).
 
     Histories are kept for student rows only: the teacher never looks at them, and they are the widest group. Student
     latents are kept because the student encoder does not change before the PPO passes are over, so they need not be
@@ -53,54 +51,65 @@ class StratifiedStorage(RolloutStorage):
     a minibatch is used.
     """
 
-    advantages: torch.Tensor
-
-    class Transition(RolloutStorage.Transition):
-        """One step of all environments, in block order."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.student_history: torch.Tensor | None = None
-            self.student_latent: torch.Tensor | None = None
-
     def __init__(
         self,
         split: EnvironmentSplit,
         num_steps: int,
-        observations: TensorDict,
-        num_actions: int,
+        *,
+        frame_width: int,
+        privileged_width: int,
+        history_width: int,
         latent_width: int,
+        num_actions: int,
         device: torch.device | str,
     ) -> None:
-        """Allocate for ``num_steps`` steps of the groups ``policy``, ``privileged`` and (student rows) ``history``."""
-        num_envs = split.num_teacher + split.num_student
-        kept = TensorDict({k: observations[k] for k in ("policy", "privileged")}, batch_size=[num_envs])
-        super().__init__("rl", num_envs, num_steps, kept, [num_actions], str(device))
+        """Allocate for ``num_steps`` steps."""
+
+        def zeros(envs: int, *width: int) -> torch.Tensor:
+            return torch.zeros(num_steps, envs, *width, device=device)
+
         self.split = split
-        history_width = observations["history"].shape[-1]
-        self.student_history = torch.zeros(num_steps, split.num_student, history_width, device=device)
-        self.student_latent = torch.zeros(num_steps, split.num_student, latent_width, device=device)
-        # Allocated here and not at the first transition: those happen in inference mode, which would make them
-        # unusable elsewhere.
-        self.distribution_params = tuple(torch.zeros(num_steps, num_envs, num_actions, device=device) for _ in range(2))
-        self._advantages: torch.Tensor = torch.zeros(num_steps, num_envs, 1, device=device)
+        self.num_steps = num_steps
+        self.num_envs = split.num_teacher + split.num_student
+        self.step = 0
+        """Steps stored so far."""
+        self.policy = zeros(self.num_envs, frame_width)
+        self.privileged = zeros(self.num_envs, privileged_width)
+        self.student_history = zeros(split.num_student, history_width)
+        self.student_latent = zeros(split.num_student, latent_width)
+        self.actions = zeros(self.num_envs, num_actions)
+        self.action_mean = zeros(self.num_envs, num_actions)
+        self.action_std = zeros(self.num_envs, num_actions)
+        self.log_prob = zeros(self.num_envs)
+        self.values = zeros(self.num_envs)
+        self.rewards = zeros(self.num_envs)
+        self.dones = zeros(self.num_envs)
+        self.returns = zeros(self.num_envs)
+        self.advantages = zeros(self.num_envs)
 
-    def add_transition(self, transition: RolloutStorage.Transition) -> None:
-        """Store one step given in block order."""
-        assert isinstance(transition, StratifiedStorage.Transition)
-        assert transition.student_history is not None and transition.student_latent is not None
-        if self.step < self.num_transitions_per_env:
-            self.student_history[self.step].copy_(transition.student_history)
-            self.student_latent[self.step].copy_(transition.student_latent)
-        super().add_transition(transition)
+    def add(self, **entries: torch.Tensor) -> None:
+        """Store entries of the present step by name, each (rows, …) in block order."""
+        for name, value in entries.items():
+            getattr(self, name)[self.step].copy_(value)
 
-    def keep_advantages(self) -> None:
-        """Copy advantages, which rsl_rl allocates anew every iteration, into memory that stays where it is (CUDA
-        graphs rely on it).
+    def compute_returns(self, last_values: torch.Tensor, *, discount: float, gae_lambda: float) -> None:
+        """Generalized advantage estimation (Schulman et al., 2016); advantages are normalized over all samples.
+
+        Args:
+            last_values: values of the states after the last step, (N,).
+            discount: γ.
+            gae_lambda: λ.
         """
-        computed: torch.Tensor = self.advantages
-        self._advantages.copy_(computed)
-        self.advantages = self._advantages
+        advantage = torch.zeros_like(last_values)
+        following = last_values
+        for step in reversed(range(self.num_steps)):
+            discounted = (1.0 - self.dones[step]) * discount
+            error = self.rewards[step] + discounted * following - self.values[step]
+            advantage = error + discounted * gae_lambda * advantage
+            self.returns[step] = advantage + self.values[step]
+            following = self.values[step]
+        advantages = self.returns - self.values
+        self.advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
 
     def minibatch_rows(self, num_minibatches: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw one random stratified partition of the rollout.
@@ -112,7 +121,7 @@ class StratifiedStorage(RolloutStorage):
         Raises:
             ValueError: there are fewer student or teacher samples than minibatches.
         """
-        steps, teachers, students = self.num_transitions_per_env, self.split.num_teacher, self.split.num_student
+        steps, teachers, students = self.num_steps, self.split.num_teacher, self.split.num_student
         if steps * min(teachers, students) < num_minibatches:
             raise ValueError(
                 f"{steps} steps of {teachers} teacher and {students} student environments do not fill "

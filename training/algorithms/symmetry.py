@@ -14,6 +14,8 @@ import torch
 
 from ...policy.contract import PolicyContract
 from ...robots.base import Robot
+from ..environment_configuration import ObservationConfiguration
+from ..height_scan import scan_pattern
 
 # Name prefixes of the left legs and of their mirror images.
 LEG_PAIRS: tuple[tuple[str, str], ...] = (("FL", "FR"), ("RL", "RR"), ("LF", "RF"), ("LH", "RH"), ("left_", "right_"))
@@ -46,10 +48,6 @@ class MirrorMap:
     def to(self, device: torch.device | str) -> MirrorMap:
         """The same map on another device."""
         return MirrorMap(self.index.to(device), self.sign.to(device))
-
-    def flipped(self) -> MirrorMap:
-        """The same permutation with all signs changed."""
-        return MirrorMap(self.index, -self.sign)
 
     @classmethod
     def signs(cls, *sign: float) -> MirrorMap:
@@ -101,12 +99,17 @@ def mirror_by_name(names: Sequence[str], flipped_marks: Sequence[str] = ()) -> M
     return MirrorMap(index, sign)
 
 
-def mirror_grid(rows: int, columns: int) -> MirrorMap:
-    """Map of a height scan of ``rows`` x positions (slow index) by ``columns`` y positions symmetric about zero (fast
-    index).
+def mirror_points(points: torch.Tensor) -> MirrorMap:
+    """Map of values at points (P, 2), the x and y positions of a height scan: each takes the value at its mirror image.
+
+    Raises:
+        SymmetryError: a point has no mirror image among them.
     """
-    index = torch.arange(rows * columns).view(rows, columns).flip(1).flatten()
-    return MirrorMap(index, torch.ones(rows * columns))
+    images = points.cpu() * torch.tensor([1.0, -1.0])
+    distance, index = torch.cdist(images, points.cpu(), compute_mode="donot_use_mm_for_euclid_dist").min(dim=1)
+    if bool((distance > 1e-4).any()):
+        raise SymmetryError(f"The height scan's point {points[int(distance.argmax())].tolist()} has no mirror image.")
+    return MirrorMap(index, torch.ones(len(points)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,19 +131,16 @@ class Mirror:
         )
 
 
-def build_mirror(
-    contract: PolicyContract, robot: Robot, *, scan_shape: tuple[int, int] = (17, 11), history_length: int | None = None
-) -> Mirror:
+def build_mirror(observations: ObservationConfiguration, *, contract: PolicyContract, robot: Robot) -> Mirror:
     """Mirror maps for the training observations of a robot.
 
     The privileged vector is base linear velocity, the noise-free policy frame, contact force per foot, torque per
     joint, acceleration per joint and the height scan, in this order.
 
     Args:
+        observations: gives the frames of the history and the points of the height scan.
         contract: gives the terms of the policy frame and the joint order.
         robot: gives the foot names.
-        scan_shape: x and y positions of the height scan, y the fast index.
-        history_length: frames in the history group, frame by frame; None for the contract's.
 
     Raises:
         SymmetryError: names do not pair up, or the default pose is not its own mirror image.
@@ -163,10 +163,11 @@ def build_mirror(
     }
     frame = MirrorMap.joined([terms[term.name] for term in contract.observation])
     feet = mirror_by_name(robot.foot_names)
+    scan = scan_pattern(observations.scan_length, observations.scan_width, observations.scan_spacing, "cpu")
     return Mirror(
         policy=frame,
-        history=MirrorMap.joined([frame] * (history_length or contract.history.length)),
-        privileged=MirrorMap.joined([VECTOR, frame, feet, joints, joints, mirror_grid(*scan_shape)]),
+        history=MirrorMap.joined([frame] * observations.history_length),
+        privileged=MirrorMap.joined([VECTOR, frame, feet, joints, joints, mirror_points(scan)]),
         action=joints,
     )
 

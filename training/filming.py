@@ -1,0 +1,70 @@
+"""Videos of the policy while it is being trained, made by ``gaitgauge play`` in a side process."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from .side_process import Job, SideProcess
+
+VIDEO_FOLDER = "videos"
+"""Folder of a run directory that holds ``model_<iteration>.mp4``."""
+SECONDS = 8.0
+"""Length of a video [s]."""
+_PACKAGE = __name__.partition(".")[0]
+
+
+class Filmer:
+    """Takes checkpoints, gives videos back later."""
+
+    def __init__(self, run: Path, *, terrain: str) -> None:
+        """Film into a run directory, on a terrain of the gauge."""
+        self._folder = run / VIDEO_FOLDER
+        self._terrain = terrain
+        self._side = SideProcess()
+        self._given_up = False
+
+    def submit(self, path: Path, iteration: int) -> None:
+        """Ask for a video of a checkpoint."""
+        if self._given_up:
+            return
+        video = self._folder / f"{path.stem}.mp4"
+        options = ["--terrain", self._terrain, "--seconds", f"{SECONDS:g}", "--out", str(video)]
+        self._side.submit(
+            Job(
+                command=[sys.executable, "-m", f"{_PACKAGE}.cli.main", "play", str(path), *options],
+                checkpoint=path,
+                iteration=iteration,
+                output=self._folder / f"{path.stem}.txt",
+                log=self._folder / f"{path.stem}.log",
+            )
+        )
+
+    def take(self, seconds: float = 0.0) -> tuple[list[tuple[Path, int]], str]:
+        """Videos that were finished since the last call, with their iterations; and a sentence for people, if there is one.
+
+        Args:
+            seconds: longest wait for those that are pending [s].
+        """
+        films, sentence = [], ""
+        for finished in self._side.drain(seconds):
+            job = finished.job
+            if not finished.failure:
+                films.append((self._folder / f"{job.checkpoint.stem}.mp4", job.iteration))
+                job.output.unlink(missing_ok=True)
+                job.log.unlink(missing_ok=True)
+            elif finished.failure == "skipped":
+                sentence = (
+                    f"No video of iteration {job.iteration}: filming is slower than training; raise --video-every."
+                )
+            else:
+                said = job.log.read_text(errors="replace").strip().splitlines() if job.log.is_file() else []
+                reason = said[-1] if said else finished.failure
+                sentence = f"No video of iteration {job.iteration}, and none from here on; training goes on: {reason}"
+                self._given_up = True
+                self._side.close()
+        return films, sentence
+
+    def close(self) -> None:
+        """Give up what is pending."""
+        self._side.close()

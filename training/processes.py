@@ -1,0 +1,118 @@
+"""The processes of one run: one for each GPU, as torchrun starts them, or this one alone.
+
+CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it
+instead. Whoever waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import distributed
+
+PATIENCE = 300.0
+"""Longest wait for the others [s]; compiling may take one of them a minute longer."""
+PATIENCE_AFTER_SIGNAL = 10.0
+"""Longest wait [s] once this process was asked to stop: torchrun asks all others when one is lost."""
+
+
+class ProcessLostError(RuntimeError):
+    """Another process of the run does not answer any more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Processes:
+    """Where this process stands among those of the run, and how they agree."""
+
+    rank: int = 0
+    """Number of this process; the first one speaks, logs and writes."""
+    count: int = 1
+    """Processes of the run."""
+
+    @classmethod
+    def join(cls, device: torch.device | str) -> Processes:
+        """Join the processes that torchrun started, if it did."""
+        here = cls(rank=int(os.environ.get("RANK", "0")), count=int(os.environ.get("WORLD_SIZE", "1")))
+        if here.several:
+            on_gpu = torch.device(device).type == "cuda"
+            if on_gpu:
+                torch.cuda.set_device(device)
+            distributed.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo")
+        return here
+
+    def leave(self) -> None:
+        """Leave the group in order; a process that lost another one just ends."""
+        if self.several and distributed.is_initialized():
+            distributed.destroy_process_group()
+
+    @property
+    def several(self) -> bool:
+        """Whether there are others."""
+        return self.count > 1
+
+    def average(self, values: torch.Tensor) -> None:
+        """Replace a tensor by its mean over the processes."""
+        if self.several:
+            with _heard():
+                distributed.all_reduce(values)
+            values /= self.count
+
+    def copy_first(self, tensors: Iterable[torch.Tensor]) -> None:
+        """Give every process the first one's tensors."""
+        if self.several:
+            with _heard():
+                for tensor in tensors:
+                    distributed.broadcast(tensor.data, src=0)
+
+    def largest(self, number: int) -> int:
+        """The largest of the processes' numbers."""
+        if not self.several:
+            return number
+        shared = torch.tensor(number)
+        with _heard():
+            distributed.all_reduce(shared, op=distributed.ReduceOp.MAX)
+        return int(shared)
+
+    def firsts(self, value: Any) -> Any:
+        """The first process's value, plain data."""
+        shared = [value]
+        if self.several:
+            with _heard():
+                distributed.broadcast_object_list(shared, src=0, device=torch.device("cpu"))
+        return shared[0]
+
+    def wait_for(self, device: torch.device | str, *, stopping: Callable[[], bool] = lambda: False) -> None:
+        """Wait until a GPU has done what was asked of it, which it cannot while another process is missing.
+
+        Args:
+            device: nothing is waited for on a CPU.
+            stopping: whether this process was asked to stop.
+
+        Raises:
+            ProcessLostError: it took too long.
+        """
+        if not self.several or torch.device(device).type != "cuda":
+            return
+        done, begin = torch.cuda.Event(), time.monotonic()
+        done.record()
+        while not done.query():
+            limit = PATIENCE_AFTER_SIGNAL if stopping() else PATIENCE
+            if time.monotonic() - begin > limit:
+                raise ProcessLostError(f"another process did not answer for {limit:.0f} s")
+            time.sleep(2e-4)
+
+
+@contextmanager
+def _heard() -> Iterator[None]:
+    """Tell a lost connection from other errors."""
+    try:
+        yield
+    except RuntimeError as error:
+        words = str(error).partition("\n")[0].partition(". ")[0]
+        raise ProcessLostError(f"another process has gone: {(words.partition('] ')[2] or words)[:200]}") from error

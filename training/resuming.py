@@ -1,0 +1,209 @@
+"""What of a run goes into its checkpoints, and how a run continues from one or begins with its networks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from ..policy.contract import PolicyContract, difference
+from ..policy.native import StoredNetwork
+from .checkpoint import (
+    TRAINING_VERSION,
+    CheckpointError,
+    checkpoint_entries,
+    learned_networks,
+    rank_file,
+    read_checkpoint,
+    student_state,
+    write_checkpoint,
+)
+from .keepsake import host_copy
+from .run_directory import read_run_json
+from .seeding import random_state, restore_random_state
+
+if TYPE_CHECKING:
+    from .runner import TrainingRunner
+
+
+class TrainingDivergedError(RuntimeError):
+    """Too many numbers are not finite for training to go on; the message says which and what survives."""
+
+
+def stored_network(runner: TrainingRunner, average: Mapping[str, Any] | None = None) -> StoredNetwork:
+    """The student as it is deployed: with averaged weights."""
+    actor = runner.alg.actor
+    weights = student_state((average or runner.average.state_dict())["actor_state_dict"])
+    return StoredNetwork(architecture=actor.architecture, arguments=actor.arguments, state_dict=weights)
+
+
+def save_run(runner: TrainingRunner, path: Path) -> None:
+    """Write a checkpoint; other processes than the first write only their own environment and random states beside it.
+
+    Raises:
+        TrainingDivergedError: a weight is not finite.
+        CheckpointError: the file cannot be written.
+    """
+    kept = "state_dict" if runner.configuration.run.keep_episodes else "progress_dict"
+    local = {
+        "random": random_state(runner.device),
+        "environment": getattr(runner.env, kept)() if hasattr(runner.env, kept) else None,
+        "num_envs": runner.env.num_envs,
+        "log": runner.logger.state_dict(),
+    }
+    if runner.processes.rank != 0:
+        write_checkpoint(rank_file(path, runner.processes.rank), local)
+        return
+    learned = host_copy(runner.learned(), runner.device)
+    for part in ("actor_state_dict", "critic_state_dict"):
+        if not all(bool(torch.isfinite(value).all()) for value in learned[part].values()):
+            raise TrainingDivergedError(
+                f"A weight in {part} is not finite; '{path}' was not written, earlier checkpoints are intact."
+            )
+    write_learned(runner, path, learned, local | {"world_size": runner.processes.count})
+    runner.logger.send(path, runner.iteration)
+
+
+def write_learned(runner: TrainingRunner, path: Path, learned: Mapping[str, Any], local: Mapping[str, Any]) -> None:
+    """Write a checkpoint of what was learned and of what this process holds beside it.
+
+    Raises:
+        CheckpointError: the file cannot be written.
+    """
+    training = {
+        **local,
+        "version": TRAINING_VERSION,
+        "task": runner.task,
+        "settings": runner.settings,
+        "progress": float(getattr(runner.env, "progress", 1.0)),
+        "best_score": runner.best_score,
+        "best_iteration": runner.best_iteration,
+    }
+    provenance = dict(runner.contract.provenance) | {
+        "task": runner.task,
+        "run": runner.log_dir.name if runner.log_dir else "",
+        "iteration": runner.iteration,
+        "environment_steps": runner.logger.total_steps,
+    }
+    contract = replace(runner.contract, provenance=provenance)
+    extra = {**learned, "iter": runner.iteration, "infos": None, "training": training}
+    write_checkpoint(path, checkpoint_entries(contract, stored_network(runner, learned["average"]), extra))
+
+
+def resume_run(runner: TrainingRunner, path: Path) -> None:
+    """Continue from a checkpoint as if the run had never stopped.
+
+    An environment without ``load_state_dict``, or another number of processes, starts fresh episodes; this is said
+    through the runner's ``message``.
+
+    Raises:
+        CheckpointError: damaged, of another task, contract, network or number of environments.
+    """
+    entries = read_checkpoint(path)
+    training = entries["training"]
+    _check_fits(runner, path, entries)
+    try:
+        runner.alg.load(entries)
+    except (RuntimeError, KeyError, ValueError) as error:
+        raise _misfit("resume", path, error) from error
+    runner.average.load_state_dict(entries.get("average"))
+    if "average" not in entries:
+        runner.message(f"'{path}' holds no average of weights: it begins here.")
+    runner.iteration = entries["iter"]
+    runner.best_score, runner.best_iteration = training["best_score"], training["best_iteration"]
+    # A score may have come back, and best.pt been replaced, after the checkpoint was written.
+    noted = read_run_json(runner.log_dir) if runner.log_dir else {}
+    if (score := noted.get("best_score")) is not None and (runner.best_score is None or score > runner.best_score):
+        runner.best_score, runner.best_iteration = score, noted["best_iteration"]
+    local: Mapping[str, Any] | None = training
+    if training["world_size"] != runner.processes.count:
+        local = None
+        runner.message(
+            f"'{path}' was written by {training['world_size'] or 'what was left of several'} processes, not "
+            f"{runner.processes.count}: episodes start anew."
+        )
+    elif runner.processes.rank != 0:
+        local = torch.load(rank_file(path, runner.processes.rank), map_location="cpu", weights_only=True)
+    runner.logger.load_state_dict((local or training)["log"])
+    if local is not None:
+        loaded = _load_environment(runner, path, local["environment"])
+        runner.fresh = not loaded or not runner.configuration.run.keep_episodes
+        restore_random_state(local["random"], runner.device)
+
+
+def begin_with(runner: TrainingRunner, path: Path) -> None:
+    """Begin with the averaged networks of another run's checkpoint; optimizers, counters and episodes start anew.
+
+    A policy file without training state gives the student alone; the first ``run.bootstrap_iterations`` then find
+    a teacher and a critic for it.
+
+    Raises:
+        CheckpointError: damaged, of other joints or another observation, or of other networks.
+    """
+    entries = read_checkpoint(path, training_state=False)
+    theirs = PolicyContract.from_json(entries["contract"])
+    for name in ("joint_names", "observation", "action_scale", "default_joint_position"):
+        if getattr(theirs, name) != getattr(runner.contract, name):
+            raise CheckpointError(
+                f"Cannot start from '{path}': its {name} is {getattr(theirs, name)}, this run's is "
+                f"{getattr(runner.contract, name)}."
+            )
+    _check_network(runner, path, entries, "start")
+    try:
+        if "training" in entries:
+            runner.alg.load(learned_networks(entries), optimizers=False)
+        else:
+            runner.alg.actor.student.load_state_dict(entries["state_dict"])
+            runner.alg.follow_student(runner.configuration.run.bootstrap_iterations)
+    except (RuntimeError, KeyError, ValueError) as error:
+        raise _misfit("start", path, error) from error
+    runner.average.load_state_dict(None)
+
+
+def _misfit(verb: str, path: Path, error: Exception) -> CheckpointError:
+    reason = " ".join(str(error).split())
+    return CheckpointError(f"Cannot {verb} from '{path}': its weights do not fit the networks of this run: {reason}")
+
+
+def _load_environment(runner: TrainingRunner, path: Path, state: Any) -> bool:
+    if state is None or not hasattr(runner.env, "load_state_dict"):
+        runner.message(f"'{path}' holds no state of the environment: episodes start anew.")
+        return False
+    try:
+        runner.env.load_state_dict(state)
+    except (ValueError, KeyError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise CheckpointError(
+            f"Cannot resume from '{path}': its environment does not fit this run's settings: {reason}"
+        ) from error
+    return True
+
+
+def _check_fits(runner: TrainingRunner, path: Path, entries: Mapping[str, Any]) -> None:
+    training = entries["training"]
+    if training["task"] != runner.task:
+        raise CheckpointError(
+            f"Cannot resume from '{path}': it is of task '{training['task']}', this run trains '{runner.task}'."
+        )
+    if lines := difference(PolicyContract.from_json(entries["contract"]), runner.contract):
+        first = lines.splitlines()[0]
+        raise CheckpointError(f"Cannot resume from '{path}': its policy contract differs from this task's: {first}")
+    _check_network(runner, path, entries, "resume")
+    if training["num_envs"] != runner.env.num_envs:
+        raise CheckpointError(
+            f"Cannot resume from '{path}': it has {training['num_envs']} environments, this run "
+            f"{runner.env.num_envs}; give --num-envs {training['num_envs']}."
+        )
+
+
+def _check_network(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], verb: str) -> None:
+    mine = checkpoint_entries(runner.contract, stored_network(runner), {})["network"]
+    if entries["network"] != mine:
+        raise CheckpointError(
+            f"Cannot {verb} from '{path}': its network is {entries['network']['architecture']} "
+            f"{entries['network']['arguments']}, this run's is {mine['architecture']} {mine['arguments']}; give the same "
+            "training.network.* settings."
+        )

@@ -1,0 +1,113 @@
+"""Commands beside a training, one at a time: it goes on while they run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ENVIRONMENT: Mapping[str, str] = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+"""A side process has no business on the GPU that trains."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One command."""
+
+    command: Sequence[str]
+    checkpoint: Path
+    """What it is about."""
+    iteration: int
+    output: Path
+    """Where its standard output goes."""
+    log: Path
+    """Where its standard error goes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finished:
+    """What became of a job."""
+
+    job: Job
+    seconds: float
+    """How long it ran [s]."""
+    failure: str
+    """Why it failed, in one sentence; empty if it did not."""
+
+
+class SideProcess:
+    """Runs jobs in the order of their submission."""
+
+    def __init__(self, *, max_waiting: int = 1) -> None:
+        """Begin without a job; when more than ``max_waiting`` wait, the oldest of them is given up."""
+        self._max_waiting = max_waiting
+        self._waiting: deque[Job] = deque()
+        self._running: tuple[Job, subprocess.Popen[bytes], float] | None = None
+        self._finished: list[Finished] = []
+
+    def submit(self, job: Job) -> None:
+        """Run a job when its turn comes."""
+        self._waiting.append(job)
+        if len(self._waiting) > self._max_waiting:
+            self._finished.append(Finished(job=self._waiting.popleft(), seconds=0.0, failure="skipped"))
+        self._start_next()
+
+    def poll(self) -> list[Finished]:
+        """Jobs that ended since the last call, without waiting."""
+        if self._running is not None:
+            job, process, start = self._running
+            if (code := process.poll()) is not None:
+                self._running = None
+                failure = f"exit code {code}; see {job.log}" if code else ""
+                self._finished.append(Finished(job=job, seconds=time.monotonic() - start, failure=failure))
+        self._start_next()
+        finished, self._finished = self._finished, []
+        return finished
+
+    def drain(self, seconds: float) -> list[Finished]:
+        """Wait for everything that is pending, at most ``seconds`` [s]."""
+        deadline = time.monotonic() + seconds
+        finished = self.poll()
+        while self.pending and time.monotonic() < deadline:
+            time.sleep(0.2)
+            finished += self.poll()
+        return finished
+
+    @property
+    def pending(self) -> int:
+        """How many submitted jobs have not been returned by ``poll``."""
+        return len(self._waiting) + (self._running is not None) + len(self._finished)
+
+    def close(self) -> None:
+        """Stop the running job and forget the waiting ones."""
+        self._waiting.clear()
+        if self._running is not None:
+            process = self._running[1]
+            self._running = None
+            process.terminate()
+            try:
+                process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _start_next(self) -> None:
+        if self._running is not None or not self._waiting:
+            return
+        job = self._waiting.popleft()
+        job.output.parent.mkdir(parents=True, exist_ok=True)
+        with job.output.open("wb") as out, job.log.open("wb") as log:
+            try:
+                # A session of its own: Ctrl-C in the terminal is for the training, which decides what becomes of the rest.
+                process = subprocess.Popen(
+                    list(job.command), stdout=out, stderr=log, env={**os.environ, **ENVIRONMENT}, start_new_session=True
+                )
+            except OSError as error:
+                failure = f"cannot start {job.command[0]}: {error.strerror}"
+                self._finished.append(Finished(job=job, seconds=0.0, failure=failure))
+                return
+        self._running = (job, process, time.monotonic())
