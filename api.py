@@ -86,12 +86,13 @@ def load_results(path: str | Path) -> Results:
     return Results(path=file, data=data)
 
 
-def load_policy(policy: str | Path, *, robot: str = "go2") -> Policy:
+def load_policy(policy: str | Path, *, robot: str = "go2", trust: bool = False) -> Policy:
     """Load a policy: own format, TorchScript, ONNX or an rsl_rl checkpoint.
 
     Args:
         policy: a file, or ``latest``, ``best`` or ``pretrained``.
         robot: name of the robot, or the path of its ``robot.toml``; a foreign file gets its contract from it.
+        trust: run the program that a file of the project's own format carries inside.
 
     Raises:
         PolicyError, ContractError, RobotError: one sentence on what is wrong.
@@ -99,7 +100,7 @@ def load_policy(policy: str | Path, *, robot: str = "go2") -> Policy:
     from .policy.loading import load_policy as load
     from .robots import load_robot
 
-    return load(str(policy), load_robot(robot))
+    return load(str(policy), load_robot(robot), trust=trust)
 
 
 def evaluate(
@@ -118,6 +119,7 @@ def evaluate(
     threads: int | None = None,
     out: str | Path | None = None,
     resume: bool = False,
+    trust: bool = False,
     watch: Callable[[Any], None] | None = None,
 ) -> Results:
     """Judge a policy, as ``gaitgauge evaluate`` does; writes results, episodes and the report.
@@ -137,6 +139,7 @@ def evaluate(
         threads: CPU threads, None for all cores; they change the time, never the results.
         out: output folder; None for ``results/<policy>-<suite>-<pipeline>``.
         resume: go on with what the folder holds.
+        trust: run the program that a policy file of the project's own format carries inside.
         watch: called a few times a second with a ``Status``.
 
     Raises:
@@ -160,6 +163,7 @@ def evaluate(
         payloads=tuple(payloads),
         seeds=tuple(seeds),
         threads=threads or os.cpu_count() or 1,
+        trust=trust,
     )
     run(request, folder, resume=resume, watch=watch)
     write_report(folder)

@@ -44,7 +44,7 @@ _ABOUT = {
 }
 
 
-def run_export(choice: str, *, out: Path | None, form: str) -> None:
+def run_export(choice: str, *, out: Path | None, form: str, trust: bool = False) -> None:
     """Export, and print each file with its check against the policy.
 
     Raises:
@@ -56,7 +56,7 @@ def run_export(choice: str, *, out: Path | None, form: str) -> None:
         hint = f"did you mean '{close[0]}'? " if close else ""
         raise UserError(f"there is no format '{form}'; {hint}choose one of: {', '.join(FORMATS)} (--format)")
     path = policy_file(choice)
-    policy = load_policy(path)
+    policy = load_policy(path, trust=trust)
     robot = load_robot(policy.contract.robot)
     # Beside the checkpoint of a run, where users of Isaac Lab look for it.
     folder = out or (path.parent if (path.parent / "run.json").is_file() else Path()) / "exported"

@@ -23,7 +23,9 @@ _HASH = 12
 # ---- import ---------------------------------------------------------------------------------------------------------
 
 
-def import_file(source: str, destination: Path, *, force: bool, trainable: bool = False, raw: bool = False) -> None:
+def import_file(
+    source: str, destination: Path, *, force: bool, trainable: bool = False, raw: bool = False, trust: bool = False
+) -> None:
     """Write a foreign policy as the project's own file, and print the contract that it got.
 
     Args:
@@ -32,6 +34,7 @@ def import_file(source: str, destination: Path, *, force: bool, trainable: bool 
         force: replace the destination if it exists.
         trainable: keep the teacher and the critic of a training checkpoint.
         raw: with ``trainable``, the weights after the last update instead of their average.
+        trust: run the program that a file of the project's own format carries inside.
 
     Raises:
         CheckpointError: ``trainable``, and the source is no training checkpoint.
@@ -51,11 +54,13 @@ def import_file(source: str, destination: Path, *, force: bool, trainable: bool 
         trim_checkpoint(find_policy(source), destination, raw=raw)
         contract = load_policy(str(destination)).contract
     else:
-        from ..policy.importing import import_policy
+        from ..policy.importing import carries_program, import_policy
 
-        contract = import_policy(source, destination)
+        contract = import_policy(source, destination, trust=trust)
     console = Terminal()
     console.say(f"wrote {destination}")
+    if not trainable and carries_program(destination):
+        console.say("it carries the program of its source, not weights alone: commands that run it need --trust")
     console.print(contract_table(contract))
 
 

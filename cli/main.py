@@ -42,6 +42,11 @@ PolicyArgument = Annotated[
     ),
 ]
 
+TrustOption = Annotated[
+    bool,
+    typer.Option("--trust", help="Run the program that a policy file of the project's own format carries inside."),
+]
+
 
 @app.command()
 @report_errors
@@ -82,6 +87,7 @@ def evaluate(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the output folder.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print results.json instead of tables.")] = False,
+    trust: TrustOption = False,
 ) -> None:
     """Gauge a policy: terrains, levels, frictions, payloads, noise and latency, down to one score with its interval."""
     from .evaluate import run_evaluation
@@ -102,6 +108,7 @@ def evaluate(
         out=out,
         resume=resume,
         json_output=json_output,
+        trust=trust,
     )
 
 
@@ -153,6 +160,7 @@ def consistency(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the output folder.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print consistency.json instead of tables.")] = False,
+    trust: TrustOption = False,
 ) -> None:
     """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why."""
     from .consistency import run_consistency
@@ -174,6 +182,7 @@ def consistency(
         out=out,
         resume=resume,
         json_output=json_output,
+        trust=trust,
     )
 
 
@@ -289,11 +298,12 @@ def export(
         Path | None, typer.Option(help="Output folder. Default: 'exported' in the run directory, or here.")
     ] = None,
     form: Annotated[str, typer.Option("--format", help="torchscript, onnx, deploy or all.")] = "all",
+    trust: TrustOption = False,
 ) -> None:
     """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it."""
     from .export import run_export
 
-    run_export(policy, out=out, form=form)
+    run_export(policy, out=out, form=form, trust=trust)
 
 
 @app.command()
@@ -323,6 +333,7 @@ def play(
     device: Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")] = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
+    trust: TrustOption = False,
 ) -> None:
     """Watch a policy walk: in MuJoCo's viewer, in a browser, or in a video file without a display."""
     from .play import run_play
@@ -341,6 +352,7 @@ def play(
         seed=seed,
         port=port,
         gamepad=gamepad,
+        trust=trust,
     )
 
 
@@ -359,11 +371,12 @@ def import_command(
     raw: Annotated[
         bool, typer.Option("--raw", help="The same with the weights after the last update, not their average.")
     ] = False,
+    trust: TrustOption = False,
 ) -> None:
     """Turn a foreign policy into the project's own file, with its contract."""
     from .inspect import import_file
 
-    import_file(source, destination, force=force, trainable=trainable or raw, raw=raw)
+    import_file(source, destination, force=force, trainable=trainable or raw, raw=raw, trust=trust)
 
 
 @app.command("list")

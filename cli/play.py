@@ -39,6 +39,7 @@ def run_play(
     seed: int,
     port: int,
     gamepad: bool = False,
+    trust: bool = False,
 ) -> None:
     """Load, build, and hand over to the viewer.
 
@@ -72,7 +73,7 @@ def run_play(
         level = LEVELS[len(LEVELS) // 2 - 1]
     ground = make_terrain(terrain, level)
     path = policy_file(choice)
-    policy = load_policy(path)
+    policy = load_policy(path, trust=trust)
     robot = load_robot(policy.contract.robot)
     settings = PlaySettings(
         backend=backend,

@@ -58,6 +58,8 @@ class Request:
     seeds: tuple[int, ...] = ()
     threads: int = 1
     """CPU threads; they change the time, never the results."""
+    trust: bool = False
+    """Run the program that a policy file of the project's own format carries inside."""
 
 
 @dataclass
@@ -118,7 +120,7 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
     for name, environment in {e.terrain: e for e in environments}.items():
         level = suite.scoring.levels if environment.searched else environment.level
         check_terrain(suite, make_terrain(name, level), searched=environment.searched)
-    policy = load_policy(request.policy, robot)
+    policy = load_policy(request.policy, robot, trust=request.trust)
     check_robot(policy.contract, robot)
     if abs(policy.contract.control_period - suite.physics.control_period) > 1e-9:
         raise SuiteError(
@@ -258,6 +260,7 @@ def _job(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: Pla
         slots = min(max(tests + quality * parts, 1), _GPU_SLOTS)
     job = LaneJob(
         policy=policy.path,
+        trust=request.trust,
         suite=suite,
         robot=robot,
         backend=request.backend,

@@ -52,6 +52,8 @@ class LaneJob:
 
     policy: str
     """Policy file."""
+    trust: bool = False
+    """Whether a program inside it is run."""
     suite: Suite
     robot: Robot
     backend: str
@@ -365,7 +367,7 @@ def run_lane(
         try:
             torch.set_num_threads(1)
             gc.freeze()  # what the lane has from its parent is not looked through for garbage again
-            runner = build_runner(job, load_policy(job.policy, job.robot))
+            runner = build_runner(job, load_policy(job.policy, job.robot, trust=job.trust))
             agenda = _RemoteAgenda(connection, changes, calls)
             while agenda.wait():
                 runner.run(agenda, agenda.report, agenda.needless)

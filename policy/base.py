@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch
 
@@ -62,6 +63,26 @@ class PolicySession(ABC):
         """
 
 
+class RowwiseSession(PolicySession):
+    """Every episode goes through the network alone: slower, and the same in every row."""
+
+    batched = False
+
+    def __init__(self, begin: Callable[[int], PolicySession], num_episodes: int) -> None:
+        """``begin`` starts a session of so many episodes."""
+        self._sessions = [begin(1) for _ in range(num_episodes)]
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """See ``PolicySession.reset``."""
+        for i, session in enumerate(self._sessions):
+            if episodes is None or bool(episodes[i]):
+                session.reset()
+
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
+        """See ``PolicySession.act``."""
+        return torch.cat([session.act(observation[i : i + 1]) for i, session in enumerate(self._sessions)])
+
+
 class Policy(ABC):
     """A loaded policy."""
 
@@ -72,6 +93,10 @@ class Policy(ABC):
     @abstractmethod
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes."""
+
+    def rowwise_session(self, num_episodes: int) -> PolicySession:
+        """Start work on ``num_episodes`` episodes on the CPU, each of which goes through the network alone."""
+        return RowwiseSession(self.session, num_episodes)
 
 
 def check_observation(observation: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> None:

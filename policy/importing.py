@@ -9,20 +9,27 @@ from ..robots import Robot
 from .base import PolicyError
 from .contract import PolicyContract
 from .loading import LOG_ROOT, load_policy
-from .native import save_policy
+from .native import ForeignFile, load_entries, read_policy, save_policy
 
 
 def import_policy(
-    source: str | Path, destination: str | Path, robot: Robot | None = None, *, log_root: Path = LOG_ROOT
+    source: str | Path,
+    destination: str | Path,
+    robot: Robot | None = None,
+    *,
+    trust: bool = False,
+    log_root: Path = LOG_ROOT,
 ) -> PolicyContract:
     """Write a policy and its contract into one file of the project's own format; its actions stay the same.
 
-    Networks that the project knows are stored as weights; a TorchScript or ONNX file is carried inside unchanged.
+    Networks that the project knows are stored as weights; a TorchScript or ONNX file is carried inside unchanged, and run from
+    there only where it is trusted.
 
     Args:
         source: a file or name as in ``load_policy``.
         destination: the file to write; an existing file is replaced only once the source has been loaded.
         robot: as in ``load_policy``.
+        trust: as in ``load_policy``; the imported file, if it carries a program, needs it in turn.
         log_root: as in ``load_policy``.
 
     Returns:
@@ -32,7 +39,7 @@ def import_policy(
         PolicyError: the source cannot be loaded, or the destination cannot be written.
         ContractError: the policy is for another robot.
     """
-    policy = load_policy(source, robot, log_root=log_root)
+    policy = load_policy(source, robot, trust=trust, log_root=log_root)
     contract = replace(
         policy.contract, provenance={**policy.contract.provenance, "imported_from": Path(policy.path).name}
     )
@@ -41,3 +48,13 @@ def import_policy(
     except OSError as error:
         raise PolicyError(f"'{destination}' cannot be written: {error.strerror or error}") from error
     return contract
+
+
+def carries_program(path: str | Path) -> bool:
+    """Whether a file of the project's own format carries a program of another format, so that it is run only if trusted.
+
+    Raises:
+        PolicyError: it is no such file.
+    """
+    entries = load_entries(Path(path).read_bytes(), source=str(path))
+    return isinstance(read_policy(entries, source=str(path)).network, ForeignFile)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..robots import Robot, load_robot
 from .adapters import (
@@ -23,7 +24,7 @@ from .native import FORMAT, FilePolicy, ForeignFile, NativePolicy, StoredNetwork
 from .rebuilt import rebuilt
 
 if TYPE_CHECKING:
-    from .onnx_file import OnnxFile
+    from .fence.child import Child
 
 LOG_ROOT = Path("logs/rsl_rl")
 PRETRAINED = Path(__file__).parent / "pretrained" / "go2.gauge.pt"
@@ -31,17 +32,21 @@ POLICY_NAMES = ("latest", "best", "pretrained")
 DEFAULT_ROBOT = "go2"
 
 
-def load_policy(path_or_name: str | Path, robot: Robot | None = None, *, log_root: Path = LOG_ROOT) -> FilePolicy:
+def load_policy(
+    path_or_name: str | Path, robot: Robot | None = None, *, trust: bool = False, log_root: Path = LOG_ROOT
+) -> FilePolicy:
     """Load a policy and try it on zeros.
 
     A file's content decides what it is, not its ending: the project's own format, TorchScript, ONNX, or a bare rsl_rl
-    checkpoint. Nothing that a file holds is executed except TorchScript's and ONNX's own operators.
+    checkpoint. Of a TorchScript or ONNX file only operators that compute are run, in a process that can do nothing else
+    (``docs/security.md``).
 
     Args:
         path_or_name: a file; or ``latest`` (last checkpoint of the last training run), ``best`` (the last run's best
             checkpoint), ``pretrained`` (the one that ships with the project).
         robot: the robot it has to fit, and whose data stand in where a foreign file does not say; None: any robot is
             accepted, and the Go2 stands in.
+        trust: run a program that a file of the project's own format carries inside; it is fenced in either way.
         log_root: where ``latest`` and ``best`` look: ``<log_root>/<experiment>/<run>/``.
 
     Raises:
@@ -51,7 +56,7 @@ def load_policy(path_or_name: str | Path, robot: Robot | None = None, *, log_roo
     path = find_policy(path_or_name, log_root=log_root)
     data = _read(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
-    policy = rebuilt(_load(data, path, str(path_or_name), stand_in))
+    policy = rebuilt(_load(data, path, str(path_or_name), stand_in, trust=trust))
     if robot is not None:
         check_robot(policy.contract, robot)
     return policy
@@ -118,7 +123,7 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _load(data: bytes, path: Path, source: str, robot: Robot) -> FilePolicy:
+def _load(data: bytes, path: Path, source: str, robot: Robot, *, trust: bool) -> FilePolicy:
     """Load a file's content; ``path`` is where its sidecars are, ``source`` what the user called it."""
     kind = file_kind(data, source)
     if kind in ("torchscript", "onnx"):
@@ -128,6 +133,11 @@ def _load(data: bytes, path: Path, source: str, robot: Robot) -> FilePolicy:
         stored = read_policy(entries, source=source)
         if isinstance(stored.network, StoredNetwork):
             return NativePolicy(stored.contract, stored.network, path=source)
+        if not trust:
+            raise PolicyError(
+                f"'{source}' carries a program of another format inside ({stored.network.kind}); "
+                "add --trust (in Python trust=True) to run it, in a process of its own"
+            )
         return _foreign(stored.network, path, source, robot, contract=stored.contract)
     found = checkpoint_network(entries, robot, path=path)
     if found is None:
@@ -139,25 +149,34 @@ def _foreign(
     file: ForeignFile, path: Path, source: str, robot: Robot, *, contract: PolicyContract | None = None
 ) -> FilePolicy:
     """Load a TorchScript or ONNX file; ``contract`` is the one that was stored with it, None to look for one."""
+    # Only those who load such a file wait for what it needs.
+    from .fence.child import Child
+    from .fenced import FencedPolicy, graph_program, script_program
+
     if file.kind == "torchscript":
-        # Only those who load such a file wait for what it needs.
-        from .torchscript import TorchscriptPolicy, load_module
+        from .fence.script import check_script
 
-        module, text = load_module(file.data, source=source)
+        script = check_script(file.data, source=source)
+        child = Child(script_program, script.data, source=source)
         if contract is None:
-            contract = _torchscript_contract(module, text, path, source, robot)
-        return TorchscriptPolicy(file.data, module, contract, path=source)
-    from .onnx_file import OnnxFile, OnnxPolicy
+            contract = _torchscript_contract(child, script.contract, path, source, robot)
+        return FencedPolicy(file, child, contract, path=source, attributes=script.attributes)
+    import onnxruntime  # noqa: F401  (the child, which is forked, may not load libraries any more)
 
-    parsed = OnnxFile(file.data, source=source, folder=path.parent)
+    from .fence.graph import check_graph
+
+    model = check_graph(file.data, source=source, folder=path.parent)
+    whole = ForeignFile(kind=file.kind, data=model.SerializeToString())
+    child = Child(graph_program, whole.data, source=source)
     if contract is None:
-        contract = _onnx_contract(parsed, path, source, robot)
-    return OnnxPolicy(parsed, contract, path=source)
+        metadata = {entry.key: entry.value for entry in model.metadata_props}
+        contract = _onnx_contract(child, metadata, path, source, robot)
+    return FencedPolicy(whole, child, contract, path=source)
 
 
-def _torchscript_contract(module: Any, text: str, path: Path, source: str, robot: Robot) -> PolicyContract:
+def _torchscript_contract(child: Child, text: str, path: Path, source: str, robot: Robot) -> PolicyContract:
     """The contract beside the file, in it, or the standard one with as many frames as the input is wide."""
-    from .torchscript import input_width
+    from .fenced import program_width
 
     contract = sidecar_contract(path)
     if contract is None and text:
@@ -165,29 +184,33 @@ def _torchscript_contract(module: Any, text: str, path: Path, source: str, robot
     if contract is not None:
         return contract
     frame = go2_contract(robot).frame_width
-    width = input_width(module, [frame * n for n in range(1, LONGEST_HISTORY + 1)], source=source)
+    width = program_width(child, [frame * n for n in range(1, LONGEST_HISTORY + 1)]) or frame
     provenance = {"adapter": "TorchScript", "file": path.name}
     return contract_for_width(width, robot, order="frame-major", provenance=provenance, source=source)
 
 
-def _onnx_contract(file: OnnxFile, path: Path, source: str, robot: Robot) -> PolicyContract:
+def _onnx_contract(child: Child, metadata: Mapping[str, str], path: Path, source: str, robot: Robot) -> PolicyContract:
     """The contract beside the file, in its metadata, from its deploy.yaml, or the standard one for its input's
     width.
     """
+    from .fenced import program_width
+
     contract = sidecar_contract(path)
     if contract is not None:
         return contract
-    if "contract" in file.metadata:
-        return _stored_contract(file.metadata["contract"], source)
+    if "contract" in metadata:
+        return _stored_contract(metadata["contract"], source)
     deploy = find_deploy_file(path)
     if deploy is not None:
         return deploy_contract(deploy, robot)
-    contract = mjlab_contract(file.metadata, robot, source=source)
+    contract = mjlab_contract(metadata, robot, source=source)
     if contract is not None:
         return contract
     frame = go2_contract(robot).frame_width
     provenance = {"adapter": "ONNX", "file": path.name}
-    return contract_for_width(file.width or frame, robot, order="term-major", provenance=provenance, source=source)
+    return contract_for_width(
+        program_width(child) or frame, robot, order="term-major", provenance=provenance, source=source
+    )
 
 
 def _stored_contract(text: str, source: str) -> PolicyContract:

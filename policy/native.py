@@ -172,7 +172,7 @@ def checksum(entries: Mapping[str, Any]) -> str:
                 add(f"{name}.{key}", value[key])
         elif isinstance(value, torch.Tensor):
             digest.update(f"{name} {value.dtype} {list(value.shape)}\n".encode())
-            digest.update(memoryview(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()))
+            digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
         else:
             digest.update(f"{name} {value}\n".encode(errors="backslashreplace"))
 

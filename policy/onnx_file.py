@@ -1,4 +1,4 @@
-"""ONNX policies, run on the CPU by onnxruntime, in batches even where the file was exported for a batch of one.
+"""ONNX programs where they run: on the CPU by onnxruntime, in batches even where the file was exported for a batch of one.
 
 The batch axis is made symbolic in a copy of the graph; where the exporter wrote the batch of one into reshapes, these
 are opened as well. A copy is only used if it proves equal to running the original row by row; else that is what is
@@ -8,19 +8,18 @@ done, which is slower.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime
 import torch
-from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 from onnxruntime.capi import onnxruntime_pybind11_state as runtime_state
 
-from .base import PolicyError, PolicySession, check_observation, checked_action
+from .base import PolicyError, PolicySession, RowwiseSession, check_observation, checked_action
 from .contract import PolicyContract
-from .native import FilePolicy, ForeignFile, first_line
+from .native import first_line
 
 ACTION_NAMES = ("actions", "action")
 PROBE_EPISODES = 3
@@ -44,27 +43,22 @@ _RUN_ERRORS = (
 class OnnxFile:
     """A parsed ONNX file with one observation as its input."""
 
-    def __init__(self, data: bytes, *, source: str, folder: Path | None = None) -> None:
-        """Parse a file's content.
+    def __init__(self, data: bytes, *, source: str) -> None:
+        """Prepare a file's content.
 
         Args:
-            data: the content.
+            data: the content, after ``fence.graph.check_graph`` and with all its weights.
             source: name for messages.
-            folder: where weights stored beside the file are.
 
         Raises:
-            PolicyError: not ONNX, damaged, or without exactly one float input of shape (batch, width).
+            PolicyError: onnxruntime does not take it, or it has not exactly one float input of shape (batch, width).
         """
         self.source = source
+        self.data = data
         try:
             self.model = onnx.load_model_from_string(data)
-            if folder is not None and any(
-                t.data_location == onnx.TensorProto.EXTERNAL for t in self.model.graph.initializer
-            ):
-                onnx.load_external_data_for_model(self.model, str(folder))
-            self.data = self.model.SerializeToString()
-            self.runtime = _runtime(self.data)
-        except (DecodeError, OSError, onnx.checker.ValidationError, *_RUN_ERRORS) as error:
+            self.runtime = _runtime(data)
+        except _RUN_ERRORS as error:
             raise PolicyError(f"'{source}' is not a usable ONNX file: {first_line(error)}") from error
         inputs = self.runtime.get_inputs()
         if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 2:
@@ -77,7 +71,6 @@ class OnnxFile:
             raise PolicyError(f"'{source}' has no output")
         self.input_name: str = inputs[0].name
         self.output_name: str = next((n for n in ACTION_NAMES if n in outputs), outputs[0])
-        self.metadata: Mapping[str, str] = {p.key: p.value for p in self.model.metadata_props}
         shape = inputs[0].shape
         self.width: int | None = shape[1] if isinstance(shape[1], int) else None
         """Width of the input, None if the file leaves it open."""
@@ -132,37 +125,50 @@ def _with_open_batch(model: onnx.ModelProto, input_name: str, *, open_reshapes: 
     return changed.SerializeToString()
 
 
-class OnnxPolicy(FilePolicy):
-    """A policy in an ONNX file."""
+class GraphProgram:
+    """An ONNX file at work for a policy."""
 
-    def __init__(self, file: OnnxFile, contract: PolicyContract, *, path: str) -> None:
+    def __init__(self, data: bytes, source: str) -> None:
+        """Prepare the file; ``data`` has been looked through (``fence.graph.check_graph``).
+
+        Raises:
+            PolicyError: onnxruntime does not take it.
+        """
+        self.source = source
+        self.file = OnnxFile(data, source=source)
+        self.contract: PolicyContract
+        self._batch: bytes | None = None
+
+    def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """``width``: of the input, None if the file leaves it open. ``prepare``: try the file, find a batched form of it."""
+        if request["do"] == "width":
+            return {"width": self.file.width}
+        self.prepare(PolicyContract.from_json(request["contract"]))
+        return {"batched": self._batch is not None}
+
+    def prepare(self, contract: PolicyContract) -> None:
         """Try the file on zeros and find a batched form of it.
 
         Raises:
             PolicyError: the file fails, or its input or output has another width than the contract says.
         """
         self.contract = contract
-        self.path = path
-        self.file = file
-        self.stored = ForeignFile(kind="onnx", data=file.data)
-        if file.width is not None and file.width != contract.observation_width:
+        if self.file.width is not None and self.file.width != contract.observation_width:
             raise PolicyError(
-                f"'{path}' takes {file.width} values, but its contract's observation has {contract.observation_width}"
+                f"'{self.source}' takes {self.file.width} values, "
+                f"but its contract's observation has {contract.observation_width}"
             )
-        self._rows = _Runner(file.data, file, contract, path)
+        self._rows = _Runner(self.file.data, self.file, contract, self.source)
         self._rows.run(np.zeros((1, contract.observation_width), np.float32))
         self._batch = self._proved_batch()
 
-    @property
-    def batched(self) -> bool:
-        """Whether one run of the file serves all episodes."""
-        return self._batch is not None
-
-    def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
-        """Start work on ``num_episodes`` episodes; the network runs on the CPU wherever the tensors are."""
-        data = self.file.data if self._batch is None else self._batch
-        runner = _Runner(data, self.file, self.contract, self.path)
-        return OnnxSession(runner, num_episodes, self.contract, torch.device(device), batched=self.batched)
+    def session(self, rows: int, *, rowwise: bool = False) -> PolicySession:
+        """Start work on so many episodes, all at once or each alone."""
+        if rowwise:
+            return RowwiseSession(self.session, rows)
+        batched = self._batch is not None
+        runner = _Runner(self._batch or self.file.data, self.file, self.contract, self.source)
+        return OnnxSession(runner, rows, self.contract, batched=batched)
 
     def _proved_batch(self) -> bytes | None:
         generator = np.random.default_rng(0)
@@ -170,7 +176,7 @@ class OnnxPolicy(FilePolicy):
         expected = np.concatenate([self._rows.run(probe[i : i + 1]) for i in range(PROBE_EPISODES)])
         for variant in self.file.variants():
             try:
-                actual = _Runner(variant, self.file, self.contract, self.path).run(probe)
+                actual = _Runner(variant, self.file, self.contract, self.source).run(probe)
             except PolicyError:
                 continue
             if np.allclose(actual, expected, rtol=PROBE_TOLERANCE, atol=PROBE_TOLERANCE, equal_nan=True):
@@ -196,23 +202,21 @@ class _Runner:
             raise PolicyError(
                 f"'{self._source}' fails on observations of shape {observation.shape}: {first_line(error)}"
             ) from error
-        if not isinstance(action, np.ndarray):
-            raise PolicyError(f"'{self._source}' returns a {type(action).__name__}; a tensor of actions is needed")
+        if not isinstance(action, np.ndarray) or action.dtype.kind not in "fiub":
+            found = f"tensor of {action.dtype}" if isinstance(action, np.ndarray) else type(action).__name__
+            raise PolicyError(f"'{self._source}' returns a {found}; a tensor of actions is needed")
         return checked_action(torch.from_numpy(action), observation.shape[0], self._contract, self._source).numpy()
 
 
 class OnnxSession(PolicySession):
     """Runs an ONNX file; it has no memory."""
 
-    def __init__(
-        self, runner: _Runner, num_episodes: int, contract: PolicyContract, device: torch.device, *, batched: bool
-    ) -> None:
+    def __init__(self, runner: _Runner, num_episodes: int, contract: PolicyContract, *, batched: bool) -> None:
         """Keep a runner; ``batched`` says whether it takes all episodes at once."""
         self.batched = batched
         self._runner = runner
         self._num_episodes = num_episodes
         self._contract = contract
-        self._device = device
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """See ``PolicySession``: there is nothing to forget."""
@@ -220,9 +224,9 @@ class OnnxSession(PolicySession):
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         check_observation(observation, self._num_episodes, self._contract, self._runner._source)
-        inputs = np.ascontiguousarray(observation.detach().cpu().numpy(), dtype=np.float32)
+        inputs = observation.numpy()
         if self.batched:
             actions = self._runner.run(inputs)
         else:
             actions = np.concatenate([self._runner.run(inputs[i : i + 1]) for i in range(len(inputs))])
-        return torch.from_numpy(actions).to(self._device)
+        return torch.from_numpy(actions)

@@ -13,25 +13,6 @@ from .base import Policy, PolicySession
 _TRIALS = 4
 
 
-class RowwiseSession(PolicySession):
-    """Every episode goes through the network alone: slower, and the same in every row."""
-
-    batched = False
-
-    def __init__(self, policy: Policy, num_episodes: int) -> None:
-        self._sessions = [policy.session(1) for _ in range(num_episodes)]
-
-    def reset(self, episodes: torch.Tensor | None = None) -> None:
-        """See ``PolicySession.reset``."""
-        for i, session in enumerate(self._sessions):
-            if episodes is None or bool(episodes[i]):
-                session.reset()
-
-    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
-        """See ``PolicySession.act``."""
-        return torch.cat([session.act(observation[i : i + 1]) for i, session in enumerate(self._sessions)])
-
-
 def steady_session(policy: Policy, num_episodes: int) -> tuple[PolicySession, bool]:
     """A session on the CPU in which rows do not matter.
 
@@ -39,7 +20,7 @@ def steady_session(policy: Policy, num_episodes: int) -> tuple[PolicySession, bo
         The session, and whether it may also be asked for the actions of any multiple of eight rows.
     """
     if not _same(policy, num_episodes, num_episodes):
-        return RowwiseSession(policy, num_episodes), False
+        return policy.rowwise_session(num_episodes), False
     fewer = all(_same(policy, num_episodes, count) for count in range(8, num_episodes, 8))
     return policy.session(num_episodes), fewer
 

@@ -1,4 +1,4 @@
-"""TorchScript policies, batched over episodes even where the file was exported for a batch of one.
+"""TorchScript programs where they run: batched over episodes even where the file was exported for a batch of one.
 
 An export with a history inside keeps it in tensors that ``forward`` changes, with an axis of length one for the batch.
 Such tensors are found by watching a run, and given one row per episode. Whether the file can be run that way is proved
@@ -10,26 +10,23 @@ from __future__ import annotations
 
 import copy
 import io
-import re
 import warnings
-import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
-from .base import PolicyError, PolicySession, check_observation, checked_action
+from .base import PolicyError, PolicySession, RowwiseSession, check_observation, checked_action
 from .contract import PolicyContract
-from .native import LOAD_ERRORS, FilePolicy, ForeignFile, first_line
+from .fence.operators import PRIM_OPERATORS, TORCH_OPERATORS
+from .fence.script import CONTRACT_FILE
+from .native import LOAD_ERRORS
 
-CONTRACT_FILE = "contract.json"
 PROBE_EPISODES = 3
 PROBE_STEPS = 8
 PROBE_TOLERANCE = 1e-5
-# An attribute as the archive's code declares it in a class body: "  history : Tensor".
-_DECLARATION = re.compile(r"^  (\w+) : ", re.MULTILINE)
 _RESET_METHODS = ("reset", "reset_memory")
 
 
@@ -54,32 +51,51 @@ class Memory:
     """Batch axis."""
 
 
-def load_module(data: bytes, *, source: str) -> tuple[Any, str]:
+def load_module(data: bytes, *, source: str) -> Any:
     """Load a TorchScript module on the CPU, in evaluation mode and freshly reset.
 
-    Returns:
-        The module, and the contract's JSON text if the archive carries one, else an empty text.
+    Args:
+        data: the archive, after ``fence.script.check_script``: loading it may run code of its own.
+        source: name for messages.
 
     Raises:
-        PolicyError: the archive is damaged.
+        PolicyError: the archive is damaged, or its methods use an operator that is not on the list.
     """
-    extra = {CONTRACT_FILE: ""}
     try:
         with warnings.catch_warnings():
             # torch announces TorchScript's retirement at every load; users of old exports can do nothing about it.
             warnings.simplefilter("ignore", DeprecationWarning)
-            module = torch.jit.load(io.BytesIO(data), map_location="cpu", _extra_files=extra)
+            module = torch.jit.load(io.BytesIO(data), map_location="cpu")
     except LOAD_ERRORS as error:
-        raise PolicyError(f"'{source}' is a damaged TorchScript file: {first_line(error)}") from error
+        raise PolicyError(f"'{source}' is a damaged TorchScript file: {last_line(error)}") from error
+    _check_operators(module, source=source)
     module.eval()
     for parameter in module.parameters():
         parameter.requires_grad_(False)
-    text = extra[CONTRACT_FILE]
     try:
         _reset(module)
     except LOAD_ERRORS as error:
-        raise PolicyError(f"'{source}' fails in its own reset(): {first_line(error)}") from error
-    return module, text.decode() if isinstance(text, bytes) else text
+        raise PolicyError(f"'{source}' fails in its own reset(): {last_line(error)}") from error
+    return module
+
+
+def _check_operators(module: Any, *, source: str) -> None:
+    """Check all operators once more, as torch has read them: nothing then hangs on how Python reads the code."""
+    graphs, pending = [], []
+    for part in module.modules():
+        for name in part._c._method_names():
+            graph = part._c._get_method(name).graph.copy()
+            torch._C._jit_pass_inline(graph)
+            graphs.append(graph)  # its nodes live as long as it does
+            pending.append(graph)
+    while pending:
+        for node in pending.pop().nodes():
+            space, _, name = node.kind().partition("::")
+            if name not in {"aten": TORCH_OPERATORS, "prim": PRIM_OPERATORS}.get(space, frozenset()):
+                raise PolicyError(
+                    f"'{source}' was not loaded: its code uses {node.kind()}, which is not on the list of tensor operators"
+                )
+            pending.extend(node.blocks())
 
 
 def input_width(module: Any, candidates: Sequence[int], *, source: str) -> int:
@@ -118,44 +134,67 @@ def first_tensor(output: Any) -> torch.Tensor:
         raise PolicyError(
             f"returns a {type(output).__name__}; a tensor of actions, alone or first in a tuple, is needed"
         )
+    strange = [
+        word
+        for word, holds in (
+            ("quantized", output.is_quantized),
+            ("complex", output.is_complex()),
+            ("sparse", output.layout != torch.strided),
+            ("meta", output.is_meta),
+            ("nested", output.is_nested),
+        )
+        if holds
+    ]
+    if strange:
+        raise PolicyError(f"returns a {strange[0]} tensor; a plain tensor of actions is needed")
     return output
 
 
-class TorchscriptPolicy(FilePolicy):
-    """A policy in a TorchScript file."""
+class ScriptProgram:
+    """A TorchScript module at work for a policy."""
 
-    def __init__(self, data: bytes, module: Any, contract: PolicyContract, *, path: str) -> None:
+    def __init__(self, data: bytes, source: str) -> None:
+        """Load the module; ``data`` has been looked through (``fence.script.check_script``).
+
+        Raises:
+            PolicyError: it cannot be loaded.
+        """
+        self.source = source
+        self._module = load_module(data, source=source)
+        self.contract: PolicyContract
+        self.memories: tuple[Memory, ...] | None = None
+
+    def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """``width``: the first of ``candidates`` that the module takes. ``prepare``: find out how to run it in batches."""
+        if request["do"] == "width":
+            return {"width": input_width(self._module, request["candidates"], source=self.source)}
+        self.prepare(PolicyContract.from_json(request["contract"]), request["attributes"])
+        return {"batched": self.memories is not None}
+
+    def prepare(self, contract: PolicyContract, attributes: Collection[str]) -> None:
         """Find out how to run the module in batches.
 
         Args:
-            data: the file's content.
-            module: as ``load_module`` returned it.
             contract: of the policy.
-            path: for messages.
+            attributes: names of all attributes that the archive's classes declare; torch itself lists only parameters and
+                buffers.
 
         Raises:
             PolicyError: the module fails on zeros, or its input or output has the wrong width.
         """
-        self.contract = contract
-        self.path = path
-        self.stored = ForeignFile(kind="torchscript", data=data)
-        self._module = module
-        self._attributes = _declared_attributes(data, source=path)
-        check = CopiesSession(module, 1, contract, torch.device("cpu"), path)
+        self.contract, self._attributes = contract, frozenset(attributes)
+        check = CopiesSession(self._module, 1, contract, torch.device("cpu"), self.source)
         check.act(torch.zeros(1, contract.observation_width))
         self.memories = self._find_memories()
 
-    @property
-    def batched(self) -> bool:
-        """Whether one run of the module serves all episodes."""
-        return self.memories is not None
-
-    def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
-        """Start work on ``num_episodes`` episodes, with a copy of the module."""
-        where = torch.device(device)
+    def session(self, rows: int, *, rowwise: bool = False) -> PolicySession:
+        """Start work on so many episodes with a copy of the module, all at once or each alone."""
+        if rowwise:
+            return RowwiseSession(self.session, rows)
+        cpu = torch.device("cpu")
         if self.memories is None:
-            return CopiesSession(self._module, num_episodes, self.contract, where, self.path)
-        return BatchSession(self._module, num_episodes, self.contract, where, self.path, self.memories)
+            return CopiesSession(self._module, rows, self.contract, cpu, self.source)
+        return BatchSession(self._module, rows, self.contract, cpu, self.source, self.memories)
 
     def _find_memories(self) -> tuple[Memory, ...] | None:
         """The module's memories, such that a batch proves equal to single runs; None if there is no such way."""
@@ -207,8 +246,8 @@ class TorchscriptPolicy(FilePolicy):
     def _proved(self, memories: tuple[Memory, ...]) -> bool:
         """Whether a batch acts as single copies do."""
         cpu = torch.device("cpu")
-        batch = BatchSession(self._module, PROBE_EPISODES, self.contract, cpu, self.path, memories)
-        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, cpu, self.path)
+        batch = BatchSession(self._module, PROBE_EPISODES, self.contract, cpu, self.source, memories)
+        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, cpu, self.source)
         generator = torch.Generator().manual_seed(0)
         for step in range(PROBE_STEPS):
             if step == PROBE_STEPS // 2:
@@ -322,13 +361,3 @@ def _reset(module: Any) -> None:
         if module._c._has_method(name):
             with _plain_execution():
                 getattr(module, name)()
-
-
-def _declared_attributes(data: bytes, *, source: str) -> frozenset[str]:
-    """Names of all attributes that the archive's classes declare; torch itself lists only parameters and buffers."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            sources = [archive.read(n).decode() for n in archive.namelist() if n.endswith(".py") and "/code/" in n]
-    except LOAD_ERRORS as error:
-        raise PolicyError(f"'{source}' is a damaged TorchScript file: {first_line(error)}") from error
-    return frozenset(name for source in sources for name in _DECLARATION.findall(source))

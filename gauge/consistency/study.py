@@ -66,6 +66,8 @@ class Request:
     factors: tuple[str, ...] = ()
     """Factors to switch; empty: all."""
     threads: int = 1
+    trust: bool = False
+    """Run the programs that policy files of the project's own format carry inside."""
 
 
 @dataclass
@@ -172,6 +174,7 @@ def prepare_study(request: Request) -> _Prepared:
                 terrains=tuple(terrains),
                 level=levels[0] if request.levels or any(t != "flat" for t in terrains) else None,
                 frictions=frictions,
+                trust=request.trust,
             )
         )
         policies.append((name, policy))

@@ -2,11 +2,12 @@
 
 import pytest
 import torch
+from gaitgauge.policy.base import RowwiseSession
 from gaitgauge.policy.contract import go2_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
-from gaitgauge.policy.steady import RowwiseSession, steady_session
+from gaitgauge.policy.steady import steady_session
 from gaitgauge.robots import load_robot
 
 ROBOT = load_robot("go2")
@@ -48,6 +49,6 @@ def test_the_shipped_policy_runs_batched():
 
 def test_alone_is_what_a_batch_of_one_gives(tiny):
     observations = torch.randn(6, 4, 45)
-    rowwise, single = RowwiseSession(tiny, 4), tiny.session(1)
+    rowwise, single = RowwiseSession(tiny.session, 4), tiny.session(1)
     for observation in observations:
         assert torch.equal(rowwise.act(observation)[2:3], single.act(observation[2:3]))

@@ -329,7 +329,7 @@ def test_import_keeps_actions_and_needs_no_sidecar(tmp_path, contract, cts_netwo
     described = replace(contract, control_period=0.01)
     (tmp_path / "source" / "contract.json").write_text(described.to_json())
     stored = import_policy(path, tmp_path / "own.gauge.pt")
-    own = load_policy(tmp_path / "own.gauge.pt")
+    own = load_policy(tmp_path / "own.gauge.pt", trust=True)
     assert own.contract == stored
     assert own.contract.hash == described.hash
     assert torch.equal(run(own.session(EPISODES), observations), run(load_policy(path).session(EPISODES), observations))

@@ -1,0 +1,171 @@
+"""Locks a process up for good: no file to write, no other program, no network, little memory.
+
+Landlock and seccomp do this on Linux, each as far as the kernel has it; limits on resources hold on every Unix.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import struct
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+MEMORY = 2**30
+"""Memory that a foreign program may take beyond what its process has when it starts [bytes]."""
+
+_PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _SECCOMP_FILTER = 38, 22, 2
+_LANDLOCK_CREATE, _LANDLOCK_ADD, _LANDLOCK_RESTRICT = 444, 445, 446
+_LANDLOCK_VERSION, _LANDLOCK_PATH = 1, 1
+_READ = 0b1101  # execute (to load a library), read a file, list a folder
+# All rights on files that each version of Landlock knows, then those on networks and on processes outside.
+_FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
+_NETWORK_RIGHTS, _SCOPES = 0b11, 0b11
+
+_OPENING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
+_CLONE_THREAD = 0x10000
+# Numbers of system calls: those with flags to look at, then those that fail whatever they are given. These change files or
+# their names and rights, start programs, open sockets, and reach into other processes or the kernel.
+# fmt: off
+_CALLS: dict[str, tuple[dict[int, tuple[int, int]], tuple[int, ...], int]] = {
+    "x86_64": (
+        {2: (1, _OPENING), 257: (2, _OPENING)},
+        (29, 41, 53, 57, 58, 59, 62, 64, 68, 76, 82, 83, 84, 85, 86, 87, 88, 90, 91, 92, 93, 94, 101, 132, 133, 165, 166, 188,
+         189, 190, 197, 198, 199, 200, 235, 240, 250, 258, 259, 260, 261, 263, 264, 265, 266, 268, 272, 280, 298, 304, 308, 310,
+         311, 316, 319, 321, 322, 323, 424, 425, 434, 437, 452),
+        56,
+    ),
+    "aarch64": (
+        {56: (2, _OPENING)},
+        (5, 6, 7, 14, 15, 16, 33, 34, 35, 36, 37, 38, 39, 40, 45, 52, 53, 54, 55, 88, 97, 117, 129, 130, 180, 186, 190, 194, 198,
+         199, 219, 221, 241, 265, 268, 270, 271, 276, 279, 280, 281, 282, 424, 425, 434, 437, 452),
+        220,
+    ),
+}
+# fmt: on
+_CLONE3 = 435
+_ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+_FIRST_FOREIGN_CALL = 0x40000000  # numbers of x86's other set of calls
+
+
+def lock(readable: Iterable[Path] = ()) -> tuple[str, ...]:
+    """Lock this thread, and every thread that it starts, for the rest of its life.
+
+    Args:
+        readable: folders that may be read, beside those of Python and the system's libraries.
+
+    Returns:
+        What holds it: of ``limits``, ``landlock`` and ``seccomp`` those that this system has.
+    """
+    held = []
+    if resource is not None:
+        _limit()
+        held.append("limits")
+    if sys.platform == "linux":
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0:
+            if _landlock(libc, [*readable, *_libraries()]):
+                held.append("landlock")
+            if _seccomp(libc):
+                held.append("seccomp")
+    if resource is not None and len(held) == 1:
+        # Neither is there: then no further file is opened at all.
+        resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+    return tuple(held)
+
+
+def allow_seconds(seconds: int) -> None:
+    """Let this process compute for so long from now; it is ended when the time is up."""
+    if resource is not None:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+        resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime) + 1 + seconds, hard))
+
+
+def _limit() -> None:
+    # no byte is written to any file, whatever is open
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    status = Path("/proc/self/statm")
+    if status.is_file():
+        mapped = int(status.read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY, mapped + MEMORY))
+
+
+def _libraries() -> list[Path]:
+    """Where Python, its packages and the system's libraries lie: modules may be loaded late."""
+    system = (
+        "/usr/lib",
+        "/usr/lib64",
+        "/lib",
+        "/lib64",
+        "/etc/ld.so.cache",
+        "/proc/self",
+        "/proc/cpuinfo",
+        "/sys/devices/system",
+    )
+    return [Path(p) for p in (sys.prefix, sys.base_prefix, *system, "/dev/null", "/dev/urandom", *sys.path) if p]
+
+
+def _landlock(libc: ctypes.CDLL, readable: list[Path]) -> bool:
+    version = libc.syscall(_LANDLOCK_CREATE, None, 0, _LANDLOCK_VERSION)
+    if version < 1:
+        return False
+    rights = (1 << _FILE_RIGHTS[min(version, 5)]) - 1
+    attributes = struct.pack("QQQ", rights, _NETWORK_RIGHTS if version >= 4 else 0, _SCOPES if version >= 6 else 0)
+    size = 8 if version < 4 else 16 if version < 6 else 24
+    rules = libc.syscall(_LANDLOCK_CREATE, attributes[:size], size, 0)
+    if rules < 0:
+        return False
+    try:
+        for path in readable:
+            try:
+                place = os.open(path, os.O_PATH | os.O_CLOEXEC)
+            except OSError:
+                continue
+            try:
+                may = _READ if path.is_dir() else 0b100
+                libc.syscall(_LANDLOCK_ADD, rules, _LANDLOCK_PATH, struct.pack("=Qi", may & rights, place), 0)
+            finally:
+                os.close(place)
+        return libc.syscall(_LANDLOCK_RESTRICT, rules, 0) == 0
+    finally:
+        os.close(rules)
+
+
+def _seccomp(libc: ctypes.CDLL) -> bool:
+    machine = platform.machine()
+    if machine not in _CALLS or sys.maxsize < 2**32:
+        return False
+    flagged, refused, clone = _CALLS[machine]
+    load, equal, at_least, masked, give = 0x20, 0x15, 0x35, 0x45, 0x06
+    kill, deny, absent, allow = 0x80000000, 0x00050000 | 1, 0x00050000 | 38, 0x7FFF0000
+    lines: list[tuple[int, int, int, int]] = [
+        (load, 0, 0, 4),
+        (equal, 1, 0, _ARCHITECTURES[machine]),
+        (give, 0, 0, kill),
+        (load, 0, 0, 0),
+        (at_least, 0, 1, _FIRST_FOREIGN_CALL),
+        (give, 0, 0, deny),
+        # the C library takes the older call where this one does not exist, and of that the flags can be seen
+        (equal, 0, 1, _CLONE3),
+        (give, 0, 0, absent),
+    ]
+    for number in refused:
+        lines += [(equal, 0, 1, number), (give, 0, 0, deny)]
+    for number, (argument, flags) in flagged.items():
+        lines += [(equal, 0, 4, number), (load, 0, 0, 16 + 8 * argument), (masked, 0, 1, flags)]
+        lines += [(give, 0, 0, deny), (give, 0, 0, allow)]
+    # threads may be started, processes not
+    lines += [(equal, 0, 4, clone), (load, 0, 0, 16), (masked, 1, 0, _CLONE_THREAD), (give, 0, 0, deny)]
+    lines += [(give, 0, 0, allow), (give, 0, 0, allow)]
+    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *line) for line in lines))
+    program = ctypes.create_string_buffer(struct.pack("HxxxxxxP", len(lines), ctypes.addressof(code)))
+    return libc.prctl(_PR_SET_SECCOMP, _SECCOMP_FILTER, program, 0, 0) == 0

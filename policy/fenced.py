@@ -1,0 +1,116 @@
+"""Policies whose network is a program of somebody else's: it runs in a process of its own (``fence``)."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import torch
+
+from .base import PolicySession, check_observation
+from .contract import PolicyContract
+from .fence.child import Child, Program
+from .native import FilePolicy, ForeignFile
+
+
+def script_program(data: bytes, source: str) -> Program:
+    """Load a TorchScript file that has been looked through; this happens where it runs."""
+    from .torchscript import ScriptProgram
+
+    return ScriptProgram(data, source)
+
+
+def graph_program(data: bytes, source: str) -> Program:
+    """Load an ONNX file that has been looked through; this happens where it runs."""
+    from .onnx_file import GraphProgram
+
+    return GraphProgram(data, source)
+
+
+def program_width(child: Child, candidates: Sequence[int] = ()) -> int | None:
+    """Width of a program's input: for TorchScript the first of the candidates that it takes, for ONNX None if it is open.
+
+    Raises:
+        PolicyError: it takes none of them.
+    """
+    width = child.ask("width", candidates=list(candidates))["width"]
+    return None if width is None else int(width)
+
+
+class FencedPolicy(FilePolicy):
+    """A policy in a TorchScript or ONNX file."""
+
+    def __init__(
+        self,
+        stored: ForeignFile,
+        child: Child,
+        contract: PolicyContract,
+        *,
+        path: str,
+        attributes: Collection[str] = (),
+    ) -> None:
+        """Try the program on zeros and find out how to run it in batches.
+
+        Args:
+            stored: the file.
+            child: the process that has loaded it.
+            contract: of the policy.
+            path: for messages.
+            attributes: names that the file's classes declare, for TorchScript.
+
+        Raises:
+            PolicyError: the program fails on zeros, or its input or output has the wrong width.
+        """
+        self.stored, self.contract, self.path = stored, contract, path
+        self._child = child
+        self._batched = bool(
+            child.ask("prepare", contract=contract.to_json(), attributes=sorted(attributes))["batched"]
+        )
+
+    @property
+    def batched(self) -> bool:
+        """Whether one run of the program serves all episodes."""
+        return self._batched
+
+    def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
+        """Start work on ``num_episodes`` episodes; the program runs on the CPU wherever the tensors are."""
+        return FencedSession(self._child, num_episodes, self.contract, self.path, device=torch.device(device))
+
+    def rowwise_session(self, num_episodes: int) -> PolicySession:
+        """Start work on ``num_episodes`` episodes, each of which goes through the program alone."""
+        cpu = torch.device("cpu")
+        return FencedSession(self._child, num_episodes, self.contract, self.path, device=cpu, rowwise=True)
+
+
+class FencedSession(PolicySession):
+    """A session in another process: one message there and one back for a control step."""
+
+    def __init__(
+        self,
+        child: Child,
+        num_episodes: int,
+        contract: PolicyContract,
+        source: str,
+        *,
+        device: torch.device,
+        rowwise: bool = False,
+    ) -> None:
+        self._number, self.batched = child.session(num_episodes, rowwise=rowwise)
+        weakref.finalize(self, child.drop, self._number)
+        self._child, self._contract, self._source, self._device = child, contract, source, device
+        self._num_episodes = num_episodes
+        self._forget: Any = None
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """See ``PolicySession``: it is done before the next action."""
+        mask = torch.ones(self._num_episodes, dtype=torch.bool) if episodes is None else episodes.cpu()
+        self._forget = mask if self._forget is None else self._forget | mask
+
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
+        """See ``PolicySession``."""
+        check_observation(observation, self._num_episodes, self._contract, self._source)
+        forget = None if self._forget is None else self._forget.numpy()
+        action = self._child.act(self._number, observation.detach().cpu().numpy(), forget, self._contract.num_joints)
+        self._forget = None
+        return action.to(self._device)
