@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from .version import __version__
 
 if TYPE_CHECKING:
-    from .api import Results, evaluate, load_policy, load_results, train
+    from .api import Results, compare, evaluate, load_policy, load_results, train
 
-__all__ = ["Results", "__version__", "evaluate", "load_policy", "load_results", "train"]
+__all__ = ["Results", "__version__", "compare", "evaluate", "load_policy", "load_results", "train"]
 
 
 def __getattr__(name: str) -> Any:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .gauge.comparison import Comparison
     from .policy.base import Policy
     from .training.stopping import TrainingOutcome
 
@@ -168,6 +169,21 @@ def evaluate(
     run(request, folder, resume=resume, watch=watch)
     write_report(folder)
     return load_results(folder)
+
+
+def compare(*results: Results | str | Path) -> Comparison:
+    """Which differences between policies are real; ``gaitgauge compare`` without the evaluating.
+
+    Args:
+        results: two or more of: what ``evaluate`` returned, results folders, copies of ``results.json``.
+
+    Raises:
+        ComparisonError: results that cannot be read, or were not made alike.
+    """
+    from .gauge.comparison import compare as run
+    from .gauge.comparison import load_result
+
+    return run([load_result(r.path if isinstance(r, Results) else Path(r)) for r in results])
 
 
 def train(task: str, *settings: str, seconds: float | None = None, **options: Any) -> tuple[TrainingOutcome, Path]:

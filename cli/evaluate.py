@@ -48,7 +48,7 @@ def run_evaluation(
     try:
         with ProgressDisplay(console, "gauging") as display:
             results = evaluate(
-                request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=_shower(display)
+                request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=shower(display)
             )
     except KeyboardInterrupt:
         again = shell_command(None, "--resume")
@@ -80,7 +80,7 @@ def default_device(backend: str) -> str:
     )
 
 
-def _shower(display: ProgressDisplay) -> Callable[[Status], None]:
+def shower(display: ProgressDisplay) -> Callable[[Status], None]:
     """What an evaluation is watched with."""
 
     def show(status: Status) -> None:

@@ -114,6 +114,70 @@ def evaluate(
 
 @app.command()
 @report_errors
+def compare(
+    contestants: Annotated[
+        list[str],
+        typer.Argument(
+            help="Two or more of: policies, as for evaluate; results folders; results.json files and score cards.",
+            metavar="A B...",
+        ),
+    ],
+    pipeline: Annotated[
+        str, typer.Option(help="How policies are evaluated: stress, or multi at one --level.")
+    ] = "stress",
+    suite: Annotated[
+        str, typer.Option(help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.")
+    ] = "gaitgauge-1",
+    backend: Annotated[str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.")] = "mujoco",
+    device: Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")] = None,
+    robot: Annotated[str, typer.Option(help="Robot name, or a robot.toml.")] = "go2",
+    terrain: Annotated[list[str] | None, typer.Option(help="Terrain; repeatable. Default: the suite's.")] = None,
+    level: Annotated[
+        int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")
+    ] = None,
+    friction: Annotated[
+        list[float] | None, typer.Option(help="Friction coefficient; repeatable. Default: the suite's.")
+    ] = None,
+    payload: Annotated[
+        list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")
+    ] = None,
+    seed: Annotated[
+        list[int] | None, typer.Option(help="Seed of the quality episodes; repeatable. Default: the suite's.")
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
+        ),
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print comparison.json instead of tables.")] = False,
+) -> None:
+    """Say which differences between policies are real. Policies are evaluated first; what has been played is not played again."""
+    from .compare import run_comparison
+
+    run_comparison(
+        contestants=contestants,
+        pipeline=pipeline,
+        suite=suite,
+        backend=backend,
+        device=device,
+        robot=robot,
+        terrains=tuple(terrain or ()),
+        level=level,
+        frictions=tuple(friction or ()),
+        payloads=tuple(payload or ()),
+        seeds=tuple(seed or ()),
+        threads=threads,
+        out=out,
+        json_output=json_output,
+    )
+
+
+@app.command()
+@report_errors
 def consistency(
     policies: Annotated[
         list[str],

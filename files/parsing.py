@@ -15,6 +15,7 @@ from dataclasses import is_dataclass
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
@@ -215,7 +216,22 @@ def build(kind: type[Kind], data: object, source: str, error: type[Exception]) -
         checker: TypeAdapter[tuple[Kind]] = _adapter(kind)  # type: ignore[arg-type]
         return checker.validate_json(text)[0]
     except ValidationError as problem:
-        raise error(f"{source}: {_sentence(problem, kind)}") from problem
+        raise _error(problem, kind, source, error) from problem
+
+
+def check_fields(instance: Any, source: str, error: type[Exception]) -> None:
+    """Check the fields of a frozen dataclass that Python code made, in its ``__post_init__``: numbers become floats and lists
+    tuples, as their annotations say.
+
+    Raises:
+        error: a value of another type or out of range.
+    """
+    kind: Any = type(instance)
+    for name, checker in _field_adapters(kind).items():
+        try:
+            object.__setattr__(instance, name, checker.validate_python({name: getattr(instance, name)})[name])
+        except ValidationError as problem:
+            raise _error(problem, kind, source, error) from problem
 
 
 def from_text(hint: Any, text: str, key: str, error: type[Exception]) -> Any:
@@ -248,8 +264,31 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 @cache
+def _field_adapters(kind: Any) -> dict[str, TypeAdapter[Any]]:
+    config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    hints: dict[str, Any] = get_type_hints(kind, include_extras=True)
+    # The table carries the configuration, and the field's name into the path.
+    tables: dict[str, Any] = {name: GenericAlias(dict, (str, hint)) for name, hint in hints.items()}
+    return {name: TypeAdapter(table, config=config) for name, table in tables.items()}
+
+
+def _error(problem: ValidationError, kind: Any, source: str, error: type[Exception]) -> Exception:
+    """An error of the class asked for; one that a dataclass raised itself stays as it is."""
+    own = problem.errors(include_url=False)[0].get("ctx", {}).get("error")
+    return (
+        own
+        if isinstance(own, error) and str(own).startswith(source)
+        else error(f"{source}: {_sentence(problem, kind)}")
+    )
+
+
+@cache
 def _text_adapter(hint: Any) -> TypeAdapter[Any]:
     return TypeAdapter(hint, config=None if is_dataclass(hint) else ConfigDict(allow_inf_nan=False))
+
+
+_MEMBER = re.compile(r"(float|int|str|bool|constrained-\w+|(tuple|dict|function|nullable)[^\w.]*\[.*)$")
+"""How pydantic names the members of a union in a path."""
 
 
 def _sentence(problem: ValidationError, kind: Any) -> str:
@@ -258,15 +297,16 @@ def _sentence(problem: ValidationError, kind: Any) -> str:
     order = ("unexpected_keyword_argument", "missing")
     first = min(errors, key=lambda e: order.index(e["type"]) if e["type"] in order else len(order))
     path = ""
-    for step in first["loc"][1:]:
-        path = f"{path}[{step}]" if isinstance(step, int) else _joined(path, step)
+    for step in first["loc"][first["loc"][0] == 0 :]:  # a number: the place in the tuple around it
+        if isinstance(step, int) or not _MEMBER.match(step):
+            path = f"{path}[{step}]" if isinstance(step, int) else _joined(path, step)
     if first["type"] == "missing" and isinstance(first["loc"][-1], int):
         return f"{path.rpartition('[')[0]} is {shown(first['input'])}; more entries are needed"
     if first["type"] == "missing":
         lacking = [str(e["loc"][-1]) for e in errors if e["type"] == "missing" and e["loc"][:-1] == first["loc"][:-1]]
         return f"{path.rpartition('.')[0] or 'it'} lacks {', '.join(lacking)}"
     if first["type"] == "unexpected_keyword_argument":
-        known = _fields_at(kind, first["loc"][1:-1])
+        known = _fields_at(kind, first["loc"][first["loc"][0] == 0 : -1])
         hint = did_you_mean(first["loc"][-1], known) or f"; choose from {', '.join(known)}"
         return f"unknown field '{path}'{hint}"
     if first["type"] == "value_error":

@@ -173,14 +173,27 @@ class Evidence:
             weights: (E,).
             columns: see ``runs``.
         """
-        rules, values = self._rules, self.runs(columns)
-        means = self._supposed(values.mean(1))
+        rules, means = self._rules, self._supposed(self.runs(columns).mean(1))
         at_levels = rules.level_weight * (self.redrawn - 1) + rules.quality_weight * means[:, None]
         levels = weights @ np.where(self._flat[:, None] | (self.redrawn == 0), 0.0, at_levels)
-        scale = np.where(self._flat, 1.0, rules.quality_weight) * weights
-        deviations = scale[:, None] * (values - values.mean(1, keepdims=True))
-        streams = deviations.sum(0, keepdims=True) if rules.shared_noise else deviations[weights != 0.0]
-        return Chance(levels=levels - levels.mean(), seeds=(streams, self._search_seeds(weights)))
+        at_reached = self.chance_at_levels(weights * np.where(self._flat, 1.0, rules.quality_weight), columns)
+        return Chance(levels=levels - levels.mean(), seeds=(*at_reached.seeds, self._search_seeds(weights)))
+
+    def chance_at_levels(self, weights: Array, columns: Sequence[str]) -> Chance:
+        """Chance in a weighted sum over environments of values as measured at the levels reached, see ``chance``."""
+        values = self.runs(columns)
+        deviations = weights[:, None] * (values - values.mean(1, keepdims=True))
+        shared = self._rules.shared_noise
+        return Chance(
+            levels=np.zeros(self._rules.resamples),
+            seeds=(deviations.sum(0, keepdims=True) if shared else deviations[weights != 0.0],),
+        )
+
+    def value(self, weights: Array, columns: Sequence[str] = (QUALITY,)) -> float:
+        """Weighted sum over environments of level-weighted values, see ``chance``."""
+        rules, means = self._rules, self.runs(columns).mean(1)
+        at_levels = rules.level_weight * (self._reached - 1) + rules.quality_weight * means
+        return float(weights @ np.where(self._flat, means, np.where(self._reached > 0, at_levels, 0.0)))
 
     def level_chance(self, weights: Array) -> Chance:
         """Chance in a weighted sum of the environments' levels, ``weights`` (E,). Quality seeds play no part."""

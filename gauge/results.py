@@ -74,6 +74,7 @@ def fold(
         "score": None,
         "score_interval": None,
         "groups": {},
+        "group_metrics": {g: list(names) for g, names in scoring.groups.items()},
         "level": _mean_level(environments) if levelled.any() else None,
         "level_interval": None,
         "terrains": {},

@@ -15,7 +15,7 @@ import yaml
 
 from ..robots.base import Robot
 from .base import PolicyError
-from .contract import ContractError, History, ObservationTerm, PolicyContract, go2_contract
+from .contract import ContractError, History, HistoryOrder, ObservationTerm, PolicyContract, go2_contract
 from .native import StoredNetwork, first_line
 
 # Observation terms as Isaac Lab and mjlab name them.
@@ -56,7 +56,7 @@ def sidecar_contract(path: Path) -> PolicyContract | None:
 
 
 def contract_for_width(
-    width: int, robot: Robot, *, order: str, provenance: Mapping[str, Any], source: str
+    width: int, robot: Robot, *, order: HistoryOrder, provenance: Mapping[str, Any], source: str
 ) -> PolicyContract:
     """The standard contract with as many frames as an input of this width holds.
 
@@ -144,7 +144,7 @@ def _deploy_contract(data: Mapping[str, Any], path: Path, robot: Robot) -> Polic
             f"'{path}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
         )
     length = lengths.pop() if lengths else 1
-    order = "frame-major" if frame_major or length == 1 else "term-major"
+    order: HistoryOrder = "frame-major" if frame_major or length == 1 else "term-major"
     return PolicyContract(
         robot=robot.name,
         joint_names=names,

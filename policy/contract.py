@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from pydantic import Field
+
+from ..files.parsing import LARGEST, Text, build, check_fields, parse_json, shown
 from ..robots.base import Robot
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION: Literal[1] = 1
+HistoryOrder = Literal["frame-major", "term-major", "frame-major-newest-first"]
 
 # Width of each observation term for a robot with J joints; None stands for J.
 TERM_WIDTH: Mapping[str, int | None] = {
@@ -28,41 +31,15 @@ TERM_WIDTH: Mapping[str, int | None] = {
     "joint_velocity": None,
     "last_action": None,
 }
-HISTORY_ORDERS = ("frame-major", "term-major", "frame-major-newest-first")
-HISTORY_STARTS = ("zeros", "repeat")
 
 
 class ContractError(ValueError):
     """A contract is malformed, or does not fit the robot, suite or policy at hand."""
 
 
-def _number(name: str, value: Any, *, positive: bool = False) -> float:
-    # The comparison is exact for whole numbers of any size, and false for NaN.
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number or not -sys.float_info.max <= value <= sys.float_info.max:
-        raise ContractError(f"contract field '{name}' must be a finite number, not {value!r}")
-    if positive and value <= 0:
-        raise ContractError(f"contract field '{name}' must be above zero, not {value!r}")
-    return float(value)
-
-
-def _entries(name: str, values: Any) -> Iterable[Any]:
-    if isinstance(values, (str, Mapping)) or not isinstance(values, Iterable):
-        raise ContractError(f"contract field '{name}' must be a list, not {values!r}")
-    return values
-
-
-def _numbers(name: str, values: Any, count: int | None = None) -> tuple[float, ...]:
-    numbers = tuple(_number(f"{name}[{i}]", v) for i, v in enumerate(_entries(name, values)))
-    if count is not None and len(numbers) != count:
-        raise ContractError(f"contract field '{name}' has {len(numbers)} entries; {count} are needed")
-    return numbers
-
-
-def _text(name: str, value: Any) -> str:
-    if not isinstance(value, str) or not value:
-        raise ContractError(f"contract field '{name}' must be a text, not {value!r}")
-    return value
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
+_Numbers = Annotated[tuple[_Number, ...], Field(min_length=1, max_length=1000)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,24 +48,18 @@ class ObservationTerm:
     raw output.
     """
 
-    name: str
+    name: Text
     """A key of ``TERM_WIDTH``."""
-    scale: tuple[float, ...]
+    scale: _Numbers
     """Factor per entry; one entry stands for all."""
-    clip: float | tuple[float, ...] | None = None
+    clip: _Positive | _Numbers | None = None
     """Largest magnitude after scaling, for all entries or per entry; None for no clipping."""
 
     def __post_init__(self) -> None:
-        if _text("observation.name", self.name) not in TERM_WIDTH:
-            raise ContractError(f"unknown observation term '{self.name}'; choose from: {', '.join(TERM_WIDTH)}")
-        where = f"observation.{self.name}"
-        object.__setattr__(self, "scale", _numbers(f"{where}.scale", self.scale))
-        if self.clip is None:
-            return
-        if isinstance(self.clip, (int, float)):
-            object.__setattr__(self, "clip", _number(f"{where}.clip", self.clip, positive=True))
-        else:
-            object.__setattr__(self, "clip", _numbers(f"{where}.clip", self.clip))
+        check_fields(self, "contract", ContractError)
+        if self.name not in TERM_WIDTH:
+            known = ", ".join(TERM_WIDTH)
+            raise ContractError(f"contract: unknown observation term {shown(self.name)}; choose from: {known}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,24 +68,18 @@ class History:
     here; ``start`` holds for its history too.
     """
 
-    length: int = 1
+    length: Annotated[int, Field(strict=True, ge=1, le=1000)] = 1
     """Number of frames, the current one included."""
-    order: str = "frame-major"
+    order: HistoryOrder = "frame-major"
     """``frame-major``: whole frames, oldest first; ``frame-major-newest-first``: the same reversed; ``term-major``: all
     frames of the first term, oldest first, then the next term.
     """
-    start: str = "zeros"
+    start: Literal["zeros", "repeat"] = "zeros"
     """What fills the frames before the first one: ``zeros``, as in the published training, or ``repeat`` for copies of
     the first frame, as the robot's own controller does it."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.length, bool) or not isinstance(self.length, int) or self.length < 1:
-            raise ContractError(
-                f"contract field 'history.length' must be a whole number of at least 1, not {self.length!r}"
-            )
-        for name, value, allowed in (("order", self.order, HISTORY_ORDERS), ("start", self.start, HISTORY_STARTS)):
-            if value not in allowed:
-                raise ContractError(f"contract field 'history.{name}' is {value!r}; choose from: {', '.join(allowed)}")
+        check_fields(self, "contract", ContractError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,77 +90,52 @@ class PolicyContract:
         ContractError: a field has the wrong type, length or value; the message names it.
     """
 
-    robot: str
+    robot: Text
     """Robot registry name."""
-    joint_names: tuple[str, ...]
+    joint_names: Annotated[tuple[Text, ...], Field(min_length=1, max_length=1000)]
     """Joints in the policy's own order, for observations and actions."""
-    default_joint_position: tuple[float, ...]
+    default_joint_position: _Numbers
     """[rad], in the policy's joint order."""
-    action_scale: tuple[float, ...]
+    action_scale: _Numbers
     """[rad] per unit of network output, per joint."""
-    action_clip: float | None = None
+    action_clip: _Positive | None = None
     """Largest magnitude of the raw action, None for no clipping."""
-    target_range: tuple[tuple[float, float], ...] | None = None
+    target_range: tuple[tuple[_Number, _Number], ...] | None = None
     """Lowest and highest joint target per joint [rad], None for no limit."""
-    stiffness: tuple[float, ...]
+    stiffness: _Numbers
     """Motor kp the policy was made for [N·m/rad]."""
-    damping: tuple[float, ...]
+    damping: _Numbers
     """Motor kd the policy was made for [N·m·s/rad]."""
-    control_period: float
+    control_period: _Positive
     """[s]."""
-    observation: tuple[ObservationTerm, ...]
+    observation: Annotated[tuple[ObservationTerm, ...], Field(min_length=1)]
     history: History = History()
-    command_limits: tuple[float, float, float]
+    command_limits: tuple[_Number, _Number, _Number]
     """Largest forward, lateral [m/s] and yaw [rad/s] command the policy was made for."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Where the policy comes from (training run, file, adapter); not part of the hash."""
-    schema_version: int = SCHEMA_VERSION
+    schema_version: Literal[1] = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
-        def put(name: str, value: Any) -> None:
-            object.__setattr__(self, name, value)
-
-        if self.schema_version != SCHEMA_VERSION:
-            raise ContractError(
-                f"contract field 'schema_version' is {self.schema_version!r}; this gaitgauge reads {SCHEMA_VERSION}"
-            )
-        _text("robot", self.robot)
-        if isinstance(self.joint_names, str) or not isinstance(self.joint_names, Sequence) or not self.joint_names:
-            raise ContractError(f"contract field 'joint_names' must be a list of names, not {self.joint_names!r}")
-        names = tuple(_text(f"joint_names[{i}]", n) for i, n in enumerate(self.joint_names))
-        if len(set(names)) != len(names):
-            raise ContractError(f"contract field 'joint_names' has a name twice: {', '.join(names)}")
-        put("joint_names", names)
-        joints = len(names)
-        for name in ("default_joint_position", "action_scale", "stiffness", "damping"):
-            put(name, _numbers(name, getattr(self, name), joints))
-        put("command_limits", _numbers("command_limits", self.command_limits, 3))
-        put("control_period", _number("control_period", self.control_period, positive=True))
-        if self.action_clip is not None:
-            put("action_clip", _number("action_clip", self.action_clip, positive=True))
-        if self.target_range is not None:
-            ranges = list(_entries("target_range", self.target_range))
-            if len(ranges) != joints:
-                raise ContractError(f"contract field 'target_range' has {len(ranges)} entries; {joints} are needed")
-            put("target_range", tuple(_numbers(f"target_range[{i}]", r, 2) for i, r in enumerate(ranges)))
-        put("observation", tuple(self.observation))
-        if not self.observation:
-            raise ContractError("contract field 'observation' lists no terms")
-        if len({t.name for t in self.observation}) != len(self.observation):
-            raise ContractError(
-                f"contract field 'observation' has a term twice: {', '.join(t.name for t in self.observation)}"
-            )
+        check_fields(self, "contract", ContractError)
+        names, joints = self.joint_names, len(self.joint_names)
+        if len(set(names)) != joints:
+            raise ContractError(f"contract: joint_names has a name twice: {shown(list(names))}")
+        for name in ("default_joint_position", "action_scale", "stiffness", "damping", "target_range"):
+            entries = getattr(self, name)
+            if entries is not None and len(entries) != joints:
+                raise ContractError(f"contract: {name} has {len(entries)} entries; {joints} are needed")
+        terms = [t.name for t in self.observation]
+        if len(set(terms)) != len(terms):
+            raise ContractError(f"contract: observation has a term twice: {', '.join(terms)}")
         for term in self.observation:
             width = TERM_WIDTH[term.name] or joints
             clip = term.clip if isinstance(term.clip, tuple) else (0.0,)
-            for name, entries in (("scale", term.scale), ("clip", clip)):
-                if len(entries) not in (1, width):
+            for name, values in (("scale", term.scale), ("clip", clip)):
+                if len(values) not in (1, width):
                     raise ContractError(
-                        f"contract field 'observation.{term.name}.{name}' has {len(entries)} entries; "
-                        f"1 or {width} are needed"
+                        f"contract: observation.{term.name}.{name} has {len(values)} entries; 1 or {width} are needed"
                     )
-        if not isinstance(self.provenance, Mapping):
-            raise ContractError(f"contract field 'provenance' must be a table, not {self.provenance!r}")
 
     @cached_property
     def num_joints(self) -> int:
@@ -223,14 +163,7 @@ class PolicyContract:
         Raises:
             ContractError: a field is unknown, missing or malformed.
         """
-        values = _checked_fields(cls, data, "")
-        terms = _entries("observation", values["observation"])
-        values["observation"] = tuple(
-            ObservationTerm(**_checked_fields(ObservationTerm, t, f"observation[{i}].")) for i, t in enumerate(terms)
-        )
-        if "history" in values:
-            values["history"] = History(**_checked_fields(History, values["history"], "history."))
-        return cls(**values)
+        return build(cls, data, "contract", ContractError)
 
     @classmethod
     def from_json(cls, text: str) -> PolicyContract:
@@ -239,11 +172,9 @@ class PolicyContract:
         Raises:
             ContractError: not JSON, or not a contract.
         """
-        try:
-            data = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise ContractError(f"the contract is not valid JSON: {error}") from error
-        return cls.from_dict(data)
+        if len(text) > LARGEST:
+            raise ContractError(f"the contract is not read: it is larger than {LARGEST / 1e6:g} MB")
+        return cls.from_dict(parse_json(text, "the contract", ContractError))
 
     def to_json(self) -> str:
         """JSON text in full precision."""
@@ -255,22 +186,6 @@ class PolicyContract:
         data = self.to_dict()
         del data["provenance"]
         return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def _checked_fields(kind: type, data: Any, prefix: str) -> dict[str, Any]:
-    """The entries of ``data``, which must be those of the dataclass ``kind`` and no others."""
-    if not isinstance(data, Mapping):
-        raise ContractError(
-            f"contract {'field ' + repr(prefix[:-1]) if prefix else 'data'} must be a table, not {data!r}"
-        )
-    known = {f.name: f for f in fields(kind)}
-    for name in data:
-        if name not in known:
-            raise ContractError(f"unknown contract field '{prefix}{name}'; allowed are: {', '.join(known)}")
-    for name, entry in known.items():
-        if name not in data and entry.default is MISSING and entry.default_factory is MISSING:
-            raise ContractError(f"contract field '{prefix}{name}' is missing")
-    return dict(data)
 
 
 def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:

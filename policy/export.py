@@ -25,7 +25,7 @@ from torch.nn import functional
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, SDK_JOINTS, SDK_LEGS, deploy_contract, matching_joint
 from .base import Policy, PolicyError
-from .contract import TERM_WIDTH, PolicyContract, difference
+from .contract import TERM_WIDTH, HistoryOrder, PolicyContract, difference
 from .loading import load_policy
 from .native import NativePolicy
 from .networks import CtsNetwork, MlpNetwork, MoeCtsNetwork
@@ -273,7 +273,7 @@ def export_policy(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path
 
 def stacked_contract(contract: PolicyContract, frames: int) -> PolicyContract:
     """The contract of a network that is handed its whole history, term by term."""
-    order = "term-major" if frames > 1 else "frame-major"
+    order: HistoryOrder = "term-major" if frames > 1 else "frame-major"
     return replace(contract, history=replace(contract.history, length=frames, order=order))
 
 

@@ -188,7 +188,7 @@ class Program:
             try:
                 with torch.no_grad(), warnings.catch_warnings():
                     warnings.simplefilter("ignore")
-                    flat = _with_layers(make_fx(torch.vmap(self._step))(observation, *memories))
+                    flat = _with_layers(make_fx(torch.vmap(lambda *one: self._step(*one)))(observation, *memories))
                     self._recorded[key] = _scripted(flat, [observation, *memories]) if script else flat
             except PROGRAM_ERRORS as error:
                 raise NotUnderstoodError(first_line(error)) from error

@@ -56,11 +56,14 @@ def rebuilt(policy: FilePolicy) -> FilePolicy:
 
 def _program(policy: FilePolicy, file: ForeignFile) -> Program:
     width = policy.contract.observation_width
-    if file.kind != "torchscript":
-        raise NotUnderstoodError("only TorchScript is understood")
-    from .torchscript_program import torchscript_program
+    # Only those who load such a file wait for what it needs.
+    if file.kind == "torchscript":
+        from .torchscript_program import torchscript_program
 
-    return torchscript_program(file.data, width, source=policy.path)
+        return torchscript_program(file.data, width, source=policy.path)
+    from .onnx_program import onnx_program
+
+    return onnx_program(file.data, width, source=policy.path)
 
 
 def _acts_alike(policy: FilePolicy, made: FilePolicy) -> bool:

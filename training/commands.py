@@ -65,6 +65,17 @@ def _range_table(
     return torch.cat((low, high, downward, either, 0.8 * period * fastest), dim=-1)
 
 
+def largest_commands(
+    configuration: CommandConfiguration, terrain_limits: Sequence[tuple[float, float, float]]
+) -> tuple[float, float, float]:
+    """Largest forward, lateral [m/s] and yaw [rad/s] speed that any stage draws on any kind of terrain."""
+    ranges = [(stage.forward, stage.lateral, stage.yaw) for stage in configuration.stages]
+    drawn = [max(abs(bound) for stage in ranges for bound in stage[axis]) for axis in range(3)]
+    allowed = [max(limits[axis] for limits in terrain_limits) for axis in range(3)]
+    forward, lateral, yaw = (min(pair) for pair in zip(drawn, allowed, strict=True))
+    return forward, lateral, yaw
+
+
 class CommandGenerator:
     """Draws commands for all worlds at once."""
 
@@ -106,8 +117,7 @@ class CommandGenerator:
         self._shares = torch.tensor(shares, device=device)
         self._stationary = RampTable([configuration.stationary_probability], device)
         # A number below the first bound sets an axis to zero, else one below the second bound to its lower limit.
-        zero = configuration.extreme_zero_probability
-        self._zero_below = torch.tensor((zero, zero, 1.0 / 3.0), device=device)
+        self._zero_below = torch.tensor(configuration.extreme_zero_probability, device=device)
         self._low_below = 0.5 * (1.0 + self._zero_below)
         self._period = control_period
         self._length = max_episode_length

@@ -21,6 +21,7 @@ from ..backends.registry import make_backend
 from ..policy.contract import History, PolicyContract, go2_contract
 from ..robots.base import JointParameters, Robot
 from ..robots.registry import load_robot
+from .commands import largest_commands
 from .configuration import ConfigurationError
 from .curriculum import TrainingPalette, assign_kinds, build_palette
 from .domain_randomization import BodyParameters, draw_bodies
@@ -397,11 +398,13 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
 def training_contract(
     robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
 ) -> PolicyContract:
-    """The interface of a policy trained here: one frame of observation, the gains and the control period of the
-    training.
+    """The interface of a policy trained here: one frame of observation, the gains, the control period and the largest
+    commands of the training.
     """
+    tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
     return replace(
         go2_contract(robot, history=History(start=configuration.observations.history_start)),
+        command_limits=largest_commands(configuration.commands, [tile.command_limits for tile in tiles]),
         stiffness=parameters.stiffness,
         damping=parameters.damping,
         control_period=configuration.physics.control_period,

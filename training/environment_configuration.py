@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..backends.base import PhysicsOptions
+from ..backends.base import TRAINING_PHYSICS, PhysicsOptions
 from ..terrains.training_tiles import DEFAULT_SHAPE, NUM_TILE_LEVELS, TileShape
 
 Range = tuple[float, float]
@@ -197,8 +197,9 @@ class CommandConfiguration:
     turn."""
     extreme_probability: float = 0.2
     """Share of draws with every axis at a limit or zero."""
-    extreme_zero_probability: float = 1.0 / 3.0
-    """Chance of each axis of an extreme command to be zero. Published: forward and lateral never are."""
+    extreme_zero_probability: tuple[float, float, float] = (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)
+    """Chance of the forward, lateral and yaw speed of an extreme command to be zero. Published: 0, 0 and 1/3, and 0, 1
+    and 1/3 for the fast task."""
     flip_probability: float = 0.2
     """Chance that an extreme command is followed by its opposite."""
     stationary_probability: Ramp = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
@@ -345,22 +346,6 @@ class TerminationConfiguration:
     the level down. None for never."""
     stuck_from: float = 0.1
     """Fraction of the run from which being stuck ends episodes: a robot that cannot walk yet is always stuck."""
-
-
-TRAINING_PHYSICS = PhysicsOptions(
-    timestep=0.005,
-    substeps=4,
-    cone="pyramidal",
-    iterations=6,
-    ls_iterations=20,
-    tolerance=1e-6,
-    foot_condim=3,
-    self_collision=False,
-    torque_limits=True,
-    torque_speed_limit=True,
-)
-"""Physics of the published training, as far as the engines have it: 200 Hz, four substeps, sliding friction only. Six solver
-iterations are faster than ten, and what ships was trained with them."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,9 +44,6 @@ from .tasks import Task, find_task
 DEFAULT_BACKEND = "mujoco-warp"
 QUICK_SUITE = "quick"
 _WAIT = "training.run.gauge_wait"
-_ENGINE_SETTINGS: Mapping[str, tuple[str, ...]] = {"mujoco": ("environment.physics.iterations=15",)}
-"""What an engine needs that others do not, before the settings of the request. MuJoCo's solver has not converged after the tasks' six
-iterations at steps of 5 ms, and throws walking robots over; mujoco_warp's has."""
 _GOING_ON_RATE, _GOING_ON_KL, _GOING_ON_STD = 3e-4, 0.006, 0.3
 """First learning rate, wanted change of the policy in an update, and exploration noise of a run that begins with trained networks."""
 
@@ -121,7 +118,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         )
     own = _own_overrides(request)
     task = find_task(request.task, own)
-    checkpoint, run, kept_backend = None, None, None
+    checkpoint, run = None, None
     if request.resume is not None:
         checkpoint = find_checkpoint(
             request.resume, experiment=task.training.run.experiment, root=request.log_root
@@ -130,7 +127,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         run = checkpoint.parent if read_run_json(checkpoint.parent).get("task") == request.task else None
         kept, kept_backend = _kept(checkpoint, request.task)
         backend = request.backend or kept_backend
-        task = kept.with_overrides([*(_ENGINE_SETTINGS.get(backend, ()) if backend != kept_backend else ()), *own])
+        task = kept.with_overrides(own)
         if task.environment.num_envs != kept.environment.num_envs:
             raise CheckpointError(
                 f"Cannot resume from '{checkpoint}': it has {kept.environment.num_envs} environments, this run "
@@ -139,7 +136,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
     else:
         backend = request.backend or DEFAULT_BACKEND
         begun = _going_on(task, _first_weights(request, task)) if request.init_from is not None else []
-        task = find_task(request.task, [*_ENGINE_SETTINGS.get(backend, ()), *begun, *own])
+        task = find_task(request.task, [*begun, *own])
     check_logger(task.training.run.logger)
     device = _device(request.device, backend)
     find_backend(backend, device)

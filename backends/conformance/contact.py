@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..base import TRAINING_PHYSICS, BackendError, PhysicsOptions
 from .bench import Bench, Worlds, expect, expect_close
 from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, level_stance
 from .suite import check
@@ -192,6 +194,52 @@ def trunk(bench: Bench) -> str:
         expect(bool((head > 1.0).all()), f"the base of a robot on its nose carries only {head.min():.3g} N")
         expect_close("trunk_contact_force_w of a robot on its nose [N]", state.trunk_contact_force_w, 0.0, 1e-3)
     return f"{part.min():.0f} N of {whole.min():.0f} N on the back, none on the nose"
+
+
+@check("contact/training", "contact_forces", "plane")
+def training(bench: Bench) -> str:
+    """In the physics of training a robot that lands and trots feels the foot forces of a solver that has converged."""
+    try:
+        return hold_to_converged(bench, TRAINING_PHYSICS)
+    except BackendError as refusal:
+        return f"refused: {refusal}"  # an engine that cannot train in this physics has nothing to keep
+
+
+def hold_to_converged(bench: Bench, physics: PhysicsOptions) -> str:
+    """Compare foot forces of robots that land and trot with those of MuJoCo's solver after up to 200 iterations.
+
+    Raises:
+        ConformanceError: the forces that only one contact in a hundred, or in a thousand, exceeds are off by more than
+            10 %, or 20 %: contacts kick, or give way.
+    """
+    changes = {f.name: getattr(physics, f.name) for f in fields(PhysicsOptions)}
+    changes |= {"torque_limits": False, "torque_speed_limit": False}
+    count, steps = 4, round(1.5 / physics.timestep)
+    parameters, pose = bench.soft(), np.asarray(bench.robot.default_joint_position)
+    legs = np.repeat([1.0, -1.0, -1.0, 1.0], len(pose) // 4) * np.resize([0.1, -0.35, 0.5], len(pose))
+    phase = 2.0 * np.pi * 2.5 * physics.timestep * np.arange(steps)[:, None] + 0.7 * np.arange(count)
+    targets = pose + np.sin(phase)[..., None] * legs
+    speed = np.c_[np.linspace(-1.0, 1.0, count), np.zeros((count, 2))]
+    start = (0.0, 0.0, bench.robot.stand_height)
+    expected = []
+    for row in range(count):
+        reference = Reference(bench.robot, parameters, timestep=physics.timestep, ground=physics)
+        reference.place(start, base_linear_velocity=speed[row])
+        for target in targets[:, row]:
+            reference.step(target)
+            expected.append(reference.foot_force)
+    found = []
+    with bench.worlds(parameters, **changes) as worlds:
+        worlds.reset(base_position=np.tile(start, (count, 1)), base_linear_velocity=speed)
+        for target in targets:
+            worlds.step(target, substeps=1)
+            found.append(np.linalg.norm(worlds.read().foot_contact_force_w, axis=-1))
+    said = []
+    for share, allowed in ((0.99, 0.1), (0.999, 0.2)):
+        wanted, force = np.quantile(expected, share), np.quantile(found, share)
+        expect_close(f"foot force that {share:.1%} stay below [N]", force, wanted, allowed * wanted)
+        said.append(f"{share:.1%} of the foot forces below {force:.0f} N ({wanted:.0f} N)")
+    return ", ".join(said)
 
 
 def back_height(reference: Reference, *, clearance: float = 0.001) -> float:

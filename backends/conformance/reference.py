@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...robots.base import JointParameters, Robot
+from ..base import PhysicsOptions
 
 GRAVITY = 9.81
 """Acceleration of free fall [m/s²]; the contract's worlds have no other."""
@@ -20,14 +21,25 @@ Array = NDArray[np.float64]
 
 
 class Reference:
-    """One robot in empty space under gravity."""
+    """One robot under gravity, in empty space or, with ``ground``, over a plane that it meets with those contact options."""
 
-    def __init__(self, robot: Robot, parameters: JointParameters, *, timestep: float = 0.002) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        parameters: JointParameters,
+        *,
+        timestep: float = 0.002,
+        ground: PhysicsOptions | None = None,
+    ) -> None:
         spec = mujoco.MjSpec.from_file(str(robot.mjcf))
         spec.option.timestep = timestep
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        if ground is not None:
+            _add_ground(spec, robot, ground)
         self.model = spec.compile()
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+        if ground is None:
+            self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         self.data = mujoco.MjData(self.model)
         self.robot, self.parameters = robot, parameters
         joints = [self.model.joint(name) for name in robot.joint_names]
@@ -134,9 +146,35 @@ class Reference:
         return np.array(velocity)
 
     @property
+    def foot_force(self) -> Array:
+        """Magnitude of all contact forces on each foot [N], (F,)."""
+        force = np.zeros((len(self.feet), 3))
+        for i, contact in enumerate(self.data.contact[: self.data.ncon]):
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(self.model, self.data, i, wrench)
+            for foot, geom in enumerate(self.feet):
+                if geom in contact.geom:
+                    force[foot] += contact.frame.reshape(3, 3).T @ wrench[:3]
+        return np.linalg.norm(force, axis=1)
+
+    @property
     def center_of_mass(self) -> Array:
         """Of the whole robot, world frame [m], (3,)."""
         return self.data.subtree_com[self.base].copy()
+
+
+def _add_ground(spec: mujoco.MjSpec, robot: Robot, physics: PhysicsOptions) -> None:
+    """Add a plane and a solver that iterates until it has converged."""
+    for geom in spec.geoms:
+        if geom.name in robot.foot_names and physics.foot_condim is not None:
+            geom.condim = physics.foot_condim
+        if not physics.self_collision and (geom.contype or geom.conaffinity):
+            geom.contype, geom.conaffinity = 0, 1
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+    option, pyramidal = spec.option, physics.cone == "pyramidal"
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL if pyramidal else mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio, option.solver = physics.impratio, mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations, option.ls_iterations, option.tolerance = 200, 100, 1e-10
 
 
 @dataclass(frozen=True, kw_only=True)

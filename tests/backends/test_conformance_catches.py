@@ -147,19 +147,19 @@ class ForgetsAtReset(MujocoBackend):
         super().reset(*args, **kwargs)
 
 
-class MotorFault(MujocoBackend):
-    """An engine that builds its motors from another scene."""
+class SceneFault(MujocoBackend):
+    """An engine that builds another scene than it was asked for."""
 
     def __init__(self, scene, **rest):
         super().__init__(self.spoil(scene), **rest)
 
 
-class SpeedIgnored(MotorFault):
+class SpeedIgnored(SceneFault):
     def spoil(self, scene):
         return replace(scene, physics=replace(scene.physics, torque_speed_limit=False))
 
 
-class BrakesAsItDrives(MotorFault):
+class BrakesAsItDrives(SceneFault):
     def spoil(self, scene):
         driving = scene.parameters.driving_torque_limit
         return replace(scene, parameters=replace(scene.parameters, torque_limit=driving))
@@ -175,6 +175,18 @@ class SpeedOfThePeriod(MujocoBackend):
     def step(self, *args, **kwargs):
         self.begin = self.state.joint_velocity.numpy().copy()
         super().step(*args, **kwargs)
+
+
+class KickingContacts(SceneFault):
+    """MuJoCo as it was trained on: a stiff cone, and too few iterations for it."""
+
+    def spoil(self, scene):
+        return replace(scene, physics=replace(scene.physics, impratio=100.0))
+
+
+class TooFewIterations(SceneFault):
+    def spoil(self, scene):
+        return replace(scene, physics=replace(scene.physics, iterations=3))
 
 
 class SwallowsRequests(MujocoBackend):
@@ -197,6 +209,8 @@ FAULTS = [
     (FeetInAnotherOrder, "kinematics/feet"),
     (MomentAboutTheOrigin, "contact/moment"),
     (FootForceCountedTwice, "contact/feet"),
+    (KickingContacts, "contact/training"),
+    (TooFewIterations, "contact/training"),
     (DivergenceHidden, "health/divergence"),
     (LateTargets, "motors/latency"),
     (SpeedIgnored, "motors/speed_limit"),

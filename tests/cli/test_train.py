@@ -365,18 +365,6 @@ def test_options_are_overrides_and_settings_win():
     assert task.training.run.gauge_interval == 50
 
 
-def test_mujoco_gets_the_solver_iterations_that_it_needs_unless_told():
-    """With six of them it throws walking robots over; mujoco_warp does not."""
-
-    def iterations(backend, *overrides):
-        request = TrainRequest(task="go2-moe-cts", backend=backend, device="cpu", overrides=overrides)
-        return prepare(request).task.environment.physics.iterations
-
-    assert iterations("mujoco") == 15
-    assert iterations("mujoco", "environment.physics.iterations=8") == 8
-    assert iterations("fake") == 6
-
-
 def test_time_limit_waits_for_no_score_unless_asked():
     def wait(*overrides: str, seconds: float | None) -> float:
         request = TrainRequest(task="go2-flat", backend="fake", seconds=seconds, overrides=overrides)

@@ -91,6 +91,13 @@ def test_extreme_commands_have_every_axis_at_a_limit_or_zero():
     assert counts.min() > COUNT / 27 * 0.85
 
 
+def test_extreme_commands_of_a_sprint_go_straight_ahead_or_back():
+    only = replace(PLAIN, extreme_probability=1.0, extreme_zero_probability=(0.0, 1.0, 1.0 / 3.0))
+    forward, lateral, yaw = draw(only, progress=0.5).command.unbind(1)
+    assert set(forward.tolist()) == {-1.5, 1.5} and set(lateral.tolist()) == {0.0}
+    assert share(yaw == 0.0) == pytest.approx(1.0 / 3.0, abs=0.01)
+
+
 def test_opposite_follows_an_extreme_command():
     flips = replace(PLAIN, flip_probability=0.3)
     before = torch.tensor([0.5, -0.5, 1.0]).expand(COUNT, 3)

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, replace
 
 import pytest
+from gaitgauge.robots import load_robot
+from gaitgauge.training.environment import training_contract
 from gaitgauge.training.overrides import TaskError, apply_overrides, override_keys
 from gaitgauge.training.tasks import TASKS, find_task, task_names
 
@@ -107,11 +109,20 @@ def test_every_key_can_be_set_to_what_it_is():
 
 
 def test_tasks():
-    assert task_names() == ["go2-moe-cts", "go2-cts", "go2-flat"]
-    moe, plain, flat = (find_task(name) for name in task_names())
+    assert task_names() == ["go2-moe-cts", "go2-cts", "go2-flat", "go2-sprint"]
+    moe, plain, flat, sprint = (find_task(name) for name in task_names())
     assert moe.training.network.student_encoder == "moe" and plain.training.network.student_encoder == "mlp"
     assert plain.environment == moe.environment
     assert [t.name for t in flat.environment.terrain.tiles] == ["flat"]
+    assert sprint.environment.commands.stages[-1].forward == (-2.0, 4.5)
+
+
+def test_the_contract_says_which_commands_a_task_trains():
+    limits = {"go2-moe-cts": (2.0, 1.0, 2.0), "go2-flat": (2.0, 1.0, 2.0), "go2-sprint": (4.5, 1.0, 2.0)}
+    robot = load_robot("go2")
+    for name, expected in limits.items():
+        contract = training_contract(robot, robot.parameters["training"], find_task(name).environment)
+        assert contract.command_limits == expected, name
 
 
 def test_unknown_task_names_the_nearest():

@@ -1,0 +1,322 @@
+"""Whether 95 % intervals hold the truth in 95 % of all cases: on whole evaluations that were repeated with fresh seeds, and on
+synthetic ones whose truth is known. And how often a policy is told apart from itself.
+
+    python benchmarks/interval_coverage.py                                    # judge docs/data/repeated_evaluations.json
+    python benchmarks/interval_coverage.py --synthetic 1000                   # and 1000 synthetic evaluations of each kind
+    python benchmarks/interval_coverage.py --record 30 --folder /tmp/repeated # play the evaluations again, and write the data
+
+Recorded are evaluations of the shipped policy by the rules of ``robogauge-1.1``, on waves and obstacles at friction 0.6. They
+differ in their seeds alone: evaluation k has the quality seeds 10k, 10k+1, 10k+2 and the search seeds 10k … 10k+4. One takes about
+a minute of one core; what the folder holds is not played again. Their truth is their mean.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gaitgauge.gauge.comparison import compare
+from gaitgauge.gauge.evaluate import Request, evaluate
+from gaitgauge.gauge.intervals import ChanceRules, Evidence
+from gaitgauge.gauge.level_chance import bisect
+from gaitgauge.gauge.results import SCHEMA, environment_weights
+from gaitgauge.gauge.store import write_atomically
+from numpy.typing import NDArray
+
+DATA = Path(__file__).parents[1] / "docs" / "data" / "repeated_evaluations.json"
+RULES = ChanceRules(
+    level_weight=0.09,
+    quality_weight=0.19,
+    pass_rate=0.8,
+    levels=10,
+    seeds=(0, 1, 2),
+    search_seeds=(0, 1, 2, 3, 4),
+    shared_noise=True,
+    resamples=1000,
+)
+"""Those of ``robogauge-1.1``."""
+SUITE = """
+extends = "robogauge-1.1"
+name = "repeated-{index}"
+
+[matrix]
+terrains = ["wave", "obstacle"]
+frictions = [0.6]
+seeds = {seeds}
+search_seeds = {search_seeds}
+"""
+Results = dict[str, Any]
+
+
+# ---- recorded -------------------------------------------------------------------------------------------------------
+
+
+def record(count: int, folder: Path, threads: int) -> list[Results]:
+    """Play whole evaluations with fresh seeds, and keep what intervals and comparisons read."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for index in range(1, count + 1):
+        suite = folder / f"repeated-{index}.toml"
+        seeds = [10 * index + s for s in range(5)]
+        suite.write_text(SUITE.format(index=index, seeds=seeds[:3], search_seeds=seeds))
+        request = Request(policy="pretrained", suite=str(suite), threads=threads)
+        results = evaluate(request, folder / f"run-{index}", resume=True)
+        print(f"{index}: {results['score']:.4f}, {results['score_interval']}", flush=True)
+        found.append(trimmed(results))
+    return found
+
+
+def trimmed(results: Mapping[str, Any]) -> Results:
+    """What intervals and comparisons read, without sub-commands. Suites that differ in seeds alone count as one."""
+    rows = [
+        {k: row[k] for k in ("terrain", "friction", "payload", "level", "score", "trials")}
+        | {"runs": {s: {**run, "commands": {}} for s, run in row["runs"].items()}}
+        for row in results["environments"]
+    ]
+    kept = ("schema", "score", "score_interval", "level", "level_interval", "groups", "group_metrics", "metrics")
+    kept += ("terrains", "chance", "pipeline", "backend", "robot")
+    return {k: results[k] for k in kept} | {
+        "suite": {"name": "repeated", "version": results["suite"]["version"], "digest": ""},
+        "policy": {k: results["policy"][k] for k in ("path", "file_sha256")},
+        "environments": rows,
+    }
+
+
+# ---- synthetic ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """A policy whose chances are known."""
+
+    terrains: tuple[str, ...]
+    frictions: tuple[float, ...]
+    success: NDArray[np.float64]
+    """Chance to reach the target, (environments, levels); 1 on flat ground, where it plays no part."""
+    quality: NDArray[np.float64]
+    """Mean quality of a run at each level, (environments, levels)."""
+    spread: float = 0.012
+    """Standard deviation of a run's quality."""
+    shared: float = 0.56
+    """Share of its variance that all environments of a seed have in common, where they share its noise."""
+    luck: float = 0.0
+    """Correlation of a seed's luck in level tests, where environments share its noise."""
+
+    @property
+    def environments(self) -> list[tuple[str, float]]:
+        """Terrain and friction of each."""
+        return [(t, f) for t in self.terrains for f in self.frictions]
+
+
+def make_policy(generator: np.random.Generator, terrains: Sequence[str], frictions: Sequence[float]) -> Known:
+    """A policy like those that were measured: half of the seeds reach the target at level 4 to 9, the odds of a success fall by a
+    factor e within 0.2 to 1.5 levels, and quality falls by 0.06 a level.
+    """
+    steps = np.arange(1, 11)
+    success, quality = [], []
+    for terrain in terrains:
+        centre, width = generator.uniform(4.0, 9.0), np.clip(0.5 * np.exp(0.5 * generator.standard_normal()), 0.2, 1.5)
+        for _ in frictions:
+            own = centre + generator.uniform(-1.0, 1.0)
+            success.append(1.0 / (1.0 + np.exp((steps - own) / width)) if terrain != "flat" else np.ones(10))
+            quality.append(generator.uniform(0.3, 0.5) - 0.06 * (steps - own) * (terrain != "flat"))
+    return Known(
+        terrains=tuple(terrains),
+        frictions=tuple(frictions),
+        success=np.array(success),
+        quality=np.clip(np.array(quality), 0.05, 0.95),
+    )
+
+
+def synthetic(policy: Known, rules: ChanceRules, generator: np.random.Generator) -> Results:
+    """One evaluation of a policy whose chances are known."""
+    common = rules.shared_noise
+    luck, shared = policy.luck * common, policy.shared * common
+    lucky = np.sqrt(luck) * generator.standard_normal(len(rules.search_seeds))
+    noise = np.sqrt(shared) * generator.standard_normal(len(rules.seeds))
+    needed = round(rules.pass_rate * len(rules.search_seeds))
+    rows = []
+    for at, (terrain, friction) in enumerate(policy.environments):
+        row: dict[str, Any] = {"terrain": terrain, "friction": friction, "payload": 0.0, "level": None}
+        if terrain != "flat":
+            draws = np.sqrt(1.0 - luck) * generator.standard_normal((10, len(rules.search_seeds))) + lucky
+            reached = draws < _quantile(policy.success[at])[:, None]
+            row["level"] = int(bisect(reached.sum(1) >= needed))
+            row["trials"] = dict(_trials(reached, rules, needed))
+        level = row["level"] or 0
+        if terrain == "flat" or level:
+            own = np.sqrt(1.0 - shared) * generator.standard_normal(len(rules.seeds))
+            runs = policy.quality[at, max(level, 1) - 1] + policy.spread * (noise + own)
+            row["runs"] = {str(s): {"quality": q, "commands": {}} for s, q in zip(rules.seeds, runs, strict=True)}
+        rows.append(row)
+    evidence = Evidence(rows, rules)
+    names = np.array([row["terrain"] for row in rows])
+    weights = environment_weights(names.tolist())
+    score = evidence.value(weights)
+    scores = {t: evidence.value((names == t) / (names == t).sum()) for t in policy.terrains}
+    levels = [row["level"] for row in rows if row["level"] is not None]
+    return {
+        "schema": SCHEMA,
+        "suite": {"name": "synthetic", "version": "1", "digest": ""},
+        "policy": {"path": "synthetic.pt", "file_sha256": ""},
+        "chance": asdict(rules),
+        "score": score,
+        "score_interval": evidence.chance(weights).interval(score),
+        "level": float(np.mean(levels)) if levels else None,
+        "terrains": {terrain: {"score": value} for terrain, value in scores.items()},
+        "metrics": {},
+        "group_metrics": {},
+        "environments": rows,
+    }
+
+
+def _trials(reached: NDArray[np.bool_], rules: ChanceRules, needed: int) -> Iterator[tuple[str, dict[str, bool]]]:
+    """The trials that a search plays: levels on its way, in rounds that end as soon as the outcome is certain."""
+    low, high = 0, rules.levels
+    while low < high:
+        level = (low + high + 1) // 2
+        played: list[bool] = []
+        while sum(played) < needed <= len(rules.search_seeds) - played.count(False):
+            played += reached[level - 1, len(played) : len(played) + needed - sum(played)].tolist()
+        yield str(level), {str(s): o for s, o in zip(rules.search_seeds, played, strict=False)}
+        low, high = (level, high) if sum(played) >= needed else (low, level - 1)
+
+
+def _quantile(chance: NDArray[np.float64]) -> NDArray[np.float64]:
+    from scipy.stats import norm
+
+    found: NDArray[np.float64] = norm.ppf(np.clip(chance, 1e-9, 1.0 - 1e-9))
+    return found
+
+
+def expected_score(policy: Known, rules: ChanceRules) -> float:
+    """The exact mean score over all seeds; a seed's luck must be zero."""
+    from scipy.stats import binom
+
+    seeds = len(rules.search_seeds)
+    passed = binom.sf(round(rules.pass_rate * seeds) - 1, seeds, policy.success)
+    scores = []
+    for at, (terrain, _) in enumerate(policy.environments):
+        if terrain == "flat":
+            scores.append(policy.quality[at, 0])
+            continue
+        total, ranges = 0.0, [(0, rules.levels, 1.0)]
+        while ranges:
+            low, high, share = ranges.pop()
+            if low < high:
+                middle = (low + high + 1) // 2
+                chance = passed[at, middle - 1]
+                ranges += [(middle, high, share * chance), (low, middle - 1, share * (1.0 - chance))]
+            elif low:
+                total += share * (rules.level_weight * (low - 1) + rules.quality_weight * policy.quality[at, low - 1])
+        scores.append(total)
+    return float(environment_weights([t for t, _ in policy.environments]) @ scores)
+
+
+KINDS = {
+    "flat alone": (("flat",), (0.6,), True),
+    "one terrain, one friction": (("wave",), (0.6,), True),
+    "waves and obstacles, one friction": (("wave", "obstacle"), (0.6,), True),
+    "one terrain, nine frictions": (("wave",), tuple(0.1 * n for n in range(2, 11)), True),
+    "all terrains, one friction": (("flat", "a", "b", "c", "d", "e", "f"), (0.6,), True),
+    "all terrains, nine frictions": (
+        ("flat", "a", "b", "c", "d", "e", "f"),
+        tuple(0.1 * n for n in range(2, 11)),
+        True,
+    ),
+    "the same, noise not shared": (("flat", "a", "b", "c", "d", "e", "f"), tuple(0.1 * n for n in range(2, 11)), False),
+}
+"""Synthetic evaluations: terrains, frictions, and whether environments share a seed's noise."""
+
+
+def coverage(kind: str, count: int, seed: int = 0) -> float:
+    """Share of the intervals of ``count`` synthetic evaluations, each of another policy, that hold the expected score."""
+    terrains, frictions, shared = KINDS[kind]
+    generator = np.random.default_rng(seed)
+    rules = replace(RULES, shared_noise=shared)
+    hits = 0
+    for _ in range(count):
+        policy = make_policy(generator, terrains, frictions)
+        low, high = synthetic(policy, rules, generator)["score_interval"]
+        hits += low <= expected_score(policy, rules) <= high
+    return hits / count
+
+
+def false_alarms(kind: str, count: int, seed: int = 1) -> tuple[float, float]:
+    """Shares of synthetic policies that are told apart from themselves with other seeds: by the score, and by any detail."""
+    terrains, frictions, shared = KINDS[kind]
+    generator = np.random.default_rng(seed)
+    rules = replace(RULES, shared_noise=shared)
+    other = replace(rules, seeds=(10, 11, 12), search_seeds=(10, 11, 12, 13, 14))
+    alarms = np.zeros(2)
+    for _ in range(count):
+        policy = make_policy(generator, terrains, frictions)
+        alarms += alarm([synthetic(policy, rules, generator), synthetic(policy, other, generator)])
+    return float(alarms[0] / count), float(alarms[1] / count)
+
+
+def alarm(pair: Sequence[Results]) -> NDArray[np.float64]:
+    """Whether a comparison finds the score real, and any detail."""
+    found = compare(pair, ["first", "second"]).differences
+    return np.array([any(d.real for d in found if (d.kind == "score") is s) for s in (True, False)], dtype=float)
+
+
+# ---- judging --------------------------------------------------------------------------------------------------------
+
+
+def judge(recorded: Sequence[Results]) -> dict[str, tuple[float, float, float, float]]:
+    """Of each quantity: mean, 1.96 σ over the evaluations, median half width of the intervals, share that holds the mean."""
+
+    def row(pairs: Sequence[tuple[float, Sequence[float]]]) -> tuple[float, float, float, float]:
+        values, ends = np.array([v for v, _ in pairs]), np.array([e for _, e in pairs])
+        held = (ends[:, 0] <= values.mean()) & (values.mean() <= ends[:, 1])
+        return values.mean(), 1.96 * values.std(ddof=1), float(np.median(np.ptp(ends, axis=1) / 2)), held.mean()
+
+    found = {"score": row([(r["score"], r["score_interval"]) for r in recorded])}
+    found["level"] = row([(r["level"], r["level_interval"]) for r in recorded])
+    for terrain in recorded[0]["terrains"]:
+        of = [r["terrains"][terrain] for r in recorded]
+        found[terrain] = row([(t["score"], t["interval"]) for t in of])
+        found[f"{terrain}, level"] = row([(t["level"], t["level_interval"]) for t in of])
+    for metric in recorded[0]["metrics"]:
+        found[metric] = row([(r["metrics"][metric]["mean50"], r["metrics"][metric]["interval"]) for r in recorded])
+    return found
+
+
+def main() -> None:
+    """Record if asked to, judge, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--record", type=int, metavar="COUNT", help="play so many evaluations and write the data")
+    parser.add_argument("--folder", type=Path, help="where they are played")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--synthetic", type=int, default=0, metavar="COUNT")
+    arguments = parser.parse_args()
+    if arguments.record:
+        if arguments.folder is None:
+            parser.error("--record needs a --folder to play in")
+        recorded = record(arguments.record, arguments.folder, arguments.threads)
+        write_atomically(arguments.data, json.dumps(recorded, separators=(",", ":")) + "\n")
+    recorded = json.loads(arguments.data.read_text())
+    print(f"{len(recorded)} whole evaluations with fresh seeds\n")
+    print(f"{'':24}{'mean':>9}{'1.96 σ':>9}{'printed':>9}{'covered':>9}")
+    for name, (mean, reach, printed, held) in judge(recorded).items():
+        print(f"{name:24}{mean:9.4f}{reach:9.4f}{printed:9.4f}{held:9.3f}")
+    pairs = list(zip(recorded[::2], recorded[1::2], strict=False))
+    alarms = np.sum([alarm(pair) for pair in pairs], axis=0)
+    print(f"\ntold apart from itself: {alarms[0]:.0f} of {len(pairs)} by the score, {alarms[1]:.0f} by a detail")
+    if arguments.synthetic:
+        print(f"\n{arguments.synthetic} synthetic evaluations of each kind")
+        print(f"{'':36}{'covered':>9}{'alarms':>9}{'in detail':>11}")
+        for kind in KINDS:
+            by_score, by_detail = false_alarms(kind, arguments.synthetic)
+            print(f"{kind:36}{coverage(kind, arguments.synthetic):9.3f}{by_score:9.3f}{by_detail:11.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""``gaitgauge compare``: evaluates what has to be, then one sentence for each pair and a table of differences."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.text import Text
+
+from ..gauge.comparing import compare_all
+from ..gauge.comparison import format_p
+from ..gauge.evaluate import Request
+from .console import Terminal, make_table, shell_command
+from .evaluate import default_device, shower
+from .progress import ProgressDisplay
+
+
+def run_comparison(
+    *,
+    contestants: Sequence[str],
+    suite: str,
+    backend: str,
+    device: str | None,
+    threads: int | None,
+    out: Path | None,
+    json_output: bool,
+    **choices: Any,
+) -> None:
+    """Compare, show progress, print what is real and where the files are."""
+    request = Request(
+        policy=contestants[0],
+        suite=suite,
+        backend=backend,
+        device=device or default_device(backend),
+        threads=threads or os.cpu_count() or 1,
+        **choices,
+    )
+    names = "-".join(Path(c).name.partition(".")[0] for c in contestants[:3])
+    console = Terminal(stderr=True)
+    try:
+        with ProgressDisplay(console, "gauging") as display:
+            found, paths = compare_all(
+                contestants,
+                request,
+                folder=out or Path("results") / f"compare-{names}",
+                runs=out or Path("results"),
+                command=["gaitgauge", *sys.argv[1:]],
+                watch=shower(display),
+            )
+    except KeyboardInterrupt:
+        console.say(f"stopped; every finished episode is kept. Go on with:\n  {shell_command()}")
+        raise typer.Exit(130) from None
+    if json_output:
+        print(json.dumps(found, indent=1))
+        return
+    print_comparison(Terminal(), found)
+    for kind, path in paths.items():
+        print(f"{kind:5}{path}")
+
+
+def print_comparison(console: Terminal, found: Mapping[str, Any]) -> None:
+    """A table of differences for each pair, then what is real in plain sentences."""
+    pairs = list(dict.fromkeys((d["first"], d["second"]) for d in found["differences"]))
+    for first, second in pairs:
+        columns = ("", "of", first, second, "difference", "95 % interval", "corrected p")
+        table = make_table(f"{second} against {first}", *columns, numbers=True)
+        table.columns[1].justify = "left"
+        before = None
+        for d in (d for d in found["differences"] if (d["first"], d["second"]) == (first, second)):
+            low_high = "one seed" if d["interval"] is None else "{:+.4f} to {:+.4f}".format(*d["interval"])
+            table.add_row(
+                "" if d["kind"] == before else d["kind"],
+                d["name"],
+                *(f"{v:.4f}" for v in d["values"]),
+                f"{d['difference']:+.4f}",
+                low_high,
+                format_p(d["corrected"]).removeprefix("= "),
+                style="bold" if d["real"] else None,
+            )
+            before = d["kind"]
+        console.print(table)
+    for sentence in found["sentences"]:
+        console.say(Text(sentence))

@@ -1,0 +1,81 @@
+"""A comparison from the command line's arguments: what is a policy is evaluated, what is a result is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from .comparison import ComparisonError, compare, load_result
+from .comparison_report import write_comparison
+from .evaluate import Request, Status, evaluate, prepare
+from .report import write_report
+
+
+def is_result(contestant: str) -> bool:
+    """Whether an argument names results rather than a policy: a folder with ``results.json``, or a file that ends in ``.json``."""
+    path = Path(contestant)
+    return path.suffix == ".json" or (path / "results.json").is_file()
+
+
+def run_folders(requests: Mapping[str, Request], root: Path) -> dict[str, Path]:
+    """Where the evaluation of each policy goes: as ``evaluate`` has it, with the policy's folder where two files have one name."""
+    stems = [Path(r.policy).stem for r in requests.values()]
+    folders = {}
+    for name, request in requests.items():
+        path = Path(request.policy)
+        stem = f"{path.resolve().parent.name}-{path.stem}" if stems.count(path.stem) > 1 else path.stem
+        folders[name] = root / f"{stem}-{Path(request.suite).stem}-{request.pipeline}"
+    return folders
+
+
+def compare_all(
+    contestants: Sequence[str],
+    request: Request,
+    *,
+    folder: Path,
+    runs: Path,
+    command: Sequence[str] = (),
+    watch: Callable[[Status], None] | None = None,
+) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Evaluate what has not been evaluated yet, compare, and write the comparison.
+
+    Args:
+        contestants: policies, results folders or copies of ``results.json``.
+        request: how policies are evaluated; its policy is replaced by each.
+        folder: where the comparison goes.
+        runs: folder of the evaluations; what it holds is gone on with.
+        command: the command line, for the provenance.
+        watch: called a few times a second during an evaluation.
+
+    Returns:
+        The comparison as plain data, and its files.
+
+    Raises:
+        ComparisonError and those of ``evaluate``: one sentence. What can be known to be wrong is said before anything is played.
+    """
+    if len(contestants) < 2:
+        raise ComparisonError(f"a comparison needs at least two policies or results; only '{contestants[0]}' was given")
+    found = {c: load_result(Path(c)) for c in contestants if is_result(c)}
+    requests = {c: replace(request, policy=c) for c in contestants if c not in found}
+    for contestant, wanted in requests.items():
+        suite, _, _, environments, _ = prepare(wanted)
+        for other, result in found.items():
+            if result["suite"]["digest"] != suite.digest:
+                named = f"{result['suite']['name']} {result['suite']['version']}"
+                raise ComparisonError(
+                    f"results of different suites do not compare: '{other}' has {named}, '{contestant}' would be "
+                    f"evaluated on {suite.name} {suite.version}; choose with --suite"
+                )
+            present = {(e["terrain"], e["friction"], e["payload"]) for e in result["environments"]}
+            if present != {(e.terrain, e.friction, e.payload) for e in environments}:
+                raise ComparisonError(
+                    f"'{other}' has other environments than '{contestant}' would be given; choose them with --terrain, "
+                    "--friction and --payload"
+                )
+    for contestant, target in run_folders(requests, runs).items():
+        found[contestant] = evaluate(requests[contestant], target, resume=True, command=command, watch=watch)
+        write_report(target)
+    comparison = compare([found[c] for c in contestants])
+    return comparison.plain(), write_comparison(folder, comparison)

@@ -1,0 +1,355 @@
+"""Which differences between policies are real: results of one suite side by side, with chance known and many looks corrected for.
+
+Works on ``results.json`` alone (schema 2, whose rows hold every trial and run). Policies that were given the same seeds are
+compared seed by seed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from itertools import combinations
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+
+from .episodes import QUALITY
+from .intervals import CONFIDENCE, Array, Chance, ChanceRules, Evidence
+from .results import ONE_SEED, SCHEMA, environment_weights
+
+KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
+"""What is compared, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
+sub-commands are compared as measured, in the environments where both policies reached the same level; all else counts levels."""
+_SAME = {"suite": "suite", "backend": "engine", "robot": "robot", "pipeline": "pipeline"}
+"""What must be the same in all results, and its name for readers."""
+
+
+class ComparisonError(ValueError):
+    """Results that cannot be compared; the message says why and what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """One quantity of two policies."""
+
+    kind: str
+    """One of ``KINDS``."""
+    name: str
+    """Which terrain, metric …"""
+    first: str
+    second: str
+    """Labels of the policies."""
+    values: tuple[float, float]
+    difference: float
+    """Of the second minus the first."""
+    interval: tuple[float, float] | None
+    """95 % interval of the difference by itself; None with one seed."""
+    p_value: float | None
+    """How likely so large a difference is if both are the same, looked at alone."""
+    corrected: float | None
+    """The same among all that are looked at (Holm)."""
+
+    @property
+    def real(self) -> bool:
+        """Whether chance is ruled out, all looks considered."""
+        return self.corrected is not None and self.corrected < 1.0 - CONFIDENCE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What the comparison of some policies found."""
+
+    suite: Mapping[str, Any]
+    policies: tuple[Mapping[str, Any], ...]
+    """Label, path, file digest, score, interval and level of each."""
+    paired: bool
+    """Whether all were given the same seeds."""
+    differences: tuple[Difference, ...]
+    """Of all pairs, in the order of ``KINDS``."""
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the scores say, one sentence for each pair, and what the details add."""
+        scores = [d for d in self.differences if d.kind == "score"]
+        return [_score_sentence(d, len(scores)) for d in scores] + [self._details_sentence()]
+
+    def _details_sentence(self) -> str:
+        details = [d for d in self.differences if d.kind != "score"]
+        if any(d.corrected is None for d in details):
+            return "Nor can it be said of any detail."
+        real = sorted((d for d in details if d.real), key=lambda d: d.corrected or 0.0)
+        if not real:
+            return f"None of the {len(details)} differences in detail is real after Holm's correction."
+        pairs = len(self.policies) > 2
+        shown = ", ".join(
+            f"{d.kind} {d.name}{f' ({d.second} and {d.first})' if pairs else ''} {d.difference:+.4f}" for d in real[:4]
+        )
+        more = f" and {len(real) - 4} more" if len(real) > 4 else ""
+        return f"Of {len(details)} differences in detail {len(real)} are real after Holm's correction: {shown}{more}."
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "schema": 1,
+            "suite": dict(self.suite),
+            "policies": [dict(p) for p in self.policies],
+            "paired": self.paired,
+            "sentences": self.sentences,
+            "differences": [asdict(d) | {"real": d.real} for d in self.differences],
+        }
+
+
+def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None = None) -> Comparison:
+    """Compare all pairs of some results.
+
+    Args:
+        results: contents of ``results.json``, two or more.
+        labels: names of the policies; None for those of their files.
+
+    Raises:
+        ComparisonError: results of different suites, engines, robots or environments, or without scores.
+    """
+    if len(results) < 2:
+        raise ComparisonError(f"a comparison needs at least two policies or results, not {len(results)}")
+    labels = list(labels) if labels else _labels(results)
+    _check(results, labels)
+    rows = results[0]["environments"]
+    order = {_key(row): at for at, row in enumerate(rows)}
+    evidence = []
+    for at, found in enumerate(results):
+        same_order = sorted(found["environments"], key=lambda row: order[_key(row)])
+        evidence.append(Evidence(same_order, chance_rules_of(found), name=str(at)))
+    paired = len({(tuple(r["chance"]["seeds"]), len(r["chance"]["search_seeds"])) for r in results}) == 1
+    raw: list[tuple[str, str, int, int, tuple[float, float], Chance]] = []
+    for first, second in combinations(range(len(results)), 2):
+        for kind, name, measure in _quantities(results[0], evidence[first], evidence[second]):
+            (one, chance), (other, chance_of_other) = measure(evidence[first]), measure(evidence[second])
+            values = (_reported(results[first], kind, name, one), _reported(results[second], kind, name, other))
+            raw.append((kind, name, first, second, values, chance_of_other.minus(chance, paired=paired)))
+    p_values = [chance.p_value(values[1] - values[0]) for *_, values, chance in raw]
+    corrected: dict[int, float] = {}
+    for family in (True, False):
+        members = [at for at, item in enumerate(raw) if (item[0] == "score") is family and p_values[at] is not None]
+        corrected |= dict(zip(members, holm([p_values[at] or 0.0 for at in members]), strict=True))
+    differences = [
+        Difference(
+            kind=kind,
+            name=name,
+            first=labels[first],
+            second=labels[second],
+            values=(round(values[0], 6), round(values[1], 6)),
+            difference=round(values[1] - values[0], 6),
+            interval=chance.interval(values[1] - values[0], None),
+            p_value=p_values[at],
+            corrected=corrected.get(at),
+        )
+        for at, (kind, name, first, second, values, chance) in enumerate(raw)
+    ]
+    return Comparison(
+        suite=results[0]["suite"],
+        policies=tuple(
+            {
+                "label": label,
+                "path": found["policy"]["path"],
+                "file_sha256": found["policy"]["file_sha256"],
+                "score": found["score"],
+                "score_interval": found["score_interval"],
+                "level": found["level"],
+                "seeds": list(found["chance"]["seeds"]),
+            }
+            for label, found in zip(labels, results, strict=True)
+        ),
+        paired=paired,
+        differences=tuple(sorted(differences, key=lambda d: KINDS.index(d.kind))),
+    )
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's step-down correction: chance of one false alarm or more among all, whatever they have in common."""
+    order = np.argsort(p_values, kind="stable")
+    found = np.zeros(len(p_values))
+    highest = 0.0
+    for rank, at in enumerate(order):
+        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[at]))
+        found[at] = highest
+    return found.tolist()
+
+
+def load_result(path: Path) -> dict[str, Any]:
+    """Read a results folder, its ``results.json``, or a copy of that.
+
+    Raises:
+        ComparisonError: there is none, or it is damaged, or too old to compare.
+    """
+    file = path / "results.json" if path.is_dir() else path
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ComparisonError(f"there are no results at '{path}'; give a folder of 'gaitgauge evaluate'") from error
+    except (OSError, ValueError) as error:
+        raise ComparisonError(f"'{file}' cannot be read as results: {error}") from error
+    if not isinstance(found, dict) or found.get("schema") != SCHEMA or "environments" not in found:
+        schema = found.get("schema") if isinstance(found, dict) else None
+        raise ComparisonError(
+            f"'{file}' has schema {schema!r}, a comparison needs {SCHEMA}, which holds trials and runs; "
+            "run its evaluation again with --resume"
+        )
+    return found
+
+
+def chance_rules_of(results: Mapping[str, Any]) -> ChanceRules:
+    """The rules of chance that some results carry."""
+    found = {f.name: results["chance"][f.name] for f in fields(ChanceRules)}
+    return ChanceRules(**found | {k: tuple(found[k]) for k in ("seeds", "search_seeds")})
+
+
+def _check(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
+    """Refuse results that were not given the same episodes."""
+    for label, found in zip(labels, results, strict=True):
+        if found["score"] is None:
+            raise ComparisonError(
+                f"the results of '{label}' have levels and no scores; use the pipeline stress or multi"
+            )
+    suites = [f"{r['suite']['name']} {r['suite']['version']}" for r in results]
+    for label, suite, found in zip(labels[1:], suites[1:], results[1:], strict=True):
+        if suite != suites[0]:
+            raise ComparisonError(
+                f"results of different suites do not compare: '{labels[0]}' has {suites[0]}, '{label}' has {suite}; "
+                "evaluate both on one suite"
+            )
+        if found["suite"]["digest"] != results[0]["suite"]["digest"]:
+            raise ComparisonError(
+                f"'{labels[0]}' and '{label}' name the suite {suite}, but its rules were changed between them; "
+                "evaluate both again"
+            )
+        for key, word in list(_SAME.items())[1:]:
+            if found.get(key) != results[0].get(key):
+                raise ComparisonError(
+                    f"results with different {word}s do not compare: '{labels[0]}' has {results[0].get(key)}, "
+                    f"'{label}' has {found.get(key)}; evaluate both alike"
+                )
+        searched = [any(row.get("trials") for row in r["environments"]) for r in (results[0], found)]
+        if searched[0] != searched[1]:
+            given, other = (label, labels[0]) if searched[0] else (labels[0], label)
+            raise ComparisonError(
+                f"'{given}' was given its level and that of '{other}' was searched for; evaluate both with the same --level"
+            )
+        both = [{_key(row) for row in r["environments"]} for r in (results[0], found)]
+        lone = sorted(both[0] ^ both[1])
+        if lone:
+            terrain, friction, payload = lone[0]
+            owner = labels[0] if lone[0] in both[0] else label
+            raise ComparisonError(
+                f"'{labels[0]}' and '{label}' were not given the same environments: only '{owner}' has {terrain} at friction "
+                f"{friction:g} and payload {payload:g} kg; give both the same --terrain, --friction and --payload"
+            )
+
+
+def _reported(results: Mapping[str, Any], kind: str, name: str, value: float) -> float:
+    """A value as the results have it, which may be rounded by the suite's rules on its way."""
+    if kind == "score":
+        return float(results["score"])
+    if kind == "group":
+        return float(results["groups"][name])
+    return float(results["terrains"][name]["score"]) if kind == "terrain" else value
+
+
+Measure = Callable[[Evidence], tuple[float, Chance]]
+
+
+def _quantities(results: Mapping[str, Any], first: Evidence, second: Evidence) -> Iterator[tuple[str, str, Measure]]:
+    """Everything in which two policies are compared: kind, name, and what gives its value and chance."""
+    rows = first.rows
+    terrains = [row["terrain"] for row in rows]
+    yield "score", "score", partial(_score, environment_weights(terrains), (QUALITY,))
+    levelled = np.array([t != "flat" for t in terrains], dtype=np.float64)
+    if any(row.get("trials") for row in rows):
+        yield "level", "mean level", partial(_level, levelled / levelled.sum())
+    even = np.full(len(rows), 1.0 / len(rows))
+    for group, metrics in results["group_metrics"].items():
+        yield "group", group, partial(_score, even, tuple(metrics))
+    names = list(dict.fromkeys(terrains))
+    for terrain in names if len(names) > 1 else ():
+        mine = np.array([t == terrain for t in terrains])
+        yield "terrain", terrain, partial(_score, mine / mine.sum(), (QUALITY,))
+    for axis, other in (("friction", "payload"), ("payload", "friction")):
+        for value, weights in _sweep(rows, axis, other):
+            yield axis, f"{value:g}", partial(_score, weights, (QUALITY,))
+    alike = np.array([bool(a.get("runs")) and a["level"] == b["level"] for a, b in zip(rows, second.rows, strict=True)])
+    if alike.any():
+        same = alike / alike.sum()
+        commands = next(list(next(iter(row["runs"].values()))["commands"]) for row in rows if row.get("runs"))
+        for metric in results["metrics"]:
+            yield "metric", metric, partial(_as_measured, same, (metric,))
+        for command in commands:
+            yield "command", command, partial(_as_measured, same, (command,))
+
+
+def _score(weights: Array, columns: Sequence[str], evidence: Evidence) -> tuple[float, Chance]:
+    return evidence.value(weights, columns), evidence.chance(weights, columns)
+
+
+def _level(weights: Array, evidence: Evidence) -> tuple[float, Chance]:
+    return float(weights @ [row["level"] or 0 for row in evidence.rows]), evidence.level_chance(weights)
+
+
+def _as_measured(weights: Array, columns: Sequence[str], evidence: Evidence) -> tuple[float, Chance]:
+    value = float(weights @ evidence.runs(columns).mean(1))
+    return value, evidence.chance_at_levels(weights, columns)
+
+
+def _sweep(rows: Sequence[Mapping[str, Any]], axis: str, other: str) -> Iterator[tuple[float, Array]]:
+    """Values of friction, or of payload, and weights of their environments: those where the other was played with several."""
+    along = {o: {r[axis] for r in rows if r[other] == o} for o in {r[other] for r in rows}}
+    for value in sorted({r[axis] for r in rows}):
+        mine = [at for at, r in enumerate(rows) if r[axis] == value and len(along[r[other]]) > 1]
+        if mine:
+            weights = np.zeros(len(rows))
+            weights[mine] = environment_weights([rows[at]["terrain"] for at in mine])
+            yield value, weights
+
+
+def _key(row: Mapping[str, Any]) -> tuple[str, float, float]:
+    return row["terrain"], row["friction"], row["payload"]
+
+
+def _labels(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Short names that tell the policies apart: of the file, with its folder where that is not enough, numbered at last."""
+    paths = [PurePath(r["policy"]["path"].replace("\\", "/")) for r in results]
+    labels = [p.name.partition(".")[0] for p in paths]
+    if len(set(labels)) < len(labels):
+        labels = [f"{p.parent.name}/{p.name.partition('.')[0]}".lstrip("/") for p in paths]
+    if len(set(labels)) < len(labels):
+        labels = [f"{label} ({at})" for at, label in enumerate(labels, 1)]
+    return labels
+
+
+def _score_sentence(found: Difference, pairs: int) -> str:
+    higher, lower = (found.second, found.first) if found.difference > 0 else (found.first, found.second)
+    if found.interval is None or found.corrected is None:
+        return (
+            f"Whether '{higher}' or '{lower}' is better cannot be said: scores differ by {abs(found.difference):.4f}, "
+            f"{ONE_SEED}; evaluate with two seeds or more."
+        )
+    low, high = found.interval if found.difference > 0 else (-found.interval[1], -found.interval[0])
+    among = f" after correction for {pairs} comparisons" if pairs > 1 else ""
+    odds = f"p {format_p(found.corrected)}{among}"
+    if found.real:
+        return (
+            f"'{higher}' is better than '{lower}': its score is higher by {abs(found.difference):.4f} "
+            f"(95 % interval {low:.4f} to {high:.4f}, {odds})."
+        )
+    return (
+        f"The scores do not tell '{found.first}' and '{found.second}' apart: they differ by {abs(found.difference):.4f}, "
+        f"and {max(abs(low), abs(high)):.4f} either way could hide in chance ({odds})."
+    )
+
+
+def format_p(value: float | None) -> str:
+    """A p-value for readers."""
+    if value is None:
+        return "–"
+    return "< 0.001" if value < 0.001 else f"= {value:.3f}"

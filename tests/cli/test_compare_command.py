@@ -1,0 +1,66 @@
+"""``gaitgauge compare`` as a user runs it."""
+
+import json
+import shutil
+
+import pytest
+
+SUITE = """
+extends = "gaitgauge-1"
+name = "tiny"
+title = "a few seconds"
+goals = [{ name = "max_velocity", phases = [0.2, 0.1] }, { name = "target_pos_velocity", phases = [] }]
+
+[matrix]
+terrains = ["flat", "slope_fd"]
+frictions = [0.6]
+payloads = [0.0]
+seeds = [0, 1]
+search_seeds = [100, 101]
+
+[commands]
+target_time = { slope = 0.3, wave = 0.3, stairs = 0.3, obstacle = 0.3 }
+
+[settling]
+longest = 0.2
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    path = tmp_path / "tiny.toml"
+    path.write_text(SUITE)
+    return path
+
+
+def test_policies_and_results_side_by_side(run, tmp_path, policy, tiny):
+    other = tmp_path / "copies" / "another.gauge.pt"
+    other.parent.mkdir()
+    shutil.copy(policy, other)
+    out = tmp_path / "out"
+    command = ("compare", policy, other, "--suite", tiny, "--threads", 1, "--out", out)
+    done = run(*command)
+    assert done.exit_code == 0, done.output
+    assert "do not tell 'another' and 'standing' apart" in done.stdout.replace(
+        "'standing' and 'another'", "'another' and 'standing'"
+    )
+    assert {p.name for p in out.iterdir() if p.is_file()} == {f"comparison.{k}" for k in ("json", "csv", "tex", "html")}
+    # what has been played is not played again, and results stand in for policies
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*.npz")}
+    again = run("compare", out / "standing.gauge-tiny-stress", other, *command[3:], "--json")
+    assert again.exit_code == 0, again.output
+    assert json.loads(again.stdout) == json.loads((out / "comparison.json").read_text())
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("*.npz")} == before
+
+
+def test_what_cannot_be_compared_is_said_before_anything_is_played(run, refused, tmp_path, policy, tiny):
+    assert "at least two" in refused("compare", policy)
+    assert "there are no results at 'none.json'" in refused("compare", policy, "none.json")
+    first = tmp_path / "first"
+    done = run("evaluate", policy, "--suite", tiny, "--threads", 1, "--out", first)
+    assert done.exit_code == 0, done.output
+    sentence = refused("compare", first, policy, "--suite", "demo")
+    assert "results of different suites do not compare" in sentence and "choose with --suite" in sentence
+    sentence = refused("compare", first, policy, "--suite", tiny, "--friction", 0.9)
+    assert "other environments" in sentence
+    assert not (tmp_path / "results").exists()
