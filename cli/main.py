@@ -178,6 +178,27 @@ def compare(
 
 @app.command()
 @report_errors
+def validate(
+    tables: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="The measured table, then one for each simulator (CSV; docs/validate.md).", metavar="REAL SIM..."
+        ),
+    ] = None,
+    example: Annotated[str | None, typer.Option(help="Tables that ship with the project: paper.")] = None,
+    ranks_only: Annotated[
+        bool, typer.Option("--ranks-only", help="Values are on different scales: compare the order of policies alone.")
+    ] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Hold predictions of simulators against measurements of a robot: errors by motion and metric, and ranks of policies."""
+    from .validate import run_validation
+
+    run_validation(tables=tables or [], example_name=example, ranks_only=ranks_only, json_output=json_output)
+
+
+@app.command()
+@report_errors
 def consistency(
     policies: Annotated[
         list[str],
