@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
+from ..files.parsing import parse_yaml, read_text
 from ..robots.base import Robot
 from .base import PolicyError
 from .contract import ContractError, History, HistoryOrder, ObservationTerm, PolicyContract, go2_contract
-from .native import StoredNetwork, first_line
+from .native import StoredNetwork
 
 # Observation terms as Isaac Lab and mjlab name them.
 FOREIGN_TERMS: Mapping[str, str] = {
@@ -49,8 +49,8 @@ def sidecar_contract(path: Path) -> PolicyContract | None:
     for sidecar in (path.with_name(f"{path.stem}.contract.json"), path.with_name("contract.json")):
         if sidecar.is_file():
             try:
-                return PolicyContract.from_json(sidecar.read_text(encoding="utf-8"))
-            except (ContractError, UnicodeDecodeError) as error:
+                return PolicyContract.from_json(read_text(sidecar, "contract", PolicyError))
+            except ContractError as error:
                 raise PolicyError(f"'{sidecar}' is not a policy contract: {error}") from error
     return None
 
@@ -97,10 +97,7 @@ def deploy_contract(path: Path, robot: Robot) -> PolicyContract:
     Raises:
         PolicyError: the file is malformed, or asks for something that a contract cannot express.
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise PolicyError(f"'{path}' is not valid YAML: {first_line(error)}") from error
+    data = parse_yaml(read_text(path, "deploy file", PolicyError), f"'{path}'", PolicyError)
     try:
         return _deploy_contract(data, path, robot)
     except ContractError as error:
@@ -348,7 +345,6 @@ def _activation(path: Path) -> str:
     settings = path.parent / "params" / "agent.yaml"
     if not settings.is_file():
         return "elu"
-    found = re.search(
-        r"^\s*activation:\s*['\"]?(\w+)", settings.read_text(encoding="utf-8", errors="replace"), re.MULTILINE
-    )
+    text = read_text(settings, "training configuration", PolicyError)
+    found = re.search(r"^\s*activation:\s*['\"]?(\w+)", text, re.MULTILINE)
     return found.group(1).lower() if found else "elu"

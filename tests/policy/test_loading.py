@@ -11,6 +11,7 @@ import torch
 from gaitgauge.policy import loading
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import ContractError, PolicyContract
+from gaitgauge.policy.digest import policy_digest
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import save_policy
@@ -176,6 +177,9 @@ def test_bare_checkpoint_with_normalization_and_activation(tmp_path, observation
     with torch.no_grad():
         expected = layers((observations[0] - 0.5) / 2.0)
         torch.testing.assert_close(load_policy(path).session(4).act(observations[0]), expected)
+    before = policy_digest(load_policy(path))
+    (tmp_path / "params" / "agent.yaml").write_text("actor:\n  hidden_dims: [16]\n  activation: relu\n")
+    assert policy_digest(load_policy(path)) != before
 
 
 def test_bare_checkpoint_of_a_student(tmp_path, cts_network: CtsNetwork, observations, run, cts_file):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from gaitgauge.files import plugins as plugins_module
 from gaitgauge.robots import JointParameters, Robot, RobotError, check_robot, load_robot, robot_names
+from gaitgauge.robots.loading import robot_digest
 
 LEGS = ("FL", "FR", "RL", "RR")
 
@@ -380,3 +381,78 @@ def test_listing_and_loading_import_no_engine():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_robot_s_digest_covers_the_model_and_all_that_it_includes(write_hopper):
+    path = write_hopper()
+    legs = path.parent / "model" / "parts" / "legs.xml"
+    mesh = path.parent / "model" / "meshes" / "shell.stl"
+    seen = [robot_digest(load_robot(path, check=False))]
+    assert seen[0] == robot_digest(load_robot(path, check=False))
+
+    def changed() -> bool:
+        seen.append(robot_digest(load_robot(path, check=False)))
+        return seen[-1] not in seen[:-1]
+
+    path.write_text(path.read_text().replace("stiffness = 30", "stiffness = 31"))
+    assert changed()
+    model = path.parent / "model" / "hopper.xml"
+    model.write_text(model.read_text().replace("<worldbody>", "<include file='parts/legs.xml'/><worldbody>"))
+    assert changed()
+    legs.parent.mkdir()
+    legs.write_text("<mujoco><compiler meshdir='meshes'/><asset><mesh file='shell.stl'/></asset></mujoco>")
+    assert changed()
+    mesh.parent.mkdir()
+    mesh.write_bytes(b"solid")
+    assert changed()
+    mesh.write_bytes(b"Solid")
+    assert changed()
+
+
+def test_a_sound_robot_is_compiled_once_until_a_file_changes(write_hopper, monkeypatch):
+    import mujoco
+
+    compiled = []
+    read = mujoco.MjSpec.from_file
+    monkeypatch.setattr(mujoco.MjSpec, "from_file", lambda file: compiled.append(file) or read(file))
+    path = write_hopper(("armature = 0.01", "armature = 0.0123"))
+    load_robot(path)
+    load_robot(path)
+    assert len(compiled) == 1
+    write_hopper(mjcf=('mass="3"', 'mass="3.5"'))
+    load_robot(path)
+    assert len(compiled) == 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "<mujoco>",
+        "<robot/>",
+        "<mujoco><worldbody><body/></worldbody></mujoco>",
+        "<mujoco><include file='missing.xml'/></mujoco>",
+        "<mujoco><include file='hopper.xml'/></mujoco>",
+        "<mujoco><asset><mesh file='missing.stl'/></asset></mujoco>",
+        "<mujoco><compiler angle='round'/></mujoco>",
+        "<mujoco><option timestep='-1'/><worldbody><body name='trunk'><freejoint/></body></worldbody></mujoco>",
+        "<mujoco><worldbody><body><joint type='free'/><geom size='nan'/></body></worldbody></mujoco>",
+        "<mujoco><default class='x'/><default class='x'/></mujoco>",
+        "<mujoco><extension><plugin plugin='mujoco.missing'/></extension></mujoco>",
+        "<!DOCTYPE a [<!ENTITY a 'xxxx'><!ENTITY b '&a;&a;'>]><mujoco model='&b;'/>",
+        "\ud83d\ude00".encode("utf-8", "surrogatepass").decode("utf-8", "replace"),
+    ],
+)
+def test_models_that_mujoco_refuses_are_one_sentence(write_hopper, text):
+    path = write_hopper()
+    (path.parent / "model" / "hopper.xml").write_text(text)
+    with pytest.raises(RobotError, match=r"hopper\.xml") as caught:
+        load_robot(path)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 600
+
+
+def test_a_binary_in_the_place_of_the_model(write_hopper):
+    path = write_hopper()
+    (path.parent / "model" / "hopper.xml").write_bytes(bytes(range(256)) * 10)
+    with pytest.raises(RobotError, match="not a model that MuJoCo can compile"):
+        load_robot(path)
