@@ -10,6 +10,7 @@ from types import TracebackType
 
 import numpy as np
 
+from ..files.writing import replacing
 from .errors import UserError
 
 RENDERERS = ("egl", "osmesa")
@@ -65,9 +66,9 @@ class Video:
         import imageio_ffmpeg
 
         self.path = path
-        self._partial = path.with_name(f".{os.getpid()}.{path.name}")
+        self._whole = replacing(path, UserError, ending=path.suffix)
         self._writer = imageio_ffmpeg.write_frames(
-            str(self._partial),
+            str(self._whole.__enter__()),
             (width, height),
             fps=fps,
             codec="libx264",
@@ -96,10 +97,7 @@ class Video:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._writer.close()
-        if kind is None:
-            os.replace(self._partial, self.path)
-        else:
-            self._partial.unlink(missing_ok=True)
+        self._whole.__exit__(kind, error, trace)
 
 
 class Picture:

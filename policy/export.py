@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import logging
 import math
-import os
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,6 +21,7 @@ import yaml
 from torch import nn
 from torch.nn import functional
 
+from ..files.writing import replacing
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, SDK_JOINTS, SDK_LEGS, deploy_contract, matching_joint
 from .base import Policy, PolicyError
@@ -411,16 +411,9 @@ def _largest_difference(policy: Policy, written: Path) -> float:
 
 def _write_checked(path: Path, data: bytes, check: Callable[[Path], float]) -> float:
     """Write beside the destination, check, and only then give it its name."""
-    partial = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
+    with replacing(path, ExportError) as partial:
         partial.write_bytes(data)
-        largest = check(partial)
-        os.replace(partial, path)
-    except OSError as error:
-        raise ExportError(f"'{path}' cannot be written: {error.strerror or error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
-    return largest
+        return check(partial)
 
 
 assert set(DEPLOY_TERMS.values()) <= set(FOREIGN_TERMS)

@@ -23,10 +23,8 @@ import hashlib
 import io
 import json
 import math
-import os
 import pickle
 import re
-import secrets
 import warnings
 import zipfile
 import zlib
@@ -38,6 +36,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..files.writing import replacing
 from .base import Policy, PolicyError, PolicySession, check_observation, checked_action
 from .contract import ContractError, PolicyContract
 from .fence.archive import packed, read_archive
@@ -147,16 +146,9 @@ def save_policy(
         )
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{os.getpid()}-{secrets.token_hex(4)}.partial")
-    try:
-        # Given a path, torch would write its name, and with it the process id, into the file: equal policies, unequal bytes.
-        with partial.open("wb") as file:
-            torch.save({**entries, **(extra or {})}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    # Given a path, torch would write its name into the file: equal policies, unequal bytes.
+    with replacing(target, PolicyError) as partial, partial.open("wb") as file:
+        torch.save({**entries, **(extra or {})}, file)
 
 
 def checksum(entries: Mapping[str, Any]) -> str:

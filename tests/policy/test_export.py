@@ -257,5 +257,5 @@ def test_bad_input(tmp_path):
     export_torchscript(policy, tmp_path / "policy.pt")
     with pytest.raises(ExportError, match="exported file already"):
         export_onnx(load_policy(tmp_path / "policy.pt"), tmp_path / "again.onnx")
-    with pytest.raises(ExportError, match="cannot be written: No such file"):
+    with pytest.raises(ExportError, match=r"cannot write .*: no such file"):
         export_torchscript(policy, Path(tmp_path / "none" / "policy.pt"))
