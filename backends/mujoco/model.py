@@ -11,8 +11,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ..terrains.base import Terrain
-from .base import BackendError, Scene
+from ...terrains.base import Terrain
+from ..base import BackendError, Scene
 
 CONTACT_SLOTS = 12
 """Ground contacts reported one by one, the strongest first; a robot that lies flat has about this many."""

@@ -5,7 +5,7 @@
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from .newton_kernels import ContactArrays, Layout, Motors, Palette, StateArrays, root_origin_velocity, root_rotation
+from .kernels import ContactArrays, Layout, Motors, Palette, StateArrays, root_origin_velocity, root_rotation
 
 wp.set_module_options({"enable_backward": False})
 

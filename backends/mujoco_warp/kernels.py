@@ -9,8 +9,8 @@ of them needs the host.
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from .mujoco_warp_arrays import ContactArrays, Motion, Motors, Palette, Roles, StateArrays
-from .warp.motor_law import motor_torque
+from ..warp.motor_law import motor_torque
+from .arrays import ContactArrays, Motion, Motors, Palette, Roles, StateArrays
 
 wp.set_module_options({"enable_backward": False})
 

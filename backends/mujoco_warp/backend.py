@@ -19,9 +19,7 @@ import mujoco_warp
 import torch
 import warp as wp
 
-from . import mujoco_warp_kernels as kernels
-from . import mujoco_warp_readout as readout
-from .base import (
+from ..base import (
     CAPABILITY_NAMES,
     BackendError,
     Capability,
@@ -32,7 +30,8 @@ from .base import (
     Scene,
     Support,
 )
-from .mujoco_warp_arrays import (
+from . import kernels, readout
+from .arrays import (
     StateArrays,
     allocate_state,
     contact_arrays,
@@ -43,11 +42,11 @@ from .mujoco_warp_arrays import (
     shared_array,
     to_warp,
 )
-from .mujoco_warp_device import DeviceScope, bytes_per_world, find_device, is_memory_error, memory_advice
-from .mujoco_warp_fields import repair_height_fields
-from .mujoco_warp_model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model
-from .mujoco_warp_order import CanonicalOrder
-from .mujoco_warp_parameters import BATCHED_FIELDS, WorldParameters
+from .device import DeviceScope, bytes_per_world, find_device, is_memory_error, memory_advice
+from .height_fields.repair import repair_height_fields
+from .model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model
+from .order import CanonicalOrder
+from .parameters import BATCHED_FIELDS, WorldParameters
 
 repair_height_fields()
 

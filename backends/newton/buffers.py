@@ -11,12 +11,12 @@ import torch
 import warp as wp
 from numpy.typing import ArrayLike
 
-from . import newton_kernels as kernels
-from .base import PhysicsState, Scene
-from .motor_law import MotorLimits
-from .newton_model import SlotTables, WorldLayout, WorldModel
-from .newton_solvers import SolverAdapter, dry_friction_slope
-from .warp.motor_law import limit_arrays
+from ..base import PhysicsState, Scene
+from ..motor_law import MotorLimits
+from ..warp.motor_law import limit_arrays
+from . import kernels
+from .model import SlotTables, WorldLayout, WorldModel
+from .solvers import SolverAdapter, dry_friction_slope
 
 SMALLEST_MASS = 0.01
 """A base never gets lighter than this [kg]."""

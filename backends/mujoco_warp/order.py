@@ -12,7 +12,7 @@ rows by kind and contact before the solver.
 import mujoco_warp
 import warp as wp
 
-from .mujoco_warp_arrays import vec5
+from .arrays import vec5
 
 wp.set_module_options({"enable_backward": False})
 

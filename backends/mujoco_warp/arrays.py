@@ -13,9 +13,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from .base import PhysicsState
-from .mujoco_warp_model import FootChains, PaletteTables, SharedModel
-from .warp.motor_law import Limits
+from ..base import PhysicsState
+from ..warp.motor_law import Limits
+from .model import FootChains, PaletteTables, SharedModel
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 """mujoco_warp's five friction coefficients of a contact: sliding twice, torsional, rolling twice."""

@@ -10,9 +10,9 @@ import mujoco_warp
 import torch
 import warp as wp
 
-from .base import BackendError
-from .mujoco_warp_fields import SEARCH_THREADS, scratch_bytes
-from .mujoco_warp_model import Capacity
+from ..base import BackendError
+from .height_fields.repair import SEARCH_THREADS, scratch_bytes
+from .model import Capacity
 
 _SCRATCH_FACTOR = 1.3
 """Memory with the solver's scratch arrays, in units of the engine's data."""

@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..terrains.base import Terrain
-from .base import BackendError, Scene
-from .mujoco_model import robot_spec
+from ...terrains.base import Terrain
+from ..base import BackendError, Scene
+from ..mujoco.model import robot_spec
 
 PARKED = (0.0, 0.0, -1000.0)
 """Where unused slots wait, out of reach of any robot."""

@@ -13,7 +13,7 @@ velocity, both in the world frame; ``body_qd`` likewise. The contract's are wxyz
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from .warp.motor_law import Limits, motor_torque
+from ..warp.motor_law import Limits, motor_torque
 
 wp.set_module_options({"enable_backward": False})
 

@@ -18,11 +18,11 @@ import newton
 import torch
 import warp as wp
 
-from . import newton_kernels as kernels
-from . import newton_readout_kernels as readout
-from .base import BackendError, Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, Scene
-from .mujoco_warp_device import is_memory_error, memory_advice
-from .newton_buffers import (
+from ..base import BackendError, Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, Scene
+from ..mujoco_warp.device import is_memory_error, memory_advice
+from . import kernels
+from . import readout_kernels as readout
+from .buffers import (
     MassTensors,
     MotorTensors,
     allocate_state,
@@ -31,9 +31,9 @@ from .newton_buffers import (
     layout_structure,
     palette_structure,
 )
-from .newton_description import describe_newton
-from .newton_model import BIRTH_HEIGHT, build_world_model
-from .newton_solvers import SOLVERS, SolverAdapter
+from .description import describe_newton
+from .model import BIRTH_HEIGHT, build_world_model
+from .solvers import SOLVERS, SolverAdapter
 
 
 class NewtonBackend(PhysicsBackend):

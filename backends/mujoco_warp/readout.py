@@ -8,7 +8,7 @@ Floating-point sums run inside one thread in the order of the constraint rows: n
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from .mujoco_warp_arrays import ContactArrays, Links, Motion, Motors, Roles, StateArrays
+from .arrays import ContactArrays, Links, Motion, Motors, Roles, StateArrays
 
 wp.set_module_options({"enable_backward": False})
 

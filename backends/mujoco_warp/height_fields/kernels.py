@@ -17,7 +17,7 @@ from mujoco_warp._src.collision_core import contact_margin_gap, geom_collision_p
 from mujoco_warp._src.collision_gjk import ccd
 from mujoco_warp._src.types import GeomType, OverflowType, mat63
 
-from .mujoco_warp_prisms import TOUCH, prism_of, sphere_on_prism, stays_clear, without_margin
+from .prisms import TOUCH, prism_of, sphere_on_prism, stays_clear, without_margin
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .base import Scene
-from .description import ModelFields
-from .newton_buffers import MotorTensors
-from .newton_model import WorldModel
+from ..base import Scene
+from ..description import ModelFields
+from .buffers import MotorTensors
+from .model import WorldModel
 
 
 def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors) -> dict[str, list[float]]:

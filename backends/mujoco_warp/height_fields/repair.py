@@ -31,9 +31,9 @@ from mujoco_warp._src.collision_core import CollisionContext
 from mujoco_warp._src.math import upper_trid_index
 from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType, OverflowType
 
-from . import mujoco_warp_field_kernels as kernels
-from .mujoco_warp_field_contacts import Contacts, Materials, write_contacts
-from .mujoco_warp_prisms import support
+from . import kernels
+from .contacts import Contacts, Materials, write_contacts
+from .prisms import support
 
 _PRISMS = (8, 64)
 """Prisms that can be listed: for each contact that there is room for, and for each world besides."""

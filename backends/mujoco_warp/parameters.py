@@ -9,12 +9,12 @@ import numpy as np
 import torch
 import warp as wp
 
-from .base import BackendError, Randomization, Scene
-from .description import ModelFields
-from .motor_law import MotorLimits
-from .mujoco_warp_arrays import Motors, shared_array, to_warp
-from .mujoco_warp_model import SharedModel
-from .warp.motor_law import limit_arrays
+from ..base import BackendError, Randomization, Scene
+from ..description import ModelFields
+from ..motor_law import MotorLimits
+from ..warp.motor_law import limit_arrays
+from .arrays import Motors, shared_array, to_warp
+from .model import SharedModel
 
 BATCHED_FIELDS = (
     "geom_friction",

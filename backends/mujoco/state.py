@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .base import PhysicsState, Scene
-from .mujoco_model import CONTACT_SLOTS, FOOT_SLOTS
+from ..base import PhysicsState, Scene
+from .model import CONTACT_SLOTS, FOOT_SLOTS
 
 RECORDED = ("qpos", "qvel", "sensordata", "actuator_force", "site_xpos")
 """What the engine records after each substep. Positions and velocities are the new ones in qpos and qvel alone; elsewhere they

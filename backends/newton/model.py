@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ..terrains.base import HeightField, Terrain
-from .base import BackendError, Scene
-from .mujoco_model import robot_spec
+from ...terrains.base import HeightField, Terrain
+from ..base import BackendError, Scene
+from ..mujoco.model import robot_spec
 
 PARKED = (0.0, 0.0, -1000.0)
 """Where unused slots wait, out of reach of any robot."""

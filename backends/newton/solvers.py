@@ -17,12 +17,11 @@ import newton
 import numpy as np
 import warp as wp
 
-from . import newton_kernels as kernels
-from . import newton_solver_kernels as solver_kernels
-from .base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
-from .mujoco_warp_fields import repair_height_fields
-from .mujoco_warp_model import SMALLEST_TOLERANCE
-from .newton_model import WorldModel, carriers, import_differences
+from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
+from ..mujoco_warp.height_fields.repair import repair_height_fields
+from ..mujoco_warp.model import SMALLEST_TOLERANCE
+from . import kernels, solver_kernels
+from .model import WorldModel, carriers, import_differences
 
 repair_height_fields()
 

@@ -8,7 +8,7 @@ from mujoco_warp._src.collision_core import contact_material_params, write_conta
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
-from .mujoco_warp_field_kernels import Lists, Shapes, Touch, margin_gap
+from .kernels import Lists, Shapes, Touch, margin_gap
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .base import (
+from ..base import (
     CAPABILITY_NAMES,
     BackendError,
     Capability,
@@ -31,10 +31,10 @@ from .base import (
     Scene,
     Support,
 )
-from .description import ModelFields
-from .motor_law import MotorLimits
-from .mujoco_model import CONTACT_SLOTS, FOOT_SLOTS, build_models
-from .mujoco_state import RECORDED, BatchState, Records, StateLayout
+from ..description import ModelFields
+from ..motor_law import MotorLimits
+from .model import CONTACT_SLOTS, FOOT_SLOTS, build_models
+from .state import RECORDED, BatchState, Records, StateLayout
 
 _STAGE = mujoco.mjtStage.mjSTAGE_VEL.value
 _INVALID = [
