@@ -29,8 +29,9 @@ from typing import Any
 
 import numpy as np
 from gaitgauge.backends.base import PhysicsOptions
+from gaitgauge.files.writing import write_atomically
 from gaitgauge.gauge.evaluate import Request, evaluate, policy_digest, prepare
-from gaitgauge.gauge.store import StoreError, write_atomically
+from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import Suite, SuiteError, load_suite
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.loading import load_policy
@@ -185,7 +186,7 @@ def training_suite(suite: Suite, physics: PhysicsOptions, parameters: str, folde
     ]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "training_physics.toml"
-    write_atomically(path, "\n".join(lines) + "\n")
+    write_atomically(path, "\n".join(lines) + "\n", StoreError)
     return path
 
 
@@ -236,7 +237,7 @@ def write_table(path: Path, rows: Mapping[tuple[str, str], Row]) -> None:
     writer = csv.DictWriter(text, FIELDS, lineterminator="\n", restval="", extrasaction="ignore")
     writer.writeheader()
     writer.writerows(ordered(rows))
-    write_atomically(path, text.getvalue())
+    write_atomically(path, text.getvalue(), StoreError)
 
 
 def ordered(rows: Mapping[tuple[str, str], Row]) -> list[Row]:

@@ -1,19 +1,18 @@
 """Where the time of a whole stress run on a GPU goes.
 
     python benchmarks/gpu_stress.py POLICY --warm-up --out stress.json
-    python benchmarks/gpu_stress.py POLICY --device cpu --terrain flat wave --friction 0.6 1.0 --seed 0 --slots 24 --limit 60
+    python benchmarks/gpu_stress.py POLICY --device cpu --terrain flat wave --friction 0.6 1.0 --seed 0 --worlds 24 --limit 60
 
 Plays ``gaitgauge evaluate POLICY --suite robogauge-1.1 --backend mujoco-warp --device cuda`` into a temporary folder and
-prints: wall time; control steps in a row; milliseconds of a control step spent in physics, in the rest of the runner's work on
-the device, and on the host at looks while the device waits; start-up; and a line for every 200 control steps with the worlds at
-work. With ``--device cpu`` it does on the CPU what a GPU would do (all levels at once, a look every ten control steps), for
+prints: wall time; control steps in a row; milliseconds of a control step spent in physics, in the rest of the rollout's work on
+the device, and on the host at polls while the device waits; start-up; and a line for every 200 control steps with the worlds at
+work. With ``--device cpu`` it does on the CPU what a GPU would do (all levels at once, a poll every ten control steps), for
 trying out. ``--warm-up`` compiles the kernels before anything is timed, with the same ground and a few worlds.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import logging
 import tempfile
@@ -26,13 +25,12 @@ from typing import Any
 
 import torch
 from gaitgauge.gauge import evaluate as evaluation
-from gaitgauge.gauge import lanes
-from gaitgauge.gauge.episodes import Episode, Record
+from gaitgauge.gauge import workers
+from gaitgauge.gauge.dispatcher import Speculation
+from gaitgauge.gauge.episodes import Episode
 from gaitgauge.gauge.goals import TARGET
-from gaitgauge.gauge.lanes import LaneJob
-from gaitgauge.gauge.pipelines import Plan
-from gaitgauge.gauge.runner import LOOK_INTERVAL, EpisodeRunner, Progress
-from gaitgauge.policy.base import Policy
+from gaitgauge.gauge.rollout import POLL_INTERVAL, Rollout
+from gaitgauge.gauge.workers import Job
 
 LINE_STEPS = 200
 
@@ -75,11 +73,11 @@ class Account:
 
     started: float = 0.0
     """When the worlds were ready."""
-    runner: EpisodeRunner | None = None
+    rollout: Rollout | None = None
     watches: dict[str, Stopwatch] = field(default_factory=dict)
     host: dict[str, float] = field(default_factory=dict)
     """Seconds of the host's clock in parts of the loop."""
-    looks: int = 0
+    polls: int = 0
     lines: list[dict[str, float]] = field(default_factory=list)
 
 
@@ -96,12 +94,11 @@ def timed(account: Account, name: str, function: Callable[..., Any]) -> Callable
     return call
 
 
-def instrument(account: Account, runner: EpisodeRunner, limit: float) -> None:
-    """Make a runner tell where its time goes."""
-    slots, device = runner._slots, runner.backend.device
-    names = ("physics", "limp", "block")
-    account.watches = {name: Stopwatch(device) for name in names}
-    step, advance = runner.backend.step, slots.advance
+def instrument(account: Account, rollout: Rollout, limit: float) -> None:
+    """Make a rollout tell where its time goes."""
+    device = rollout.backend.device
+    account.watches = {name: Stopwatch(device) for name in ("physics", "limp", "block")}
+    step, launch, poll = rollout.backend.step, rollout.launch, rollout.poll
 
     def timed_step(*arguments: Any, **options: Any) -> None:
         watch = account.watches["limp" if options.get("substeps") == 1 else "physics"]
@@ -109,38 +106,43 @@ def instrument(account: Account, runner: EpisodeRunner, limit: float) -> None:
         step(*arguments, **options)
         watch.add(begin)
 
-    def timed_advance(steps: int) -> None:
+    def timed_launch() -> None:
         begin = account.watches["block"].mark()
-        advance(steps)
+        launch()
         account.watches["block"].add(begin)
 
-    look = timed(account, "waiting for the device", slots.look)
-
-    def counted_look() -> Any:
-        found = look()
-        account.looks += 1
-        if runner.control_steps // LINE_STEPS != (runner.control_steps - runner._look_interval) // LINE_STEPS:
-            line(account, len(slots._taken))
+    def counted_poll() -> Any:
+        if device.type == "cuda":
+            began = perf_counter()
+            torch.cuda.synchronize(device)
+            waited = account.host.get("waiting for the device", 0.0) + perf_counter() - began
+            account.host["waiting for the device"] = waited
+        records = poll()
+        account.polls += 1
+        if (
+            rollout.control_steps
+            and rollout.control_steps // LINE_STEPS != (rollout.control_steps - rollout.poll_interval) // LINE_STEPS
+        ):
+            line(account, rollout.backend.num_worlds - rollout.free_worlds)
         if perf_counter() - account.started > limit:
             raise OutOfTimeError
-        return found
+        return records
 
-    runner.backend.step = timed_step  # type: ignore[method-assign]
-    slots.advance = timed(account, "launching", timed_advance)  # type: ignore[method-assign]
-    slots.look = counted_look  # type: ignore[method-assign]
-    for name, part in (("collecting", "_look"), ("filing", "_report"), ("seating", "_fill")):
-        setattr(runner, part, timed(account, name, getattr(runner, part)))
-    account.runner, account.started = runner, perf_counter()
+    rollout.backend.step = timed_step  # type: ignore[method-assign]
+    rollout.launch = timed(account, "launching", timed_launch)  # type: ignore[method-assign]
+    rollout.poll = timed(account, "polling", counted_poll)  # type: ignore[method-assign]
+    rollout.begin = timed(account, "beginning segments", rollout.begin)  # type: ignore[method-assign]
+    account.rollout, account.started = rollout, perf_counter()
 
 
 def line(account: Account, taken: int) -> None:
     """Print how the run is, and keep it."""
-    assert account.runner is not None
+    assert account.rollout is not None
     physics = account.watches["physics"].total()
     before = account.lines[-1] if account.lines else {"control_steps": 0, "physics_s": 0.0}
-    steps = account.runner.control_steps - before["control_steps"]
+    steps = account.rollout.control_steps - before["control_steps"]
     row = {
-        "control_steps": account.runner.control_steps,
+        "control_steps": account.rollout.control_steps,
         "seconds": perf_counter() - account.started,
         "worlds_at_work": taken,
         "physics_s": physics,
@@ -156,93 +158,74 @@ def line(account: Account, taken: int) -> None:
 
 def summary(account: Account, began: float, ended: float) -> dict[str, Any]:
     """The figures of a run that got as far as it did."""
-    runner = account.runner
-    if runner is None or runner.control_steps == 0:
+    rollout = account.rollout
+    if rollout is None or rollout.control_steps == 0:
         return {"wall_s": ended - began}
-    steps, host = runner.control_steps, account.host
+    steps, host = rollout.control_steps, account.host
     physics, limp, block = (account.watches[name].total() for name in ("physics", "limp", "block"))
-    # what the host does while the device has nothing to do: looking at what ended, filling the slots
-    idle = host.get("collecting", 0.0) - host.get("waiting for the device", 0.0) + host.get("seating", 0.0)
+    # what the host does while the device has nothing to do: seeing what ended, filling the worlds
+    idle = host.get("polling", 0.0) - host.get("waiting for the device", 0.0) + host.get("beginning segments", 0.0)
     return {
         "wall_s": ended - began,
         "start_up_s": account.started - began,
         "playing_s": ended - account.started,
-        "worlds": runner.backend.num_worlds,
+        "worlds": rollout.backend.num_worlds,
         "control_steps": steps,
-        "physics_steps": runner.physics_steps,
-        "looks": account.looks,
+        "physics_steps": rollout.physics_steps,
+        "polls": account.polls,
         "ms_a_control_step": {
             "playing": (ended - account.started) / steps * 1e3,
             "physics": physics / steps * 1e3,
             "limp physics step of robots put back": limp / steps * 1e3,
-            "runner on the device": (block - physics) / steps * 1e3,
-            "host at looks": idle / steps * 1e3,
+            "rollout on the device": (block - physics) / steps * 1e3,
+            "host at polls": idle / steps * 1e3,
         },
         "share_of_wall": {
             "physics": (physics + limp) / (ended - began),
             "start_up": (account.started - began) / (ended - began),
         },
         "host_s": {name: round(seconds, 3) for name, seconds in host.items()},
-        "recorded": runner._slots._recording.enabled,
+        "captured": rollout.captured,
         "timeline": account.lines,
     }
 
 
-class Warming:
-    """An agenda with one walk on the first ground."""
-
-    def __init__(self, job: LaneJob) -> None:
-        terrain, level = job.terrains[0]
-        goals = tuple(goal.name for goal in job.suite.goals if goal.name != TARGET)
-        walk = {"terrain": terrain, "level": level, "friction": 0.5, "payload": 0.0, "seed": 0, "stage": "eval"}
-        self._waiting = [Episode(**walk, goals=goals)]  # type: ignore[arg-type]
-
-    def take(self, most: int, *, urgent: bool = False) -> list[Episode]:
-        """The walk, once."""
-        taken, self._waiting = ([], self._waiting) if urgent or not most else (self._waiting, [])
-        return taken
-
-    def finished(self, record: Record) -> tuple[()]:
-        """Nothing follows."""
-        return ()
-
-
-def compile_kernels(runner: EpisodeRunner, job: LaneJob) -> None:
-    """Play the beginning of a walk."""
-
-    def watch(progress: Progress) -> None:
-        if progress.control_steps >= 2 * runner._look_interval:
-            raise OutOfTimeError
-
-    with contextlib.suppress(OutOfTimeError):
-        runner.run(Warming(job), watch)
-    if runner.backend.device.type == "cuda":
-        torch.cuda.synchronize(runner.backend.device)
-    runner.backend.close()
+def compile_kernels(rollout: Rollout, job: Job) -> None:
+    """Play the beginning of a walk on the first ground."""
+    terrain, level = job.places[0]
+    goals = tuple(goal.name for goal in job.suite.goals if goal.name != TARGET)
+    walk = Episode(terrain=terrain, level=level, friction=0.5, payload=0.0, seed=0, stage="eval", goals=goals)
+    rollout.play([walk])
+    for _ in range(2):
+        rollout.advance()
+    if rollout.backend.device.type == "cuda":
+        torch.cuda.synchronize(rollout.backend.device)
+    rollout.backend.close()
 
 
 def run(arguments: argparse.Namespace) -> dict[str, Any]:
     """One run; returns its figures."""
     account = Account()
 
-    def build(job: LaneJob, policy: Policy) -> EpisodeRunner:
-        if arguments.slots:
-            job = replace(job, slots=arguments.slots)
+    def build(job: Job) -> Rollout:
+        if arguments.worlds:
+            job = replace(job, worlds=arguments.worlds)
         if arguments.warm_up:
             begun = perf_counter()
-            compile_kernels(plain(replace(job, slots=16), policy), job)
+            compile_kernels(plain(replace(job, worlds=16)), job)
             print(f"warm-up {perf_counter() - begun:.1f} s", flush=True)
             excluded[0] += perf_counter() - begun
-        runner = plain(job, policy)
-        instrument(account, runner, arguments.limit)
-        return runner
+        rollout = plain(job)
+        instrument(account, rollout, arguments.limit)
+        return rollout
 
-    plain, began, excluded = lanes.build_runner, perf_counter(), [0.0]
-    lanes.EpisodeRunner = partial(  # type: ignore[misc, assignment]
-        EpisodeRunner, look_interval=arguments.look_interval, capture=not arguments.no_capture
+    plain, began, excluded = workers.Job.rollout, perf_counter(), [0.0]
+    workers.Rollout = partial(  # type: ignore[misc, assignment]
+        Rollout, poll_interval=arguments.poll_interval, capture=not arguments.no_capture
     )
-    lanes.build_runner = build
-    evaluation.Plan = lambda *values, **options: Plan(*values, **options | {"speculative": True})  # type: ignore[misc, assignment]
+    workers.Job.rollout = build  # type: ignore[method-assign]
+    at_once = Speculation(at_work=arguments.worlds or 4096, test_probability=0.02, quality_probability=0.5)
+    evaluation.Speculation = lambda **options: at_once  # type: ignore[misc, assignment]
     request = evaluation.Request(
         policy=arguments.policy,
         suite=arguments.suite,
@@ -273,8 +256,8 @@ def main() -> None:
     parser.add_argument("--terrain", nargs="*", default=[])
     parser.add_argument("--friction", type=float, nargs="*", default=[])
     parser.add_argument("--seed", type=int, nargs="*", default=[])
-    parser.add_argument("--slots", type=int, default=0, help="worlds; 0 for as many as evaluate takes")
-    parser.add_argument("--look-interval", type=int, default=LOOK_INTERVAL)
+    parser.add_argument("--worlds", type=int, default=0, help="worlds; 0 for as many as evaluate takes")
+    parser.add_argument("--poll-interval", type=int, default=POLL_INTERVAL)
     parser.add_argument("--no-capture", action="store_true", help="do not record control steps as CUDA graphs")
     parser.add_argument("--warm-up", action="store_true", help="compile the kernels before anything is timed")
     parser.add_argument("--limit", type=float, default=500.0, help="stop playing after so many seconds")

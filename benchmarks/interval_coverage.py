@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gaitgauge.files.writing import write_atomically
 from gaitgauge.gauge.comparison import compare
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.intervals import ChanceRules, Evidence
 from gaitgauge.gauge.level_chance import bisect
 from gaitgauge.gauge.results import SCHEMA, environment_weights
-from gaitgauge.gauge.store import write_atomically
+from gaitgauge.gauge.store import StoreError
 from numpy.typing import NDArray
 
 DATA = Path(__file__).parents[1] / "docs" / "data" / "repeated_evaluations.json"
@@ -301,7 +302,7 @@ def main() -> None:
         if arguments.folder is None:
             parser.error("--record needs a --folder to play in")
         recorded = record(arguments.record, arguments.folder, arguments.threads)
-        write_atomically(arguments.data, json.dumps(recorded, separators=(",", ":")) + "\n")
+        write_atomically(arguments.data, json.dumps(recorded, separators=(",", ":")) + "\n", StoreError)
     recorded = json.loads(arguments.data.read_text())
     print(f"{len(recorded)} whole evaluations with fresh seeds\n")
     print(f"{'':24}{'mean':>9}{'1.96 σ':>9}{'printed':>9}{'covered':>9}")

@@ -42,13 +42,13 @@ def run_evaluation(
         threads=threads or os.cpu_count() or 1,
         **choices,
     )
-    prepare(request)  # all that can be wrong with the request is said before anything is written
+    prepared = prepare(request)  # all that can be wrong with the request is said before anything is written
     folder = out or Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
     console = Terminal(stderr=True)
     try:
         with ProgressDisplay(console, "gauging") as display:
             results = evaluate(
-                request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=shower(display)
+                prepared, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=shower(display)
             )
     except KeyboardInterrupt:
         again = shell_command(None, "--resume")

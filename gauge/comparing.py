@@ -59,8 +59,9 @@ def compare_all(
         raise ComparisonError(f"a comparison needs at least two policies or results; only '{contestants[0]}' was given")
     found = {c: load_result(Path(c)) for c in contestants if is_result(c)}
     requests = {c: replace(request, policy=c) for c in contestants if c not in found}
-    for contestant, wanted in requests.items():
-        suite, _, _, environments, _ = prepare(wanted)
+    prepared_requests = {c: prepare(wanted) for c, wanted in requests.items()}
+    for contestant, prepared in prepared_requests.items():
+        suite = prepared.suite
         for other, result in found.items():
             if result["suite"]["digest"] != suite.digest:
                 named = f"{result['suite']['name']} {result['suite']['version']}"
@@ -69,13 +70,13 @@ def compare_all(
                     f"evaluated on {suite.name} {suite.version}; choose with --suite"
                 )
             present = {(e["terrain"], e["friction"], e["payload"]) for e in result["environments"]}
-            if present != {(e.terrain, e.friction, e.payload) for e in environments}:
+            if present != {(e.terrain, e.friction, e.payload) for e in prepared.environments}:
                 raise ComparisonError(
                     f"'{other}' has other environments than '{contestant}' would be given; choose them with --terrain, "
                     "--friction and --payload"
                 )
     for contestant, target in run_folders(requests, runs).items():
-        found[contestant] = evaluate(requests[contestant], target, resume=True, command=command, watch=watch)
+        found[contestant] = evaluate(prepared_requests[contestant], target, resume=True, command=command, watch=watch)
         write_report(target)
     comparison = compare([found[c] for c in contestants])
     return comparison.plain(), write_comparison(folder, comparison)

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import jinja2
 
+from ..files.writing import write_atomically
 from .charts import terrain_label
-from .comparison import KINDS, Comparison, Difference, format_p
+from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p
 from .consistency import charts
 from .report import TEMPLATES, metric_label
-from .store import write_atomically
 
 _TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}", "\\": r"\textbackslash{}"}
 _TEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", "–": "--"}
@@ -35,7 +35,7 @@ def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
     }
     paths = {kind: folder / f"comparison.{kind}" for kind in contents}
     for kind, text in contents.items():
-        write_atomically(paths[kind], text)
+        write_atomically(paths[kind], text, ComparisonError)
     return paths
 
 

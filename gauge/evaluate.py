@@ -1,44 +1,53 @@
-"""One evaluation from request to results: builds the worlds, plays the plan, keeps every episode, writes ``results.json``."""
+"""One evaluation, from a request to ``results.json``, in four steps.
+
+``plan``: an environment and the records there are say what is required next, and what counts.
+``workers``: play the episodes that the ``dispatcher`` pushes to them, and send records back.
+``rollout``: what a worker does: a loop over the worlds of one backend.
+``results``: the counted records become rows and scores.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import platform
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ..backends.mujoco import MujocoBackend
-from ..backends.registry import find_backend
+from ..backends.base import PhysicsBackend
+from ..backends.registry import find_backend, make_backend
+from ..files.provenance import provenance
+from ..files.writing import write_atomically
 from ..policy.base import Policy
 from ..policy.contract import check_robot
 from ..policy.loading import find_policy, load_policy
 from ..robots import Robot, RobotError, load_robot
 from ..terrains.registry import make_terrain, terrain_names
-from .episodes import Episode
+from .dispatcher import Dispatcher, Speculation, play
+from .episodes import QUALITY, Episode
 from .goals import SUB_COMMANDS, TARGET, check_terrain
-from .lanes import LaneJob, play, play_in_lanes
-from .pipelines import PIPELINES, Environment, Plan, make_environments
+from .pipelines import PIPELINES, Environment, make_environments
+from .plan import Plan, PlanRules, environment_result, plan
 from .results import fold, health, rows_csv
-from .runner import Progress
-from .store import RunFolder, write_atomically
-from .suite import Goal, Suite, SuiteError, load_suite
+from .segments import count_segments
+from .store import RunFolder, StoreError
+from .suite import Suite, SuiteError, load_suite
+from .workers import Job, local_workers, start_workers
 
-PACKAGES = ("gaitgauge", "mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib")
-_SLOTS = 24
-"""Worlds of a process on the CPU: more share the loop's cost, fewer keep more processes busy to the end."""
-_GPU_SLOTS = 4096
+_WORLDS = 24
+"""Worlds of a worker on the CPU: more share the loop's cost, fewer keep more workers busy to the end."""
+_GPU_WORLDS = 4096
 """Largest number of worlds on a GPU."""
+_EARLY = 16
+"""Episodes of a worker on the CPU up to which it plays others speculatively: more of them slow those that are required."""
 _WATCH_INTERVAL = 0.2
-"""Time between two looks at how far a run is [s]."""
+"""Shortest time between two calls of ``watch`` [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,24 +71,40 @@ class Request:
     """Run the program that a policy file of the project's own format carries inside."""
 
 
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class Status:
     """How far an evaluation is, for the progress display."""
 
     done: int
-    """Episodes that have ended, those of an earlier run included."""
-    known: int
-    """Episodes known to be needed so far; level searches add more."""
+    """Counted episodes that have ended, those of an earlier run included."""
     expected: int
-    """Episodes expected in all, searches that are still open estimated."""
+    """Episodes expected in all, those of searches that are still open by their probability."""
     active: tuple[Episode, ...]
-    physics_steps: int
+    """Episodes at work."""
     seconds: float
     remaining_work: float
     """Estimated share of the work that is left, 0 to 1."""
 
 
-def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], list[int]]:
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """A request that can be carried out, and what it names."""
+
+    request: Request
+    suite: Suite
+    robot: Robot
+    policy: Policy
+    environments: tuple[Environment, ...]
+    seeds: tuple[int, ...]
+    """Seeds of the quality episodes."""
+
+    @property
+    def rules(self) -> PlanRules:
+        """What plans depend on."""
+        return PlanRules(suite=self.suite, seeds=self.seeds, quality=self.request.pipeline != "level")
+
+
+def prepare(request: Request) -> Prepared:
     """Check a request and load what it names.
 
     Raises:
@@ -118,8 +143,8 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
         suite, terrains=terrains, frictions=frictions or None, payloads=payloads or None, level=level
     )
     for name, environment in {e.terrain: e for e in environments}.items():
-        level = suite.scoring.levels if environment.searched else environment.level
-        check_terrain(suite, make_terrain(name, level), searched=environment.searched)
+        highest = suite.scoring.levels if environment.level is None else environment.level
+        check_terrain(suite, make_terrain(name, highest), searched=environment.searched)
     policy = load_policy(request.policy, robot, trust=request.trust)
     check_robot(policy.contract, robot)
     if abs(policy.contract.control_period - suite.physics.control_period) > 1e-9:
@@ -127,7 +152,14 @@ def prepare(request: Request) -> tuple[Suite, Robot, Policy, list[Environment], 
             f"the policy was made for a control period of {policy.contract.control_period:g} s, suite '{suite.name}' runs "
             f"{suite.physics.control_period:g} s; use a policy of that period"
         )
-    return suite, robot, policy, environments, list(dict.fromkeys(seeds))
+    return Prepared(
+        request=request,
+        suite=suite,
+        robot=robot,
+        policy=policy,
+        environments=tuple(environments),
+        seeds=tuple(dict.fromkeys(seeds)),
+    )
 
 
 def _terrains(request: Request, suite: Suite) -> list[str]:
@@ -159,20 +191,21 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
     return chosen
 
 
-def identity(request: Request, suite: Suite, policy: Policy, environments: list[Environment], seeds: list[int]) -> dict:
+def identity(prepared: Prepared) -> dict[str, Any]:
     """What decides about the results: a folder that holds another run is refused."""
+    request, suite = prepared.request, prepared.suite
     return {
         "suite": f"{suite.name} {suite.version}",
         "suite_digest": suite.digest,
-        "policy": policy.contract.hash,
+        "policy": prepared.policy.contract.hash,
         "policy_file": policy_digest(request.policy),
         "pipeline": request.pipeline,
         "backend": request.backend,
         "device": torch.device(request.device).type,
         "robot": request.robot,
         "level": request.level,
-        "environments": [e.key for e in environments],
-        "seeds": seeds,
+        "environments": [e.key for e in prepared.environments],
+        "seeds": list(prepared.seeds),
         "noise": "by segment",  # runs begun before episodes fell into segments drew theirs otherwise
     }
 
@@ -183,156 +216,144 @@ def policy_digest(name: str) -> str:
 
 
 def evaluate(
-    request: Request,
+    request: Request | Prepared,
     folder: Path,
     *,
     resume: bool = False,
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
+    make: Callable[..., PhysicsBackend] = make_backend,
 ) -> dict[str, Any]:
     """Evaluate a policy; every finished episode is on disk at once, so that nothing is lost when the process is killed.
 
     Args:
-        request: what to do.
+        request: what to do, as it is or prepared already.
         folder: where ``results.json``, ``episodes.csv``, ``report.html`` and ``episodes/`` go.
         resume: go on with what the folder holds.
         command: the command line, for the provenance.
-        watch: called a few times a second, between control steps.
+        watch: called a few times a second.
+        make: builds engines by name.
 
     Returns:
         The content of ``results.json``.
 
     Raises:
-        SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, StoreError: one sentence.
+        SuiteError, RobotError, PolicyError, ContractError, BackendError, StoreError, RecordError: one sentence.
     """
     began = time.perf_counter()
-    suite, robot, policy, environments, seeds = prepare(request)
-    store = RunFolder(folder, identity(request, suite, policy, environments, seeds), resume=resume)
-    on_cpu = torch.device(request.device).type == "cpu"
-    if on_cpu:
+    prepared = request if isinstance(request, Prepared) else prepare(request)
+    request, suite, rules = prepared.request, prepared.suite, prepared.rules
+    if torch.device(request.device).type == "cpu":
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
-    evaluated = request.pipeline != "level"
-    columns: tuple[str, ...] = (*suite.metrics.weights, "quality")
-    # A GPU plays every level of every search at once: a few long batches instead of many short ones.
-    plan = Plan(suite, environments, seeds, store, evaluate=evaluated, speculative=not on_cpu)
-    job, lanes = _job(request, suite, robot, policy, plan)
-    on_step = _watcher(plan, watch, began)
-    effort = play(job, policy, plan, on_step) if lanes == 1 else play_in_lanes(job, plan, lanes, on_step)
-    results = fold(suite, environments, columns, evaluated=evaluated)
-    results["policy"] = {
-        "path": policy.path,
-        "contract_hash": policy.contract.hash,
-        "file_sha256": policy_digest(request.policy),
-        "provenance": dict(policy.contract.provenance),
-    }
-    results["pipeline"] = request.pipeline
-    results["backend"] = request.backend
-    results["robot"] = robot.name
-    results["health"] = dict(health(environments))
-    results["solver"] = dict(find_backend(request.backend, request.device).solver_settings(suite.physics))
-    provenance = _provenance(request, command, time.perf_counter() - began, effort.physics_steps)
-    results["provenance"] = provenance | {"processes": lanes}
-    if effort.engine_seconds is not None:
-        results["provenance"]["engine_seconds"] = round(effort.engine_seconds, 2)
-    write_atomically(folder / "episodes.csv", rows_csv([r for e in environments for r in (*e.trials, *e.records)]))
-    write_atomically(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+    planners = [partial(plan, environment, rules=rules) for environment in prepared.environments]
+    on_progress = _watcher(prepared, watch, began)
+    with RunFolder(folder, identity(prepared), resume=resume) as store:
+        job, count, speculation = _workers(prepared, [planner(store.records) for planner in planners], make)
+        with closing(start_workers(job, count)) as workers:
+            effort = play(planners, store.records, store.put, workers, speculation=speculation, watch=on_progress)
+        outcomes = [environment_result(environment, store.records, rules) for environment in prepared.environments]
+        counted = [record for outcome in outcomes for record in (*outcome.trials, *outcome.records)]
+        results = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
+        results["policy"] = {
+            "path": prepared.policy.path,
+            "contract_hash": prepared.policy.contract.hash,
+            "file_sha256": policy_digest(request.policy),
+            "provenance": dict(prepared.policy.contract.provenance),
+        }
+        results["pipeline"] = request.pipeline
+        results["backend"] = request.backend
+        results["robot"] = prepared.robot.name
+        results["health"] = dict(health(outcomes))
+        results["solver"] = dict(find_backend(request.backend, request.device).solver_settings(suite.physics))
+        results["provenance"] = provenance(
+            command=command,
+            device=request.device,
+            threads=request.threads,
+            digests={"policy": policy_digest(request.policy), "suite": suite.digest},
+            seconds=round(time.perf_counter() - began, 2),
+            physics_steps=effort.physics_steps,
+            processes=count,
+        )
+        if effort.engine_seconds is not None:
+            results["provenance"]["engine_seconds"] = round(effort.engine_seconds, 2)
+        write_atomically(folder / "episodes.csv", rows_csv(counted), StoreError)
+        write_atomically(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n", StoreError)
+        store.discard_all_but([record.episode for record in counted])
     return results
 
 
-def _job(request: Request, suite: Suite, robot: Robot, policy: Policy, plan: Plan) -> tuple[LaneJob, int]:
-    """What to play with, and in how many processes."""
-    keys = [
+def _workers(
+    prepared: Prepared, plans: Sequence[Plan], make: Callable[..., PhysicsBackend]
+) -> tuple[Job, int, Speculation]:
+    """What to play with, how many workers play, and what they play speculatively."""
+    request, suite = prepared.request, prepared.suite
+    places = [
         (e.terrain, level)
-        for e in plan.environments
+        for e in prepared.environments
         for level in ([e.level] if e.level is not None else range(1, suite.scoring.levels + 1))
-        if level > 0 or e.terrain == "flat"
     ]
-    keys = list(dict.fromkeys(keys)) or [("flat", 0)]
-    parts = sum(len(SUB_COMMANDS[g.name]) for g in suite.goals if g.name != TARGET)
-    lanes = 1
-    tests, quality = plan.waiting
-    if torch.device(request.device).type == "cpu":
-        at_once = max(len(plan.seeds) * parts, len(suite.matrix.search_seeds))
-        slots = min(len(plan.environments) * at_once, _SLOTS)
-        if request.backend == MujocoBackend.name and os.name == "posix":
-            lanes = max(min(request.threads, tests + quality), 1)
+    required = [episode for found in plans for episode in found.required]
+    on_gpu = torch.device(request.device).type != "cpu"
+    count = local_workers(request.backend, request.device, threads=request.threads, most=len(required))
+    if on_gpu:
+        # a GPU plays nearly every level of every search at once: a few long batches instead of many short ones
+        speculation = Speculation(at_work=_GPU_WORLDS, test_probability=0.02, quality_probability=0.5)
+        worlds = min(max(sum(map(count_segments, (*required, *speculation.choose(plans, required)))), 1), _GPU_WORLDS)
     else:
-        slots = min(max(tests + quality * parts, 1), _GPU_SLOTS)
-    job = LaneJob(
-        policy=policy.path,
-        trust=request.trust,
+        walk = sum(len(SUB_COMMANDS[g.name]) for g in suite.goals if g.name != TARGET)
+        worlds = min(
+            len(prepared.environments) * max(len(prepared.seeds) * walk, len(suite.matrix.search_seeds)), _WORLDS
+        )
+        # a single worker has no core to spare
+        speculation = Speculation(at_work=_EARLY * count if count > 1 else 0)
+    job = Job(
         suite=suite,
-        robot=robot,
-        backend=request.backend,
-        device=request.device,
-        terrains=tuple(keys),
-        slots=slots,
-        threads=max(request.threads // lanes, 1),
+        policy=prepared.policy,
+        robot=prepared.robot,
+        places=tuple(dict.fromkeys(places)),
+        worlds=worlds,
+        build=partial(make, request.backend, device=request.device),
+        threads=max(request.threads // count, 1),
     )
-    return job, lanes
+    return job, count, speculation
 
 
-def _watcher(plan: Plan, watch: Callable[[Status], None] | None, began: float) -> Callable[[Progress], None] | None:
+def _watcher(
+    prepared: Prepared, watch: Callable[[Status], None] | None, began: float
+) -> Callable[[Dispatcher], None] | None:
+    """Tells ``watch`` now and then how far playing is."""
     if watch is None:
         return None
-    suite = plan.suite
-    goals: dict[str, Goal] = {g.name: g for g in suite.goals}
-    seconds: dict[str, float] = {
-        name: sum(goal.phases) * len(SUB_COMMANDS[name]) or 0.4 * max(suite.commands.target_time.values(), default=25.0)
-        for name, goal in goals.items()
+    suite = prepared.suite
+    # control steps that a goal usually takes; a target is reached, or missed, in part of the time that it may take
+    crossing = 0.4 * max(suite.commands.target_time.values(), default=25.0)
+    settling = suite.settling.shortest
+    usual: dict[str, float] = {
+        g.name: sum(sum(g.phases or (crossing,)) + settling for _ in SUB_COMMANDS[g.name])
+        / suite.physics.control_period
+        for g in suite.goals
     }
-
     next_time = began
 
-    def on_step(progress: Progress) -> None:
+    def on_progress(dispatcher: Dispatcher) -> None:
         nonlocal next_time
         if time.perf_counter() < next_time:
             return
-        left = plan.expected_left()
-        total = plan.done + left
-        expected = round(total)
-        active = progress.active()
-        for episode, age in active.items():
-            usual = sum(seconds[g] for g in episode.goals) / suite.physics.control_period
-            left -= min(age / usual, 0.95)
+        plans, active = dispatcher.plans, dispatcher.active()
+        required = {episode for found in plans for episode in found.required}
+        done = sum(len(found.counted) - len(found.required) for found in plans)
+        left = len(required) + sum(probability for found in plans for probability in found.possible.values())
+        total = done + left
+        left -= sum(min(age / sum(usual[g] for g in e.goals), 0.95) for e, age in active.items() if e in required)
         watch(
             Status(
-                done=plan.done,
-                known=plan.total_known,
-                expected=expected,
+                done=done,
+                expected=round(total),
                 active=tuple(active),
-                physics_steps=progress.physics_steps,
                 seconds=time.perf_counter() - began,
                 remaining_work=max(left, 0.0) / total if total else 0.0,
             )
         )
         next_time = time.perf_counter() + _WATCH_INTERVAL
 
-    return on_step
-
-
-def _provenance(request: Request, command: Sequence[str], seconds: float, physics_steps: int) -> dict[str, Any]:
-    """Where a result comes from."""
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed"
-    return {
-        "versions": versions,
-        "command": " ".join(command),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "host": platform.node(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs, {platform.system()} {platform.release()}",
-        "device": _device_name(request.device),
-        "threads": request.threads,
-        "seconds": round(seconds, 2),
-        "physics_steps": physics_steps,
-    }
-
-
-def _device_name(device: str) -> str:
-    if torch.device(device).type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return device
+    return on_progress

@@ -41,7 +41,7 @@ Command = tuple[float, float, float]
 class Schedule:
     """What every goal of a suite commands at every control step, worked out in advance.
 
-    A part is one sub-command of a goal, from one reset to the next. A goal's clock runs through its parts, starts with one
+    A sub-command runs from one reset to the next. A goal's clock runs through its sub-commands, starts with one
     control period at the first commanded step, stands still while the robot settles, and adds up rounding errors in double
     precision, as the reference's does.
     """
@@ -71,30 +71,31 @@ class Schedule:
         self.target_steps = {family: round(t / period) for family, t in suite.commands.target_time.items()}
         """Control steps that the target goal may take, by terrain family."""
         early = suite.commands.clock_offset * period
-        self.parts: dict[str, tuple[tuple[Command, ...], ...]] = {
-            g.name: ((),) if g.name == TARGET else _velocity_parts(g.name, g.phases, period, early) for g in suite.goals
+        self.sub_commands: dict[str, tuple[tuple[Command, ...], ...]] = {
+            g.name: ((),) if g.name == TARGET else _velocity_commands(g.name, g.phases, period, early)
+            for g in suite.goals
         }
-        """Commands of each part of each goal, one for each step, as multiples of the limits; none for the target goal."""
-        # One long table: zeros for the target goal, whose commands follow from the state, then every part, each after a row of
-        # zeros for the time in which the robot settles.
+        """Commands of each sub-command of each goal, one for each step, as multiples of the limits; none for the target goal."""
+        # One long table: zeros for the target goal, whose commands follow from the state, then every sub-command, each after a row
+        # of zeros for the time in which the robot settles.
         zero = (0.0, 0.0, 0.0)
         rows: list[Command] = [zero] * (1 + max(self.target_steps.values(), default=0))
         self._first: dict[tuple[str, int], int] = {}
-        for name, parts in self.parts.items():
-            for part, commands in enumerate(parts):
-                self._first[name, part] = 0 if name == TARGET else len(rows)
+        for name, sub_commands in self.sub_commands.items():
+            for number, commands in enumerate(sub_commands):
+                self._first[name, number] = 0 if name == TARGET else len(rows)
                 rows += [] if name == TARGET else [zero, *commands]
         self._rows = torch.tensor(rows, device=device, dtype=dtype)
 
-    def first_row(self, goal: str, part: int) -> int:
-        """Where a part begins in the table that ``commands`` reads."""
-        return self._first[goal, part]
+    def first_row(self, goal: str, sub_command: int) -> int:
+        """Where a sub-command begins in the table that ``commands`` reads."""
+        return self._first[goal, sub_command]
 
     def commands(self, row: torch.Tensor, limits: torch.Tensor) -> torch.Tensor:
         """Commands of the velocity goals, zero for the target goal.
 
         Args:
-            row: ``first_row`` of each part, plus the number of the commanded step from 1 on, or 0 while settling, (N,) int64.
+            row: ``first_row`` of each sub-command, plus the number of the commanded step from 1 on, or 0 while settling, (N,) int64.
             limits: command limits, (N, 3).
 
         Returns:
@@ -103,10 +104,10 @@ class Schedule:
         return self._rows.index_select(0, row) * limits
 
 
-def _velocity_parts(
+def _velocity_commands(
     name: str, phases: tuple[float, ...], period: float, early: float
 ) -> tuple[tuple[Command, ...], ...]:
-    """Commands of the parts of a velocity goal. The clock ends the last one, which may be a step short.
+    """Commands of a velocity goal's sub-commands, step by step. The clock ends the last one, which may be a step short.
 
     Args:
         name: the goal.
@@ -116,20 +117,20 @@ def _velocity_parts(
     """
     signs, duration, second = SUB_COMMANDS[name], sum(phases), _SECOND_PHASE[name]
     total, steps = duration * len(signs), round(duration / period)
-    parts: list[tuple[Command, ...]] = []
+    found: list[tuple[Command, ...]] = []
     time = 0.0
     for _ in signs:
         commands: list[Command] = []
         for _ in range(steps):
             time += period
             if time - early >= total:
-                return (*parts, tuple(commands))
+                return (*found, tuple(commands))
             at = math.floor((time - early) / duration)
             factor = 1.0 if time - early - at * duration < phases[0] else second
             x, y, yaw = signs[at] if at < len(signs) else (0, 0, 0)
             commands.append((factor * x + 0.0, factor * y + 0.0, factor * yaw + 0.0))  # no negative zeros
-        parts.append(tuple(commands))
-    return tuple(parts)
+        found.append(tuple(commands))
+    return tuple(found)
 
 
 def check_terrain(suite: Suite, terrain: Terrain, *, searched: bool) -> None:

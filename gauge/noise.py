@@ -17,25 +17,25 @@ from .suite import Noise
 TABLE_STEPS = 2000
 """Control steps of a seed that are drawn in advance at a time."""
 BLOCK_STEPS = 32
-"""Control steps that are looked up for all slots at a time."""
+"""Control steps that are looked up for all worlds at a time."""
 
 
 class NoiseStream(ABC):
-    """Draws for K slots: half widths times uniform numbers in [-1, 1), and delays. Every episode has a stream of its own."""
+    """Draws for K worlds: half widths times uniform numbers in [-1, 1), and delays. Every episode has a stream of its own."""
 
     tables: tuple[torch.Tensor, ...] = ()
     """Memory that ``draw`` reads, and that ``assign`` may replace by other memory."""
 
     @abstractmethod
-    def assign(self, slot: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
-        """Read an episode's stream in a slot, up to ``steps`` control steps from its start."""
+    def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
+        """Read an episode's stream in a world, up to ``steps`` control steps from its start."""
 
     @abstractmethod
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """Noise by observation term and delay [substeps] of every slot.
+        """Noise by observation term and delay [substeps] of every world.
 
         Args:
-            step: place in each slot's stream, in control steps, (…, K) int64.
+            step: place in each world's stream, in control steps, (…, K) int64.
 
         Returns:
             ``{term: (…, K, width)}`` in physical units, and (…, K) int64.
@@ -50,20 +50,20 @@ class ReferenceStream(NoiseStream):
     one seed therefore share one table. What no observation contains is drawn and forgotten.
     """
 
-    def __init__(self, noise: Noise, joints: int, slots: int, device: torch.device) -> None:
+    def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
         self._noise, self._joints, self._device = noise, joints, device
         self._seeds: dict[int, int] = {}
         self._generators: list[_PythonGenerator] = []
         self._length = 0
         self._uniform = torch.zeros(0, 0, 2 * joints + 3, device=device)
         self._delays = torch.zeros(0, 0, dtype=torch.int64, device=device)
-        self._row = torch.zeros(slots, dtype=torch.int64, device=device)
+        self._row = torch.zeros(worlds, dtype=torch.int64, device=device)
         half = [noise.joint_position] * joints + [noise.joint_velocity] * joints + [0.05] * 3
         half += [noise.base_angular_velocity] * 3 + [0.05] * 3 + [noise.base_angular_velocity] * 3
         self._half = half
         self._observed = [*range(2 * joints), *range(len(half) - 3, len(half))]
 
-    def assign(self, slot: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
+    def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
         """See ``NoiseStream.assign``."""
         if steps > self._length:
             more = -(-(steps - self._length) // TABLE_STEPS) * TABLE_STEPS
@@ -78,7 +78,7 @@ class ReferenceStream(NoiseStream):
             self._generators.append(generator)
             self._uniform = torch.cat((self._uniform, uniform))
             self._delays = torch.cat((self._delays, delays))
-        self._row[slot] = self._seeds[episode.seed]
+        self._row[world] = self._seeds[episode.seed]
 
     @property
     def tables(self) -> tuple[torch.Tensor, ...]:  # type: ignore[override]
@@ -176,17 +176,17 @@ def low_to_high(unit: NDArray[np.float64], half: Sequence[float]) -> NDArray[np.
 class CounterStream(NoiseStream):
     """A hash of (episode, control step, index): every episode has a stream of its own, with no state to carry."""
 
-    def __init__(self, noise: Noise, joints: int, slots: int, device: torch.device) -> None:
+    def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
         self._noise, self._joints = noise, joints
-        self._key = torch.zeros(slots, dtype=torch.int64, device=device)
+        self._key = torch.zeros(worlds, dtype=torch.int64, device=device)
         half = [noise.joint_position] * joints + [noise.joint_velocity] * joints + [noise.base_angular_velocity] * 3
         self._half = torch.tensor(half, device=device)
         self._index = torch.arange(2 * joints + 4, dtype=torch.int64, device=device)
 
-    def assign(self, slot: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
+    def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
         """See ``NoiseStream.assign``."""
         low, high = zlib.crc32(episode.key.encode()), zlib.crc32(episode.key[::-1].encode())
-        self._key[slot] = (high << 31) ^ low
+        self._key[world] = (high << 31) ^ low
 
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """See ``NoiseStream.draw``."""
@@ -219,34 +219,34 @@ def _shift(value: torch.Tensor, bits: int) -> torch.Tensor:
     return (value >> bits) & ((1 << (64 - bits)) - 1)
 
 
-def make_stream(noise: Noise, joints: int, slots: int, device: torch.device) -> ReferenceStream | CounterStream:
+def make_stream(noise: Noise, joints: int, worlds: int, device: torch.device) -> ReferenceStream | CounterStream:
     """The stream that a suite asks for."""
-    return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, slots, device)
+    return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, worlds, device)
 
 
 class NoiseReader:
     """Reads K streams step by step, many steps at a time."""
 
-    def __init__(self, stream: NoiseStream, slots: int, device: torch.device) -> None:
+    def __init__(self, stream: NoiseStream, worlds: int, device: torch.device) -> None:
         self._stream = stream
         self._device = device
-        self._offset = torch.zeros(slots, dtype=torch.int64, device=device)
+        self._offset = torch.zeros(worlds, dtype=torch.int64, device=device)
         self._ahead = torch.arange(BLOCK_STEPS, device=device)[:, None]
         self._block: list[tuple[dict[str, torch.Tensor], torch.Tensor]] = []
         self._now = 0
 
-    def begin(self, slots: Sequence[int], episodes: Sequence[Episode], starts: Sequence[int], steps: int) -> None:
-        """Let some slots read other streams from the next step on.
+    def begin(self, worlds: Sequence[int], episodes: Sequence[Episode], starts: Sequence[int], steps: int) -> None:
+        """Let some worlds read other streams from the next step on.
 
         Args:
-            slots: which.
+            worlds: which.
             episodes: whose streams.
             starts: the places in them at which to begin, in control steps.
             steps: none of them reads more than this number of control steps.
         """
-        for slot, episode, start in zip(slots, episodes, starts, strict=True):
-            self._stream.assign(slot, episode, start + steps)
-        at = torch.tensor(slots, device=self._device)
+        for world, episode, start in zip(worlds, episodes, starts, strict=True):
+            self._stream.assign(world, episode, start + steps)
+        at = torch.tensor(worlds, device=self._device)
         self._offset[at] = torch.tensor(starts, device=self._device) - self._now
         self._block = []
 

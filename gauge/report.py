@@ -9,10 +9,11 @@ from typing import Any
 
 import jinja2
 
+from ..files.writing import write_atomically
 from . import charts
 from .charts import FLAT, Row, number, terrain_label
 from .results import SCHEMA
-from .store import StoreError, write_atomically
+from .store import StoreError
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -57,7 +58,7 @@ def write_report(folder: Path) -> Path:
     except (OSError, ValueError) as error:
         raise StoreError(f"{source} cannot be read ({error}); run gaitgauge evaluate again with --resume") from error
     page = folder / "report.html"
-    write_atomically(page, render(results))
+    write_atomically(page, render(results), StoreError)
     return page
 
 

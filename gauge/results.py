@@ -13,7 +13,7 @@ import numpy as np
 from .episodes import Record
 from .goals import SUB_COMMANDS, command_name
 from .intervals import CONFIDENCE, ChanceRules, Evidence
-from .pipelines import Environment
+from .plan import EnvironmentResult
 from .scoring import STATISTICS, Array, command_statistics, group_values, level_score, rounded, run_statistics
 from .suite import Suite
 
@@ -37,7 +37,7 @@ def chance_rules(suite: Suite, seeds: Sequence[int]) -> ChanceRules:
 
 
 def fold(
-    suite: Suite, environments: Sequence[Environment], columns: Sequence[str], *, evaluated: bool | None = None
+    suite: Suite, environments: Sequence[EnvironmentResult], columns: Sequence[str], *, evaluated: bool | None = None
 ) -> dict[str, Any]:
     """Everything of ``results.json`` but the policy and the provenance.
 
@@ -130,11 +130,13 @@ def environment_weights(terrains: Sequence[str]) -> Array:
     return np.array([1.0 / (count * list(terrains).count(t)) for t in terrains])
 
 
-def _mean_level(environments: Sequence[Environment]) -> float:
+def _mean_level(environments: Sequence[EnvironmentResult]) -> float:
     return float(np.mean([e.level or 0 for e in environments if e.terrain != "flat"]))
 
 
-def _environment(suite: Suite, environment: Environment, columns: list[str]) -> tuple[dict[str, Any], dict[str, Array]]:
+def _environment(
+    suite: Suite, environment: EnvironmentResult, columns: list[str]
+) -> tuple[dict[str, Any], dict[str, Array]]:
     """Row of one environment, and its level-weighted statistics by column and ``score``."""
     scoring, flat, level = suite.scoring, environment.terrain == "flat", environment.level or 0
     statistics = {n: np.zeros(3) for n in [*columns[:-1], "score"]}
@@ -147,12 +149,8 @@ def _environment(suite: Suite, environment: Environment, columns: list[str]) -> 
         "score": None,
         "interval": None,
     }
-    if environment.searched:
-        row["search"] = {
-            str(level): bool(test.passed)
-            for level, test in sorted(environment.tests.items())
-            if test.passed is not None
-        }
+    if environment.search is not None:
+        row["search"] = {str(level): passed for level, passed in sorted(environment.search.items())}
         row["trials"] = {str(level): {} for level in sorted({t.episode.level for t in environment.trials})}
         for trial in sorted(environment.trials, key=lambda t: t.episode):
             row["trials"][str(trial.episode.level)][str(trial.episode.seed)] = bool(trial.success)
@@ -235,7 +233,7 @@ def _numbers(names: Sequence[str], values: Sequence[Array]) -> dict[str, float]:
     return dict(zip(names, (_number(v) for v in np.ravel(np.asarray(values))), strict=bool(values)))
 
 
-def health(environments: Sequence[Environment]) -> Mapping[str, int]:
+def health(environments: Sequence[EnvironmentResult]) -> Mapping[str, int]:
     """How many quality episodes fell, diverged or overflowed."""
     records = [r for e in environments for r in e.records]
     return {

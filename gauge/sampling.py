@@ -14,6 +14,8 @@ from ..robots.base import Robot
 from .metrics import MetricEvaluator
 from .suite import Suite
 
+GRAVITY = 9.81
+"""[m/s²]; turns the robot's mass into its weight."""
 _MOTION = ("base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity_b")
 _JOINTS = ("joint_position", "joint_velocity", "joint_torque")
 _CONTACTS = ("ground_moment_w", "ground_force_w", "foot_normal_force", "foot_tangential_force")
@@ -39,10 +41,18 @@ class SampledState:
 
 
 class SampleTable:
-    """Samples of K slots. A slot's rows depend on its own segment alone, and so do the metrics worked out from them."""
+    """Samples of K worlds. A world's rows depend on its own segment alone, and so do the metrics worked out from them."""
 
     def __init__(
-        self, suite: Suite, robot: Robot, weight: float, slots: int, device: torch.device, dtype: torch.dtype
+        self,
+        suite: Suite,
+        robot: Robot,
+        weight: float,
+        worlds: int,
+        device: torch.device,
+        dtype: torch.dtype,
+        *,
+        one_by_one: bool,
     ) -> None:
         """Prepare the table; ``reserve`` gives it rows.
 
@@ -50,9 +60,11 @@ class SampleTable:
             suite: the rules.
             robot: the robot.
             weight: its weight [N].
-            slots: number of slots K.
+            worlds: number of worlds K.
             device: where the states live.
             dtype: floating-point type of the states.
+            one_by_one: evaluate metrics segment by segment. In a CPU's vector units the last bit may depend on who else is in a
+                batch, while a GPU evaluates all segments at once.
         """
         self._metrics = MetricEvaluator(suite.metrics, robot, weight, device, dtype)
         self.names = self._metrics.names
@@ -65,32 +77,30 @@ class SampleTable:
             self._widths += [3, 3, feet, feet]
         # then the command, the torque before, whether that is known, and whether the sample counts
         self._split = [*self._widths, 3, joints, 1, 1]
-        self._slots, self._device, self._dtype = slots, device, dtype
-        # in a CPU's vector units the last bit may depend on who else is in a batch: there, every segment has one of its own
-        self._together = device.type != "cpu"
+        self._worlds, self._device, self._dtype, self._one_by_one = worlds, device, dtype, one_by_one
         self.rows = torch.zeros(0, 0, device=device, dtype=dtype)
-        """Everybody's rows, one slot's after the other's; other memory after ``reserve``."""
-        self._begin = torch.zeros(slots, dtype=torch.int64, device=device)
+        """All rows, one world's after the other's; other memory after ``reserve``."""
+        self._begin = torch.zeros(worlds, dtype=torch.int64, device=device)
         self.capacity = 0
-        """Rows of each slot."""
-        self.count = torch.zeros(slots, dtype=torch.int64, device=device)
-        """Rows that each slot has filled, (K,)."""
-        self._torque = torch.zeros(slots, joints, device=device, dtype=dtype)
-        self._torque_known = torch.zeros(slots, dtype=torch.bool, device=device)
+        """Rows of each world."""
+        self.count = torch.zeros(worlds, dtype=torch.int64, device=device)
+        """Rows that each world has filled, (K,)."""
+        self._torque = torch.zeros(worlds, joints, device=device, dtype=dtype)
+        self._torque_known = torch.zeros(worlds, dtype=torch.bool, device=device)
 
     def reserve(self, rows: int) -> None:
         """Have room for segments of so many samples."""
         if rows <= self.capacity:
             return
-        # one row more, for those who have no sample to write
-        table = torch.zeros(self._slots, rows + 1, sum(self._split), device=self._device, dtype=self._dtype)
+        # one row more, for worlds that have no sample to write
+        table = torch.zeros(self._worlds, rows + 1, sum(self._split), device=self._device, dtype=self._dtype)
         if self.capacity:
-            table[:, : self.capacity] = self.rows.view(self._slots, self.capacity + 1, -1)[:, :-1]
+            table[:, : self.capacity] = self.rows.view(self._worlds, self.capacity + 1, -1)[:, :-1]
         self.rows, self.capacity = table.flatten(0, 1), rows
-        self._begin = torch.arange(self._slots, device=self._device) * (rows + 1)
+        self._begin = torch.arange(self._worlds, device=self._device) * (rows + 1)
 
     def clear(self, mask: torch.Tensor) -> None:
-        """Forget the samples of some slots, (K,) bool."""
+        """Forget the samples of some worlds, (K,) bool."""
         self.count.masked_fill_(mask, 0)
 
     def forget_torque(self, mask: torch.Tensor) -> None:
@@ -98,11 +108,11 @@ class SampleTable:
         self._torque_known &= ~mask
 
     def write(self, sample: PhysicsState, due: torch.Tensor, keep: torch.Tensor, command: torch.Tensor) -> None:
-        """Write a row for every slot whose sample is due.
+        """Write a row for every world whose sample is due.
 
         Args:
-            sample: the state at which it is taken; the other slots' rows do not matter.
-            due: (K,) bool; nobody's may be before ``reserve``.
+            sample: the state at which it is taken; the other worlds' rows do not matter.
+            due: (K,) bool; none may be before ``reserve``.
             keep: whether it counts, (K,) bool.
             command: commanded velocities, (K, 3).
         """
@@ -125,22 +135,22 @@ class SampleTable:
             self._torque_known |= active
 
     def read(
-        self, slots: Sequence[int], counts: Sequence[int], limits: torch.Tensor, friction: torch.Tensor
+        self, worlds: Sequence[int], counts: Sequence[int], limits: torch.Tensor, friction: torch.Tensor
     ) -> list[Samples]:
-        """What the metrics say of some slots' first samples.
+        """What the metrics say of some worlds' first samples.
 
         Args:
-            slots: which.
+            worlds: which.
             counts: number of samples T of each, at least 1.
-            limits: command limits of all slots' segments, (K, 3).
+            limits: command limits of all worlds' segments, (K, 3).
             friction: their friction coefficients, (K,).
         """
-        owner = np.repeat(slots, counts)
-        first = np.repeat(np.asarray(slots) * (self.capacity + 1) - np.cumsum(counts) + counts, counts)
-        at, slot = torch.tensor(np.stack((first + np.arange(len(owner)), owner)), device=self._device)
-        parts = [len(owner)] if self._together else list(counts)
-        rows = (self.rows[at], limits[slot], friction[slot])
-        values = torch.cat([self._evaluate(*part) for part in zip(*(x.split(parts) for x in rows), strict=True)])
+        owner = np.repeat(worlds, counts)
+        first = np.repeat(np.asarray(worlds) * (self.capacity + 1) - np.cumsum(counts) + counts, counts)
+        at, world = torch.tensor(np.stack((first + np.arange(len(owner)), owner)), device=self._device)
+        batches = list(counts) if self._one_by_one else [len(owner)]
+        rows = (self.rows[at], limits[world], friction[world])
+        values = torch.cat([self._evaluate(*batch) for batch in zip(*(x.split(batches) for x in rows), strict=True)])
         pieces = np.split(values.cpu().numpy(), np.cumsum(counts)[:-1])
         return [(piece[:, :-1], piece[:, -1] > 0) for piece in pieces]
 

@@ -10,14 +10,18 @@ import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .episodes import Episode, Record
-from .goals import TARGET, Schedule
+from .goals import SUB_COMMANDS, TARGET, Schedule
 from .suite import Suite
+
+
+def count_segments(episode: Episode) -> int:
+    """Number of segments of an episode that can be played side by side at first."""
+    return sum(len(SUB_COMMANDS[goal]) for goal in episode.goals)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,14 +32,13 @@ class Segment:
     goal: str
     goal_index: int
     """Place of the goal in the order in which the episode plays them."""
-    part: int
-    """Sub-command."""
+    sub_command: int
     again: bool = False
     """Whether the episode's one penetration lies behind it: no other one counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class SegmentOutcome:
     """What came of a segment, or of its beginning."""
 
     samples: NDArray[np.float32]
@@ -49,19 +52,33 @@ class Outcome:
     """Whether the target was reached."""
     restarted: bool = False
     """Whether a penetration made a target goal start again."""
-    until_penetration: Outcome | None = None
+    until_penetration: SegmentOutcome | None = None
     """What a velocity segment was when the robot first went too deep, if it did and if that matters; all of it ran on."""
+
+    def cut_short(self, *, samples: int, control_steps: int, physics_steps: int, overflowed: bool) -> SegmentOutcome:
+        """The beginning of a velocity segment, up to a penetration, after which its goal starts again."""
+        return replace(
+            self,
+            samples=self.samples[:samples],
+            control_steps=control_steps,
+            physics_steps=physics_steps,
+            overflowed=overflowed,
+            falls=0,
+            diverged=False,
+            restarted=True,
+            until_penetration=None,
+        )
 
 
 class SegmentRules:
     """What a suite says about segments."""
 
     def __init__(self, suite: Suite, schedule: Schedule) -> None:
-        self.parts = {name: len(parts) for name, parts in schedule.parts.items()}
+        self.sub_commands = {name: len(commands) for name, commands in schedule.sub_commands.items()}
         self.fall_closes_goal = suite.events.fall == "close-goal"
         self.restarts = suite.events.penetration is not None
         settling = math.floor(suite.settling.longest / suite.physics.control_period) + 3
-        longest = max((len(p) for parts in schedule.parts.values() for p in parts), default=0)
+        longest = max((len(steps) for commands in schedule.sub_commands.values() for steps in commands), default=0)
         self.stretch = settling + longest
         """Control steps that no segment of a velocity goal exceeds: each has so much of its episode's noise."""
         crossing = max(schedule.target_steps.values(), default=0) + 2 * settling
@@ -73,31 +90,27 @@ class SegmentRules:
 
     def goals(self, episode: Episode) -> list[str]:
         """The goals of an episode in the order in which it plays them."""
-        return [name for name in self.parts if name in episode.goals]
+        return [name for name in self.sub_commands if name in episode.goals]
 
     def noise_start(self, segment: Segment) -> int:
         """Where in its episode's noise a segment begins, in control steps: no two segments share a draw.
 
-        First come the velocity goals' parts in order, then their second attempts, then the target goal.
+        First come the velocity goals' sub-commands in order, then their second attempts, then the target goal.
         """
         goals = [name for name in self.goals(segment.episode) if name != TARGET]
-        total = sum(self.parts[name] for name in goals)
+        total = sum(self.sub_commands[name] for name in goals)
         if segment.goal == TARGET:
             return 2 * total * self.stretch
-        before = sum(self.parts[name] for name in goals[: goals.index(segment.goal)])
-        return (before + segment.part + (total if segment.again else 0)) * self.stretch
+        before = sum(self.sub_commands[name] for name in goals[: goals.index(segment.goal)])
+        return (before + segment.sub_command + (total if segment.again else 0)) * self.stretch
 
     def segments(self, episode: Episode, goal_index: int, *, again: bool) -> list[Segment]:
         """All segments of one goal of an episode."""
         name = self.goals(episode)[goal_index]
         return [
-            Segment(episode=episode, goal=name, goal_index=goal_index, part=part, again=again)
-            for part in range(self.parts[name])
+            Segment(episode=episode, goal=name, goal_index=goal_index, sub_command=number, again=again)
+            for number in range(self.sub_commands[name])
         ]
-
-    def count(self, episode: Episode) -> int:
-        """Number of segments that can be played side by side at first."""
-        return sum(self.parts[name] for name in self.goals(episode))
 
 
 @dataclass
@@ -108,7 +121,7 @@ class OpenEpisode:
     rules: SegmentRules
     number: int = 0
     """How many episodes began before it."""
-    outcomes: dict[Segment, Outcome] = field(default_factory=dict)
+    outcomes: dict[Segment, SegmentOutcome] = field(default_factory=dict)
     started: set[Segment] = field(default_factory=set)
     """Segments that have been handed out."""
     _made: dict[tuple[int, bool], list[Segment]] = field(default_factory=dict)
@@ -123,13 +136,13 @@ class OpenEpisode:
         self.started.update(found)
         return found
 
-    def _follow(self) -> tuple[list[tuple[Segment, Outcome]], list[Segment], bool]:
+    def _follow(self) -> tuple[list[tuple[Segment, SegmentOutcome]], list[Segment], bool]:
         """Go through the episode in order, as far as outcomes are known.
 
         Returns:
             What counts, complete only if nothing is missing; the segments that are missing; whether a goal was begun again.
         """
-        counted: list[tuple[Segment, Outcome]] = []
+        counted: list[tuple[Segment, SegmentOutcome]] = []
         missing: list[Segment] = []
         restarted = False
         for index, goal in enumerate(self.rules.goals(self.episode)):
@@ -154,7 +167,9 @@ class OpenEpisode:
             self._made[goal_index, again] = self.rules.segments(self.episode, goal_index, again=again)
         return self._made[goal_index, again]
 
-    def _play(self, segments: Sequence[Segment], watched: bool) -> tuple[list[tuple[Segment, Outcome]], list[Segment]]:
+    def _play(
+        self, segments: Sequence[Segment], watched: bool
+    ) -> tuple[list[tuple[Segment, SegmentOutcome]], list[Segment]]:
         """What counts of a goal's segments up to the one that ends the attempt, and which are missing for that.
 
         ``watched`` says whether it is certain that a penetration interrupts the goal.
@@ -195,22 +210,12 @@ class OpenEpisode:
             columns=columns if has_samples else (),
             samples=np.concatenate([o.samples for o in outcomes]),
             goal_index=index([s.goal_index for s, _ in counted]),
-            part_index=index([s.part for s, _ in counted]),
+            part_index=index([s.sub_command for s, _ in counted]),
         )
 
 
-class Agenda(Protocol):
-    """Who says which episodes run next."""
-
-    def take(self, most: int, *, urgent: bool = False) -> Sequence[Episode]:
-        """Up to ``most`` episodes that can start now; with ``urgent`` only those on whose outcome other episodes wait."""
-
-    def finished(self, record: Record) -> Collection[Episode]:
-        """An episode has ended; returns episodes at work that nobody needs any more."""
-
-
 class SegmentQueue:
-    """Segments that wait for a place, and the episodes that they belong to."""
+    """Segments that wait for a world, and the episodes that they belong to."""
 
     def __init__(self, rules: SegmentRules, columns: tuple[str, ...]) -> None:
         """``columns`` are those of the samples."""
@@ -219,18 +224,21 @@ class SegmentQueue:
         self._begun = 0
         self._waiting: deque[Segment] = deque()
 
-    def take(self, agenda: Agenda, most: int) -> list[Segment]:
-        """Up to ``most`` segments to play now.
+    def __len__(self) -> int:
+        """Number of segments that wait."""
+        return len(self._waiting)
 
-        Episodes on which others wait come first. Others begin only when no segment waits, so that few episodes are open.
-        """
-        for episode in reversed(agenda.take(most, urgent=True)):
+    def add(self, episodes: Sequence[Episode]) -> None:
+        """Let episodes begin: level tests, on which others wait, before all that waits, the others behind it."""
+        tests = [e for e in episodes if e.stage == "search"]
+        for episode in reversed(tests):
             self._waiting.extendleft(reversed(self._begin(episode)))
-        while len(self._waiting) < most:
-            episodes = agenda.take(1)
-            if not episodes:
-                break
-            self._waiting.extend(self._begin(episodes[0]))
+        for episode in episodes:
+            if episode.stage != "search":
+                self._waiting.extend(self._begin(episode))
+
+    def take(self, most: int) -> list[Segment]:
+        """Up to ``most`` segments to play now."""
         return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
 
     def _begin(self, episode: Episode) -> list[Segment]:
@@ -238,7 +246,7 @@ class SegmentQueue:
         self._begun += 1
         return opened.start()
 
-    def finish(self, outcomes: Mapping[Segment, Outcome]) -> tuple[list[Record], set[Segment]]:
+    def finish(self, outcomes: Mapping[Segment, SegmentOutcome]) -> tuple[list[Record], set[Segment]]:
         """Segments have ended.
 
         Returns:
@@ -263,7 +271,7 @@ class SegmentQueue:
         return records, hidden
 
     def drop(self, episodes: Collection[Episode]) -> None:
-        """Forget episodes that nobody needs any more."""
+        """Forget cancelled episodes."""
         for episode in episodes:
             self._open.pop(episode, None)
         self._waiting = deque(s for s in self._waiting if s.episode not in episodes)
@@ -271,18 +279,3 @@ class SegmentQueue:
     def steps_behind(self, episode: Episode) -> int:
         """Control steps of an open episode's segments that have ended."""
         return sum(outcome.control_steps for outcome in self._open[episode].outcomes.values())
-
-
-def cut_short(outcome: Outcome, *, samples: int, control_steps: int, physics_steps: int, overflowed: bool) -> Outcome:
-    """The beginning of a velocity segment, up to a penetration, after which its goal starts again."""
-    return replace(
-        outcome,
-        samples=outcome.samples[:samples],
-        control_steps=control_steps,
-        physics_steps=physics_steps,
-        overflowed=overflowed,
-        falls=0,
-        diverged=False,
-        restarted=True,
-        until_penetration=None,
-    )

@@ -11,7 +11,8 @@ import numpy as np
 from ...backends.base import PhysicsOptions, Support
 from ...backends.registry import backend_class
 from ..episodes import QUALITY
-from .closed_loop import Design, Records
+from ..plan import Records
+from .closed_loop import Design
 from .errors import ConsistencyError
 from .variants import Value, Variant
 

@@ -6,45 +6,35 @@ is what physics made of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 
-from ...backends.base import Scene
 from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...robots import Robot
-from ...terrains.registry import make_terrain
+from ..dispatcher import Dispatcher, Speculation, play
 from ..episodes import QUALITY, Episode, Record
-from ..goals import SUB_COMMANDS, TARGET
-from ..runner import EpisodeRunner, Progress
+from ..goals import TARGET
+from ..plan import Records, plan_list
 from ..scoring import run_statistics
+from ..segments import count_segments
 from ..suite import Suite
+from ..workers import Job, local_workers, start_workers
 from .statistics import Array, Estimate, effect_size, outcome_agreement, paired_mean, terrain_weights
 from .variants import MakeBackend, Variant
 
-_SLOTS = 24
+_WORLDS = 24
 """Worlds on the CPU."""
-_MANY_SLOTS = 8192
+_GPU_WORLDS = 8192
 """Worlds on a GPU, at most."""
 _MEAN50 = 2
 """Position of mean@50 among ``scoring.STATISTICS``."""
-
-Records = Mapping[str, Record]
-"""Finished episodes by their key."""
-
-
-class Store(Protocol):
-    """Where finished episodes are kept."""
-
-    def get(self, episode: Episode) -> Record | None:
-        """The record of an episode that has already run."""
-
-    def put(self, record: Record) -> None:
-        """Keep a record."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,58 +77,20 @@ def episodes_of(cell: Cell, suite: Suite, seeds: Sequence[int]) -> list[Episode]
     ]
 
 
-class EpisodeList:
-    """The agenda of a fixed list of episodes (see ``runner.Agenda``)."""
-
-    def __init__(self, episodes: Sequence[Episode], store: Store) -> None:
-        """Take what the store has from there; the longest of the others come first."""
-        self._store = store
-        self.records: dict[str, Record] = {}
-        self._queue: list[Episode] = []
-        for episode in episodes:
-            known = store.get(episode)
-            if known is None:
-                self._queue.append(episode)
-            else:
-                self.records[episode.key] = known
-        self._queue.sort(key=lambda e: e.stage != "eval")
-
-    @property
-    def waiting(self) -> int:
-        """Number of episodes that have not begun."""
-        return len(self._queue)
-
-    @property
-    def waiting_segments(self) -> int:
-        """Number of worlds in which they can be played side by side."""
-        return sum(len(SUB_COMMANDS[goal]) for episode in self._queue for goal in episode.goals)
-
-    def take(self, most: int, *, urgent: bool = False) -> list[Episode]:
-        """Up to ``most`` episodes that can start now; no episode is urgent."""
-        most = 0 if urgent else most
-        taken, self._queue = self._queue[:most], self._queue[most:]
-        return taken
-
-    def finished(self, record: Record) -> Collection[Episode]:
-        """Keep an episode's record."""
-        self._store.put(record)
-        self.records[record.episode.key] = record
-        return ()
-
-
-def play(
+def play_variant(
     variant: Variant,
     episodes: Sequence[Episode],
     *,
     suite: Suite,
     robot: Robot,
     policy: Policy,
-    store: Store,
+    records: dict[Episode, Record],
+    keep: Callable[[Record], None],
     threads: int = 1,
     make: MakeBackend = make_backend,
-    watch: Callable[[int, int], None] | None = None,
-) -> dict[str, Record]:
-    """Play the episodes that the store does not hold yet.
+    watch: Callable[[int], None] | None = None,
+) -> None:
+    """Play the episodes of which there is no record yet, as an evaluation plays those that its plans require.
 
     Args:
         variant: the engine.
@@ -146,42 +98,37 @@ def play(
         suite: the rules.
         robot: whose model is simulated.
         policy: who walks.
-        store: where records go and may already be.
+        records: episodes that have ended; those that end are added.
+        keep: called with each record.
         threads: CPU threads; results do not depend on them.
         make: builds engines by name.
-        watch: called after each control step with the episodes that have ended and all there are.
-
-    Returns:
-        All records by their episode's key.
+        watch: called now and then with the number of episodes that have ended.
 
     Raises:
         BackendError: the engine cannot do what the episodes need.
         PolicyError: the policy's output is not finite.
     """
-    agenda = EpisodeList(episodes, store)
-    if not agenda.waiting:
-        return agenda.records
-    places = list(dict.fromkeys((e.terrain, e.level) for e in episodes))
-    slots = min(agenda.waiting_segments, _SLOTS if torch.device(variant.device).type == "cpu" else _MANY_SLOTS)
-    scene = Scene(
+    waiting = [e for e in episodes if e not in records]
+    if not waiting:
+        return
+    count = local_workers(variant.backend, variant.device, threads=threads, most=len(waiting))
+    most = _WORLDS if torch.device(variant.device).type == "cpu" else _GPU_WORLDS
+    job = Job(
+        suite=suite,
+        policy=policy,
         robot=robot,
-        parameters=robot.parameters[suite.parameters],
-        terrains=tuple(make_terrain(name, level) for name, level in places),
-        terrain_index=(0,) * slots,
-        physics=suite.physics,
+        places=tuple(dict.fromkeys((e.terrain, e.level) for e in episodes)),
+        worlds=min(sum(map(count_segments, waiting)), most),
+        build=partial(variant.worlds, make=make),
+        threads=max(threads // count, 1),
     )
-    backend = variant.worlds(scene, threads=threads, make=make)
-    index = {place: i for i, place in enumerate(places)}
 
-    def on_step(_: Progress) -> None:
+    def on_progress(dispatcher: Dispatcher) -> None:
         if watch is not None:
-            watch(len(agenda.records), len(episodes))
+            watch(len(episodes) - len(dispatcher.plans[0].required))
 
-    try:
-        EpisodeRunner(suite, policy, backend, lambda e: index[e.terrain, e.level]).run(agenda, on_step)
-    finally:
-        backend.close()
-    return agenda.records
+    with closing(start_workers(job, count)) as workers:
+        play([partial(plan_list, episodes)], records, keep, workers, speculation=Speculation(), watch=on_progress)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +168,7 @@ class Design:
         values = np.zeros((len(self.cells), len(self.seeds), len(columns)))
         for i, cell in enumerate(self.cells):
             for j, episode in enumerate(e for e in episodes_of(cell, self.suite, self.seeds) if e.stage == "eval"):
-                record = records[episode.key]
+                record = records[episode]
                 values[i, j] = [run_statistics(record, m)[_MEAN50] for m in range(len(columns))]
         return Table(values=values, columns=columns)
 
@@ -332,9 +279,7 @@ def health_of(records: Records) -> dict[str, int]:
 def _outcomes(design: Design, reference: Records, compared: Records, rows: Sequence[int]) -> dict[str, Any]:
     """Agreement on falls in quality episodes, and on targets reached in crossings."""
     pairs = [
-        (reference[e.key], compared[e.key])
-        for i in rows
-        for e in episodes_of(design.cells[i], design.suite, design.seeds)
+        (reference[e], compared[e]) for i in rows for e in episodes_of(design.cells[i], design.suite, design.seeds)
     ]
     walks = [(a, b) for a, b in pairs if a.episode.stage == "eval"]
     crossings = [(a, b) for a, b in pairs if a.episode.stage == "search"]
@@ -348,7 +293,7 @@ def _rows(design: Design, reference: Records, compared: Records, first: Table, s
     rows = []
     for i, cell in enumerate(design.cells):
         for episode in episodes_of(cell, design.suite, design.seeds):
-            pair = (reference[episode.key], compared[episode.key])
+            pair = (reference[episode], compared[episode])
             row: dict[str, Any] = {
                 "episode": episode.key,
                 "terrain": cell.terrain,

@@ -9,9 +9,10 @@ from typing import Any
 
 import jinja2
 
+from ...files.writing import write_atomically
 from ..charts import number, terrain_label
 from ..report import TEMPLATES, metric_label
-from ..store import StoreError, write_atomically
+from ..store import StoreError
 from . import charts
 from .study import SCHEMA
 
@@ -57,7 +58,7 @@ def write_page(folder: Path) -> Path:
     except (OSError, ValueError) as error:
         raise StoreError(f"{source} cannot be read ({error}); run gaitgauge consistency again with --resume") from error
     page = folder / "consistency.html"
-    write_atomically(page, render(results))
+    write_atomically(page, render(results), StoreError)
     return page
 
 

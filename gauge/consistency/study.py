@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
-import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +14,20 @@ import torch
 
 from ...backends.base import BackendError
 from ...backends.registry import make_backend
+from ...files.provenance import provenance
+from ...files.writing import write_atomically
 from ...policy.base import Policy
 from ...robots import Robot
 from ...robots.geometry import total_mass
 from ...terrains.registry import gauge_terrain_names
-from ..evaluate import PACKAGES, policy_digest, prepare
 from ..evaluate import Request as EvaluateRequest
-from ..slots import GRAVITY
-from ..store import RunFolder, write_atomically
+from ..evaluate import policy_digest, prepare
+from ..plan import Records
+from ..sampling import GRAVITY
+from ..store import RunFolder, StoreError
 from ..suite import Suite, SuiteError, load_suite
 from .attribution import Factor, choose_factors, effect_of_switch, perturbed
-from .closed_loop import Cell, Design, Records, compare, gap_only, health_of, make_cells, play
+from .closed_loop import Cell, Design, compare, gap_only, health_of, make_cells, play_variant
 from .errors import ConsistencyError
 from .models import compare_models
 from .open_loop import Trajectory, compare_trajectories, record_targets, replay
@@ -163,7 +162,7 @@ def prepare_study(request: Request) -> _Prepared:
     policies = []
     robot = None
     for name in request.policies:
-        _, robot, policy, _, _ = prepare(
+        prepared_policy = prepare(
             EvaluateRequest(
                 policy=name,
                 suite=request.suite,
@@ -177,7 +176,8 @@ def prepare_study(request: Request) -> _Prepared:
                 trust=request.trust,
             )
         )
-        policies.append((name, policy))
+        robot = prepared_policy.robot
+        policies.append((name, prepared_policy.policy))
     assert robot is not None
     prepared = _Prepared(
         request=request,
@@ -262,9 +262,11 @@ def study(
         "shared_draws": prepared.design.shared_draws,
         "resamples": prepared.suite.scoring.bootstrap,
         "policies": blocks,
-        "provenance": _provenance(request, command, time.perf_counter() - began),
+        "provenance": provenance(
+            command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)
+        ),
     }
-    write_atomically(folder / "consistency.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+    write_atomically(folder / "consistency.json", json.dumps(results, indent=1, allow_nan=False) + "\n", StoreError)
     return results
 
 
@@ -341,27 +343,28 @@ class _Policy:
         if variant.label in self._records:
             return self._records[variant.label]
         self._part += 1
-        store = RunFolder(self._folder / variant.folder, self._identity(variant), resume=self._resume)
         episodes = prepared.design.episodes()
 
-        def on_step(done: int, total: int) -> None:
+        def on_progress(done: int) -> None:
             if self._watch is not None:
                 seconds = time.perf_counter() - self._began
-                self._watch(Status(self._name, variant.label, self._part, self._parts, done, total, seconds))
+                self._watch(Status(self._name, variant.label, self._part, self._parts, done, len(episodes), seconds))
 
-        records = play(
-            variant,
-            episodes,
-            suite=prepared.suite,
-            robot=prepared.robot,
-            policy=self._policy,
-            store=store,
-            threads=prepared.request.threads,
-            make=self._make,
-            watch=on_step,
-        )
-        self._records[variant.label] = records
-        return records
+        with RunFolder(self._folder / variant.folder, self._identity(variant), resume=self._resume) as store:
+            play_variant(
+                variant,
+                episodes,
+                suite=prepared.suite,
+                robot=prepared.robot,
+                policy=self._policy,
+                records=store.records,
+                keep=store.put,
+                threads=prepared.request.threads,
+                make=self._make,
+                watch=on_progress,
+            )
+        self._records[variant.label] = store.records
+        return store.records
 
     def _identity(self, variant: Variant) -> dict[str, Any]:
         """What decides about the records of a variant."""
@@ -440,22 +443,3 @@ class _Policy:
             if label != base
         }
         return compare_models(prepared.robot, descriptions, base), {"floor": floor.label, "differences": differences}
-
-
-def _provenance(request: Request, command: Sequence[str], seconds: float) -> dict[str, Any]:
-    """Where a study comes from."""
-    versions = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed"
-    return {
-        "versions": versions,
-        "command": " ".join(command),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "host": platform.node(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs, {platform.system()} {platform.release()}",
-        "threads": request.threads,
-        "seconds": round(seconds, 2),
-    }

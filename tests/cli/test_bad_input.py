@@ -51,7 +51,8 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def earlier_run(folder: Path, **identity: object) -> dict[str, bytes]:
     """A folder that holds the results of another run; returns what is in it."""
-    RunFolder(folder, {"suite": "gaitgauge-1 1.0.0", "policy": "other", **identity}, resume=False)
+    with RunFolder(folder, {"suite": "gaitgauge-1 1.0.0", "policy": "other", **identity}, resume=False):
+        pass
     (folder / "episodes" / "flat-0.npz").write_bytes(b"an earlier episode")
     (folder / "results.json").write_text('{"score": 0.5}\n')
     return content(folder)

@@ -1,5 +1,5 @@
 import sys
 from pathlib import Path
 
-# The scripted policy, engine and agenda are shared by several test files.
+# The scripted policy, and engine are shared by several test files.
 sys.path.insert(0, str(Path(__file__).parent))

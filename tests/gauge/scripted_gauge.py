@@ -1,15 +1,14 @@
 """A gauge in which nothing is left to physics: scripted policies, short suites, an engine without physics."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 
-import pytest
 import torch
 from gaitgauge.backends import Scene
 from gaitgauge.backends.base import PhysicsState
 from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.episodes import Episode, Record
-from gaitgauge.gauge.runner import EpisodeRunner, Progress
+from gaitgauge.gauge.rollout import Rollout
 from gaitgauge.gauge.suite import Goal, Suite, load_suite
 from gaitgauge.policy.base import Policy, PolicySession
 from gaitgauge.policy.contract import go2_contract
@@ -35,9 +34,9 @@ class ScriptedPolicy(Policy):
         self.seen = []  # what earlier sessions were asked, as a trial, is of no interest
         return ScriptedSession(self)
 
-    def commands(self, slot: int = 0) -> torch.Tensor:
-        """Forward, lateral and yaw commands that a slot's policy was given, step by step, (T, 3)."""
-        return torch.stack([o[slot, 6:9] for o in self.seen]) / torch.tensor([2.0, 2.0, 0.25])
+    def commands(self, world: int = 0) -> torch.Tensor:
+        """Forward, lateral and yaw commands that a world's policy was given, step by step, (T, 3)."""
+        return torch.stack([o[world, 6:9] for o in self.seen]) / torch.tensor([2.0, 2.0, 0.25])
 
 
 class ScriptedSession(PolicySession):
@@ -50,22 +49,6 @@ class ScriptedSession(PolicySession):
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         self.seen.append(observation.clone())
         return self.policy.act(observation)
-
-
-class Agenda:
-    """Hands out episodes in the given order and keeps what came of them."""
-
-    def __init__(self, episodes: Sequence[Episode]) -> None:
-        self.waiting, self.records = list(episodes), []
-
-    def take(self, most: int, *, urgent: bool = False) -> list[Episode]:
-        most = 0 if urgent else most
-        taken, self.waiting = self.waiting[:most], self.waiting[most:]
-        return taken
-
-    def finished(self, record: Record) -> Collection[Episode]:
-        self.records.append(record)
-        return ()
 
 
 def short_suite(
@@ -163,17 +146,21 @@ class Puppet(FakeBackend):
 
 
 def fake(
-    suite: Suite, script: FakeScript | None = None, *, slots: int = 1, terrain: Terrain | None = None
+    suite: Suite, script: FakeScript | None = None, *, worlds: int = 1, terrain: Terrain | None = None
 ) -> FakeBackend:
     """An engine without physics that follows a script."""
-    scene = Scene(
+    return Puppet(scene(suite, worlds, terrain), script=script)
+
+
+def scene(suite: Suite, worlds: int, terrain: Terrain | None = None) -> Scene:
+    """Worlds on one terrain."""
+    return Scene(
         robot=GO2,
         parameters=GO2.parameters[suite.parameters],
         terrains=(terrain or ground(),),
-        terrain_index=(0,) * slots,
+        terrain_index=(0,) * worlds,
         physics=suite.physics,
     )
-    return Puppet(scene, script=script)
 
 
 def play(
@@ -181,41 +168,46 @@ def play(
     episodes: Sequence[Episode],
     script: FakeScript | None = None,
     *,
-    slots: int = 1,
+    worlds: int = 1,
     terrain: Terrain | None = None,
     policy: ScriptedPolicy | None = None,
 ) -> list[Record]:
     """Records of the episodes in the order in which they ended."""
-    agenda = Agenda(episodes)
-    run(suite, fake(suite, script, slots=slots, terrain=terrain), agenda, policy)
-    return agenda.records
+    return run(suite, fake(suite, script, worlds=worlds, terrain=terrain), episodes, policy)
 
 
-def run(suite: Suite, backend: FakeBackend, agenda: Agenda, policy: ScriptedPolicy | None = None) -> EpisodeRunner:
-    """Play an agenda, which must come to an end."""
+def run(
+    suite: Suite,
+    backend: FakeBackend,
+    episodes: Sequence[Episode],
+    policy: ScriptedPolicy | None = None,
+    *,
+    watch: Callable[[Rollout], None] = lambda rollout: None,
+    **options,
+) -> list[Record]:
+    """Records of the episodes in the order in which they ended; ``watch`` is called at every poll."""
+    rollout = Rollout(suite, policy or ScriptedPolicy(), backend, lambda e: 0, **options)
+    rollout.play(episodes)
+    return to_the_end(rollout, watch)
 
-    def watch(progress: Progress) -> None:
-        assert progress.control_steps < 2000, "the runner does not come to an end"
 
-    runner = EpisodeRunner(suite, policy or ScriptedPolicy(), backend, lambda e: 0)
-    runner.run(agenda, watch)
-    return runner
+def to_the_end(rollout: Rollout, watch: Callable[[Rollout], None] = lambda rollout: None) -> list[Record]:
+    """Records of all that a rollout has to play, which must come to an end."""
+    records = []
+    while not rollout.idle:
+        records += rollout.advance()
+        watch(rollout)
+        assert rollout.control_steps < 4000, "the rollout does not come to an end"
+    return records
 
 
 def beginning(suite: Suite, script: FakeScript | None = None, *, steps: int) -> torch.Tensor:
     """Commands of the first control steps of an episode with the diagonal goal, (steps, 3)."""
-
-    class EnoughError(Exception):
-        pass
-
-    def watch(progress: Progress) -> None:
-        if progress.control_steps == steps:
-            raise EnoughError
-
     policy = ScriptedPolicy()
-    runner = EpisodeRunner(suite, policy, fake(suite, script), lambda e: 0)
-    with pytest.raises(EnoughError):
-        runner.run(Agenda([episode(DIAGONAL)]), watch)
+    rollout = Rollout(suite, policy, fake(suite, script), lambda e: 0)
+    rollout.play([episode(DIAGONAL)])
+    for _ in range(steps):
+        rollout.advance()
     return policy.commands()
 
 
@@ -241,6 +233,6 @@ def tipping(substep: int):
     return motion
 
 
-def at(seconds: float, slots: int = 1) -> torch.Tensor:
-    """The same moment for every slot."""
-    return torch.full((slots,), seconds)
+def at(seconds: float, worlds: int = 1) -> torch.Tensor:
+    """The same moment for every world."""
+    return torch.full((worlds,), seconds)

@@ -15,11 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gaitgauge.backends import make_backend
 from gaitgauge.backends.base import BackendError
 from gaitgauge.backends.fake import FakeScript
 from gaitgauge.gauge import evaluate as evaluation
-from gaitgauge.gauge import lanes
-from gaitgauge.gauge.evaluate import Request, evaluate, prepare
+from gaitgauge.gauge.episodes import Record
+from gaitgauge.gauge.evaluate import Request, identity, prepare
 from gaitgauge.gauge.store import RunFolder, StoreError
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.base import PolicyError
@@ -84,6 +85,12 @@ def puppets(name, scene, *, device="cpu", threads=1):
     return Puppet(scene, script=FakeScript(motion=gliding))
 
 
+def evaluate(request, folder, *, make=None, **options):
+    """An evaluation, on the engine without physics where a request names that."""
+    make = make or (puppets if getattr(request, "backend", "fake") == "fake" else make_backend)
+    return evaluation.evaluate(request, folder, make=make, **options)
+
+
 @pytest.fixture
 def request_for(tmp_path, monkeypatch):
     """Makes requests for a tiny suite on an engine without physics."""
@@ -93,7 +100,6 @@ def request_for(tmp_path, monkeypatch):
     policy = tmp_path / "policy.gauge.pt"
     stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
     save_policy(policy, go2_contract(GO2), stored)
-    monkeypatch.setattr(lanes, "make_backend", puppets)
     monkeypatch.setattr(evaluation, "_WATCH_INTERVAL", 0.0)
 
     def make(base="gaitgauge-1", **choices):
@@ -163,9 +169,9 @@ def test_a_level_run_has_levels_and_no_score(request_for, tmp_path):
     assert results["terrains"] == {"slope_fd": {"level": 2.0}}
 
 
-def test_a_policy_that_passes_nothing_scores_zero(request_for, tmp_path, monkeypatch):
-    monkeypatch.setattr(lanes, "make_backend", lambda name, scene, **options: Puppet(scene))
-    results = evaluate(request_for(terrains=("slope_fd",)), tmp_path / "run")
+def test_a_policy_that_passes_nothing_scores_zero(request_for, tmp_path):
+    request = request_for(terrains=("slope_fd",))
+    results = evaluate(request, tmp_path / "run", make=lambda name, scene, **options: Puppet(scene))
     assert results["score"] == 0.0
     assert results["level"] == 0.0
     assert results["metrics"]["dof_power"]["mean50"] == 0.0
@@ -188,7 +194,9 @@ def test_the_progress_lists_every_episode_once_and_counts_down(request_for, tmp_
     assert shares[0] > 0.9
     assert shares[-1] == 0.0
     # while nothing ends and nothing begins, work that is done shows
-    steady = [(a, b) for a, b in pairwise(seen) if a.active == b.active and a.known == b.known and a.done == b.done]
+    steady = [
+        (a, b) for a, b in pairwise(seen) if a.active == b.active and a.expected == b.expected and a.done == b.done
+    ]
     assert steady
     assert all(b.remaining_work <= a.remaining_work for a, b in steady)
 
@@ -220,6 +228,31 @@ def test_a_run_killed_after_any_episode_ends_with_the_very_same_results(request_
         assert sorted(puts) == episodes, "an episode was played twice or never"
         assert without_provenance(folder) == without_provenance(tmp_path / "whole")
         assert (folder / "episodes.csv").read_bytes() == (tmp_path / "whole" / "episodes.csv").read_bytes()
+
+
+def test_speculative_episodes_that_nothing_asked_for_are_gone_at_the_end(request_for, tmp_path):
+    """A killed run may leave some: they are no part of results, whatever they say."""
+    evaluate(request_for(), tmp_path / "whole")
+    evaluate(request_for(), tmp_path / "run")
+    (tmp_path / "run" / "results.json").unlink()
+    with RunFolder(tmp_path / "run", identity(prepare(request_for())), resume=True) as folder:
+        counted = next(e for e in folder.records if e.stage == "search")
+        extra = Record(episode=replace(counted, level=1), success=False)
+        assert extra.episode not in folder.records
+        folder.put(extra)
+    evaluate(request_for(), tmp_path / "run", resume=True)
+    assert without_provenance(tmp_path / "run") == without_provenance(tmp_path / "whole")
+    files = [{p.name: p.read_bytes() for p in (tmp_path / n / "episodes").iterdir()} for n in ("run", "whole")]
+    assert files[0] == files[1]
+
+
+def test_two_processes_cannot_use_one_folder(request_for, tmp_path, monkeypatch):
+    monkeypatch.setattr("gaitgauge.files.writing._PATIENCE", 0.1)
+    with (
+        RunFolder(tmp_path / "run", identity(prepare(request_for())), resume=False),
+        pytest.raises(StoreError, match="another process is writing to"),
+    ):
+        evaluate(request_for(), tmp_path / "run", resume=True)
 
 
 def test_a_finished_run_resumes_to_itself_without_playing(request_for, tmp_path, monkeypatch):
@@ -272,7 +305,7 @@ def test_a_policy_that_answers_nonsense_leaves_what_was_finished(request_for, tm
     )
     with pytest.raises(
         PolicyError,
-        match="returned nan for a finite observation at control step 0 of diagonal_velocity, part 1, of episode eval-flat",
+        match="returned nan for a finite observation at control step 0 of diagonal_velocity, sub-command 1, of episode eval-flat",
     ):
         evaluate(request, tmp_path / "run")
     assert not (tmp_path / "run" / "results.json").exists()
@@ -314,7 +347,7 @@ def test_impossible_requests_are_refused_before_anything_is_written(request_for,
 
 
 def test_terrains_keep_the_suites_order(request_for):
-    environments = prepare(request_for(terrains=("slope_fd", "flat")))[3]
+    environments = prepare(request_for(terrains=("slope_fd", "flat"))).environments
     assert [e.terrain for e in environments] == ["flat", "slope_fd"]
 
 
@@ -331,10 +364,9 @@ CHILD = """
 import sys
 sys.path.insert(0, {tests!r})
 import test_evaluate_runs as runs
-from gaitgauge.gauge import evaluate as evaluation, lanes
+from gaitgauge.gauge.evaluate import Request
 from pathlib import Path
-lanes.make_backend = runs.puppets
-evaluation.evaluate(evaluation.Request(policy={policy!r}, suite={suite!r}, backend="fake"), Path({folder!r}), resume=True)
+runs.evaluate(Request(policy={policy!r}, suite={suite!r}, backend="fake"), Path({folder!r}), resume=True)
 """
 
 
@@ -430,16 +462,16 @@ def test_processes_end_with_the_one_that_started_them(real_request, tmp_path):
     code = ORPHANS.format(policy=real_request.policy, suite=real_request.suite, folder=str(tmp_path / "run"))
     process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)])
     deadline = time.monotonic() + 60
-    lanes_started: list[int] = []
-    while time.monotonic() < deadline and len(lanes_started) < 2:
-        lanes_started = children(process.pid)
+    workers: list[int] = []
+    while time.monotonic() < deadline and len(workers) < 2:
+        workers = children(process.pid)
         time.sleep(0.01)
-    assert len(lanes_started) == 2
+    assert len(workers) == 2
     process.kill()
     process.wait()
-    while time.monotonic() < deadline and any(map(at_work, lanes_started)):
+    while time.monotonic() < deadline and any(map(at_work, workers)):
         time.sleep(0.05)
-    assert not any(map(at_work, lanes_started))
+    assert not any(map(at_work, workers))
 
 
 def at_work(process):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gaitgauge.gauge.episodes import Episode, Record
-from gaitgauge.gauge.pipelines import Environment
+from gaitgauge.gauge.plan import EnvironmentResult
 from gaitgauge.gauge.results import fold
 from gaitgauge.gauge.scoring import (
     command_statistics,
@@ -169,11 +169,16 @@ def test_benchmark_and_level_fold_as_in_the_papers_tables(model):
 
 
 def flat_environment(qualities, friction=0.6, terrain="flat", level=0, searched=False):
-    environment = Environment(terrain=terrain, friction=friction, payload=0.0, level=level, searched=searched)
-    for seed, quality in enumerate(qualities):
-        samples = np.full((4, 7), quality)
-        environment.records.append(record(samples, [0, 0, 1, 1], [0, 1, 0, 1], seed=seed, terrain=terrain, level=level))
-    return environment
+    halves = {"goals": [0, 0, 1, 1], "parts": [0, 1, 0, 1], "terrain": terrain, "level": level}
+    return EnvironmentResult(
+        terrain=terrain,
+        friction=friction,
+        payload=0.0,
+        level=level,
+        search={} if searched else None,
+        trials=[],
+        records=[record(np.full((4, 7), quality), **halves, seed=seed) for seed, quality in enumerate(qualities)],
+    )
 
 
 def test_fold_weighs_terrains_the_same_and_counts_unpassed_environments_zero():

@@ -25,10 +25,10 @@ def schedule(suite):
 
 
 def commands(suite, name, limits=LEVELLED):
-    """Command at every commanded step of a goal, part after part, as the runner reads them."""
+    """Command at every commanded step of a goal, sub-command after sub-command, as the rollout reads them."""
     table = schedule(suite)
     out = []
-    for part, steps in enumerate(table.parts[name]):
+    for part, steps in enumerate(table.sub_commands[name]):
         rows = table.first_row(name, part) + torch.arange(len(steps) + 1)
         found = table.commands(rows, torch.tensor([limits], dtype=torch.float64)).tolist()
         assert found[0] == [0.0, 0.0, 0.0]  # while the robot settles
@@ -77,15 +77,15 @@ def test_the_references_goals_have_the_same_sequence_of_commands():
 
 def test_a_clock_that_ran_for_whole_sub_commands_leaks_the_next_command():
     """After six sub-commands of 300 steps each the rounding errors have brought the clock one step ahead."""
-    assert schedule(REFERENCE).parts["diagonal_velocity"][5][-1] == (0.0, -1.0, 0.0)  # the seventh, (0, -)
-    assert schedule(OWN).parts["diagonal_velocity"][5][-1] == (-1.0, 0.0, 0.0)  # the sign-inverted sixth, (+, 0)
+    assert schedule(REFERENCE).sub_commands["diagonal_velocity"][5][-1] == (0.0, -1.0, 0.0)  # the seventh, (0, -)
+    assert schedule(OWN).sub_commands["diagonal_velocity"][5][-1] == (-1.0, 0.0, 0.0)  # the sign-inverted sixth, (+, 0)
 
 
 def test_the_references_clock_takes_a_step_from_the_last_sub_command_of_each_goal():
     for suite, short in ((REFERENCE, 1), (OWN, 0)):
         table = schedule(suite)
-        assert [len(p) for p in table.parts["diagonal_velocity"]] == [300] * 7 + [300 - short]
-        assert [len(p) for p in table.parts["max_velocity"]] == [350] * 5 + [350 - short]
+        assert [len(p) for p in table.sub_commands["diagonal_velocity"]] == [300] * 7 + [300 - short]
+        assert [len(p) for p in table.sub_commands["max_velocity"]] == [350] * 5 + [350 - short]
 
 
 def test_the_table_has_no_commands_for_the_target():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.backends import Randomization, Scene, make_backend
-from gaitgauge.backends.mujoco.model import build_models
+from gaitgauge.backends.mujoco_model import build_models
 from gaitgauge.gauge.metrics import (
     METRIC_NAMES,
     MetricEvaluator,
@@ -22,7 +22,7 @@ from gaitgauge.gauge.metrics import (
     torque_smoothness,
     zmp_margin,
 )
-from gaitgauge.gauge.slots import GRAVITY
+from gaitgauge.gauge.sampling import GRAVITY
 from gaitgauge.gauge.suite import SuiteError, load_suite
 from gaitgauge.robots import JointParameters, Robot
 from gaitgauge.robots.geometry import stance_span, total_mass

@@ -26,8 +26,8 @@ def python_draws(seed, steps):
 
 def stream(kind, seeds=(0,)):
     made = make_stream(kind, 12, len(seeds), CPU)
-    for slot, seed in enumerate(seeds):
-        made.assign(slot, episode(MAXIMUM, seed=seed))
+    for world, seed in enumerate(seeds):
+        made.assign(world, episode(MAXIMUM, seed=seed))
     return made
 
 
@@ -131,7 +131,7 @@ def test_every_episode_has_numbers_of_its_own(changes):
     assert not torch.equal(terms["joint_velocity"][0], terms["joint_velocity"][1])
 
 
-def test_the_own_stream_is_the_same_in_any_slot_and_at_any_time():
+def test_the_own_stream_is_the_same_in_any_world_and_at_any_time():
     many, one = stream(OWN, (2, 0, 1)), stream(OWN, (1,))
     many.draw(torch.tensor([50, 3, 0]))
     for step in (7, 0, 7):

@@ -12,8 +12,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from gaitgauge.gauge import charts
-from gaitgauge.gauge.episodes import Episode, Record
-from gaitgauge.gauge.pipelines import LevelTest, make_environments
+from gaitgauge.gauge.episodes import Record
+from gaitgauge.gauge.pipelines import make_environments
+from gaitgauge.gauge.plan import PlanRules, environment_result, plan
 from gaitgauge.gauge.report import STATISTIC_LABELS, metric_matrix, render, report_data, warnings, write_report
 from gaitgauge.gauge.results import fold, health
 from gaitgauge.gauge.store import StoreError
@@ -23,22 +24,14 @@ HOSTILE = 'a/<img src="http://evil.example/x.png" onerror=alert(1)></script><scr
 REACH = {"slope_fd": 7, "slope_bd": 6, "stairs_fd": 9, "stairs_bd": 4, "wave": 8, "obstacle": 3}
 
 
-def played(suite, environment, seed, generator):
-    """A quality episode of random but plausible samples: harder ground and slipperier floors are worse."""
+def ended(suite, episode, generator, reached):
+    """A record of random but plausible samples, worse on harder ground and slippery floors; a target met up to a level."""
+    if episode.stage == "search":
+        return Record(episode=episode, success=episode.level <= reached)
     names = [*suite.metrics.weights, "quality"]
-    goals = ("diagonal_velocity", "max_velocity")
-    centre = 0.82 - 0.03 * (environment.level or 0) - 0.15 * (environment.friction < 0.35)
+    centre = 0.82 - 0.03 * episode.level - 0.15 * (episode.friction < 0.35)
     by_metric = np.array([0.12 * math.sin(zlib.crc32(n.encode())) for n in names])
     samples = np.clip(centre + by_metric + 0.12 * generator.standard_normal((120, len(names))), 0, 1).astype(np.float32)
-    episode = Episode(
-        terrain=environment.terrain,
-        level=environment.level or 0,
-        friction=environment.friction,
-        payload=environment.payload,
-        seed=seed,
-        stage="eval",
-        goals=goals,
-    )
     return Record(
         episode=episode,
         falls=int(generator.random() < 0.04),
@@ -47,35 +40,6 @@ def played(suite, environment, seed, generator):
         goal_index=np.repeat([0, 1], 60).astype(np.int16),
         part_index=np.tile(np.repeat(np.arange(6), 10), 2).astype(np.int16),
     )
-
-
-def crossing(environment, level, seed, success):
-    """An episode of a level test."""
-    episode = Episode(
-        terrain=environment.terrain,
-        level=level,
-        friction=environment.friction,
-        payload=environment.payload,
-        seed=seed,
-        stage="search",
-        goals=("target_pos_velocity",),
-    )
-    return Record(episode=episode, success=success)
-
-
-def search(environment, reached, levels):
-    """Fill in the outcomes of a binary search that ends at the level reached."""
-    low, high = 0, levels
-    while low < high:
-        middle = (low + high + 1) // 2
-        test = LevelTest([0, 1, 2, 3, 4], 0.8, all_at_once=True)
-        test.next_round()
-        for seed in range(5):
-            test.record(middle <= reached)
-            environment.trials.append(crossing(environment, middle, seed, middle <= reached))
-        environment.tests[middle] = test
-        low, high = (middle, high) if middle <= reached else (low, middle - 1)
-    environment.level = low
 
 
 def sample(pipeline="stress", suite="robogauge-1.1", resamples=10, **choices):
@@ -89,17 +53,15 @@ def _sample(pipeline, suite, resamples, reach=None, **choices):
     suite = replace(suite, scoring=replace(suite.scoring, bootstrap=resamples))
     generator = np.random.default_rng(0)
     chosen = {"terrains": suite.matrix.terrains, "frictions": None, "payloads": None, "level": None, **choices}
-    environments = make_environments(suite, **chosen)
-    for environment in environments:
-        if environment.searched:
-            handicap = round(6 * max(0.0, 0.4 - environment.friction) + max(0.0, environment.payload))
-            search(
-                environment,
-                max(0, (REACH[environment.terrain] if reach is None else reach) - 2 * handicap),
-                suite.scoring.levels,
-            )
-        if pipeline != "level" and (environment.level or environment.terrain == "flat"):
-            environment.records = [played(suite, environment, s, generator) for s in suite.matrix.seeds]
+    rules = PlanRules(suite=suite, seeds=suite.matrix.seeds, quality=pipeline != "level")
+    environments = []
+    for environment in make_environments(suite, **chosen):
+        handicap = round(6 * max(0.0, 0.4 - environment.friction) + max(0.0, environment.payload))
+        reached = (REACH.get(environment.terrain, 0) if reach is None else reach) - 2 * handicap
+        records = {}
+        while required := plan(environment, records, rules).required:
+            records |= {e: ended(suite, e, generator, reached) for e in required}
+        environments.append(environment_result(environment, records, rules))
     results = fold(suite, environments, (*suite.metrics.weights, "quality"))
     policy = {"path": "policies/go2_cts.pt", "contract_hash": "ab" * 32, "file_sha256": "cd" * 32}
     return results | {

@@ -6,23 +6,23 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends import Scene
 from gaitgauge.gauge.goals import Schedule
-from gaitgauge.gauge.runner import EpisodeRunner
-from gaitgauge.gauge.segments import OpenEpisode, Outcome, Segment, SegmentRules, cut_short
+from gaitgauge.gauge.rollout import Rollout
+from gaitgauge.gauge.segments import OpenEpisode, Segment, SegmentOutcome, SegmentRules
 from gaitgauge.gauge.suite import load_suite
 from scripted_gauge import (
     DIAGONAL,
-    GO2,
     MAXIMUM,
     TARGET,
-    Agenda,
     Puppet,
     ScriptedPolicy,
     episode,
     fake,
     ground,
+    run,
+    scene,
     short_suite,
+    to_the_end,
 )
 
 REFERENCE, OWN = "robogauge-1.1", "gaitgauge-1"
@@ -76,9 +76,9 @@ def in_a_row(told, goals, closes, restarts):
 
 
 def outcome_of(told, segment, restarts):
-    it = told[segment.goal, segment.part, segment.again]
-    rows = [(segment.goal_index, segment.part, segment.again, step) for step in range(it["steps"])]
-    whole = Outcome(
+    it = told[segment.goal, segment.sub_command, segment.again]
+    rows = [(segment.goal_index, segment.sub_command, segment.again, step) for step in range(it["steps"])]
+    whole = SegmentOutcome(
         samples=np.asarray(rows, dtype=np.float32),
         control_steps=it["steps"],
         physics_steps=10 * it["steps"],
@@ -90,8 +90,8 @@ def outcome_of(told, segment, restarts):
     if not restarts or deep is None or segment.again:
         return whole
     early = it["overflow"] is not None and it["overflow"] < deep
-    cut = cut_short(whole, samples=deep, control_steps=deep, physics_steps=10 * deep, overflowed=early)
-    return Outcome(**{**vars(whole), "until_penetration": cut})
+    cut = whole.cut_short(samples=deep, control_steps=deep, physics_steps=10 * deep, overflowed=early)
+    return SegmentOutcome(**{**vars(whole), "until_penetration": cut})
 
 
 @pytest.mark.parametrize("name", [REFERENCE, OWN])
@@ -142,7 +142,7 @@ def test_a_target_goal_waits_for_what_comes_before_it_and_has_no_second_penetrat
             waiting = [s for s in waiting[1:] + opened.start() if s in opened.missing()]
         assert waiting[0].again is (deep is not None)
         zeros = np.zeros((1, 4), dtype=np.float32)
-        opened.outcomes[waiting[0]] = Outcome(samples=zeros, control_steps=1, physics_steps=10, reached=True)
+        opened.outcomes[waiting[0]] = SegmentOutcome(samples=zeros, control_steps=1, physics_steps=10, reached=True)
         record = opened.record(("a", "b", "c", "d"))
         assert record.success is True
         assert record.restarted is (deep is not None)
@@ -170,10 +170,10 @@ def test_no_two_segments_share_a_draw(name):
         assert all(end <= begin for (_, end), (begin, _) in pairwise(spans))
         # the longest settling, then the longest sub-command, in control steps of 20 ms
         assert all(end - begin >= 151 + 350 for begin, end in spans)
-    assert rules.noise_start(Segment(episode=episode(TARGET), goal=TARGET, goal_index=0, part=0)) == 0
+    assert rules.noise_start(Segment(episode=episode(TARGET), goal=TARGET, goal_index=0, sub_command=0)) == 0
 
 
-# ---- the runner -------------------------------------------------------------------------------------------------------
+# ---- the rollout ------------------------------------------------------------------------------------------------------
 
 SIGNS = {  # commanded directions of first phases that no other sub-command has at that time
     "diagonal 1": (-1, 1, 0),
@@ -204,8 +204,8 @@ class Stage(Puppet):
                 first[mask & here & (first == 0)] = substep
 
 
-def stage(name, slots, falls, penetrations, count=1, *, look_interval=None):
-    """Records of both goals and of a crossing, for one seed or several; a ``look_interval`` is for GPUs, where a look waits."""
+def stage(name, worlds, falls, penetrations, count=1, *, poll_interval=None):
+    """Records of both goals and of a crossing, for one seed or several; a ``poll_interval`` is for GPUs, where a poll waits."""
     suite = short_suite(name)
 
     def act(observation):
@@ -213,20 +213,11 @@ def stage(name, slots, falls, penetrations, count=1, *, look_interval=None):
         action[:, :3] = observation[:, 6:9]
         return action
 
-    scene = Scene(
-        robot=GO2,
-        parameters=GO2.parameters[suite.parameters],
-        terrains=(ground((5.0, 0.0, 0.4)),),
-        terrain_index=(0,) * slots,
-        physics=suite.physics,
-    )
     walks = [episode(DIAGONAL, MAXIMUM, seed=seed) for seed in range(count)]
-    agenda = Agenda([*walks, *(episode(TARGET, stage="search", seed=seed) for seed in range(count))])
-    backend = Stage(scene, falls, penetrations)
-    runner = EpisodeRunner(suite, ScriptedPolicy(act), backend, lambda e: 0, look_interval=look_interval)
-    runner._slots._table._together = look_interval is not None
-    runner.run(agenda)
-    return sorted(agenda.records, key=lambda r: (r.episode.stage, r.episode.seed))
+    crossings = [episode(TARGET, stage="search", seed=seed) for seed in range(count)]
+    backend = Stage(scene(suite, worlds, ground((5.0, 0.0, 0.4))), falls, penetrations)
+    records = run(suite, backend, [*walks, *crossings], ScriptedPolicy(act), poll_interval=poll_interval)
+    return sorted(records, key=lambda r: (r.episode.stage, r.episode.seed))
 
 
 def counts(record):
@@ -241,7 +232,7 @@ WHOLE = [[5] * 7 + [4], [5] * 5 + [4]]  # the goal's clock ends the last sub-com
 STEPS, SUBSTEPS = 12, 25
 
 
-@pytest.mark.parametrize("slots", [1, 3, 24])
+@pytest.mark.parametrize("worlds", [1, 3, 24])
 @pytest.mark.parametrize(
     ("falls", "penetrations", "samples", "fell", "restarted", "steps", "substeps"),
     [
@@ -311,8 +302,10 @@ STEPS, SUBSTEPS = 12, 25
         ),
     ],
 )
-def test_falls_and_penetrations_of_the_reference(slots, falls, penetrations, samples, fell, restarted, steps, substeps):
-    record = stage(REFERENCE, slots, falls, penetrations)[0]
+def test_falls_and_penetrations_of_the_reference(
+    worlds, falls, penetrations, samples, fell, restarted, steps, substeps
+):
+    record = stage(REFERENCE, worlds, falls, penetrations)[0]
     assert counts(record) == samples
     assert (record.falls, record.restarted) == (fell, restarted)
     assert (record.control_steps, record.physics_steps) == (steps, substeps)
@@ -334,10 +327,10 @@ def test_the_samples_of_a_second_attempt_follow_those_of_the_first():
     assert record.part_index.tolist() == parts + [p for p, n in enumerate(WHOLE[1]) for _ in range(n)]
 
 
-@pytest.mark.parametrize("slots", [1, 3, 24])
-def test_a_fall_in_the_own_suite_costs_its_own_sub_command(slots):
+@pytest.mark.parametrize("worlds", [1, 3, 24])
+def test_a_fall_in_the_own_suite_costs_its_own_sub_command(worlds):
     """Samples fall on 6, 11, 16 and 21; penetrations are no events."""
-    record = stage(OWN, slots, {"diagonal 1": 12}, {"diagonal 4": 12})[0]
+    record = stage(OWN, worlds, {"diagonal 1": 12}, {"diagonal 4": 12})[0]
     assert counts(record) == [[4] * 8, [4] * 6]
     assert (record.falls, record.restarted) == (1, False)
     lost = [not record.samples[i].any() for i in range(len(record.samples))]
@@ -371,113 +364,81 @@ def assert_equal(records, others):
 
 @pytest.mark.parametrize("name", [REFERENCE, OWN])
 @pytest.mark.parametrize("events", EVENTS)
-def test_slots_and_neighbours_change_no_bit_of_a_record(name, events):
+def test_worlds_and_neighbours_change_no_bit_of_a_record(name, events):
     alone = stage(name, 1, *events, count=2)
     assert len(alone) == 4
-    for slots in (3, 24, 40):
-        assert_equal(alone, stage(name, slots, *events, count=2))
+    for worlds in (3, 24, 40):
+        assert_equal(alone, stage(name, worlds, *events, count=2))
 
 
 @pytest.mark.parametrize("name", [REFERENCE, OWN])
 @pytest.mark.parametrize("events", EVENTS)
-@pytest.mark.parametrize("look_interval", [1, 3, 10])
-def test_a_loop_that_seldom_looks_gives_the_same_records(name, events, look_interval):
-    """On a GPU a look at the data would wait for the device: everything is worked out for everybody, and who ends waits."""
-    assert_equal(stage(name, 5, *events, count=2), stage(name, 5, *events, count=2, look_interval=look_interval))
+@pytest.mark.parametrize("poll_interval", [2, 3, 10])
+def test_the_poll_interval_changes_no_bit_of_a_record(name, events, poll_interval):
+    """On a GPU reading a value would wait for the device: everything is worked out for every world, and those that end wait."""
+    assert_equal(stage(name, 5, *events, count=2), stage(name, 5, *events, count=2, poll_interval=poll_interval))
 
 
-@pytest.mark.parametrize("look_interval", [None, 1, 10])
-def test_crossings_alone_take_no_samples(look_interval):
+@pytest.mark.parametrize("poll_interval", [1, 3, 10])
+def test_crossings_alone_take_no_samples(poll_interval):
     """A search has no quality episodes, so that the table of samples stays empty."""
     suite = short_suite(REFERENCE)
-    backend = fake(suite, slots=3, terrain=ground((5.0, 0.0, 0.4)))
-    runner = EpisodeRunner(suite, ScriptedPolicy(), backend, lambda e: 0, look_interval=look_interval)
-    agenda = Agenda([episode(TARGET, stage="search", seed=seed) for seed in range(4)])
-    runner.run(agenda)
-    assert [(r.success, len(r.samples)) for r in agenda.records] == [(False, 0)] * 4
+    backend = fake(suite, worlds=3, terrain=ground((5.0, 0.0, 0.4)))
+    crossings = [episode(TARGET, stage="search", seed=seed) for seed in range(4)]
+    records = run(suite, backend, crossings, poll_interval=poll_interval)
+    assert [(r.success, len(r.samples)) for r in records] == [(False, 0)] * 4
 
 
-def test_few_episodes_are_open_at_a_time():
-    """Others begin only when slots are free and no segment waits; what is finished is handed over at once."""
+def test_segments_wait_for_free_worlds_and_what_is_finished_is_handed_over_at_once():
+    """Thirty segments in four worlds, twelve control steps each."""
     suite = short_suite(OWN)
-    scene = Scene(
-        robot=GO2,
-        parameters=GO2.parameters[suite.parameters],
-        terrains=(ground(),),
-        terrain_index=(0,) * 4,
-        physics=suite.physics,
-    )
-    agenda, most = Agenda([episode(MAXIMUM, seed=seed) for seed in range(5)]), []
-
-    def watch(progress):
-        active = progress.active()
+    rollout = Rollout(suite, ScriptedPolicy(), fake(suite, worlds=4), lambda e: 0)
+    assert (rollout.idle, rollout.room) == (True, 4)
+    walks = [episode(MAXIMUM, seed=seed) for seed in range(5)]
+    rollout.play(walks[:2])
+    assert (rollout.idle, rollout.room) == (False, 4 - 2 * 6)
+    rollout.play(walks[2:])
+    ended, most = [], []
+    while not rollout.idle:
+        ended += [(r.episode.seed, rollout.control_steps) for r in rollout.advance()]
+        active = rollout.ages()
+        assert all(0 <= age <= 6 * STEPS for age in active.values())
         most.append(len(active))
-        assert all(0 < age <= 6 * STEPS for age in active.values())
-
-    EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0).run(agenda, watch)
-    assert [r.episode.seed for r in agenda.records] == list(range(5))
+    # six segments an episode, four at a time
+    assert ended == [(0, 2 * STEPS), (1, 3 * STEPS), (2, 5 * STEPS), (3, 6 * STEPS), (4, 8 * STEPS)]
     assert max(most) == 2
-    # thirty segments in four slots, twelve control steps each
-    assert len(most) == 8 * STEPS
 
 
 def test_level_tests_go_before_waiting_segments():
     suite = short_suite(OWN)
-    started = []
-
-    class Urgent(Agenda):
-        def take(self, most, *, urgent=False):
-            first = [e for e in self.waiting if e.stage == "search" and self.ready]
-            rest = [] if urgent else [e for e in self.waiting if e.stage == "eval"]
-            taken = (first + rest)[:most]
-            self.waiting = [e for e in self.waiting if e not in taken]
-            return taken
-
-    agenda = Urgent([episode(DIAGONAL, MAXIMUM), episode(TARGET, stage="search")])
-    agenda.ready = False
-    scene = Scene(
-        robot=GO2,
-        parameters=GO2.parameters[suite.parameters],
-        terrains=(ground((9.0, 0.0, 0.4)),),
-        terrain_index=(0, 0),
-        physics=suite.physics,
-    )
-
-    def watch(progress):
-        agenda.ready = progress.control_steps >= 5  # in the first of seven rounds of two segments
-        started.extend((e.stage, progress.control_steps) for e, age in progress.active().items() if age <= 1)
-
-    EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0).run(agenda, watch)
-    assert ("search", STEPS + 1) in started
-    assert [r.episode.stage for r in agenda.records] == ["search", "eval"]
+    backend = fake(suite, worlds=2, terrain=ground((9.0, 0.0, 0.4)))
+    rollout = Rollout(suite, ScriptedPolicy(), backend, lambda e: 0)
+    rollout.play([episode(DIAGONAL, MAXIMUM)])
+    for _ in range(5):  # in the first of seven rounds of two segments
+        rollout.advance()
+    crossing = episode(TARGET, stage="search")
+    rollout.play([crossing])
+    while crossing not in rollout.ages() or not rollout.ages()[crossing]:
+        rollout.advance()
+    assert rollout.control_steps == STEPS + 1
+    assert [r.episode.stage for r in to_the_end(rollout)] == ["search", "eval"]
 
 
-@pytest.mark.parametrize("look_interval", [None, 1, 10])
-def test_episodes_that_nobody_needs_any_more_leave_their_slots(look_interval):
+@pytest.mark.parametrize("poll_interval", [1, 3, 10])
+def test_cancelled_episodes_leave_their_worlds(poll_interval):
     """The first to end makes another needless, of which some segments are at work and others wait; the last one goes on."""
     suite = short_suite(OWN)
-    short, long = episode(MAXIMUM, seed=0), [episode(DIAGONAL, MAXIMUM, seed=1)]
-    last = episode(DIAGONAL, seed=3)
-
-    class Dropping(Agenda):
-        def finished(self, record):
-            super().finished(record)
-            return long if record.episode == short else ()
-
-    agenda = Dropping([short, *long, last])
-    scene = Scene(
-        robot=GO2,
-        parameters=GO2.parameters[suite.parameters],
-        terrains=(ground((9.0, 0.0, 0.4)),),
-        terrain_index=(0,) * 8,
-        physics=suite.physics,
-    )
-    seen = []
-    runner = EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0, look_interval=look_interval)
-    runner.run(agenda, lambda progress: seen.append(set(progress.active())))
-    assert [r.episode for r in agenda.records] == [short, last]
-    first = next(i for i, active in enumerate(seen) if short not in active)
-    assert not any(set(long) & active for active in seen[first:])
-    alone = Agenda([last])
-    EpisodeRunner(suite, ScriptedPolicy(), Puppet(scene), lambda e: 0).run(alone)
-    np.testing.assert_array_equal(agenda.records[1].samples, alone.records[0].samples)
+    short, long, last = episode(MAXIMUM, seed=0), episode(DIAGONAL, MAXIMUM, seed=1), episode(DIAGONAL, seed=3)
+    backend = fake(suite, worlds=8)
+    rollout = Rollout(suite, ScriptedPolicy(), backend, lambda e: 0, poll_interval=poll_interval)
+    rollout.play([short, long, last])
+    (first,) = next(records for records in iter(rollout.advance, None) if records)
+    assert first.episode == short
+    assert rollout.advance() == []
+    assert long in rollout.ages()
+    rollout.drop([long])
+    assert long not in rollout.ages()
+    (record,) = to_the_end(rollout)
+    assert record.episode == last
+    (alone,) = run(suite, fake(suite, worlds=8), [last])
+    np.testing.assert_array_equal(record.samples, alone.samples)

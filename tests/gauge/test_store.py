@@ -7,10 +7,25 @@ import re
 import numpy as np
 import pytest
 from gaitgauge.gauge.episodes import Record, RecordError
-from gaitgauge.gauge.store import MemoryStore, RunFolder, StoreError, write_atomically
+from gaitgauge.gauge.store import RunFolder, StoreError
 from scripted_gauge import DIAGONAL, MAXIMUM, episode
 
 REQUEST = {"suite": "s 1", "seeds": [0, 1], "level": None}
+
+
+def opened(path, *, resume=False):
+    with RunFolder(path, REQUEST, resume=resume):
+        pass
+
+
+def put(path, record):
+    with RunFolder(path, REQUEST, resume=False) as folder:
+        folder.put(record)
+
+
+def records(path):
+    with RunFolder(path, REQUEST, resume=True) as folder:
+        return folder.records
 
 
 def full_record(**changes):
@@ -40,39 +55,36 @@ def same(one, other):
 
 @pytest.mark.parametrize("success", [None, True, False])
 def test_a_record_comes_back_bit_by_bit(tmp_path, success):
-    folder = RunFolder(tmp_path / "run", REQUEST, resume=False)
     record = full_record(success=success)
-    folder.put(record)
-    again = RunFolder(tmp_path / "run", REQUEST, resume=True).get(record.episode)
+    put(tmp_path / "run", record)
+    again = records(tmp_path / "run")[record.episode]
     same(again, record)
     assert again.success is success
     assert again.diverged is True
 
 
 def test_a_record_without_samples_comes_back(tmp_path):
-    folder = RunFolder(tmp_path, REQUEST, resume=False)
     record = Record(episode=episode("target_pos_velocity", stage="search"), success=True)
-    folder.put(record)
-    same(RunFolder(tmp_path, REQUEST, resume=True).get(record.episode), record)
+    put(tmp_path, record)
+    same(records(tmp_path)[record.episode], record)
 
 
-def test_an_episode_that_never_ran_is_unknown(tmp_path):
-    folder = RunFolder(tmp_path, REQUEST, resume=False)
-    folder.put(full_record())
-    resumed = RunFolder(tmp_path, REQUEST, resume=True)
-    assert resumed.get(episode(DIAGONAL)) is None
-    memory = MemoryStore()
-    memory.put(full_record())
-    assert memory.get(episode(DIAGONAL)) is None
-
-
-def test_what_a_killed_process_left_half_written_is_no_record(tmp_path):
-    folder = RunFolder(tmp_path, REQUEST, resume=False)
+def test_what_a_killed_process_left_half_written_is_no_record_and_goes(tmp_path):
     record = full_record()
-    (tmp_path / "episodes" / f"{record.episode.key}.tmp").write_bytes(b"half")
-    assert RunFolder(tmp_path, REQUEST, resume=True).get(record.episode) is None
-    folder.put(record)
-    same(RunFolder(tmp_path, REQUEST, resume=True).get(record.episode), record)
+    put(tmp_path, record)
+    half = tmp_path / "episodes" / ".0123456789abcdef.partial.npz"
+    half.write_bytes(b"half")
+    assert list(records(tmp_path)) == [record.episode]
+    assert not half.exists()
+
+
+def test_records_that_results_do_not_count_are_discarded(tmp_path):
+    kept, other = full_record(), full_record(episode=episode(DIAGONAL, seed=7))
+    with RunFolder(tmp_path, REQUEST, resume=False) as folder:
+        folder.put(kept)
+        folder.put(other)
+        folder.discard_all_but([kept.episode])
+    assert list(records(tmp_path)) == [kept.episode]
 
 
 def damaged(kind, data):
@@ -88,27 +100,27 @@ def damaged(kind, data):
 @pytest.mark.parametrize("kind", ["truncated", "empty", "text", "flipped", "array"])
 def test_a_damaged_record_is_one_sentence(tmp_path, kind):
     record = full_record()
-    RunFolder(tmp_path, REQUEST, resume=False).put(record)
+    put(tmp_path, record)
     file = tmp_path / "episodes" / f"{record.episode.key}.npz"
     file.write_bytes(damaged(kind, file.read_bytes()))
     with pytest.raises(RecordError, match=r"is damaged .*; delete it and run again with --resume") as caught:
-        RunFolder(tmp_path, REQUEST, resume=True).get(record.episode)
+        records(tmp_path)
     assert "\n" not in str(caught.value)
     assert str(file) in str(caught.value)
 
 
 def test_a_record_under_another_episodes_name_is_damaged(tmp_path):
     record = full_record()
-    RunFolder(tmp_path, REQUEST, resume=False).put(record)
+    put(tmp_path, record)
     other = episode(DIAGONAL)
     (tmp_path / "episodes" / f"{record.episode.key}.npz").rename(tmp_path / "episodes" / f"{other.key}.npz")
     with pytest.raises(RecordError, match=re.escape(f"it holds episode {record.episode.key}")):
-        RunFolder(tmp_path, REQUEST, resume=True).get(other)
+        records(tmp_path)
 
 
 def test_a_record_runs_no_code_when_it_is_read(tmp_path):
     record = full_record()
-    RunFolder(tmp_path, REQUEST, resume=False).put(record)
+    put(tmp_path, record)
     file = tmp_path / "episodes" / f"{record.episode.key}.npz"
     np.savez(file, head=np.array([{"a": 1}], dtype=object), samples=[], goal_index=[], part_index=[])
     with pytest.raises(RecordError, match="damaged"):
@@ -119,15 +131,15 @@ def test_a_record_runs_no_code_when_it_is_read(tmp_path):
 
 
 def test_a_folder_is_taken_up_again_only_when_asked(tmp_path):
-    RunFolder(tmp_path / "run", REQUEST, resume=False)
+    opened(tmp_path / "run")
     with pytest.raises(StoreError, match="already holds this run; go on with --resume"):
-        RunFolder(tmp_path / "run", REQUEST, resume=False)
-    RunFolder(tmp_path / "run", REQUEST, resume=True)
+        opened(tmp_path / "run")
+    opened(tmp_path / "run", resume=True)
 
 
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_folder_of_another_run_is_refused_and_left_as_it_is(tmp_path, resume):
-    RunFolder(tmp_path, REQUEST, resume=False).put(full_record())
+    put(tmp_path, full_record())
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     with pytest.raises(StoreError, match=r"belongs to another run \(seeds was \[0, 1\], now \[2\]\)"):
         RunFolder(tmp_path, {**REQUEST, "seeds": [2]}, resume=resume)
@@ -147,7 +159,7 @@ def test_a_folder_with_something_else_in_it_is_refused(tmp_path):
 
 @pytest.mark.parametrize("content", ["{", "[1, 2]", ""])
 def test_a_damaged_request_is_refused(tmp_path, content):
-    RunFolder(tmp_path, REQUEST, resume=False)
+    opened(tmp_path)
     (tmp_path / "request.json").write_text(content)
     with pytest.raises(StoreError, match=r"request\.json is damaged"):
         RunFolder(tmp_path, REQUEST, resume=True)
@@ -155,8 +167,9 @@ def test_a_damaged_request_is_refused(tmp_path, content):
 
 def test_a_folder_of_a_run_that_was_killed_while_it_began_will_do(tmp_path):
     (tmp_path / "episodes").mkdir()
-    (tmp_path / "request.json.tmp").write_text('{"sui')
-    RunFolder(tmp_path, REQUEST, resume=True)
+    (tmp_path / ".0123456789abcdef.partial").write_text('{"sui')
+    (tmp_path / ".lock").touch()
+    opened(tmp_path, resume=True)
     (tmp_path / "other" / "episodes").mkdir(parents=True)
     (tmp_path / "other" / "episodes" / "x.npz").write_bytes(b"")
     with pytest.raises(StoreError, match="holds no run"):
@@ -165,19 +178,6 @@ def test_a_folder_of_a_run_that_was_killed_while_it_began_will_do(tmp_path):
 
 def test_an_empty_folder_and_one_that_is_not_there_will_do(tmp_path):
     (tmp_path / "empty").mkdir()
-    RunFolder(tmp_path / "empty", REQUEST, resume=True)
-    RunFolder(tmp_path / "a" / "b", REQUEST, resume=False)
+    opened(tmp_path / "empty", resume=True)
+    opened(tmp_path / "a" / "b")
     assert json.loads((tmp_path / "a" / "b" / "request.json").read_text()) == REQUEST
-
-
-def test_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
-    path = tmp_path / "results.json"
-    write_atomically(path, "first")
-
-    def fail(*_):
-        raise OSError("disk full")
-
-    monkeypatch.setattr("os.fsync", fail)
-    with pytest.raises(OSError, match="disk full"):
-        write_atomically(path, "second")
-    assert path.read_text() == "first"

@@ -1,5 +1,0 @@
-"""MuJoCo on the CPU."""
-
-from .backend import MujocoBackend
-
-__all__ = ["MujocoBackend"]

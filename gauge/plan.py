@@ -1,0 +1,233 @@
+"""What is to be played in an environment, as a pure function of the episodes that have ended (gauge protocol §7).
+
+``plan(environment, records, rules)`` returns the level as far as it is known, the episodes that count, those of them that
+have not ended (required), and those that may be required yet, with the probability of that. A first run, a resumed one, the
+scheduling of episodes and the folding of results all ask this function; there is no other state than the records.
+
+Two rules hold, and tests check them. What counts depends on the outcomes of the counted episodes alone: records of others,
+played ahead of time, change when something is known and never what. And what is required once stays counted.
+
+Another way to find a level, a curve over several levels for example, is another function of the same arguments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+from .episodes import Episode, Record
+from .goals import TARGET
+from .pipelines import Environment
+from .suite import Suite
+
+Records = Mapping[Episode, Record]
+"""Episodes that have ended."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanRules:
+    """What a plan depends on beside environment and records."""
+
+    suite: Suite
+    seeds: tuple[int, ...]
+    """Seeds of the quality episodes."""
+    quality: bool = True
+    """Whether quality is evaluated at the level, and not the level alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is known of an environment and what is to be played there."""
+
+    level: int | None
+    """Level reached or given, None while searched for; 0 on flat ground, and where not even level 1 is passed."""
+    passed: Mapping[int, bool] = field(default_factory=dict)
+    """Outcomes of the levels that the search has asked for, in its order."""
+    counted: tuple[Episode, ...]
+    """Episodes of which the results consist, in order, as far as they are known."""
+    required: tuple[Episode, ...]
+    """Those of them that have not ended."""
+    possible: Mapping[Episode, float] = field(default_factory=dict)
+    """Episodes that have not ended and may be required yet, and how probable that is."""
+
+
+def plan(environment: Environment, records: Records, rules: PlanRules) -> Plan:
+    """Plan an environment: the level by bisection over level tests unless it is given, then the quality episodes.
+
+    Args:
+        environment: what is gauged.
+        records: episodes that have ended, of this environment and of others.
+        rules: see ``PlanRules``.
+    """
+    counted: list[Episode] = []
+    passed: dict[int, bool] = {}
+    low, high = 0, rules.suite.scoring.levels
+    if environment.level is not None:
+        low = high = environment.level
+    while low < high:
+        test = _level_test(environment, (low + high + 1) // 2, records, rules)
+        counted += test.counted
+        if test.passed is None:
+            break
+        passed[test.level] = test.passed
+        low, high = (test.level, high) if test.passed else (low, test.level - 1)
+    level = low if low == high else None
+    if level is not None:
+        counted += _quality(environment, level, rules)
+    possible = dict(_possible(environment, low, high, records, rules, 1.0)) if level is None else {}
+    counts = set(counted)
+    return Plan(
+        level=level,
+        passed=passed,
+        counted=tuple(counted),
+        required=tuple(e for e in counted if e not in records),
+        possible={e: p for e, p in possible.items() if p > 0.0 and e not in records and e not in counts},
+    )
+
+
+def plan_list(episodes: Sequence[Episode], records: Records) -> Plan:
+    """The plan of a fixed list of episodes, at levels that are given."""
+    return Plan(level=None, counted=tuple(episodes), required=tuple(e for e in episodes if e not in records))
+
+
+def _possible(
+    environment: Environment, low: int, high: int, records: Records, rules: PlanRules, probability: float
+) -> Iterator[tuple[Episode, float]]:
+    """Episodes that a search between two levels may ask for, and how probable that is, given how probable the search is."""
+    if low == high:
+        yield from ((episode, probability) for episode in _quality(environment, low, rules))
+        return
+    test = _level_test(environment, (low + high + 1) // 2, records, rules)
+    # a round that has begun is played to its end, even where the outcome is certain before
+    yield from ((episode, probability) for episode in test.counted)
+    yield from ((episode, probability * test.goes_on) for episode in test.later)
+    if test.probability > 0.0:
+        yield from _possible(environment, test.level, high, records, rules, probability * test.probability)
+    if test.probability < 1.0:
+        yield from _possible(environment, low, test.level - 1, records, rules, probability * (1.0 - test.probability))
+
+
+# ---- one level --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelTest:
+    """One level, played with the search seeds in rounds.
+
+    A round has as many episodes as must still succeed: the outcome is that of playing all seeds, and the episodes that count
+    depend on nothing but their results. Shorter rounds would save episodes where a level is failed, and cost rounds where it is
+    passed; a search is a chain of rounds, and the longest chain is what a run of few environments waits for.
+    """
+
+    level: int
+    counted: Sequence[Episode]
+    """Episodes of the rounds so far."""
+    later: Sequence[Episode]
+    """Episodes of which another round may consist."""
+    passed: bool | None
+    """Whether the level is passed, as soon as that is certain."""
+    probability: float
+    """How probable it is that the level is passed: 0 or 1 once that is certain."""
+    goes_on: float
+    """How probable it is that the present round leaves the outcome open."""
+
+
+def _level_test(environment: Environment, level: int, records: Records, rules: PlanRules) -> LevelTest:
+    """How far the test of a level is."""
+    suite = rules.suite
+    seeds = suite.matrix.search_seeds
+    episodes = [_episode(environment, level, seed, "search", suite) for seed in seeds]
+    outcomes = [bool(records[e].success) if e in records else None for e in episodes]
+    needed = math.ceil(suite.scoring.pass_rate * len(seeds) - 1e-9)
+    most_failures = len(seeds) - needed
+    size = needed
+    while None not in outcomes[:size]:
+        missing = needed - outcomes[:size].count(True)
+        if missing <= 0 or missing > len(seeds) - size:
+            break
+        size += missing
+    successes, failures = outcomes.count(True), outcomes.count(False)
+    passed = True if successes >= needed else False if failures > most_failures else None
+    known = successes, failures
+    at_least, open_until = needed - successes, most_failures - failures
+    running = outcomes[:size].count(None)
+    return LevelTest(
+        level=level,
+        counted=episodes[:size],
+        later=episodes[size:],
+        passed=passed,
+        probability=sum(_successes(*known, outcomes.count(None))[max(at_least, 0) :]) if passed is None else passed,
+        goes_on=sum(
+            p for more, p in enumerate(_successes(*known, running)) if more < at_least and running - more <= open_until
+        ),
+    )
+
+
+@lru_cache
+def _successes(successes: int, failures: int, more: int) -> tuple[float, ...]:
+    """Probabilities of 0 to ``more`` successes in that many further episodes, after some successes and failures.
+
+    Every rate of success is equally probable to begin with, which makes it a beta-binomial distribution.
+    """
+
+    def beta(a: int, b: int) -> float:
+        return math.factorial(a) * math.factorial(b) / math.factorial(a + b + 1)
+
+    before = beta(successes, failures)
+    return tuple(math.comb(more, k) * beta(successes + k, failures + more - k) / before for k in range(more + 1))
+
+
+def _quality(environment: Environment, level: int, rules: PlanRules) -> list[Episode]:
+    """The quality episodes at a level; none where not even level 1 is passed."""
+    if not rules.quality or (level == 0 and environment.terrain != "flat"):
+        return []
+    return [_episode(environment, level, seed, "eval", rules.suite) for seed in rules.seeds]
+
+
+def _episode(environment: Environment, level: int, seed: int, stage: str, suite: Suite) -> Episode:
+    return Episode(
+        terrain=environment.terrain,
+        level=level,
+        friction=environment.friction,
+        payload=environment.payload,
+        seed=seed,
+        stage=stage,
+        goals=tuple(g.name for g in suite.goals if (g.name == TARGET) == (stage == "search")),
+    )
+
+
+# ---- the end ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentResult(Environment):
+    """An environment at the level reached or given, and what came of it."""
+
+    search: Mapping[int, bool] | None
+    """Levels that the search asked for, and whether they were passed; None where the level was given."""
+    trials: Sequence[Record]
+    """Episodes of the level tests."""
+    records: Sequence[Record]
+    """Quality episodes, in the order of the seeds."""
+
+    @property
+    def searched(self) -> bool:
+        """Whether the level was found by search."""
+        return self.search is not None
+
+
+def environment_result(environment: Environment, records: Records, rules: PlanRules) -> EnvironmentResult:
+    """What came of an environment of which all required episodes have ended."""
+    found = plan(environment, records, rules)
+    counted = [records[episode] for episode in found.counted]
+    return EnvironmentResult(
+        terrain=environment.terrain,
+        friction=environment.friction,
+        payload=environment.payload,
+        level=found.level,
+        search=found.passed if environment.searched else None,
+        trials=[r for r in counted if r.episode.stage == "search"],
+        records=[r for r in counted if r.episode.stage == "eval"],
+    )

@@ -1,0 +1,234 @@
+"""What is known of the segment in every world of a rollout: what it is, how far it is, and what it has counted so far.
+
+A control step reads and writes these tensors in place; where it is captured as a CUDA graph they have to stay where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+
+from ..robots.base import Robot
+from ..robots.rotation import from_yaw
+from ..terrains.base import Terrain
+from .goals import TARGET, Schedule
+from .segments import Segment, SegmentRules
+from .suite import Suite
+
+
+class SegmentCounts(NamedTuple):
+    """What a world counted during a segment, and up to its first penetration."""
+
+    control_steps: int
+    substeps: int
+    falls: int
+    lost_samples: int
+    samples: int
+    """Rows in the table of samples."""
+    penetration_control_steps: int
+    penetration_substeps: int
+    penetration_samples: int
+    diverged: bool
+    overflowed: bool
+    reached: bool
+    penetrated: bool
+    penetration_overflowed: bool
+
+
+@dataclass(kw_only=True)
+class WorldBuffers:
+    """Tensors over K worlds, the first axis of each: (K,) where nothing else is said."""
+
+    active: torch.Tensor
+    """Whether the world takes part in control steps, bool."""
+
+    # what does not change during a segment
+    spawn: torch.Tensor
+    """Base position after a reset [m], world frame, (K, 3)."""
+    heading: torch.Tensor
+    """Base orientation after a reset, wxyz, (K, 4)."""
+    terrain_index: torch.Tensor
+    """Terrain of the scene, int64."""
+    target: torch.Tensor
+    """Position to reach [m], world frame, (K, 3)."""
+    backward: torch.Tensor
+    """Whether the way to the target is walked backwards, bool."""
+    speed: torch.Tensor
+    """Forward speed on the way to the target [m/s]."""
+    limits: torch.Tensor
+    """Command limits, forward, lateral [m/s] and yaw [rad/s], (K, 3)."""
+    friction: torch.Tensor
+    """Sliding friction coefficient."""
+    first_row: torch.Tensor
+    """Where the sub-command begins in ``Schedule.commands``, int64."""
+    length: torch.Tensor
+    """Control steps of the sub-command, or those that the target goal may take, int64."""
+    noise_start: torch.Tensor
+    """Where the segment begins in its episode's noise [control steps], int64."""
+    aims: torch.Tensor
+    """Whether the segment aims at a target, bool."""
+    sampled: torch.Tensor
+    """Whether samples are taken, bool."""
+
+    # how far it is
+    settling: torch.Tensor
+    """Whether the robot is waited for to stand, bool."""
+    commanded_steps: torch.Tensor
+    """Control steps since it stood, int64."""
+    tick: torch.Tensor
+    """Substeps on the grid of samples, int64."""
+    substeps: torch.Tensor
+    """Substeps so far, int64."""
+    control_steps: torch.Tensor
+    """Control steps so far, int64."""
+    done: torch.Tensor
+    """Whether the way to the target is over, and the robot settles once more, bool."""
+    reached: torch.Tensor
+    """Whether the target was reached, bool."""
+    falls: torch.Tensor
+    """int64."""
+    diverged: torch.Tensor
+    """bool."""
+    overflowed: torch.Tensor
+    """bool."""
+    lost_samples: torch.Tensor
+    """Samples that a fall cost, int64."""
+    action: torch.Tensor
+    """The last action, float32, (K, J)."""
+    target_command: torch.Tensor
+    """Command that leads to the target, forward, lateral [m/s] and yaw [rad/s], (K, 3)."""
+
+    # the first penetration, and how far the segment was then
+    watched: torch.Tensor
+    """Whether a penetration would matter, bool."""
+    penetrated: torch.Tensor
+    """Whether there was one, bool."""
+    penetration_control_steps: torch.Tensor
+    penetration_substeps: torch.Tensor
+    penetration_samples: torch.Tensor
+    penetration_overflowed: torch.Tensor
+
+    # since the last poll
+    ended: torch.Tensor
+    """Whether the segment has ended, bool."""
+    respawn: torch.Tensor
+    """Whether the robot goes back to its spawn, bool."""
+    not_finite: torch.Tensor
+    """Whether the policy answered a finite observation with something else, bool."""
+
+    @classmethod
+    def allocate(cls, count: int, joints: int, device: torch.device, dtype: torch.dtype) -> WorldBuffers:
+        """Buffers of ``count`` empty worlds; ``dtype`` is that of the physics."""
+
+        def zeros(*shape: int, kind: torch.dtype = dtype) -> torch.Tensor:
+            return torch.zeros(count, *shape, device=device, dtype=kind)
+
+        floats = {
+            "spawn": zeros(3),
+            "heading": zeros(4),
+            "target": zeros(3),
+            "speed": zeros(),
+            "limits": zeros(3) + 1.0,
+            "friction": zeros() + 1.0,
+            "action": zeros(joints, kind=torch.float32),
+            "target_command": zeros(3),
+        }
+        integers = (
+            "terrain_index first_row length noise_start commanded_steps tick substeps control_steps falls lost_samples "
+            "penetration_control_steps penetration_substeps penetration_samples"
+        )
+        flags = (
+            "active backward aims sampled settling done reached diverged overflowed watched penetrated "
+            "penetration_overflowed ended respawn not_finite"
+        )
+        return cls(
+            **floats,
+            **{name: zeros(kind=torch.int64) for name in integers.split()},
+            **{name: zeros(kind=torch.bool) for name in flags.split()},
+        )
+
+    def mask(self, worlds: Sequence[int]) -> torch.Tensor:
+        """(K,) bool, true for some worlds."""
+        mask = torch.zeros_like(self.active)
+        if worlds:
+            mask[torch.tensor(worlds, device=mask.device)] = True
+        return mask
+
+    def begin(
+        self,
+        worlds: Sequence[int],
+        segments: Sequence[Segment],
+        terrain_index: Sequence[int],
+        *,
+        terrains: Sequence[Terrain],
+        suite: Suite,
+        robot: Robot,
+        schedule: Schedule,
+        rules: SegmentRules,
+    ) -> None:
+        """Let segments begin in worlds; nothing of the worlds' earlier ones is left.
+
+        Args:
+            worlds: where.
+            segments: one for each of them.
+            terrain_index: their terrains, indices into ``terrains``.
+            terrains: those of the scene.
+            suite, robot, schedule, rules: what decides about a segment.
+        """
+        device = self.active.device
+        at = torch.tensor(worlds, device=device)
+        episodes, grounds = [s.episode for s in segments], [terrains[i] for i in terrain_index]
+        poses = [
+            t.spawns["level_eval" if e.stage == "eval" else "level_search"]
+            for t, e in zip(grounds, episodes, strict=True)
+        ]
+        aims, stand = [s.goal == TARGET for s in segments], robot.stand_height
+
+        def write(into: torch.Tensor, values: Sequence[object]) -> None:
+            into[at] = torch.tensor(values, device=device, dtype=into.dtype)
+
+        write(self.spawn, [(p.position[0], p.position[1], p.position[2] + stand) for p in poses])
+        self.heading[at] = from_yaw(torch.tensor([p.yaw for p in poses], device=device, dtype=self.heading.dtype))
+        write(self.terrain_index, terrain_index)
+        if any(aims):
+            write(self.target, [t.target or (0.0, 0.0, 0.0) for t in grounds])
+            write(self.backward, [t.backward for t in grounds])
+            write(self.speed, [suite.commands.target_speed.get(t.family, 0.0) for t in grounds])
+        write(self.limits, [suite.command_limits(t.family) for t in grounds])
+        write(self.friction, [e.friction for e in episodes])
+        write(self.first_row, [schedule.first_row(s.goal, s.sub_command) for s in segments])
+        lengths = [
+            schedule.target_steps.get(t.family, 0)
+            if s.goal == TARGET
+            else len(schedule.sub_commands[s.goal][s.sub_command])
+            for s, t in zip(segments, grounds, strict=True)
+        ]
+        write(self.length, lengths)
+        write(self.noise_start, [rules.noise_start(s) for s in segments])
+        write(self.aims, aims)
+        write(self.watched, [rules.restarts and not s.again for s in segments])
+        write(self.sampled, [e.stage == "eval" for e in episodes])
+        mask = self.mask(worlds)
+        for counter in (self.tick, self.substeps, self.control_steps, self.falls, self.lost_samples):
+            counter.masked_fill_(mask, 0)
+        for flag in (self.done, self.reached, self.penetrated, self.diverged, self.overflowed):
+            flag.masked_fill_(mask, 0)
+
+    def leave(self, worlds: Sequence[int]) -> None:
+        """Empty worlds."""
+        at = torch.tensor(worlds, dtype=torch.int64, device=self.active.device)
+        for flag in (self.active, self.ended, self.respawn, self.not_finite):
+            flag[at] = False
+
+    def counts(self, worlds: Sequence[int], samples: torch.Tensor) -> list[SegmentCounts]:
+        """What some worlds counted; ``samples``: rows that each of the K worlds has in the table of samples, (K,)."""
+        whole = (self.control_steps, self.substeps, self.falls, self.lost_samples, samples)
+        beginning = (self.penetration_control_steps, self.penetration_substeps, self.penetration_samples)
+        flags = (self.diverged, self.overflowed, self.reached, self.penetrated, self.penetration_overflowed)
+        numbers = torch.stack([t.to(torch.int64) for t in (*whole, *beginning, *flags)], dim=1)
+        rows = numbers[torch.tensor(worlds, device=numbers.device)].tolist()
+        split = len(whole) + len(beginning)
+        return [SegmentCounts(*row[:split], *map(bool, row[split:])) for row in rows]
