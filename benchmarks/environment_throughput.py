@@ -30,9 +30,9 @@ from gaitgauge.training.tasks import find_task
 from torch.utils._python_dispatch import TorchDispatchMode
 
 PARTS = (
-    ("random numbers", "program.uniform", "draw"),
-    ("targets", "program", "targets"),
-    ("latency", "program", "delay"),
+    ("random numbers", "parts.uniform", "draw"),
+    ("targets", "parts", "targets"),
+    ("latency", "parts", "delay"),
     ("physics", "backend", "step"),
     ("reading the state", "", "_read"),
     ("judging and resetting (torch)", "", "_after_physics"),

@@ -69,7 +69,7 @@ def _shown(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
-        return ",".join(_shown(v) for v in value)
+        return ",".join(_shown(v) for v in value) or "()"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

@@ -14,6 +14,10 @@ from ..terrains.base import Terrain
 from ..terrains.training_tiles import TILE_KINDS, make_tile
 from .configuration import ConfigurationError
 from .environment_configuration import TerrainConfiguration, TileConfiguration
+from .environment_memory import EnvironmentMemory
+from .own_terms import resolve
+from .randomness import UniformColumns
+from .step_inputs import StepInputs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,6 +77,53 @@ def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
     bounds = torch.tensor([sum(shares[: i + 1]) / total for i in range(len(shares))], dtype=torch.float64)
     middle = (torch.arange(num_envs, dtype=torch.float64) + 0.5) / num_envs
     return torch.searchsorted(bounds[:-1].contiguous(), middle, right=True)
+
+
+class Levels:
+    """Which tile each world stands on."""
+
+    def __init__(self, configuration: TerrainConfiguration, palette: TrainingPalette, kind: torch.Tensor) -> None:
+        """Put the tiles' indices on the device.
+
+        Args:
+            configuration: distances and switches.
+            palette: the tiles.
+            kind: kind of tile of every world, (N,) int64.
+
+        Raises:
+            ConfigurationError: the level rule is not there.
+        """
+        self._settings, self._kind, self._num_levels = configuration, kind, palette.num_levels
+        self._index = palette.index.to(kind.device)
+        self._rule = resolve(configuration.level_rule, "terrain.level_rule")
+
+    def follow(self, memory: EnvironmentMemory, inputs: StepInputs) -> None:
+        """Remember how far the robots came, and how far they should have come."""
+        memory.farthest.copy_(torch.maximum(memory.farthest, inputs.distance))
+        forward, lateral = memory.command[:, :1], memory.command[:, 1:2]
+        heading_xy = inputs.heading_xy
+        left_xy = torch.stack((-heading_xy[:, 1], heading_xy[:, 0]), dim=1)
+        memory.commanded_way.add_((forward * heading_xy + lateral * left_xy) * inputs.period)
+        memory.commanded_farthest.copy_(torch.maximum(memory.commanded_farthest, memory.commanded_way.norm(dim=1)))
+
+    def move(
+        self, memory: EnvironmentMemory, uniform: UniformColumns, worlds: torch.Tensor, failed: torch.Tensor
+    ) -> None:
+        """Level and tile of the next episode of the masked worlds, of which some ``failed``, both (N,) bool."""
+        level = self._rule(
+            self._settings,
+            level=memory.level,
+            num_levels=self._num_levels,
+            farthest=memory.farthest,
+            commanded=memory.commanded_farthest,
+            fallen=failed,
+            uniform=uniform["level"][:, 0],
+        )
+        torch.where(worlds & memory.moves_level, level, memory.level, out=memory.level)
+        variants = self._index.shape[2]
+        variant = (uniform["variant"][:, 0] * variants).long().clamp(max=variants - 1)
+        tile = self._index[self._kind, memory.level, variant]
+        torch.where(worlds, tile, memory.terrain_index, out=memory.terrain_index)
 
 
 def next_level(

@@ -26,17 +26,12 @@ from .configuration import ConfigurationError
 from .curriculum import TrainingPalette, assign_kinds, build_palette
 from .domain_randomization import BodyParameters, draw_bodies
 from .environment_configuration import EnvironmentConfiguration
+from .events import EpisodeStart
+from .observations import Observations
+from .own_terms import resolve_own
+from .step import EnvironmentStep, StepResult
 from .step_graph import CapturedFunction
-from .step_program import StepProgram
-from .step_records import (
-    AFTER_RESET,
-    AFTER_STEP,
-    METRICS,
-    EpisodeStart,
-    Observations,
-    Verdict,
-    static_inputs,
-)
+from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
 
 STATE_VERSION = 1
 
@@ -109,7 +104,7 @@ class TrainingEnvironment(VecEnv):
         self._generator = torch.Generator(device=self.device)
         self._generator.manual_seed(configuration.seed)
         self._inputs = static_inputs(self.backend.state, stays=self.backend.state_stays)
-        self.program = StepProgram(
+        self.parts = EnvironmentStep(
             configuration,
             robot=self.robot,
             parameters=parameters,
@@ -119,10 +114,10 @@ class TrainingEnvironment(VecEnv):
             inputs=self._inputs,
             generator=self._generator,
         )
-        self.max_episode_length = self.program.max_episode_length
-        self.kind = self.program.kind
+        self.max_episode_length = self.parts.max_episode_length
+        self.kind = self.parts.kind
         self.common_step_counter = 0
-        self._kind_share = self._kind_averages()
+        self._events = resolve_own(configuration.events, "events").values()
         self._bodies = draw_bodies(
             configuration.randomization, self.num_envs, len(self.robot.collision_bodies), self._generator
         )
@@ -130,10 +125,10 @@ class TrainingEnvironment(VecEnv):
         schedule = configuration.schedule
         if not 0.0 <= schedule.begin <= 1.0:
             raise ConfigurationError(f"schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1")
-        self.program.memory.step.fill_(round(schedule.begin * schedule.horizon_steps))
+        self.parts.memory.step.fill_(round(schedule.begin * schedule.horizon_steps))
         self._begin(level.to(self.device))
-        self._after_physics: Callable[[], Verdict] = self.program.after_physics
-        self._observe: Callable[[], Observations] = self.program.observe
+        self._after_physics: Callable[[], StepResult] = self.parts.after_physics
+        self._observe: Callable[[], Observations] = self.parts.observe
         if fuse:
             self._after_physics = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
             self._observe = torch.compile(self._observe, fullgraph=True, dynamic=False)
@@ -143,7 +138,7 @@ class TrainingEnvironment(VecEnv):
     @property
     def progress(self) -> torch.Tensor:
         """Fraction of the run that schedules are at, a scalar tensor."""
-        return self.program.progress()
+        return self.parts.progress()
 
     @staticmethod
     def _start_levels(configuration: EnvironmentConfiguration) -> torch.Tensor:
@@ -155,29 +150,23 @@ class TrainingEnvironment(VecEnv):
         random = torch.Generator().manual_seed(configuration.seed)
         return torch.randint(highest + 1, (configuration.num_envs,), generator=random)
 
-    def _kind_averages(self) -> torch.Tensor:
-        """Matrix that averages over the worlds of each kind, (K, N)."""
-        kinds = torch.arange(len(self.palette.tiles), device=self.device)
-        of_kind = (self.kind[None, :] == kinds[:, None]).float()
-        return of_kind / of_kind.sum(dim=1, keepdim=True).clamp_min(1.0)
-
     def _begin(self, level: torch.Tensor) -> None:
         """Begin an episode in every world, on the given levels, (N,)."""
-        memory = self.program.memory
+        memory = self.parts.memory
         memory.level.copy_(level)
         memory.moves_level.zero_()  # what an earlier episode came to moves nothing
-        if self.program.push_steps > 0:
-            memory.push_phase.random_(self.program.push_steps, generator=self._generator)
+        if self.parts.pushes.steps > 0:
+            memory.push_phase.random_(self.parts.pushes.steps, generator=self._generator)
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        self.program.uniform.draw()
-        start = self.program.begin_episodes(everyone, torch.zeros_like(everyone), self.program.progress())
+        self.parts.uniform.draw()
+        start = self.parts.begin_episodes(everyone, torch.zeros_like(everyone), self.parts.progress())
         self._reset(start)
         self._read(AFTER_STEP)
-        self._observations = _clone(self.program.observe())
+        self._observations = self.parts.observe().clone()
 
     def _capture(self) -> None:
         """Capture both torch parts; what their warm-up changes is put back."""
-        memory, motors = self.program.memory, self.program.motors
+        memory, motors = self.parts.memory, self.parts.motors
         before = memory.snapshot()
         motors_before = motors.snapshot()
         with torch.no_grad():
@@ -191,15 +180,15 @@ class TrainingEnvironment(VecEnv):
     @property
     def episode_length_buf(self) -> torch.Tensor:
         """Control steps of every world's present episode, (N,) int64. Assigning copies into the same tensor."""
-        return self.program.memory.episode_length
+        return self.parts.memory.episode_length
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        self.program.memory.episode_length.copy_(value)
+        self.parts.memory.episode_length.copy_(value)
 
     def get_observations(self) -> TensorDict:
         """Present observations, copies."""
-        return self._pack(_clone(self._observations))
+        return self._pack(self._observations.clone())
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -212,26 +201,26 @@ class TrainingEnvironment(VecEnv):
             Observations; rewards (N,); dones (N,) int64; extras with ``time_outs`` (N,) float and, every
             ``log_interval`` steps, ``log``. All are new tensors that no later step touches.
         """
-        program = self.program
-        program.action.copy_(actions)
-        program.uniform.draw()
-        self.backend.step(program.targets(), delay=program.delay())
+        parts = self.parts
+        parts.action.copy_(actions)
+        parts.uniform.draw()
+        self.backend.step(parts.targets(), delay=parts.delay())
         self._read(AFTER_STEP)
-        verdict = self._after_physics()
+        result = self._after_physics()
         self.common_step_counter += 1
-        extras: dict[str, Any] = {"time_outs": verdict.time_out.float()}
+        extras: dict[str, Any] = {"time_outs": result.time_out.float()}
         if self.common_step_counter % self.configuration.log_interval == 0:
             extras["log"] = self._log()
-        self._reset(verdict.start)
-        if program.push_steps > 0:
+        self._reset(result.start)
+        if (push := result.push) is not None:
             self.backend.push(
-                verdict.push,
-                linear_velocity_w=verdict.push_linear_velocity,
-                angular_velocity_b=verdict.push_angular_velocity,
+                push.worlds, linear_velocity_w=push.linear_velocity, angular_velocity_b=push.angular_velocity
             )
+        for event in self._events:
+            event(self, result.done)
         self._read(AFTER_RESET)
-        self._observations = _clone(self._observe())
-        return self._pack(self._observations), verdict.reward.clone(), verdict.done.long(), extras
+        self._observations = self._observe().clone()
+        return self._pack(self._observations), result.reward.clone(), result.done.long(), extras
 
     def close(self) -> None:
         """Free the physics."""
@@ -247,7 +236,7 @@ class TrainingEnvironment(VecEnv):
             getattr(self._inputs, name).copy_(getattr(state, name))
 
     def _reset(self, start: EpisodeStart) -> None:
-        self.program.motors.apply(self.backend)
+        self.parts.motors.apply(self.backend)
         self.backend.reset(
             start.worlds,
             base_position=start.base_position,
@@ -255,8 +244,8 @@ class TrainingEnvironment(VecEnv):
             joint_position=start.joint_position,
             base_linear_velocity=start.base_linear_velocity,
             base_angular_velocity=start.base_angular_velocity,
-            held_target=self.program.default_pose.expand(self.num_envs, -1),
-            terrain_index=self.program.memory.terrain_index,
+            held_target=self.parts.default_pose.expand(self.num_envs, -1),
+            terrain_index=self.parts.memory.terrain_index,
         )
 
     def _pack(self, observations: Observations) -> TensorDict:
@@ -264,33 +253,9 @@ class TrainingEnvironment(VecEnv):
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def _log(self) -> dict[str, torch.Tensor]:
-        """What happened since the last log, as tensors on the device; sums start anew."""
-        memory, program = self.program.memory, self.program
-        terms = len(program.rewards.names)
-        finished = memory.finished_ends.sum()
-        values = torch.cat(
-            (
-                memory.finished_rewards / (memory.finished_steps * program.period),
-                memory.finished_ends / finished,
-                memory.metric_sums / memory.metric_steps,
-            )
-        )
-        memory.last_log.copy_(torch.where(torch.isfinite(values), values, memory.last_log))
-        memory.sums.zero_()
-        ends = program.terminations.names
-        names = [f"Episode_Reward/{n}" for n in program.rewards.names] + [f"Episode_Termination/{n}" for n in ends]
-        names += [f"Metrics/{n}" for n in METRICS]
-        assert len(names) == terms + len(ends) + len(METRICS)
-        log = dict(zip(names, memory.last_log.clone().unbind(), strict=True))
-        levels = (self._kind_share * memory.level.float()).sum(dim=1)
-        log |= {
-            f"Curriculum/{tile.name}": level for tile, level in zip(self.palette.tiles, levels.unbind(), strict=True)
-        }
-        log["Curriculum/mean_level"] = memory.level.float().mean()
-        log["Curriculum/progress"] = program.progress()
-        log["Physics/overflow_worlds"] = self.backend.state.overflowed.sum().float()
-        log["Physics/nan_resets"] = memory.diverged_total.float()
-        return log
+        """What happened since the last log, as tensors on the device."""
+        log = self.parts.log.read(self.parts.memory, self.parts.progress())
+        return log | {"Physics/overflow_worlds": self.backend.state.overflowed.sum().float()}
 
     # --- resuming ---------------------------------------------------------------------------------------------------
 
@@ -300,8 +265,8 @@ class TrainingEnvironment(VecEnv):
         """
         return {
             "version": STATE_VERSION,
-            "step": self.program.memory.step.clone(),
-            "level": self.program.memory.level.to(torch.int16),
+            "step": self.parts.memory.step.clone(),
+            "level": self.parts.memory.level.to(torch.int16),
             "bodies": {f.name: getattr(self._bodies, f.name).clone() for f in fields(self._bodies)},
             "common_step_counter": self.common_step_counter,
         }
@@ -317,8 +282,8 @@ class TrainingEnvironment(VecEnv):
         state = self.backend.state
         return {
             "version": STATE_VERSION,
-            "memory": self.program.memory.snapshot(),
-            "motors": self.program.motors.snapshot(),
+            "memory": self.parts.memory.snapshot(),
+            "motors": self.parts.motors.snapshot(),
             "bodies": {f.name: getattr(self._bodies, f.name).clone() for f in fields(self._bodies)},
             "observations": {f.name: getattr(self._observations, f.name).clone() for f in fields(self._observations)},
             "generator": self._generator.get_state(),
@@ -340,17 +305,17 @@ class TrainingEnvironment(VecEnv):
         if "memory" not in state:
             self._begin_from(state)
             return
-        program = self.program
-        program.memory.restore({name: value.to(self.device) for name, value in state["memory"].items()})
-        program.motors.restore(state["motors"])
+        parts = self.parts
+        parts.memory.restore({name: value.to(self.device) for name, value in state["memory"].items()})
+        parts.motors.restore(state["motors"])
         self._bodies = BodyParameters(**{name: value.to(self.device) for name, value in state["bodies"].items()})
         self._bodies.apply(self.backend)
-        program.motors.apply(self.backend)
+        parts.motors.apply(self.backend)
         self._observations = Observations(**{n: v.to(self.device).clone() for n, v in state["observations"].items()})
         self._generator.set_state(state["generator"].cpu())
         self.common_step_counter = state["common_step_counter"]
         physics = {name: value.to(self.device) for name, value in state["physics"].items()}
-        program.action.copy_(program.memory.action)
+        parts.action.copy_(parts.memory.action)
         self.backend.reset(
             base_position=physics["base_position_w"],
             base_quaternion=physics["base_quaternion_w"],
@@ -358,8 +323,8 @@ class TrainingEnvironment(VecEnv):
             base_linear_velocity=physics["base_linear_velocity_w"],
             base_angular_velocity=physics["base_angular_velocity_b"],
             joint_velocity=physics["joint_velocity"],
-            held_target=program.targets(),
-            terrain_index=program.memory.terrain_index,
+            held_target=parts.targets(),
+            terrain_index=parts.memory.terrain_index,
         )
         self._read(AFTER_RESET)
 
@@ -370,7 +335,7 @@ class TrainingEnvironment(VecEnv):
             raise ValueError(
                 f"the saved environment does not fit: it has {len(level)} worlds, this environment {self.num_envs}"
             )
-        self.program.memory.step.copy_(progress["step"])
+        self.parts.memory.step.copy_(progress["step"])
         self.common_step_counter = progress["common_step_counter"]
         self._bodies = BodyParameters(**{name: value.to(self.device) for name, value in progress["bodies"].items()})
         self._bodies.apply(self.backend)
@@ -409,7 +374,3 @@ def training_contract(
         damping=parameters.damping,
         control_period=configuration.physics.control_period,
     )
-
-
-def _clone(observations: Observations) -> Observations:
-    return Observations(**{f.name: getattr(observations, f.name).clone() for f in fields(observations)})

@@ -56,6 +56,51 @@ class JointConfiguration:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OwnReward:
+    """A reward term of one's own."""
+
+    name: str
+    """Name in the log and in settings."""
+    function: str
+    """``module:function`` of ``StepInputs`` to one number for each world, (N,)."""
+    weight: Ramp | float
+    """Weight per second; penalties are negative."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnTermination:
+    """An end of episodes of one's own."""
+
+    name: str
+    """Name in the log and in settings."""
+    function: str
+    """``module:function`` of ``StepInputs`` and ``TerminationConfiguration`` to (N,) bool."""
+    time_out: bool = False
+    """Whether the end is no failure: what would have followed is bootstrapped."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnObservation:
+    """Something more that teacher and critic see."""
+
+    name: str
+    """Name in settings."""
+    function: str
+    """``module:function`` of ``ObservationInputs`` to (N, width), without noise, of the order of one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnEvent:
+    """Something more that happens to the physics."""
+
+    name: str
+    """Name in settings."""
+    function: str
+    """``module:function`` of the environment and the worlds whose episode begins, (N,) bool; called in every step after
+    resets and pushes."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class NoiseConfiguration:
     """Half-widths of the uniform noise that every observation gets, in physical units. 0 turns an entry off."""
 
@@ -87,6 +132,9 @@ class ObservationConfiguration:
     """Distance between scan points [m]."""
     scan_cell: float = 0.05
     """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
+    own: tuple[OwnObservation, ...] = ()
+    """Entries of one's own behind those of ``privileged``. The mirror images of ``training.algorithm.symmetry`` do not
+    know them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,6 +207,8 @@ class RewardConfiguration:
     """Contact force from which a thigh, a calf or the base counts as touching [N]."""
     soft_limit: float = 0.9
     """Share of a joint's range, about its middle, that is free of the joint-limit penalty."""
+    own: tuple[OwnReward, ...] = ()
+    """Terms of one's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,6 +258,8 @@ class CommandConfiguration:
     """Chance that a stationary command keeps its yaw rate, so that the robot turns on the spot. Published: always."""
     stationary_longest: float = 3.0
     """Longest stationary command [s]."""
+    generator: str = "gaitgauge.training.commands:CommandGenerator"
+    """``module:class`` that draws commands, this one or one derived from it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,6 +331,8 @@ class TerrainConfiguration:
     levels."""
     spread_distance: float = 3.0
     """Those episodes start up to this far from the tile's middle, in x and in y [m]."""
+    level_rule: str = "gaitgauge.training.curriculum:next_level"
+    """``module:function`` that says on which level the next episode is, with the arguments of this one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,6 +400,8 @@ class TerminationConfiguration:
     the level down. None for never."""
     stuck_from: float = 0.1
     """Fraction of the run from which being stuck ends episodes: a robot that cannot walk yet is always stuck."""
+    own: tuple[OwnTermination, ...] = ()
+    """Rules of one's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -371,5 +427,7 @@ class EnvironmentConfiguration:
     randomization: RandomizationConfiguration = RandomizationConfiguration()
     push: PushConfiguration = PushConfiguration()
     termination: TerminationConfiguration = TerminationConfiguration()
+    events: tuple[OwnEvent, ...] = ()
+    """Events of one's own."""
     log_interval: int = 8
     """Environment steps between two logs of finished episodes; each log costs the learner's logger time."""

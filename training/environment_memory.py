@@ -9,6 +9,8 @@ from dataclasses import dataclass, fields
 
 import torch
 
+from .step_inputs import StepInputs
+
 EPISODE = (
     "farthest",
     "commanded_way",
@@ -157,6 +159,15 @@ class EnvironmentMemory:
             last_log=numbers(terms + ends + metrics),
             diverged_total=counts(),
         )
+
+    def remember(self, inputs: StepInputs) -> None:
+        """Keep what the next step compares itself with."""
+        self.previous_action.copy_(self.action)
+        self.action.copy_(inputs.action)
+        self.joint_acceleration.copy_(inputs.joint_acceleration)
+        self.joint_velocity.copy_(inputs.joint_velocity)
+        self.joint_torque.copy_(inputs.joint_torque)
+        self.foot_force.copy_(inputs.state.foot_contact_force_w.norm(dim=-1))
 
     def begin_episode(self, worlds: torch.Tensor) -> None:
         """Clear what belongs to one episode in the masked worlds, (N,) bool."""

@@ -1,14 +1,25 @@
 """What the networks see: the noisy frame, its history, and the privileged state of teacher and critic.
 
-The frame itself comes from the policy room's builder, the one that the gauge uses too.
+The frame itself comes from the policy room's builder, the one that the gauge uses too. The privileged state is a table,
+``PRIVILEGED_TERMS``, of functions of ``ObservationInputs``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+
 import torch
 
+from ..backends.base import PhysicsState
 from ..policy.contract import TERM_WIDTH, PolicyContract
-from .environment_configuration import NoiseConfiguration
+from ..policy.observation import ObservationBuilder
+from ..robots.rotation import rotate_inverse
+from .environment_configuration import NoiseConfiguration, ObservationConfiguration
+from .environment_memory import EnvironmentMemory
+from .height_scan import HeightRasters, heading, place_pattern
+from .own_terms import resolve_own
+from .randomness import UniformColumns
 
 LINEAR_VELOCITY_SCALE = 2.0
 FOOT_FORCE_SCALE = 1e-3
@@ -58,44 +69,115 @@ def push_history(history: torch.Tensor, frame: torch.Tensor, forget: torch.Tenso
     return torch.cat((kept, newest), dim=1)
 
 
-def height_entries(base_height: torch.Tensor, ground: torch.Tensor) -> torch.Tensor:
-    """Scan entries: height of the base over each point less ``HEIGHT_OFFSET``, clipped to 1 m, scaled.
+@dataclass(frozen=True, kw_only=True)
+class ObservationInputs:
+    """What is observed: the present state, which is fresh in worlds that were just reset. N worlds."""
 
-    Args:
-        base_height: z of the base, world frame [m], (N,).
-        ground: z of the ground at each scan point, world frame [m], (N, P).
-    """
-    return (base_height[:, None] - HEIGHT_OFFSET - ground).clamp(-1.0, 1.0) * HEIGHT_SCALE
+    state: PhysicsState
+    """The physics; poses and velocities are fresh, forces those of the last step."""
+    memory: EnvironmentMemory
+    """Commands, actions, and what the last step led to."""
+    frame: torch.Tensor
+    """Observation of the policy without noise, (N, 45)."""
+    ground: torch.Tensor
+    """Height of the ground at each point of the scan, world frame [m], (N, P)."""
+    torque_limit: torch.Tensor
+    """Largest torque of each joint [N·m], (J,)."""
 
 
-def privileged_state(
-    *,
-    base_linear_velocity_b: torch.Tensor,
-    frame: torch.Tensor,
-    foot_force: torch.Tensor,
-    torque_ratio: torch.Tensor,
-    joint_acceleration: torch.Tensor,
-    heights: torch.Tensor,
-) -> torch.Tensor:
-    """State that only training knows, without noise: 263 entries for a robot with 12 joints, 4 feet and 187 scan
-    points.
+def base_linear_velocity(inputs: ObservationInputs) -> torch.Tensor:
+    """Velocity of the base in its own frame, (N, 3)."""
+    state = inputs.state
+    return rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w) * LINEAR_VELOCITY_SCALE
 
-    Args:
-        base_linear_velocity_b: [m/s], (N, 3); entries 0:3, scaled by 2.
-        frame: the observation without noise, (N, 45); entries 3:48.
-        foot_force: norm of each foot's contact force [N], (N, 4); entries 48:52, scaled by 1e-3.
-        torque_ratio: torque over its limit, (N, J); entries 52:64.
-        joint_acceleration: [rad/s²], (N, J); entries 64:76, scaled by 1e-4. The published code has the opposite sign.
-        heights: entries of the height scan, (N, P); the rest.
-    """
-    return torch.cat(
-        (
-            base_linear_velocity_b * LINEAR_VELOCITY_SCALE,
-            frame,
-            foot_force * FOOT_FORCE_SCALE,
-            torque_ratio,
-            joint_acceleration * JOINT_ACCELERATION_SCALE,
-            heights,
-        ),
-        dim=1,
-    )
+
+def frame(inputs: ObservationInputs) -> torch.Tensor:
+    """The policy's observation without noise, (N, 45)."""
+    return inputs.frame
+
+
+def foot_force(inputs: ObservationInputs) -> torch.Tensor:
+    """Norm of each foot's contact force, (N, F)."""
+    return inputs.memory.foot_force * FOOT_FORCE_SCALE
+
+
+def torque_ratio(inputs: ObservationInputs) -> torch.Tensor:
+    """Torques over their limits, (N, J)."""
+    return inputs.memory.joint_torque / inputs.torque_limit
+
+
+def joint_acceleration(inputs: ObservationInputs) -> torch.Tensor:
+    """Joint accelerations, (N, J). The published code has the opposite sign."""
+    return inputs.memory.joint_acceleration * JOINT_ACCELERATION_SCALE
+
+
+def height_scan(inputs: ObservationInputs) -> torch.Tensor:
+    """Height of the base over each point of the scan less ``HEIGHT_OFFSET``, clipped to 1 m, (N, P)."""
+    height = inputs.state.base_position_w[:, 2:3] - HEIGHT_OFFSET - inputs.ground
+    return height.clamp(-1.0, 1.0) * HEIGHT_SCALE
+
+
+PrivilegedTerm = Callable[[ObservationInputs], torch.Tensor]
+
+PRIVILEGED_TERMS: Mapping[str, PrivilegedTerm] = {
+    f.__name__: f for f in (base_linear_velocity, frame, foot_force, torque_ratio, joint_acceleration, height_scan)
+}
+"""State that only training knows, without noise, in this order: 263 entries for 12 joints, 4 feet and 187 scan points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """The three observation groups."""
+
+    policy: torch.Tensor
+    """Noisy frame, (N, 45)."""
+    history: torch.Tensor
+    """Noisy frames, oldest first, the current one last, (N, 225)."""
+    privileged: torch.Tensor
+    """(N, 263)."""
+
+    def clone(self) -> Observations:
+        """Copies."""
+        return Observations(**{f.name: getattr(self, f.name).clone() for f in fields(self)})
+
+
+class Observer:
+    """Makes observations of the present state."""
+
+    def __init__(
+        self,
+        configuration: ObservationConfiguration,
+        *,
+        contract: PolicyContract,
+        builder: ObservationBuilder,
+        scan: torch.Tensor,
+        rasters: HeightRasters,
+        torque_limit: torch.Tensor,
+    ) -> None:
+        """Choose the terms.
+
+        Raises:
+            ConfigurationError: a term of one's own is not there.
+        """
+        own = resolve_own(configuration.own, "observations.own", taken=PRIVILEGED_TERMS)
+        self._terms: list[PrivilegedTerm] = [*PRIVILEGED_TERMS.values(), *own.values()]
+        self._builder, self._scan, self._rasters = builder, scan, rasters
+        self._torque_limit = torque_limit
+        self._noise = noise_amplitude(contract, configuration.noise, scan.device)
+        self._start = contract.history.start
+
+    def __call__(self, state: PhysicsState, memory: EnvironmentMemory, uniform: UniformColumns) -> Observations:
+        """Observations; the noisy frame is added to the history."""
+        clean = self._builder.build(state, memory.command, memory.action)
+        noisy = add_noise(clean, uniform.signed("noise"), self._noise)
+        memory.history.copy_(push_history(memory.history, noisy, memory.just_reset, start=self._start))
+        points = place_pattern(self._scan, state.base_position_w[:, :2], heading(state.base_quaternion_w))
+        inputs = ObservationInputs(
+            state=state,
+            memory=memory,
+            frame=clean,
+            ground=self._rasters.height(memory.terrain_index, points),
+            torque_limit=self._torque_limit,
+        )
+        privileged = torch.cat([term(inputs) for term in self._terms], dim=1)
+        return Observations(policy=noisy, history=memory.history.flatten(1), privileged=privileged)

@@ -13,6 +13,7 @@ import torch
 
 from ..robots.rotation import projected_gravity
 from .environment_configuration import Ramp, RewardConfiguration
+from .own_terms import resolve_own
 from .schedules import RampTable
 from .step_inputs import StepInputs
 
@@ -181,18 +182,25 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
         termination,
     )
 }
-"""All terms by the names of their weights in ``RewardConfiguration``."""
+"""All terms by the names of their weights in ``RewardConfiguration``, which adds those of one's own."""
 
 
 class RewardFunction:
     """The weighted sum of the terms whose weight is not zero."""
 
     def __init__(self, configuration: RewardConfiguration, control_period: float, device: torch.device | str) -> None:
-        """Choose the terms and put their weights on the device."""
+        """Choose the terms and put their weights on the device.
+
+        Raises:
+            ConfigurationError: a term of one's own is not there.
+        """
+        own = resolve_own(configuration.own, "rewards.own", taken=REWARD_TERMS)
         weights: dict[str, Ramp | float] = {name: getattr(configuration, name) for name in REWARD_TERMS}
+        weights |= {term.name: term.weight for term in configuration.own}
         used = {name: weight for name, weight in weights.items() if weight != 0.0}
         self.names: tuple[str, ...] = tuple(used)
-        self._terms = [REWARD_TERMS[name] for name in self.names]
+        terms = {**REWARD_TERMS, **own}
+        self._terms = [terms[name] for name in self.names]
         self._weights = RampTable(list(used.values()), device)
         # The termination penalty is per fall; all other weights are per second.
         period = [1.0 if name == "termination" else control_period for name in self.names]

@@ -2,11 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 
 from ..backends.base import PhysicsState
+
+AFTER_STEP = (
+    "base_position_w",
+    "base_quaternion_w",
+    "base_linear_velocity_w",
+    "base_angular_velocity_b",
+    "joint_position",
+    "joint_velocity",
+    "joint_torque",
+    "foot_position_w",
+    "foot_velocity_w",
+    "foot_contact_force_w",
+    "body_contact_force_w",
+    "trunk_contact_force_w",
+    "diverged",
+)
+"""Physics state that a step is judged by."""
+AFTER_RESET = AFTER_STEP[:6]
+"""Physics state that is observed."""
+
+
+def static_inputs(state: PhysicsState, *, stays: bool = False) -> PhysicsState:
+    """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32; or, if these stay for
+    good, the engine's own.
+    """
+    if stays:
+        return state
+    return PhysicsState(**{f.name: _float32(getattr(state, f.name)).clone() for f in fields(PhysicsState)})
+
+
+def _float32(value: torch.Tensor) -> torch.Tensor:
+    return value.float() if value.is_floating_point() else value
 
 
 @dataclass(kw_only=True)
@@ -75,6 +107,10 @@ class StepInputs:
     """Worlds whose physics is not sound any more, (N,) bool."""
     progress: torch.Tensor
     """Fraction of the run, scalar."""
+    heading_xy: torch.Tensor
+    """Unit vector of the base's x axis in the world's xy plane, (N, 2)."""
+    period: float
+    """Control period [s]."""
     state: PhysicsState
     """The physics, for whatever else a function needs."""
     failed: torch.Tensor

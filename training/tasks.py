@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from importlib import import_module
 from types import MappingProxyType
 
 from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
@@ -200,6 +201,18 @@ TASKS: Mapping[str, Task] = MappingProxyType({task.name: task for task in (_moe_
 """All tasks by name."""
 
 
+def _own_task(path: str) -> Task:
+    """The task at ``module:attribute``, under this name, by which a resumed run finds it again."""
+    module, _, attribute = path.partition(":")
+    try:
+        found = getattr(import_module(module), attribute, None)
+    except (ImportError, ValueError) as error:
+        raise TaskError(f"task '{path}': {error}; is its folder on PYTHONPATH?") from error
+    if not isinstance(found, Task):
+        raise TaskError(f"task '{path}': module '{module}' has no Task of the name '{attribute}'")
+    return replace(found, name=path)
+
+
 def task_names() -> list[str]:
     """Names of all tasks."""
     return list(TASKS)
@@ -211,18 +224,22 @@ def find_task(name: str, overrides: Iterable[str] = ()) -> Task:
     Schedules are spread over the run's iterations, unless ``environment.schedule.horizon_steps`` is set.
 
     Args:
-        name: one of ``task_names()``.
+        name: one of ``task_names()``, or ``module:attribute`` of a ``Task`` of one's own.
         overrides: ``environment.…=value`` and ``training.…=value``.
 
     Raises:
         TaskError: unknown task, or a key or value that does not fit.
     """
-    if name not in TASKS:
+    if ":" in name:
+        known = _own_task(name)
+    elif name in TASKS:
+        known = TASKS[name]
+    else:
         near = get_close_matches(name, TASKS, n=2, cutoff=0.3)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise TaskError(f"unknown task '{name}'; {hint}the tasks are: {', '.join(TASKS)}")
     chosen = list(overrides)
-    task = TASKS[name].with_overrides(chosen)
+    task = known.with_overrides(chosen)
     own_horizon = any(o.split("=", 1)[0].strip() == "environment.schedule.horizon_steps" for o in chosen)
     return task if own_horizon else task.with_horizon()
 

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import torch
 
 from .environment_configuration import TerminationConfiguration
+from .own_terms import resolve_own
+from .rewards import commanded_to_move, progress_share
 from .step_inputs import StepInputs
 
 STUCK_SHORTFALL = 0.9
@@ -55,7 +57,12 @@ def tilt(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor
 
 
 def stuck(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
-    """Nearly all of the commanded speed has been missing for about ``stuck`` seconds."""
+    """Nearly all of the commanded speed has been missing for about ``stuck`` seconds: an average that began at 0 has come
+    to ``STUCK_SHORTFALL`` after this much time at a standstill.
+    """
+    assert settings.stuck is not None
+    missing = torch.where(commanded_to_move(inputs.command), 1.0 - progress_share(inputs), 0.0).nan_to_num(0.0)
+    inputs.shortfall.lerp_(missing, 1.0 - (1.0 - STUCK_SHORTFALL) ** (inputs.period / settings.stuck))
     return (inputs.shortfall > STUCK_SHORTFALL) & (inputs.progress >= settings.stuck_from)
 
 
@@ -72,7 +79,7 @@ TERMINATIONS: dict[str, Termination] = {
     "stuck": Termination(rule=stuck),
     "diverged": Termination(rule=diverged),
 }
-"""All rules by name. A rule whose setting of the same name is None or false is left out."""
+"""All rules by name. A rule whose setting of the same name is None or false is left out; ``own`` adds more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,9 +98,15 @@ class Terminations:
     """The rules in use."""
 
     def __init__(self, configuration: TerminationConfiguration) -> None:
-        """Choose the rules."""
+        """Choose the rules.
+
+        Raises:
+            ConfigurationError: a rule of one's own is not there.
+        """
         self._settings = configuration
         used = {name: t for name, t in TERMINATIONS.items() if getattr(configuration, name, True) not in (None, False)}
+        own = resolve_own(configuration.own, "termination.own", taken=TERMINATIONS)
+        used |= {t.name: Termination(rule=own[t.name], time_out=t.time_out) for t in configuration.own}
         # Time-outs first, so that each sort is neighbouring columns.
         self.names: tuple[str, ...] = tuple(sorted(used, key=lambda name: not used[name].time_out))
         self._rules = [used[name].rule for name in self.names]

@@ -17,6 +17,7 @@ from gaitgauge.training.environment_configuration import (
     ResetConfiguration,
     TerminationConfiguration,
 )
+from gaitgauge.training.events import joint_ranges
 from small_environment import FLAT, STAIRS, gliding, idle, make
 
 NEVER = math.inf
@@ -74,7 +75,7 @@ def test_action_becomes_targets_with_the_drawn_latency():
     delayed = RandomizationConfiguration(motor_offset=(0.0, 0.0), delay=(0.02, 0.02))
     environment = make(script=FakeScript(joint_law="track"), randomization=delayed)
     action = torch.full((8, 12), 0.4)
-    default = environment.program.default_pose
+    default = environment.parts.default_pose
     environment.step(action)
     assert environment.backend.state.joint_position[0].tolist() == pytest.approx(default.tolist(), abs=1e-6)
     environment.step(action)
@@ -83,10 +84,10 @@ def test_action_becomes_targets_with_the_drawn_latency():
 
 def test_latency_is_uniform_over_whole_substeps():
     environment = make(4000)
-    counts = torch.bincount(environment.program.delay(), minlength=5)
+    counts = torch.bincount(environment.parts.delay(), minlength=5)
     assert len(counts) == 5
     assert (counts.float() / 4000).tolist() == pytest.approx([0.2] * 5, abs=0.03)
-    assert make(randomization=RandomizationConfiguration(delay=(0.0, 0.0))).program.delay() is None
+    assert make(randomization=RandomizationConfiguration(delay=(0.0, 0.0))).parts.delay() is None
 
 
 def test_falls_and_divergence_end_episodes_without_time_out():
@@ -131,7 +132,7 @@ def test_the_trunk_ends_an_episode_only_where_it_is_told_to():
         assert any(done) == ends, newtons
         weight = environment.backend.state.trunk_contact_force_w[:, 2]
         assert ends or (weight > 100.0).all()
-        assert ("trunk_contact" in environment.program.terminations.names) == (newtons is not None)
+        assert ("trunk_contact" in environment.parts.terminations.names) == (newtons is not None)
 
 
 def test_impossible_joint_speed_counts_as_divergence():
@@ -167,7 +168,7 @@ def test_first_observation_after_a_reset_is_fresh():
     )
     while not (result := idle(environment))[2].any():
         pass
-    observations, state, program = result[0], environment.backend.state, environment.program
+    observations, state, parts = result[0], environment.backend.state, environment.parts
     privileged = observations["privileged"]
     w, _, _, z = state.base_quaternion_w.float().unbind(1)
     yaw = 2 * torch.atan2(z, w)
@@ -177,7 +178,7 @@ def test_first_observation_after_a_reset_is_fresh():
     assert velocity.abs().max() <= 0.5 + 1e-6 and velocity.std() > 0.2
     assert torch.allclose(privileged[:, 3:6], 0.25 * state.base_angular_velocity_b.float(), atol=1e-6)
     assert torch.allclose(privileged[:, 6:9], torch.tensor([0.0, 0.0, -1.0]).expand(64, 3), atol=1e-6)
-    assert torch.allclose(privileged[:, 12:24], state.joint_position.float() - program.default_pose, atol=1e-6)
+    assert torch.allclose(privileged[:, 12:24], state.joint_position.float() - parts.default_pose, atol=1e-6)
     assert (privileged[:, 24:76] == 0).all(), "no velocities, actions, forces, torques or accelerations yet"
     ground = torch.tensor(
         [
@@ -205,8 +206,9 @@ def test_episodes_start_above_the_highest_ground_below_the_robot():
 
 def test_joints_start_within_their_limits():
     environment = make(300, reset=ResetConfiguration())
-    position, program = environment.backend.state.joint_position.float(), environment.program
-    assert (position >= program.joint_lower - 1e-6).all() and (position <= program.joint_upper + 1e-6).all()
+    position = environment.backend.state.joint_position.float()
+    lower, upper = joint_ranges(environment.robot).unbind(1)
+    assert (position >= lower - 1e-6).all() and (position <= upper + 1e-6).all()
     assert (position.std(dim=0) > 0.02).all()
 
 
@@ -274,13 +276,13 @@ def test_commands_hold_for_their_interval():
         extreme_probability=0.0,
     )
     environment = make(commands=commands)
-    command = environment.program.memory.command.clone()
+    command = environment.parts.memory.command.clone()
     for interval in range(3):
         for step in range(10):
-            assert torch.equal(environment.program.memory.command, command), (interval, step)
+            assert torch.equal(environment.parts.memory.command, command), (interval, step)
             observations = idle(environment)[0]
-        assert not (environment.program.memory.command == command).all(dim=1).any()
-        command = environment.program.memory.command.clone()
+        assert not (environment.parts.memory.command == command).all(dim=1).any()
+        command = environment.parts.memory.command.clone()
         assert torch.allclose(observations["policy"][:, 6:9], command * torch.tensor([2.0, 2.0, 0.25]))
 
 
@@ -304,12 +306,12 @@ def test_reward_is_the_sum_of_the_logged_terms():
     total = torch.zeros(4)
     for _ in range(5):
         total += idle(environment)[1]
-    assert torch.allclose(environment.program.memory.episode_rewards.sum(dim=1), total, atol=1e-6)
+    assert torch.allclose(environment.parts.memory.episode_rewards.sum(dim=1), total, atol=1e-6)
 
 
 def test_dynamic_sigma():
     environment = make(5, terrain=replace(STAIRS, levels=9))
-    memory, program = environment.program.memory, environment.program
+    memory, parts = environment.parts.memory, environment.parts
     assert environment.kind.tolist() == [0, 0, 0, 1, 1]
     commands = [[1.0, -0.5, 1.5], [2.0, 1.5, 3.0], [0.2, 0.0, 0.5], [2.0, 1.0, 2.0], [0.0, 0.0, 0.0]]
     memory.command.copy_(torch.tensor(commands))
@@ -322,7 +324,7 @@ def test_dynamic_sigma():
         [0.25, 0.25, 0.25],
         [0.25, 0.25, 0.25],
     ]
-    assert torch.allclose(program.sigma(), torch.tensor(expected), atol=1e-6)
+    assert torch.allclose(parts.read.sigma(memory), torch.tensor(expected), atol=1e-6)
 
 
 def test_joint_constants_can_be_overridden():

@@ -75,7 +75,7 @@ def test_kinds_are_blocks_in_proportion():
 def test_students_and_teachers_share_every_kind_and_level():
     environment = make(800, terrain=replace(STAIRS, levels=3))
     student = torch.arange(800) % 4 == 0
-    level, kind = environment.program.memory.level, environment.kind
+    level, kind = environment.parts.memory.level, environment.kind
     for k in range(2):
         for lv in range(3):
             here = (kind == k) & (level == lv)
@@ -111,7 +111,7 @@ def test_unknown_kind():
 
 def test_worlds_climb_levels_and_get_the_tile_of_their_level():
     environment = make(12, script=gliding(8.0), terrain=replace(STAIRS, highest_start_level=0))
-    memory = environment.program.memory
+    memory = environment.parts.memory
     assert (memory.level == 0).all()
     for _ in range(54):
         idle(environment)
@@ -126,7 +126,7 @@ def test_falls_lower_the_level_of_the_fallen():
     never = float("inf")
     fall = torch.tensor([0.1, never, 0.1, never], dtype=torch.float64)
     environment = make(4, script=FakeScript(fall_time=fall), terrain=replace(STAIRS, tiles=STAIRS.tiles[:1]))
-    memory = environment.program.memory
+    memory = environment.parts.memory
     memory.level.fill_(2)
     while not idle(environment)[2].any():
         pass
@@ -136,24 +136,24 @@ def test_falls_lower_the_level_of_the_fallen():
 def test_divergence_moves_no_level():
     diverge = torch.tensor([0.1, float("inf")], dtype=torch.float64)
     environment = make(2, script=FakeScript(diverge_time=diverge), terrain=replace(STAIRS, tiles=STAIRS.tiles[:1]))
-    environment.program.memory.level.fill_(2)
+    environment.parts.memory.level.fill_(2)
     while not idle(environment)[2].any():
         pass
-    assert environment.program.memory.level.tolist() == [2, 2]
+    assert environment.parts.memory.level.tolist() == [2, 2]
 
 
 def test_episodes_spread_over_the_tile_do_not_move_levels():
     spread = replace(STAIRS, spread_probability=1.0, tiles=STAIRS.tiles[:1])
     environment = make(8, script=gliding(8.0), terrain=spread)
-    level = environment.program.memory.level.clone()
+    level = environment.parts.memory.level.clone()
     finished = sum(idle(environment)[2] for _ in range(60))
     assert (finished > 0).all()
-    assert torch.equal(environment.program.memory.level, level)
+    assert torch.equal(environment.parts.memory.level, level)
 
 
 def test_commanded_way_follows_the_robot_s_heading():
     environment = make(4, script=gliding(0.0, 0.0, 4.0))
-    memory = environment.program.memory
+    memory = environment.parts.memory
     memory.command.copy_(torch.tensor([1.0, 0.0, 0.0]).expand(4, 3))
     memory.command_steps.fill_(1000)
     idle(environment, 39)
@@ -203,10 +203,10 @@ def test_a_robot_without_progress_is_stuck_after_the_time_set():
 
 def test_being_stuck_lowers_the_level():
     environment = make(4, terrain=STAIRS, commands=forward_at(0.5), termination=STUCK)
-    environment.program.memory.level.fill_(2)
+    environment.parts.memory.level.fill_(2)
     while not idle(environment)[2].any():
-        assert environment.program.memory.level.tolist() == [2] * 4
-    assert environment.program.memory.level.tolist() == [1] * 4
+        assert environment.parts.memory.level.tolist() == [2] * 4
+    assert environment.parts.memory.level.tolist() == [1] * 4
 
 
 def test_who_was_told_to_stand_is_not_stuck():

@@ -6,7 +6,7 @@ import pytest
 import torch
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import ALL_TILES, EnvironmentConfiguration, TerrainConfiguration
-from gaitgauge.training.step_records import AFTER_RESET, AFTER_STEP
+from gaitgauge.training.step_inputs import AFTER_RESET, AFTER_STEP
 
 torch.set_num_threads(1)
 
@@ -30,7 +30,7 @@ def test_robots_stand_and_see_the_ground(environment):
         observations, reward, _, extras = environment.step(torch.zeros(6, 12))
         assert all(observations[name].isfinite().all() for name in ("policy", "history", "privileged"))
         assert reward.isfinite().all()
-    assert float(environment.program.memory.diverged_total) == 0
+    assert float(environment.parts.memory.diverged_total) == 0
     assert float(extras["log"]["Physics/overflow_worlds"]) == 0
     standing = environment.episode_length_buf >= 35
     assert standing.sum() >= 3, "the standing pose holds"
@@ -67,9 +67,9 @@ def test_captured_and_eager_steps_agree():
     for step in range(120):
         action = torch.randn(64, 12, generator=random).cuda() * 1.5
         for environment in (eager, captured):
-            environment.program.action.copy_(action)
-            environment.program.uniform.draw()
-        eager.backend.step(eager.program.targets(), delay=eager.program.delay())
+            environment.parts.action.copy_(action)
+            environment.parts.uniform.draw()
+        eager.backend.step(eager.parts.targets(), delay=eager.parts.delay())
         read(AFTER_STEP)
         left, right = eager._after_physics(), captured._after_physics()
         assert torch.equal(left.done, right.done), step
@@ -93,4 +93,4 @@ def test_a_captured_environment_runs():
         for _ in range(100):
             observations, reward, _, _ = environment.step(torch.randn(256, 12, device="cuda:0") * 0.3)
     assert observations["history"].isfinite().all() and reward.isfinite().all()
-    assert int(environment.program.memory.step) == 100
+    assert int(environment.parts.memory.step) == 100

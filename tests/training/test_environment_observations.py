@@ -37,15 +37,15 @@ def test_frames_and_history_are_those_of_the_policy_room_s_builder(start):
     assert environment.contract.history == History(start=start)
     contract = replace(environment.contract, history=History(length=5, start=start))
     builder = ObservationBuilder(contract, load_robot("go2"), 5)
-    program = environment.program
-    expected = builder.build(environment.backend.state, program.memory.command, program.memory.action)
+    parts = environment.parts
+    expected = builder.build(environment.backend.state, parts.memory.command, parts.memory.action)
     random = torch.Generator().manual_seed(0)
     for step in range(7):
         observations = environment.get_observations()
         assert torch.allclose(observations["history"], expected, atol=1e-6), step
         assert torch.allclose(observations["policy"], expected[:, 180:], atol=1e-6)
         environment.step(torch.randn(5, 12, generator=random) * 0.3)
-        expected = builder.build(environment.backend.state, program.memory.command, program.memory.action)
+        expected = builder.build(environment.backend.state, parts.memory.command, parts.memory.action)
 
 
 def test_noise_amplitudes_and_where_there_is_none():
@@ -147,7 +147,7 @@ def test_rasters_go_on_beyond_their_edge_and_survive_nan():
 def test_height_entries_are_clipped_and_read_the_world_s_own_terrain():
     environment = make(40, terrain=replace(STAIRS, highest_start_level=2), reset=ResetConfiguration(velocity=0.0))
     privileged = environment.get_observations()["privileged"][:, 76:]
-    state, pattern = environment.backend.state, environment.program.scan
+    state, pattern = environment.backend.state, environment.parts.scan
     points = place_pattern(pattern, state.base_position_w[:, :2].float(), heading(state.base_quaternion_w.float()))
     for world in (0, 5, 17, 39):
         terrain = environment.palette.terrains[int(environment.backend.terrain_index[world])]
@@ -162,17 +162,11 @@ def test_height_entries_are_clipped_and_read_the_world_s_own_terrain():
 def test_foot_and_base_heights_are_measured_over_the_ground():
     environment = make(8, terrain=replace(STAIRS, highest_start_level=2), script=FakeScript())
     wiggle(environment, 1)
-    program = environment.program
+    parts = environment.parts
     state = environment.backend.state
-    captured = []
-    program.rewards = lambda inputs, progress: (
-        captured.append(inputs) or torch.zeros(8, len(environment.program.memory.last_log))
-    )
-    program._record = lambda *ignored: None
-    wiggle(environment, 1)
-    inputs = captured[0]
+    inputs = parts.read(parts.inputs, parts.memory, parts.action, parts.progress())
     for world in range(8):
-        terrain = environment.palette.terrains[int(program.memory.terrain_index[world])]
+        terrain = environment.palette.terrains[int(parts.memory.terrain_index[world])]
         feet = np.round(state.foot_position_w[world].numpy() / 0.05) * 0.05
         expected = state.foot_position_w[world, :, 2].numpy() - terrain.height(feet[:, 0], feet[:, 1])
         assert inputs.foot_height[world].numpy() == pytest.approx(expected, abs=1e-4)

@@ -103,17 +103,17 @@ def test_progress_without_episodes(tmp_path):
     reached = busy()
     run(reached, 17, 1)
     level = torch.arange(12) % 3
-    reached.program.memory.level.copy_(level)
+    reached.parts.memory.level.copy_(level)
     torch.save(reached.progress_dict(), tmp_path / "progress.pt")
 
     resumed = busy(seed=99)
     run(resumed, 3, 5)
     resumed.load_state_dict(torch.load(tmp_path / "progress.pt", weights_only=True))
-    memory = resumed.program.memory
+    memory = resumed.parts.memory
     assert torch.equal(memory.level, level) and resumed.common_step_counter == 17
-    assert torch.equal(resumed.program.progress(), reached.program.progress())
+    assert torch.equal(resumed.parts.progress(), reached.parts.progress())
     assert int(memory.episode_length.abs().sum()) == 0 and torch.equal(memory.history[:, :-1], memory.history[:, 1:])
-    kinds, variants = resumed.program._tile_index, memory.terrain_index
+    kinds, variants = resumed.palette.index, memory.terrain_index
     assert all(int(variants[i]) in kinds[resumed.kind[i], level[i]].tolist() for i in range(12))
     for name, value in reached.progress_dict()["bodies"].items():
         assert torch.equal(resumed.progress_dict()["bodies"][name], value), name
@@ -128,8 +128,8 @@ def test_progress_of_other_worlds_is_refused():
 
 def test_a_run_can_begin_in_the_middle_of_its_schedule():
     environment = make(12, **{**BUSY, "schedule": ScheduleConfiguration(horizon_steps=40, begin=0.5)})
-    assert float(environment.program.progress()) == 0.5
+    assert float(environment.parts.progress()) == 0.5
     run(environment, 4, 1)
-    assert float(environment.program.progress()) == pytest.approx(0.6)
+    assert float(environment.parts.progress()) == pytest.approx(0.6)
     with pytest.raises(ConfigurationError, match=r"schedule\.begin is 2"):
         make(12, **{**BUSY, "schedule": ScheduleConfiguration(begin=2.0)})

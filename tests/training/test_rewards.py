@@ -46,6 +46,8 @@ def quiet():
         shortfall=torch.zeros(2),
         diverged=torch.zeros(2, dtype=torch.bool),
         progress=torch.tensor(0.5),
+        heading_xy=torch.tensor([[1.0, 0.0]] * 2),
+        period=0.02,
         state=None,
         failed=torch.zeros(2, dtype=torch.bool),
         base_height_target=0.38,
@@ -176,7 +178,7 @@ def test_weights_follow_progress(quiet):
 
 def test_every_weight_names_a_term():
     settings = {"tracking_sigma", "dynamic_sigma", "sigma_linear_range", "sigma_yaw_range", "base_height_target"}
-    settings |= {"foot_height_scale", "foot_height_over", "collision_force", "soft_limit"}
+    settings |= {"foot_height_scale", "foot_height_over", "collision_force", "soft_limit", "own"}
     assert {f.name for f in fields(RewardConfiguration)} - settings == set(REWARD_TERMS)
 
 

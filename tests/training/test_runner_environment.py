@@ -48,7 +48,7 @@ def test_resumes_exactly_with_the_training_environment(tmp_path):
 
 def test_the_algorithm_and_checkpoints_know_where_schedules_are(tmp_path):
     runner = build(tmp_path, entropy_coefficient=Ramp(start=0.5, end=0.1, begin=0.0, until=0.5))
-    runner.env.program.memory.step.fill_(runner.env.configuration.schedule.horizon_steps // 4 - 6)
+    runner.env.parts.memory.step.fill_(runner.env.configuration.schedule.horizon_steps // 4 - 6)
     runner.learn(1)
     assert float(runner.alg.losses.entropy_coefficient) == pytest.approx(0.3)
     assert reached(read_checkpoint(tmp_path / "model_1.pt")) == pytest.approx(0.25)

@@ -143,8 +143,14 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
         robot: gives the foot names.
 
     Raises:
-        SymmetryError: names do not pair up, or the default pose is not its own mirror image.
+        SymmetryError: names do not pair up, the default pose is not its own mirror image, or there are observations of
+            one's own.
     """
+    if observations.own:
+        raise SymmetryError(
+            f"The mirror image of the observation '{observations.own[0].name}' is not known; set "
+            "training.algorithm.symmetry=none."
+        )
     joints = mirror_by_name(contract.joint_names, ABDUCTION_MARKS)
     pose = torch.tensor(contract.default_joint_position)
     if not torch.allclose(joints(pose), pose, atol=1e-6):

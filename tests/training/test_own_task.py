@@ -1,0 +1,110 @@
+"""A task of one's own, with a reward, an end, an observation and an event of its own: the example is the test."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from gaitgauge.backends.fake import FakeBackend, FakeScript
+from gaitgauge.robots import load_robot
+from gaitgauge.training.algorithms.symmetry import SymmetryError, build_mirror
+from gaitgauge.training.configuration import ConfigurationError
+from gaitgauge.training.environment import TrainingEnvironment, training_contract
+from gaitgauge.training.environment_configuration import (
+    EnvironmentConfiguration,
+    OwnReward,
+    OwnTermination,
+    RewardConfiguration,
+    TerminationConfiguration,
+)
+from gaitgauge.training.own_terms import resolve
+from gaitgauge.training.tasks import TaskError, find_task
+from small_environment import idle, make
+
+FOLDER = Path(__file__).parents[2] / "examples" / "own_task"
+
+
+@pytest.fixture
+def example(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    yield "quiet_walk:TASK"
+    sys.modules.pop("quiet_walk", None)
+
+
+def environment_of(task, script):
+    settings = replace(task.environment, num_envs=4)
+    return TrainingEnvironment(settings, backend=lambda scene: FakeBackend(scene, script=script))
+
+
+def test_the_example_trains_with_its_own_terms(example):
+    task = find_task(example, ["training.run.iterations=7", "environment.rewards.own.soft_landing.weight=-2.0"])
+    assert (task.name, task.environment.schedule.horizon_steps) == (example, 7 * 24)
+    rolling = FakeScript(
+        motion=lambda b: (torch.zeros_like(b.force_w), torch.tensor([2.0, 0.0, 0.0]).to(b.force_w).expand_as(b.force_w))
+    )
+    environment = environment_of(task, rolling)
+    observations = environment.get_observations()
+    assert observations["privileged"].shape == (4, 264)
+    assert torch.allclose(observations["privileged"][:, -1], environment.backend.state.base_position_w[:, 2].float())
+    for _ in range(100):
+        extras = idle(environment)[3]
+        if "log" in extras:
+            log = extras["log"]
+    assert float(log["Episode_Termination/load_lost"]) == 1.0, "2 rad/s take a quarter of a second to 0.5 rad"
+    assert log["Episode_Reward/soft_landing"].isfinite()
+    assert environment.backend.force_w[:, 1].abs().max() > 0.0, "the wind blows after 100 steps"
+
+
+def test_an_own_reward_is_weighted_like_any_other(example):
+    settings = RewardConfiguration(own=(OwnReward(name="tall", function="quiet_walk:soft_landing", weight=3.0),))
+    plain, own = make(4), make(4, rewards=settings)
+    assert own.parts.rewards.names == (*plain.parts.rewards.names, "tall")
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        ("soft_landing", r"rewards.own.mine.function is 'soft_landing'; write module:function"),
+        (
+            "no_such_module:f",
+            r"'no_such_module:f', but No module named 'no_such_module'; is its folder on PYTHONPATH\?",
+        ),
+        ("math:no_such_function", r"module 'math' has no function 'no_such_function'"),
+    ],
+)
+def test_functions_that_are_not_there(function, message):
+    with pytest.raises(ConfigurationError, match=message):
+        make(2, rewards=RewardConfiguration(own=(OwnReward(name="mine", function=function, weight=1.0),)))
+
+
+def test_a_name_that_is_taken():
+    mine = OwnTermination(name="tilt", function="math:sin")
+    with pytest.raises(ConfigurationError, match=r"termination.own has 'tilt', a name that is taken"):
+        make(2, termination=TerminationConfiguration(own=(mine,)))
+
+
+def test_a_task_that_is_not_there(example):
+    with pytest.raises(TaskError, match=r"task 'quiet_walk:TUSK': module 'quiet_walk' has no Task of the name 'TUSK'"):
+        find_task("quiet_walk:TUSK")
+    with pytest.raises(TaskError, match=r"task 'nowhere:TASK': No module named 'nowhere'; is its folder on PYTHONPATH"):
+        find_task("nowhere:TASK")
+
+
+def test_own_observations_have_no_mirror_image(example):
+    environment = find_task(example).environment
+    robot = load_robot("go2")
+    contract = training_contract(robot, robot.parameters["training"], environment)
+    with pytest.raises(SymmetryError, match=r"observation 'base_height' is not known; set .*symmetry=none"):
+        build_mirror(environment.observations, contract=contract, robot=robot)
+
+
+def test_own_terms_are_set_one_by_one(example):
+    with pytest.raises(TaskError, match=r"environment\.rewards\.own"):
+        find_task(example, ["environment.rewards.own=mine"])
+
+
+def test_rules_that_settings_name_are_there():
+    settings = EnvironmentConfiguration()
+    assert resolve(settings.commands.generator, "").__name__ == "CommandGenerator"
+    assert resolve(settings.terrain.level_rule, "").__name__ == "next_level"

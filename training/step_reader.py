@@ -1,0 +1,149 @@
+"""Turns the physics after a control step into what rewards and terminations look at."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from ..backends.base import PhysicsState
+from ..robots.base import Robot
+from ..robots.rotation import rotate_inverse
+from .curriculum import TrainingPalette
+from .environment_configuration import EnvironmentConfiguration
+from .environment_memory import EnvironmentMemory
+from .events import joint_ranges
+from .height_scan import HeightRasters, heading_and_upright, place_pattern
+from .step_inputs import StepInputs
+
+
+class StepReader:
+    """Computes ``StepInputs``; everything that never changes is on the device."""
+
+    def __init__(
+        self,
+        configuration: EnvironmentConfiguration,
+        *,
+        robot: Robot,
+        palette: TrainingPalette,
+        kind: torch.Tensor,
+        scan: torch.Tensor,
+        rasters: HeightRasters,
+    ) -> None:
+        """Prepare constants.
+
+        Args:
+            configuration: the environment's settings.
+            robot: the robot.
+            palette: the tiles.
+            kind: kind of tile of every world, (N,) int64.
+            scan: points of the height scan about the base [m], (P, 2).
+            rasters: heights of the ground.
+        """
+        self._settings, self._rasters = configuration.rewards, rasters
+        self._joint_velocity_limit = configuration.termination.joint_velocity
+        self._period = configuration.physics.control_period
+        self._longest = round(configuration.episode_length / self._period)
+        self._device = device = kind.device
+        near = (scan[:, 0].abs() <= 0.2 + 1e-4) & (scan[:, 1].abs() <= 0.15 + 1e-4)
+        self._trunk_points = scan[near]
+        self._default_pose = torch.tensor(robot.default_joint_position, device=device)
+        ranges = joint_ranges(robot).to(device)
+        lower, upper = ranges.unbind(1)
+        middle, half = ranges.mean(dim=1), 0.5 * (upper - lower) * self._settings.soft_limit
+        self._soft_lower, self._soft_upper = middle - half, middle + half
+        self._hips = self._indices(robot.joint_names, "hip")
+        bodies = robot.collision_bodies
+        self._base = bodies.index(robot.base_body)
+        self._legs = torch.cat((self._indices(bodies, "thigh"), self._indices(bodies, "calf")))
+        r, tiles = self._settings, palette.tiles
+        sigma = torch.tensor([tile.sigma for tile in tiles], device=device)[kind]
+        self._sigma_growth = sigma - r.tracking_sigma
+        levels = torch.arange(1, palette.num_levels + 1, device=device)
+        self._difficulty = (torch.exp(levels * 0.1) - 1.0).clamp(max=1.0)
+        low = torch.tensor((r.sigma_linear_range[0], r.sigma_linear_range[0], r.sigma_yaw_range[0]), device=device)
+        high = torch.tensor((r.sigma_linear_range[1], r.sigma_linear_range[1], r.sigma_yaw_range[1]), device=device)
+        self._sigma_low, self._sigma_rate = low, 1.0 / (high - low)
+        leave = configuration.terrain.leave_distance
+        distance = [leave if leave is not None and tile.ends else math.inf for tile in tiles]
+        self._leave = torch.tensor(distance, device=device)[kind]
+
+    def _indices(self, names: tuple[str, ...], part: str) -> torch.Tensor:
+        found = [i for i, name in enumerate(names) if part in name]
+        return torch.tensor(found, dtype=torch.int64, device=self._device)
+
+    def sigma(self, memory: EnvironmentMemory) -> torch.Tensor:
+        """Tracking width of every command axis, (N, 3) (paper, dynamic velocity tracking precision adjustment)."""
+        base = self._settings.tracking_sigma
+        command = memory.command
+        if not self._settings.dynamic_sigma:
+            return torch.full_like(command, base)
+        speed = ((command.abs() - self._sigma_low) * self._sigma_rate).clamp(0.0, 1.0)
+        return base + speed * (self._difficulty[memory.level] * self._sigma_growth)[:, None]
+
+    def __call__(
+        self, state: PhysicsState, memory: EnvironmentMemory, action: torch.Tensor, progress: torch.Tensor
+    ) -> StepInputs:
+        """What the step led to.
+
+        Args:
+            state: physics after the step.
+            memory: what was before it, and the counters, which are the step's.
+            action: raw action of the step, (N, J).
+            progress: fraction of the run, scalar.
+        """
+        settings, base = self._settings, state.base_position_w
+        velocity_b = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)
+        heading_xy, upright = heading_and_upright(state.base_quaternion_w)
+        touching = state.body_contact_force_w.norm(dim=-1)
+        fast = state.joint_velocity.abs().amax(dim=1)
+        total = base.sum(dim=1) + velocity_b.sum(dim=1) + state.joint_position.sum(dim=1)
+        # Both comparisons are false for NaN.
+        sound = (total.abs() < math.inf) & (fast <= self._joint_velocity_limit)
+        diverged = state.diverged | ~sound
+        trunk = place_pattern(self._trunk_points, base[:, :2], heading_xy)
+        points = torch.cat((trunk, state.foot_position_w[..., :2]), dim=1)
+        ground = self._rasters.height(memory.terrain_index, points)
+        below_base = ground[:, : len(self._trunk_points)].mean(dim=1)
+        below_feet = (
+            ground[:, len(self._trunk_points) :] if settings.foot_height_over == "foot" else below_base[:, None]
+        )
+        return StepInputs(
+            base_linear_velocity_b=velocity_b,
+            base_angular_velocity_b=state.base_angular_velocity_b,
+            base_quaternion_w=state.base_quaternion_w,
+            base_height=base[:, 2] - below_base,
+            command=memory.command,
+            sigma=self.sigma(memory),
+            joint_position=state.joint_position,
+            joint_velocity=state.joint_velocity,
+            joint_acceleration=(state.joint_velocity - memory.joint_velocity) * (1.0 / self._period),
+            joint_torque=state.joint_torque,
+            previous_joint_torque=memory.joint_torque,
+            default_joint_position=self._default_pose,
+            soft_lower=self._soft_lower,
+            soft_upper=self._soft_upper,
+            hip_joints=self._hips,
+            action=action,
+            previous_action=memory.action,
+            second_previous_action=memory.previous_action,
+            foot_height=state.foot_position_w[..., 2] - below_feet,
+            foot_velocity_w=state.foot_velocity_w,
+            touching_bodies=(touching[:, self._legs] > settings.collision_force).sum(dim=1).float(),
+            base_touching=(touching[:, self._base] > settings.collision_force).float(),
+            upright=upright,
+            trunk_contact_force_w=state.trunk_contact_force_w,
+            distance=base[:, :2].abs().amax(dim=1),
+            leave_distance=self._leave,
+            episode_length=memory.episode_length,
+            max_episode_length=self._longest,
+            shortfall=memory.shortfall,
+            diverged=diverged,
+            progress=progress,
+            heading_xy=heading_xy,
+            period=self._period,
+            state=state,
+            failed=diverged,
+            base_height_target=settings.base_height_target,
+            foot_height_length=settings.foot_height_scale * settings.base_height_target,
+        )
