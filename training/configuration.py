@@ -153,7 +153,7 @@ class RunConfiguration:
     gauge_score: str = "score"
     """Key of the gauge's result by which ``best.pt`` is chosen."""
     gauge_wait: float = 900.0
-    """Longest wait for pending scores at the end of a run [s]."""
+    """Longest wait for pending scores, and for pending videos, at the end of a run [s]."""
     random_episode_start: bool = True
     """Whether the first episodes start at random ages, so that resets spread over time."""
     keep_episodes: bool = True

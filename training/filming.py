@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from .side_process import Job, SideProcess
@@ -40,14 +41,17 @@ class Filmer:
             )
         )
 
-    def take(self, seconds: float = 0.0) -> tuple[list[tuple[Path, int]], str]:
+    def take(
+        self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False
+    ) -> tuple[list[tuple[Path, int]], str]:
         """Videos that were finished since the last call, with their iterations; and a sentence for people, if there is one.
 
         Args:
             seconds: longest wait for those that are pending [s].
+            stop: says when to wait no longer.
         """
         films, sentence = [], ""
-        for finished in self._side.drain(seconds):
+        for finished in self._side.drain(seconds, stop):
             job = finished.job
             if not finished.failure:
                 films.append((self._folder / f"{job.checkpoint.stem}.mp4", job.iteration))
@@ -64,6 +68,11 @@ class Filmer:
                 self._given_up = True
                 self._side.close()
         return films, sentence
+
+    @property
+    def pending(self) -> int:
+        """How many videos are still to come."""
+        return self._side.pending
 
     def close(self) -> None:
         """Give up what is pending."""

@@ -159,13 +159,9 @@ class TrainingRunner:
                         break
             except ProcessLostError as error:
                 raise self._rescue(error, begin) from error
-        if self.scorer is not None and reason != "signal":
-            self._submit(written)
-            if self.scorer.pending:
-                self.message("Waiting for the gauge.")
-            self._take_reports(self.scorer.drain(run.gauge_wait))
-        if reason != "signal":
-            self._take_videos(run.gauge_wait)
+            if reason != "signal":
+                self._submit(written)
+                self._wait(run.gauge_wait, lambda: signals.received is not None)
         self.logger.flush()
         code = 128 + signals.received if reason == "signal" and signals.received else 0
         outcome = TrainingOutcome(reason=reason, iteration=self.iteration, checkpoint=written, exit_code=code)
@@ -287,10 +283,19 @@ class TrainingRunner:
         self._take_videos()
         return written
 
-    def _take_videos(self, seconds: float = 0.0) -> None:
+    def _wait(self, seconds: float, stop: Callable[[], bool]) -> None:
+        """Wait for pending scores and videos, at most ``seconds`` [s] each, until ``stop`` says so."""
+        names = (("gauge", self.scorer), ("video", self.filmer))
+        if waiting := [name for name, side in names if side is not None and side.pending and seconds > 0.0]:
+            self.message(f"Waiting for the {' and the '.join(waiting)}.")
+        if self.scorer is not None:
+            self._take_reports(self.scorer.drain(seconds, stop))
+        self._take_videos(seconds, stop)
+
+    def _take_videos(self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False) -> None:
         """Log finished videos, after a wait of at most ``seconds``."""
         if self.filmer is not None:
-            videos, sentence = self.filmer.take(seconds)
+            videos, sentence = self.filmer.take(seconds, stop)
             for video, iteration in videos:
                 self.logger.send(video, iteration)
             if sentence:

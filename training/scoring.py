@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,9 +77,9 @@ class Scorer:
         """How many submitted checkpoints have not been reported."""
         return self._side.pending
 
-    def drain(self, seconds: float) -> list[ScoreReport]:
-        """Wait for everything that is pending, at most ``seconds`` [s]."""
-        return [_report(finished) for finished in self._side.drain(seconds)]
+    def drain(self, seconds: float, stop: Callable[[], bool] = lambda: False) -> list[ScoreReport]:
+        """Wait for everything that is pending, at most ``seconds`` [s], until ``stop`` says so."""
+        return [_report(finished) for finished in self._side.drain(seconds, stop)]
 
     def close(self) -> None:
         """Give up what is pending."""

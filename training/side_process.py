@@ -6,7 +6,7 @@ import os
 import subprocess
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,11 +68,11 @@ class SideProcess:
         finished, self._finished = self._finished, []
         return finished
 
-    def drain(self, seconds: float) -> list[Finished]:
-        """Wait for everything that is pending, at most ``seconds`` [s]."""
+    def drain(self, seconds: float, stop: Callable[[], bool] = lambda: False) -> list[Finished]:
+        """Wait for everything that is pending, at most ``seconds`` [s], until ``stop`` says so."""
         deadline = time.monotonic() + seconds
         finished = self.poll()
-        while self.pending and time.monotonic() < deadline:
+        while self.pending and time.monotonic() < deadline and not stop():
             time.sleep(0.2)
             finished += self.poll()
         return finished

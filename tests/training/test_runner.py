@@ -197,7 +197,7 @@ class SlowScorer:
         scores = {"score": self.scores[iteration], "velocity": 0.1}
         self.waiting.append(ScoreReport(path=path, iteration=iteration, scores=scores))
 
-    def drain(self, seconds):
+    def drain(self, seconds, stop=None):
         reports, self.waiting = self.waiting, []
         return reports
 

@@ -1,0 +1,84 @@
+"""Several processes of one run, as far as one process can show it; ``test_several_processes.py`` starts real ones."""
+
+import pytest
+import torch
+from gaitgauge.training.keepsake import Keepsake
+from gaitgauge.training.logger import RunLogger
+from gaitgauge.training.processes import Processes
+from gaitgauge.training.runner import TrainingRunner
+from gaitgauge.training.seeding import seed_everything
+from toy_training import ToyEnv, toy_configuration, toy_contract, toy_mirror
+
+
+class Twins(Processes):
+    """Two processes that compute the same: the sum over both is twice what one has."""
+
+    def average(self, values):
+        values += values.clone()
+        values /= self.count
+
+    def copy_first(self, tensors):
+        pass
+
+    def largest(self, number):
+        return number
+
+
+@pytest.mark.parametrize("symmetry", ["none", "alternate"])
+def test_a_step_in_two_halves_is_the_same_step(symmetry):
+    def learned(processes):
+        seed_everything(0)
+        configuration = toy_configuration(algorithm={"symmetry": symmetry})
+        runner = TrainingRunner(
+            ToyEnv(), configuration, contract=toy_contract(), task="toy", mirror=toy_mirror(), processes=processes
+        )
+        runner.learn(2)
+        return [p.detach() for p in (*runner.alg.actor.parameters(), *runner.alg.critic.parameters())]
+
+    for alone, together in zip(learned(Processes()), learned(Twins(count=2)), strict=True):
+        assert torch.equal(alone, together)
+
+
+def test_a_keepsake_does_not_change_with_what_it_was_taken_of():
+    weight, plain = torch.ones(3), {"lr": 0.1, "betas": (0.9, 0.999)}
+    keepsake = Keepsake()
+    assert keepsake.take() is None
+    for iteration, value in ((1, 1.0), (2, 5.0)):
+        weight.fill_(value)
+        keepsake.keep({"state": {0: weight}, "groups": [plain]}, iteration, "cpu")
+    weight.zero_()
+    assert keepsake.iteration == 2
+    kept = keepsake.take()
+    assert kept["state"][0].tolist() == [5.0, 5.0, 5.0]
+    assert kept["groups"] == [plain]
+
+
+class Service:
+    """A writer of a service: steps must rise."""
+
+    def __init__(self):
+        self.seen = []
+
+    def add_scalar(self, name, value, step):
+        self.seen.append((name, value, step))
+
+    def save_model(self, path, step):
+        self.seen.append(("model", path, step))
+
+    def save_video(self, path, step):
+        self.seen.append(("video", path, step))
+
+
+def test_a_late_score_stands_where_it_came_back(tmp_path):
+    logger = RunLogger(toy_configuration(), num_envs=8, processes=1, device="cpu")
+    logger.writer = Service()
+    logger.write({"Loss/value": 1.0}, 7)
+    logger.write({"Gauge/quick/score": 0.5}, 4)
+    logger.send(tmp_path / "model_8.pt", 8)
+    logger.send(tmp_path / "model_4.mp4", 4)
+    assert logger.writer.seen == [
+        ("Loss/value", 1.0, 7),
+        ("Gauge/quick/score", 0.5, 7),
+        ("model", str(tmp_path / "model_8.pt"), 8),
+        ("video", tmp_path / "model_4.mp4", 7),
+    ]
