@@ -20,7 +20,7 @@ import torch
 
 from .base import PolicyError, PolicySession, RowwiseSession, check_observation, checked_action
 from .contract import PolicyContract
-from .fence.operators import PRIM_OPERATORS, TORCH_OPERATORS
+from .fence.operators import OPERATORS
 from .fence.script import CONTRACT_FILE
 from .native import LOAD_ERRORS
 
@@ -91,7 +91,7 @@ def _check_operators(module: Any, *, source: str) -> None:
     while pending:
         for node in pending.pop().nodes():
             space, _, name = node.kind().partition("::")
-            if name not in {"aten": TORCH_OPERATORS, "prim": PRIM_OPERATORS}.get(space, frozenset()):
+            if name not in OPERATORS.get(space, frozenset()):
                 raise PolicyError(
                     f"'{source}' was not loaded: its code uses {node.kind()}, which is not on the list of tensor operators"
                 )

@@ -76,6 +76,13 @@ unchecked_cast unchecked_unwrap_optional
 PRIM_OPERATORS = frozenset(_PRIM.split())
 """Operators of TorchScript itself: control flow, attributes, numbers."""
 
+_QUANTIZED = """
+linear_dynamic linear_dynamic_fp16 linear_prepack linear_prepack_fp16 linear_relu_dynamic linear_unpack linear_unpack_fp16
+"""
+
+OPERATORS = {"aten": TORCH_OPERATORS, "prim": PRIM_OPERATORS, "quantized": frozenset(_QUANTIZED.split())}
+"""Operators of TorchScript by their set; the last are those of linear layers with weights of eight bits."""
+
 _PYTHON_NAMES = """
 AssertionError BaseException Exception IndexError KeyError NotImplementedError RuntimeError TypeError ValueError abs all
 annotate any bool chr complex dict divmod enumerate float format getattr hasattr hash hex int isinstance len list max min oct

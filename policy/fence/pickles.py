@@ -20,6 +20,8 @@ MOST_OPERATIONS = 2_000_000
 
 REBUILD_TENSOR = "torch._utils _rebuild_tensor_v2"
 """The call that makes a dense tensor."""
+REBUILD_QUANTIZED = "torch._utils _rebuild_qtensor"
+"""The call that makes a quantized one, with the same arguments first."""
 
 ITEM_SIZES: Mapping[str, int] = {
     "torch DoubleStorage": 8,
@@ -32,6 +34,9 @@ ITEM_SIZES: Mapping[str, int] = {
     "torch CharStorage": 1,
     "torch ByteStorage": 1,
     "torch BoolStorage": 1,
+    "torch QInt8Storage": 1,
+    "torch QUInt8Storage": 1,
+    "torch QInt32Storage": 4,
     "torch ComplexFloatStorage": 8,
     "torch ComplexDoubleStorage": 16,
 }

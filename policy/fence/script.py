@@ -17,8 +17,8 @@ import torch
 
 from ..base import PolicyError
 from .archive import packed, read_archive
-from .operators import PRIM_OPERATORS, PYTHON_NAMES, TORCH_OPERATORS
-from .pickles import REBUILD_TENSOR, Call, check_tensors, read_pickle
+from .operators import OPERATORS, PYTHON_NAMES, TORCH_OPERATORS
+from .pickles import REBUILD_QUANTIZED, REBUILD_TENSOR, Call, check_tensors, read_pickle
 
 MOST_CODE = 8 * 2**20
 """Most code of a file [characters]."""
@@ -26,10 +26,11 @@ CONTRACT_FILE = "contract.json"
 LONGEST_CONTRACT = 1_000_000
 
 _OWN = "__torch__"
-_CUSTOM_CLASS = re.compile(r"__torch__\.torch\.classes\b")
+# Classes of torch's own that are no code of the archive, but for the weights of quantized linear layers.
+_CUSTOM_CLASS = re.compile(r"__torch__\.torch\.classes\b(?!\.quantized\.LinearPackedParamsBase$)")
 _PLAIN_NAMES = re.compile(
     r"torch\.jit\._pickle (build_(int|double|bool|tensor)list|restore_type_tag)|collections OrderedDict|torch (\w+)Storage"
-    r"|torch\._utils _rebuild_tensor_v2|torch device|builtins complex"
+    r"|torch\._utils _rebuild_(tensor_v2|qtensor)|torch device|builtins complex|torch per_(tensor|channel)_affine"
 )
 # Written by hand, code may differ in how Python and torch read it; what torch itself writes has none of these.
 _STRANGE = re.compile(r"[^\n\x20-\x7e]|\\\n")
@@ -144,7 +145,7 @@ class _Checker(ast.NodeVisitor):
                 self.refuse(dotted)
         elif words[0] == "ops":
             space, name = (words[1], words[2]) if len(words) == 3 else ("", "")
-            known = {"aten": TORCH_OPERATORS, "prim": PRIM_OPERATORS}.get(space, frozenset())
+            known = OPERATORS.get(space, frozenset())
             if name not in known:
                 self.refuse(dotted)
         elif words[0] == _OWN and _CUSTOM_CLASS.match(dotted):
@@ -230,7 +231,8 @@ def _check_pickle(records: Mapping[str, bytes], name: str, source: str) -> None:
         if _CUSTOM_CLASS.search(text):
             raise PolicyError(f"'{source}' was not loaded: its data hold '{text}', a class that is not its own")
     sizes = {key.partition("/")[2]: len(data) for key, data in records.items() if key.startswith(f"{name}/")}
-    check_tensors((call for call in reading.calls if call.function.name == REBUILD_TENSOR), sizes, source=source)
+    tensors = (call for call in reading.calls if call.function.name in (REBUILD_TENSOR, REBUILD_QUANTIZED))
+    check_tensors(tensors, sizes, source=source)
 
 
 def _texts(calls: Iterable[Call]) -> Iterable[str]:

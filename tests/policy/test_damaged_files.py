@@ -8,10 +8,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from gaitgauge.policy.adapters import deploy_contract, sidecar_contract
 from gaitgauge.policy.base import LONGEST_MESSAGE, PolicyError
 from gaitgauge.policy.fence import archive, pickles
 from gaitgauge.policy.loading import find_policy, load_policy
 from gaitgauge.policy.native import checksum, save_policy
+from gaitgauge.robots import load_robot
 
 WEIGHT = "encoder.0.weight"
 
@@ -132,6 +134,57 @@ def test_nested_arguments(cts_file):
     entries["network"]["arguments"] = "[" * 60_000
     torch.save({**entries, "checksum": checksum(entries)}, cts_file)
     refused(cts_file, "arguments")
+
+
+ACTOR = {"actor.0.weight": torch.zeros(8, 45), "actor.0.bias": torch.zeros(8)}
+ACTOR |= {"actor.2.weight": torch.zeros(12, 8), "actor.2.bias": torch.zeros(12)}
+NORMALIZER = {"obs_normalizer._mean": torch.zeros(1, 45), "obs_normalizer._std": torch.ones(1, 45)}
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [
+        {k: v for k, v in (ACTOR | NORMALIZER).items() if k != "obs_normalizer._std"},
+        {k: v for k, v in ACTOR.items() if k != "actor.0.weight"},
+        {k: v for k, v in ACTOR.items() if k != "actor.2.bias"},
+        ACTOR | {"actor.0.weight": torch.zeros(45)},
+        ACTOR | {"actor.0.weight": torch.tensor(1.0)},
+        ACTOR | {7: torch.zeros(1)},
+        ACTOR | {"actor.0.bias": 3},
+        {k: v for k, v in ACTOR.items() if k.endswith("bias")},
+        {**ACTOR, "student_encoder.0.weight": torch.zeros(4, 7)},
+        torch.zeros(3, 3),
+        {},
+    ],
+)
+def test_checkpoints_with_missing_entries(tmp_path, weights):
+    path = tmp_path / "model_1.pt"
+    torch.save({"model_state_dict": weights, "iter": 1}, path)
+    refused(path, "model_1.pt")
+
+
+NESTED = "[" * 100_000
+LAUGHS = "a0: &a0 [x]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 40))
+
+
+@pytest.mark.parametrize("text", [NESTED, LAUGHS, "&a [*a]", "a: !!python/object:os.system x", "x" * 2_000_000, "\0"])
+def test_deploy_files_that_never_end(tmp_path, text):
+    path = tmp_path / "deploy.yaml"
+    path.write_text(text)
+    with pytest.raises(PolicyError, match=r"deploy\.yaml") as caught:
+        deploy_contract(path, load_robot("go2"))
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("text", [NESTED, '{"a":' * 50_000, "", "null", '"x"', "9" * 10_000, "x" * 2_000_000])
+def test_contracts_that_are_none(tmp_path, cts_file, text):
+    """Inside a file, and beside one."""
+    entries = {**torch.load(cts_file, weights_only=True), "contract": text}
+    torch.save({**entries, "checksum": checksum(entries)}, cts_file)
+    refused(cts_file, "cts.gauge.pt")
+    (tmp_path / "contract.json").write_text(text)
+    with pytest.raises(PolicyError, match=r"contract\.json"):
+        sidecar_contract(tmp_path / "policy.pt")
 
 
 @pytest.mark.parametrize(

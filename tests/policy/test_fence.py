@@ -125,7 +125,7 @@ def test_a_program_that_opens_a_file_is_refused_by_name(tmp_path, contract, plac
         ("torch = observation\n    x = torch.from_file(self.target)", "variable named torch"),
         ("__torch__ = observation\n    x = __torch__.save(self.target)", "variable named __torch__"),
         ("x = fork(self.forward, observation)", "fork"),
-        ("x = ops.quantized.linear_unpack(observation)", "ops.quantized"),
+        ("x = ops.quantized.add(observation, observation, 1.0, 0)", "ops.quantized.add"),
         ("x = ops.load_library(self.target)", "ops.load_library"),
         ("x = __torch__.torch.classes.profiling.SourceStats()", "__torch__.torch.classes"),
         ("x = getattr(torch, 'from_' + 'file')(self.target)", "what it computed"),
@@ -170,6 +170,19 @@ def test_a_method_of_its_own_lets_no_operator_through():
     records[name] += b"  def set_(self: __torch__.Plain, x: Tensor) -> Tensor:\n    return (x).set_(x)\n"
     with pytest.raises(PolicyError, match="set_"):
         check_script(packed(records), source="policy")
+
+
+def test_linear_layers_with_weights_of_eight_bits_are_run(tmp_path):
+    torch.manual_seed(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        module = torch.ao.quantization.quantize_dynamic(
+            nn.Sequential(nn.Linear(45, 12)), {nn.Linear}, dtype=torch.qint8
+        )
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(module))
+    observation = torch.randn(1, 45)
+    assert torch.equal(load_policy(path).session(1).act(observation), module(observation))
 
 
 class Sparse(Plain):
