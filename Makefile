@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: install demo test test-slow test-gpu check docs format clean
+.PHONY: install demo test test-slow test-gpu fuzz check docs format clean
 
 install: $(READY)
 
@@ -27,6 +27,11 @@ test-slow: install
 
 test-gpu: install
 	$(BIN)/python -m pytest -m gpu
+
+# What somebody else may have written, against every parser: CASES of each.
+CASES ?= 10000
+fuzz: install
+	GAITGAUGE_FUZZ_CASES=$(CASES) $(BIN)/python -m pytest -n auto tests/fuzz
 
 check: install
 	$(BIN)/ruff check .

@@ -31,7 +31,7 @@ import torch
 import warp as wp
 from gaitgauge.backends.base import PhysicsOptions, Scene
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
-from gaitgauge.backends.mujoco_warp_model import SMALLEST_TOLERANCE
+from gaitgauge.backends.mujoco_warp.model import SMALLEST_TOLERANCE
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation import ObservationBuilder

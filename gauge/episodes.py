@@ -5,38 +5,42 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from ..files.parsing import Seed, Text, build, one_line, parse_json
 from ..files.writing import replacing
 
+Count = Annotated[int, Field(ge=0, lt=2**53)]
+_LARGEST = 10**9
+"""Bytes that a record unpacks to at most; an episode has some hundred kilobytes."""
 QUALITY = "quality"
 """Column of the sample table that holds the quality of each sample."""
 
 
 class RecordError(ValueError):
-    """An episode's file is damaged, or cannot be written."""
+    """An episode's file is damaged."""
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
 class Episode:
     """One uninterrupted run of a policy: a world, a seed and the goals it goes through."""
 
-    terrain: str
-    level: int
+    terrain: Text
+    level: Count
     """1..10; 0 on flat ground."""
     friction: float
     payload: float
     """Mass added to the base [kg]."""
-    seed: int
-    stage: str
+    seed: Seed
+    stage: Text
     """``search`` for the level test, ``eval`` for quality."""
-    goals: tuple[str, ...]
+    goals: tuple[Text, ...]
 
     @property
     def key(self) -> str:
@@ -82,10 +86,13 @@ class Record:
 
     def save(self, folder: Path) -> None:
         """Write the record as one file, all or nothing. It survives the death of the process at once, and that of the machine soon."""
-        head = {**self.summary(), "goals": list(self.episode.goals), "columns": list(self.columns)}
-        with replacing(folder / f"{self.episode.key}.npz", RecordError, durable=False, ending=".npz") as partial:
+        head = {k: v for k, v in vars(self).items() if k in _HEAD} | asdict(self.episode)
+        with (
+            replacing(folder / f"{self.episode.key}.npz", RecordError, durable=False) as partial,
+            partial.open("wb") as file,
+        ):
             np.savez(
-                partial,
+                file,
                 head=np.frombuffer(json.dumps(head).encode(), dtype=np.uint8),
                 samples=self.samples,
                 goal_index=self.goal_index,
@@ -100,17 +107,104 @@ class Record:
             RecordError: the file is damaged.
         """
         try:
+            with zipfile.ZipFile(path) as archive:
+                if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
+                    raise RecordError(f"it unpacks to more than {_LARGEST / 1e6:g} MB")
             with np.load(path, allow_pickle=False) as data:
-                head: Mapping[str, Any] = json.loads(data["head"].tobytes())
+                head = parse_json(data["head"].tobytes(), "its head", RecordError)
                 arrays = {k: data[k] for k in ("samples", "goal_index", "part_index")}
-            names = ("terrain", "level", "friction", "payload", "seed", "stage")
-            episode = Episode(goals=tuple(head["goals"]), **{n: head[n] for n in names})
+            if not isinstance(head, dict):
+                raise RecordError("its head is no table")
+            names = [f.name for f in fields(Episode)]
+            episode = build(Episode, {n: head[n] for n in names}, "its head", RecordError)
             if episode.key != path.stem:
-                raise ValueError(f"it holds episode {episode.key}")
-            rest = ("success", "falls", "diverged", "overflowed", "restarted", "control_steps", "physics_steps")
-            return cls(episode=episode, columns=tuple(head["columns"]), **arrays, **{n: head[n] for n in rest})
-        except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+                raise RecordError(f"it holds episode {one_line(episode.key)}")
+            rest = build(_Outcome, {n: head[n] for n in _HEAD}, "its head", RecordError)
+            record = cls(episode=episode, **vars(rest), **arrays)
+            record.check_samples()
+            return record
+        except _READ_ERRORS as error:
+            reason = (
+                f"it lacks {one_line(error)}"
+                if isinstance(error, KeyError)
+                else one_line(error) or type(error).__name__
+            )
             raise RecordError(
-                f"episode file {path} is damaged ({reason}); delete it and run again with --resume"
+                f"episode file {one_line(path)} is damaged ({reason}); delete it and run again with --resume"
             ) from error
+
+    def check_samples(self) -> None:
+        """Compare the samples' shapes, types and indices with the rest.
+
+        Raises:
+            RecordError: they do not fit.
+        """
+        count = len(self.samples)
+        expected: dict[str, tuple[NDArray[Any], Any, tuple[int, ...]]] = {
+            "samples": (self.samples, np.float32, (count, len(self.columns) if count else self.samples.shape[-1])),
+            "goal_index": (self.goal_index, np.int16, (count,)),
+            "part_index": (self.part_index, np.int16, (count,)),
+        }
+        for name, (array, kind, shape) in expected.items():
+            if array.dtype != kind or array.shape != shape:
+                raise RecordError(f"{name} is {array.dtype} {list(array.shape)}, not {np.dtype(kind)} {list(shape)}")
+        if count and not (self.goal_index.min() >= 0 and self.goal_index.max() < len(self.episode.goals)):
+            raise RecordError("goal_index is out of range")
+        if count and self.part_index.min() < 0:
+            raise RecordError("part_index is out of range")
+
+
+def read_records(folder: Path) -> tuple[dict[Episode, Record], list[Path]]:
+    """All records of a folder of episodes. A damaged file is set aside under the ending ``.damaged``, so that its episode is
+    played again.
+
+    Returns:
+        Records by episode, and where the damaged files are now.
+
+    Raises:
+        OSError: a damaged file cannot be renamed.
+    """
+    records: dict[Episode, Record] = {}
+    damaged = []
+    for path in sorted(folder.glob("*.npz")):
+        try:
+            record = Record.load(path)
+        except RecordError:
+            damaged.append(path.rename(path.with_name(path.name[:200] + ".damaged")))
+        else:
+            records[record.episode] = record
+    return records, damaged
+
+
+@dataclass(kw_only=True)
+class _Outcome:
+    """What a file says of an episode beside its samples."""
+
+    success: bool | None
+    falls: Count
+    diverged: bool
+    overflowed: bool
+    restarted: bool
+    control_steps: Count
+    physics_steps: Count
+    columns: Annotated[tuple[Text, ...], Field(max_length=1000)]
+
+
+_HEAD = [f.name for f in fields(_Outcome)]
+_READ_ERRORS = (
+    RecordError,
+    OSError,
+    KeyError,
+    ValueError,
+    TypeError,
+    EOFError,
+    IndexError,
+    MemoryError,
+    OverflowError,
+    NotImplementedError,
+    RuntimeError,
+    SyntaxError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What numpy and zipfile raise on files that are not theirs."""

@@ -280,9 +280,25 @@ def checkpoint_network(
     ELU.
 
     Raises:
-        PolicyError: it is one, but of another kind or of a width that the standard contract does not have.
+        PolicyError: it is one, but of another kind, of a width that the standard contract does not have, or with missing or
+            malformed entries.
     """
-    weights = entries.get("actor_state_dict") or entries.get("model_state_dict")
+    try:
+        return _checkpoint_network(entries, robot, path)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError) as error:
+        if isinstance(error, (PolicyError, ContractError)):
+            raise
+        raise PolicyError(
+            f"'{path}' is an rsl_rl checkpoint with a missing or malformed entry ({type(error).__name__}: {error})"
+        ) from error
+
+
+def _checkpoint_network(
+    entries: Mapping[str, Any], robot: Robot, path: Path
+) -> tuple[PolicyContract, StoredNetwork] | None:
+    weights = next(
+        (w for k in ("actor_state_dict", "model_state_dict") if isinstance(w := entries.get(k), Mapping) and w), None
+    )
     if not isinstance(weights, Mapping) or not all(isinstance(v, torch.Tensor) for v in weights.values()):
         return None
     actor = {

@@ -167,32 +167,62 @@ class Program:
         self._step = step
         self.initial = tuple(value.detach().clone() for value in initial)
         self.source = source
-        self._recorded: dict[tuple[int, int, bool], GraphModule] = {}
+        self._recorded: dict[tuple[int, int, str], Any] = {}
 
-    def recorded(self, num_episodes: int, width: int, *, script: bool) -> Any:
-        """The function of many robots: observations (N, 1, F) and memories (N, …) to actions (N, …) and memories.
+    def recorded(self, num_episodes: int, width: int) -> GraphModule:
+        """The function of many robots: observations (N, 1, F) and memories (N, …) to actions (N, 1, J) and memories.
 
         Args:
             num_episodes: robots N.
             width: entries of an observation F.
-            script: whether to replay it without Python, where that gives the same to the last bit.
 
         Raises:
             NotUnderstoodError: the function of one robot cannot be made one of many.
         """
-        key = (num_episodes, width, script)
+        made: GraphModule = self._kept(num_episodes, width, "recorded", self._many)
+        return made
+
+    def scripted(self, num_episodes: int, width: int) -> Any:
+        """The same on the CPU without Python between the operations, where that gives the same to the last bit."""
+        return self._kept(
+            num_episodes, width, "scripted", lambda n, f: _scripted(self.recorded(n, f), self._inputs(n, f))
+        )
+
+    def remembering(self, num_episodes: int, width: int) -> Any:
+        """The same without the actions."""
+
+        def make(n: int, f: int) -> Any:
+            return _scripted(_without_actions(self.recorded(n, f)), self._inputs(n, f))
+
+        return self._kept(num_episodes, width, "remembering", make)
+
+    def _kept(self, num_episodes: int, width: int, kind: str, make: Callable[[int, int], Any]) -> Any:
+        key = (num_episodes, width, kind)
         if key not in self._recorded:
-            generator = torch.Generator().manual_seed(0)
-            observation = torch.randn(num_episodes, 1, width, generator=generator)
-            memories = [value.expand(num_episodes, *value.shape).clone() for value in self.initial]
             try:
                 with torch.no_grad(), warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    flat = _with_layers(make_fx(torch.vmap(lambda *one: self._step(*one)))(observation, *memories))
-                    self._recorded[key] = _scripted(flat, [observation, *memories]) if script else flat
+                    warnings.simplefilter("ignore")  # torch announces the retirement of what replays without Python
+                    self._recorded[key] = make(num_episodes, width)
             except PROGRAM_ERRORS as error:
                 raise NotUnderstoodError(first_line(error)) from error
         return self._recorded[key]
+
+    def _inputs(self, num_episodes: int, width: int) -> list[torch.Tensor]:
+        observation = torch.randn(num_episodes, 1, width, generator=torch.Generator().manual_seed(0))
+        return [observation, *(value.expand(num_episodes, *value.shape).clone() for value in self.initial)]
+
+    def _many(self, num_episodes: int, width: int) -> GraphModule:
+        return _with_layers(make_fx(torch.vmap(lambda *one: self._step(*one)))(*self._inputs(num_episodes, width)))
+
+
+def _without_actions(flat: GraphModule) -> GraphModule:
+    kept = copy.copy(flat)
+    kept.graph = copy.deepcopy(flat.graph)
+    (output,) = (node for node in kept.graph.nodes if node.op == "output")
+    output.args = (tuple(output.args[0][1:]),)
+    kept.graph.eliminate_dead_code()
+    kept.recompile()
+    return kept
 
 
 def _with_layers(flat: GraphModule) -> GraphModule:
@@ -227,8 +257,13 @@ class ProgramSession(PolicySession):
             NotUnderstoodError: that cannot be done.
         """
         self._program, self._contract, self._num_episodes = program, contract, num_episodes
-        flat = program.recorded(num_episodes, contract.observation_width, script=device.type == "cpu")
-        self._network = flat if device.type == "cpu" else _moved(flat, device)
+        on_cpu = device.type == "cpu"
+        self._network = (
+            program.scripted(num_episodes, contract.observation_width)
+            if on_cpu
+            else _moved(program.recorded(num_episodes, contract.observation_width), device)
+        )
+        self._few_rows_pay = on_cpu
         self._initial = [v.to(device).expand(num_episodes, *v.shape) for v in program.initial]
         self._memories = [value.clone() for value in self._initial]
 
@@ -248,10 +283,23 @@ class ProgramSession(PolicySession):
         check_observation(observation, self._num_episodes, self._contract, source)
         try:
             with torch.no_grad():
+                if rows is not None and self._few_rows_pay:
+                    return self._act_of(rows, observation)
                 action, *self._memories = self._network(observation.unsqueeze(1), *self._memories)
         except RuntimeError as error:
             raise PolicyError(f"'{source}' failed: {first_line(error)}") from error
         return checked_action(action.flatten(1), self._num_episodes, self._contract, source)
+
+    def _act_of(self, rows: torch.Tensor, observation: torch.Tensor) -> torch.Tensor:
+        """Actions of some rows, zeros for the others; all remember."""
+        width, memories = self._contract.observation_width, self._memories
+        network = self._program.scripted(len(rows), width)
+        some, *_ = network(observation[rows].unsqueeze(1), *(value[rows] for value in memories))
+        if memories:
+            remember = self._program.remembering(self._num_episodes, width)
+            self._memories = list(remember(observation.unsqueeze(1), *memories))
+        some = checked_action(some.flatten(1), len(rows), self._contract, self._program.source)
+        return some.new_zeros(self._num_episodes, some.shape[1]).index_copy_(0, rows, some)
 
 
 def _moved(flat: GraphModule, device: torch.device) -> GraphModule:

@@ -8,6 +8,7 @@ and ``FL_calf_joint``); the longest fitting key wins.
 
 from __future__ import annotations
 
+import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import asdict, fields
@@ -108,7 +109,7 @@ def model_files(mjcf: Path) -> list[Path]:
         ]
         names = [v for e in elements for k, v in e.attrib.items() if k.startswith("file")]
         paths = [folder / name for name in names for folder in folders]
-        found += [path for path in dict.fromkeys(paths) if path not in found and path.is_file()]
+        found += [path for path in dict.fromkeys(paths) if path not in found and os.path.isfile(path)]
     return found
 
 
@@ -145,7 +146,7 @@ def _fits(ending: str, joint: str) -> bool:
 
 def _check(robot: Robot, source: str) -> None:
     """Refuse what each field alone allows and all of them together do not."""
-    if not robot.mjcf.is_file():
+    if not os.path.isfile(robot.mjcf):  # false where the name itself is impossible, too
         raise RobotError(
             f"{source}: mjcf names '{one_line(robot.mjcf)}', which does not exist; the path is relative to the robot file"
         )

@@ -83,7 +83,7 @@ class EnergyMeter:
     def __init__(self, scene: Scene) -> None:
         import mujoco
 
-        from ...backends.mujoco_model import robot_spec
+        from ...backends.mujoco.model import robot_spec
 
         self._mujoco = mujoco
         self._model = robot_spec(scene).compile()

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from gaitgauge.backends.base import CAPABILITY_NAMES
 from gaitgauge.backends.capability_table import BEGIN, END, ENGINES, capability_table, update_document
-from gaitgauge.backends.newton_solvers import SOLVERS
+from gaitgauge.backends.newton.solvers import SOLVERS
 from gaitgauge.backends.registry import backend_names
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "backends.md"

@@ -14,15 +14,15 @@ import torch
 import warp_throughput
 from gaitgauge.backends import BackendError, PhysicsOptions, PhysicsState, Randomization, Scene
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
-from gaitgauge.backends.mujoco_warp_device import (
+from gaitgauge.backends.mujoco_warp.device import (
     DeviceScope,
     bytes_per_world,
     find_device,
     is_memory_error,
     memory_advice,
 )
-from gaitgauge.backends.mujoco_warp_model import PARKED, Capacity, buffer_capacity, build_shared_model
-from gaitgauge.backends.mujoco_warp_order import CONTACT_FIELDS, ROW_FIELDS
+from gaitgauge.backends.mujoco_warp.model import PARKED, Capacity, buffer_capacity, build_shared_model
+from gaitgauge.backends.mujoco_warp.order import CONTACT_FIELDS, ROW_FIELDS
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Box, HeightField, Terrain

@@ -8,10 +8,10 @@ import pytest
 import torch
 from gaitgauge.backends import BackendError, PhysicsOptions, Randomization, Scene, Support
 from gaitgauge.backends.base import CAPABILITY_NAMES
-from gaitgauge.backends.mujoco_model import robot_spec
+from gaitgauge.backends.mujoco.model import robot_spec
 from gaitgauge.backends.newton import NewtonBackend
-from gaitgauge.backends.newton_model import PARKED, _slot_tables, build_world_model, carriers, import_differences
-from gaitgauge.backends.newton_solvers import SOLVERS, dry_friction_slope
+from gaitgauge.backends.newton.model import PARKED, _slot_tables, build_world_model, carriers, import_differences
+from gaitgauge.backends.newton.solvers import SOLVERS, dry_friction_slope
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Box, HeightField, Terrain

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.backends import Randomization, Scene, make_backend
-from gaitgauge.backends.mujoco_model import build_models
+from gaitgauge.backends.mujoco.model import build_models
 from gaitgauge.gauge.metrics import (
     METRIC_NAMES,
     MetricEvaluator,

@@ -2,11 +2,13 @@
 
 import pytest
 import torch
-from gaitgauge.policy.base import RowwiseSession
+from gaitgauge.policy.base import Policy, PolicySession, RowwiseSession
 from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.export import export_onnx, export_torchscript
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.rebuilt import RebuiltPolicy
 from gaitgauge.policy.steady import steady_session
 from gaitgauge.robots import load_robot
 
@@ -43,8 +45,57 @@ def test_rows_do_not_matter(tiny, count):
 
 
 def test_the_shipped_policy_runs_batched():
-    session, fewer = steady_session(load_policy("pretrained", ROBOT), 24)
-    assert session.batched and fewer and not isinstance(session, RowwiseSession)
+    session, _ = steady_session(load_policy("pretrained", ROBOT), 24)
+    assert session.batched and not isinstance(session, RowwiseSession)
+
+
+@pytest.fixture(scope="module", params=["own", "torchscript", "onnx", "row by row"])
+def policy(request, tmp_path_factory):
+    """The shipped policy and its exports, and a network that needs each row alone."""
+    own = load_policy("pretrained", ROBOT)
+    if request.param == "own":
+        return own
+    path = tmp_path_factory.mktemp("exported") / "policy"
+    if request.param == "row by row":
+        return OverRows(own)
+    export = export_torchscript if request.param == "torchscript" else export_onnx
+    export(own, path)
+    made = load_policy(path, ROBOT)
+    assert isinstance(made, RebuiltPolicy)
+    return made
+
+
+class OverRows(Policy):
+    """A policy whose rows influence each other, as one would whose file normalizes over the batch."""
+
+    def __init__(self, inner: Policy) -> None:
+        self._inner, self.contract, self.path = inner, inner.contract, inner.path
+
+    def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
+        session = self._inner.session(num_episodes, device=device)
+        alone = session.act
+        session.act = lambda observation, rows=None: alone(observation - observation.mean(), rows)
+        return session
+
+
+def test_the_number_of_episodes_does_not_matter(policy):
+    """To the last bit: in runs of 1 to 30 episodes, wholly or in part at work, with resets on the way."""
+    steps, most = 6, 30
+    width = policy.contract.observation_width
+    observations = torch.randn(steps, most, width, generator=torch.Generator().manual_seed(1))
+    results = {}
+    with torch.inference_mode():
+        for count in (1, 5, 8, 13, 24, 30):
+            session, fewer = steady_session(policy, count)
+            actions = []
+            for step, observation in enumerate(observations[:, :count]):
+                if step == 3:
+                    session.reset(torch.arange(count) % 3 == 0)
+                rows = torch.arange(8) if fewer and count > 8 and step % 2 else None
+                actions.append(session.act(observation, rows)[:8])
+            results[count] = torch.stack(actions)
+    for count, result in results.items():
+        assert torch.equal(result, results[30][:, :count])
 
 
 def test_alone_is_what_a_batch_of_one_gives(tiny):

@@ -196,6 +196,7 @@ def test_longest_key_wins(write_hopper):
         ("[0.5, 0, 1]", "[0.5, 1]", "command_limits is [0.5, 1]; more entries are needed"),
         ("[0.5, 0, 1]", "[0.5, -1, 1]", "command_limits[1] is -1; it must be greater than or equal to 0"),
         ('= "soft"', '= "hard"', "default_parameters is 'hard'; the parameter sets are: soft"),
+        ("model/hopper.xml", "x" * 300, "which does not exist"),
         ("model/hopper.xml", "hopper.xml", "which does not exist; the path is relative to the robot file"),
         ("stand_height = 0.5", "stand_height = inf", "stand_height is inf; it must be a finite number"),
         (

@@ -1,0 +1,5 @@
+"""MuJoCo on the CPU."""
+
+from .backend import MujocoBackend
+
+__all__ = ["MujocoBackend"]

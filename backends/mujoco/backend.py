@@ -1,0 +1,470 @@
+"""The reference engine: MuJoCo on the CPU, many worlds on a thread pool (``mujoco.batch.Batch``), float64, bit-reproducible.
+
+Every world runs on a model of its own, a copy of its terrain's, so that friction, masses and gains can differ. The motor
+law is an affine actuator inside the model and is therefore evaluated at every physics step; where its limits follow the
+speed, every physics step gets the target whose torque they allow. After a step, positions and
+velocities are those of the new state, forces those of the step just taken; the penetration watch sees the contacts with
+which each substep started.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import fields
+from time import perf_counter
+from typing import ClassVar
+
+import mujoco
+import mujoco.batch
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..base import (
+    CAPABILITY_NAMES,
+    BackendError,
+    Capability,
+    PhysicsBackend,
+    PhysicsState,
+    Randomization,
+    Scene,
+    Support,
+)
+from ..description import ModelFields
+from ..motor_law import MotorLimits
+from .model import CONTACT_SLOTS, FOOT_SLOTS, build_models
+from .state import RECORDED, BatchState, Records, StateLayout
+
+_STAGE = mujoco.mjtStage.mjSTAGE_VEL.value
+_INVALID = [
+    w.value
+    for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+]
+_FULL = [w.value for w in (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+
+Array = NDArray[np.float64]
+
+
+class MujocoBackend(PhysicsBackend):
+    """MuJoCo (C engine) on the CPU. Results do not depend on the number of threads nor on the other worlds."""
+
+    name: ClassVar[str] = "mujoco"
+
+    @classmethod
+    def capabilities(cls) -> Mapping[str, Capability]:
+        """Exact in everything but GPU execution."""
+        exact = {name: Capability(support=Support.EXACT) for name in CAPABILITY_NAMES}
+        exact["gpu"] = Capability(support=Support.NONE, note="runs on CPU threads")
+        exact["penetration"] = Capability(support=Support.EXACT, note="seen one substep late")
+        exact["contact_forces"] = Capability(
+            support=Support.EXACT,
+            note=f"single points of the {CONTACT_SLOTS} strongest contacts, {FOOT_SLOTS} for each foot",
+        )
+        return exact
+
+    def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
+        if torch.device(device).type != "cpu":
+            raise BackendError(
+                f"backend 'mujoco' runs on the CPU, not on device '{device}'; use --device cpu, or mujoco-warp"
+            )
+        self.scene = scene
+        self.device = torch.device("cpu")
+        self.dtype = torch.float64
+        n, robot = scene.num_worlds, scene.robot
+        self._limits = MotorLimits.of(scene)
+        self._palette = build_models(scene)
+        self._terrain = np.asarray(scene.terrain_index, dtype=np.int64)
+        nominal = self._palette[0]
+        self._models = [copy.copy(self._palette[t]) for t in self._terrain]
+        self._batch = mujoco.batch.Batch(nominal, n, threads, True)
+        self._batch.set_models(self._models)
+        self.engine_seconds: float = 0.0
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        tilt = scene.physics.watch_tilt
+        self._tilt_bound = 0.0 if tilt is None else 0.5 * (1.0 - np.cos(tilt))
+        self._ctrl, self._applied = self._batch.bind("ctrl"), self._batch.bind("xfrc_applied")
+        self._time = self._batch.bind("time")
+        self._index_model(nominal)
+        self._randomized: dict[int, dict[str, Array]] = {}
+        joints = robot.num_joints
+        self._held = np.zeros((n, joints))
+        self._offset = np.zeros((n, joints))
+        self._limp = np.ones(n, dtype=bool)
+        self._gain, self._strength = np.zeros((n, joints)), np.ones((n, joints))
+        self._kd_over_kp = np.zeros((n, joints))
+        self._read_gains(range(n))
+        self._warned = np.zeros((n, 2), dtype=np.int64)
+        self._live = {
+            "time": self._time,
+            "qpos": self._qpos,
+            "qvel": self._qvel,
+            "torque": self._batch.bind("actuator_force"),
+            "sites": self._batch.bind("site_xpos"),
+            "sensors": self._batch.bind("sensordata"),
+        }
+        layout = StateLayout(nominal, scene)
+        self._state = BatchState(layout, self._live)
+        self._sample = BatchState(layout, {k: v.copy() for k, v in self._live.items()})
+        self._deep = layout.penetration
+        self._everyone = np.arange(n)
+        self._rooms: dict[tuple[int, int], tuple[Array, Records]] = {}
+        stand = torch.tensor([0.0, 0.0, robot.stand_height], dtype=torch.float64).repeat(n, 1)
+        self.reset(base_position=stand, base_quaternion=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, 1))
+
+    # ---- layout -------------------------------------------------------------------------------------------------
+
+    def _index_model(self, model: mujoco.MjModel) -> None:
+        """Find where the robot's joints, feet and sensors lie in MuJoCo's arrays."""
+        robot = self.scene.robot
+        free = model.joint(model.body(robot.base_body).jntadr[0])
+        self._base = model.body(robot.base_body).id
+        if free.type[0] != mujoco.mjtJoint.mjJNT_FREE or free.qposadr[0] != 0:
+            raise BackendError(
+                f"body '{robot.base_body}' of robot '{robot.name}' must carry a free joint and come first"
+            )
+        self._joint_q = np.array([model.joint(j).qposadr[0] for j in robot.joint_names])
+        self._joint_v = np.array([model.joint(j).dofadr[0] for j in robot.joint_names])
+        self._bodies = np.array([model.body(b).id for b in robot.collision_bodies])
+
+    # ---- reading ------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> PhysicsState:
+        """State after the last call, as views of MuJoCo's memory: they change with the next call."""
+        return self._state
+
+    @property
+    def sample(self) -> PhysicsState:
+        """Snapshot taken by the last ``step(sample_at=…)``."""
+        return self._sample
+
+    # ---- acting -------------------------------------------------------------------------------------------------
+
+    def _rows(self, worlds: torch.Tensor | None) -> NDArray[np.int64]:
+        """Indices of the masked worlds."""
+        if worlds is None:
+            return self._everyone
+        if worlds.dtype != torch.bool or worlds.shape != (self.num_worlds,):
+            raise BackendError(
+                f"the mask of worlds must be {self.num_worlds} booleans, not {tuple(worlds.shape)} of {worlds.dtype}"
+            )
+        return np.flatnonzero(worlds.numpy())
+
+    def reset(
+        self,
+        worlds: torch.Tensor | None = None,
+        *,
+        base_position: torch.Tensor,
+        base_quaternion: torch.Tensor,
+        joint_position: torch.Tensor | None = None,
+        base_linear_velocity: torch.Tensor | None = None,
+        base_angular_velocity: torch.Tensor | None = None,
+        joint_velocity: torch.Tensor | None = None,
+        held_target: torch.Tensor | None = None,
+        terrain_index: torch.Tensor | None = None,
+    ) -> None:
+        """See ``PhysicsBackend.reset``."""
+        rows = self._rows(worlds)
+        if len(rows) == 0:
+            return
+        if terrain_index is not None:
+            self._switch_terrain(rows, terrain_index.numpy())
+        self._batch.reset(rows.astype(np.int32), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._qpos[rows, 0:3] = base_position.numpy()[rows]
+        self._qpos[rows, 3:7] = base_quaternion.numpy()[rows]
+        pose = np.asarray(self.scene.robot.default_joint_position)
+        self._qpos[np.ix_(rows, self._joint_q)] = pose if joint_position is None else joint_position.numpy()[rows]
+        for columns, value in (
+            (np.arange(0, 3), base_linear_velocity),
+            (np.arange(3, 6), base_angular_velocity),
+            (self._joint_v, joint_velocity),
+        ):
+            self._qvel[np.ix_(rows, columns)] = 0.0 if value is None else value.numpy()[rows]
+        self._limp[rows] = held_target is None
+        self._held[rows] = 0.0 if held_target is None else held_target.numpy()[rows]
+        self._batch.forward(rows.astype(np.int32), stage=_STAGE)
+        self._warned[rows] = self._warning_counts(rows)
+        for flags in self._state.flags.values():
+            flags[rows] = 0
+        self._state.forget_forces(rows)
+
+    def _switch_terrain(self, rows: NDArray[np.int64], index: NDArray[np.int64]) -> None:
+        """Give worlds another model of the palette, with their own randomization on it."""
+        changed = [int(r) for r in rows if index[r] != self._terrain[r]]
+        for r in changed:
+            self._terrain[r] = index[r]
+            self._models[r] = copy.copy(self._palette[index[r]])
+            self._apply_randomization(r)
+        if changed:
+            self._batch.set_models(self._models)
+
+    def step(
+        self,
+        joint_targets: torch.Tensor | None,
+        *,
+        delay: torch.Tensor | None = None,
+        sample_at: torch.Tensor | None = None,
+        worlds: torch.Tensor | None = None,
+        substeps: int | None = None,
+    ) -> None:
+        """See ``PhysicsBackend.step``."""
+        rows = self._rows(worlds)
+        n = len(rows)
+        if n == 0:
+            return
+        those = slice(None) if n == self.num_worlds else rows  # a slice gives views, which saves copies
+        total = self.scene.physics.substeps if substeps is None else substeps
+        held, offset, some_limp = self._held[those], self._offset[those], bool(self._limp[those].any())
+        targets, waits = held, None
+        if joint_targets is not None:
+            targets = np.asarray(joint_targets.numpy(), dtype=np.float64)[those]
+            if not np.isfinite(targets).all():
+                broken = np.logical_not(np.isfinite(targets).all(axis=1))
+                targets = np.where(broken[:, None], held, targets)
+                self._state.flags["diverged"][rows[broken]] = True
+            if delay is not None:
+                waits = np.arange(total) < delay.numpy()[those, None]
+        control, records = self._memory(n, total)
+        control[:] = (targets + offset)[:, None]
+        if waits is not None:
+            np.copyto(control, (held + offset)[:, None], where=waits[..., None])
+        if some_limp and waits is None:
+            waits = np.full((n, total), joint_targets is None)
+        if self._limits.by_speed:
+            loose = np.zeros((n, total), dtype=bool) if waits is None else waits & self._limp[those, None]
+            records = self._play_singly(rows, control, loose)
+        elif some_limp and waits is not None:
+            records = self._play_some_limp(rows, control, self._limp[those], waits)
+        else:
+            self._play(rows, control, records)
+        if joint_targets is not None:  # a target that waits for the whole step acts from the next one on
+            self._held[those] = targets
+            if some_limp:
+                self._limp[those] = False
+        began = perf_counter()
+        self._batch.forward(self._ids(rows), stage=_STAGE)
+        self.engine_seconds += perf_counter() - began
+        seen = self._watch(those, records)
+        self._flag(rows)
+        flags = self._state.flags
+        self.eventful = seen or bool(flags["diverged"][those].any() or flags["overflowed"][those].any())
+        self._state.renew(those)
+        if sample_at is not None:
+            at = sample_at.numpy()[those]
+            if at.any():
+                self._sample.take(self._state, rows, records, at)
+
+    def _ids(self, rows: NDArray[np.int64]) -> NDArray[np.int32] | None:
+        """World indices as MuJoCo takes them: None for all."""
+        return None if len(rows) == self.num_worlds else rows.astype(np.int32)
+
+    def _memory(self, n: int, count: int) -> tuple[Array, Records]:
+        """Room for the controls of ``n`` worlds over ``count`` substeps, (n, count, J), and for what is recorded of them.
+
+        It is the same memory for every ``n``, which the processor's caches then hold.
+        """
+        if (n, count) not in self._rooms:
+            whole = self.num_worlds
+            if n == whole:
+                shapes = {name: getattr(self._batch, name).shape[1:] for name in RECORDED}
+                records = {name: np.zeros((n, count, *shape)) for name, shape in shapes.items()}
+                self._rooms[n, count] = np.zeros((n, count, self._held.shape[1])), records
+            else:
+                control, records = self._memory(whole, count)
+                self._rooms[n, count] = control[:n], {name: array[:n] for name, array in records.items()}
+        return self._rooms[n, count]
+
+    def _play(self, rows: NDArray[np.int64], control: Array, records: Records) -> None:
+        """Step worlds with the given controls, (rows, substeps, J), and record them after each substep."""
+        began = perf_counter()
+        self._batch.rollout(control.shape[1], control, ids=self._ids(rows), record=RECORDED, out=records)
+        self.engine_seconds += perf_counter() - began
+
+    def _play_some_limp(
+        self, rows: NDArray[np.int64], control: Array, limp: NDArray[np.bool_], waits: NDArray[np.bool_]
+    ) -> Records:
+        """The same where the motors of some worlds hang limp while they wait, (rows,) and (rows, substeps)."""
+        others, some = rows[~limp], control[~limp]
+        loose = self._play_singly(rows[limp], control[limp], waits[limp])
+        records = self._memory(len(others), control.shape[1])[1]
+        if len(others):
+            self._play(others, some, records)
+        return _merge(limp, records, loose)
+
+    def _play_singly(self, rows: NDArray[np.int64], control: Array, loose: NDArray[np.bool_]) -> Records:
+        """The same, a substep at a time, where a target must follow the state: ``loose`` motors, (rows, substeps), get the one
+        at which the law gives no torque, and those at a limit that depends on the speed the one that gives the limit.
+        """
+        parts = []
+        for substep in range(control.shape[1]):
+            position, velocity = self._qpos[np.ix_(rows, self._joint_q)], self._qvel[np.ix_(rows, self._joint_v)]
+            free = position + self._kd_over_kp[rows] * velocity
+            target = control[:, substep]
+            if self._limits.by_speed:
+                gain, strength = self._gain[rows], self._strength[rows]
+                asked = gain * (target - free)
+                lower, upper = self._limits.bounds(velocity)
+                given = asked.clip(lower * strength, upper * strength)
+                cut = (given != asked) & (gain > 0.0)
+                target = np.where(cut, free + np.divide(given, gain, out=np.zeros_like(gain), where=cut), target)
+            now, records = self._memory(len(rows), 1)
+            now[:] = np.where(loose[:, substep, None], free, target)[:, None]
+            self._play(rows, now, records)
+            parts.append({name: array.copy() for name, array in records.items()})
+        return {name: np.concatenate([p[name] for p in parts], axis=1) for name in RECORDED}
+
+    def _watch(self, those: slice | NDArray[np.int64], records: Records) -> bool:
+        """Record the first substep at which a watched limit was exceeded; returns whether any was."""
+        physics, seen = self.scene.physics, {}
+        if physics.watch_tilt is not None:
+            qpos = records["qpos"]
+            seen["tilt_substep"] = qpos[:, :, 4] ** 2 + qpos[:, :, 5] ** 2 > self._tilt_bound
+        if self._deep is not None:
+            # no contact reads 0
+            seen["penetration_substep"] = records["sensordata"][:, :, self._deep] < -float(
+                physics.watch_penetration or 0.0
+            )
+        exceeded = False
+        for name, over in seen.items():
+            some = bool(over.any())
+            self._state.flags[name][those] = _first(over) if some else 0
+            exceeded |= some
+        return exceeded
+
+    def _warning_counts(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Number of MuJoCo's invalid-state and buffer-full warnings so far, (rows, 2)."""
+        numbers = self._batch.warning[rows, :, 1]
+        return np.stack([numbers[:, _INVALID].sum(1), numbers[:, _FULL].sum(1)], axis=1)
+
+    def _flag(self, rows: NDArray[np.int64]) -> None:
+        """Set ``diverged`` and ``overflowed`` from MuJoCo's warnings."""
+        if not self._batch.warning[:, :, 1].any():
+            return
+        new = self._warning_counts(rows) > self._warned[rows]
+        self._state.flags["diverged"][rows] |= new[:, 0]
+        self._state.flags["overflowed"][rows] |= new[:, 1]
+
+    # ---- changing the model ---------------------------------------------------------------------------------------
+
+    def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
+        """See ``PhysicsBackend.randomize``."""
+        rows = self._rows(worlds)
+        for item in fields(Randomization):
+            value = getattr(randomization, item.name)
+            if value is None:
+                continue
+            if len(value) != len(rows):
+                raise BackendError(
+                    f"Randomization.{item.name} has {len(value)} rows for {len(rows)} worlds; give one row for each"
+                )
+            for row, entry in zip(rows, value.to(torch.float64).numpy(), strict=True):
+                self._randomized.setdefault(int(row), {})[item.name] = entry
+        for row in rows:
+            self._apply_randomization(int(row))
+        self._read_gains(rows)
+        self._batch.set_models(self._models)
+
+    def _apply_randomization(self, row: int) -> None:
+        """Write a world's randomization into its model, starting from its terrain's nominal values."""
+        values = self._randomized.get(row, {})
+        model, nominal = self._models[row], self._palette[self._terrain[row]]
+        if "friction" in values:
+            model.geom_friction[:, 0] = values["friction"]
+        inertial = False
+        model.body_mass[:] = nominal.body_mass
+        model.body_inertia[:] = nominal.body_inertia
+        if "link_mass_scale" in values:
+            others = self._bodies != self._base
+            scale = values["link_mass_scale"][others]
+            model.body_mass[self._bodies[others]] *= scale
+            model.body_inertia[self._bodies[others]] *= scale[:, None]
+            inertial = True
+        if "base_mass_offset" in values:
+            model.body_mass[self._base] = max(float(nominal.body_mass[self._base] + values["base_mass_offset"]), 0.01)
+            inertial = True
+        if "base_com_offset" in values:
+            model.body_ipos[self._base] = nominal.body_ipos[self._base] + values["base_com_offset"]
+            inertial = True
+        if inertial:
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+        ones = np.ones(self.scene.robot.num_joints)
+        strength = values.get("motor_strength", ones)
+        model.actuator_gainprm[:, 0] = nominal.actuator_gainprm[:, 0] * values.get("stiffness_scale", ones) * strength
+        model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
+        model.actuator_biasprm[:, 2] = nominal.actuator_biasprm[:, 2] * values.get("damping_scale", ones) * strength
+        model.actuator_forcerange[:] = nominal.actuator_forcerange * strength[:, None]
+        self._offset[row] = values.get("motor_offset", 0.0)
+
+    def _read_gains(self, rows: range | NDArray[np.int64]) -> None:
+        """Read kp and strength of each motor, and kd/kp, from which the torque-free target follows."""
+        for row in rows:
+            model = self._models[row]
+            gain = model.actuator_gainprm[:, 0]
+            self._gain[row] = gain
+            self._strength[row] = self._randomized.get(int(row), {}).get("motor_strength", 1.0)
+            self._kd_over_kp[row] = np.divide(
+                -model.actuator_biasprm[:, 2], gain, out=np.zeros_like(gain), where=gain > 0
+            )
+
+    def push(
+        self,
+        worlds: torch.Tensor | None = None,
+        *,
+        linear_velocity_w: torch.Tensor | None = None,
+        angular_velocity_b: torch.Tensor | None = None,
+    ) -> None:
+        """See ``PhysicsBackend.push``."""
+        rows = self._rows(worlds)
+        for first, value in ((0, linear_velocity_w), (3, angular_velocity_b)):
+            if value is not None:
+                new = value.numpy()[rows]
+                old = self._qvel[rows, first : first + 3]
+                self._qvel[rows, first : first + 3] = np.where(np.isnan(new), old, new)
+        self._batch.forward(rows.astype(np.int32), stage=_STAGE)
+
+    def apply_force(self, force_w: torch.Tensor) -> None:
+        """See ``PhysicsBackend.apply_force``."""
+        applied = self._applied.reshape(self.num_worlds, -1, 6)
+        applied[:, self._base, 0:3] = force_w.numpy()
+
+    def describe(self) -> Mapping[str, list[float]]:
+        """See ``PhysicsBackend.describe``."""
+        model, robot = self._models[0], self.scene.robot
+        feet, floor = [model.geom(f).id for f in robot.foot_names], model.geom("floor").id
+        limited = model.actuator_forcelimited.astype(bool)
+        dofs, joints = self._joint_v, [model.joint(j).id for j in robot.joint_names]
+        return ModelFields(
+            total_mass=float(model.body_mass.sum()),
+            body_mass=model.body_mass[self._bodies],
+            body_inertia=model.body_inertia[self._bodies],
+            joint_range=np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf]),
+            joint_armature=model.dof_armature[dofs],
+            joint_damping=model.dof_damping[dofs],
+            joint_friction_loss=model.dof_frictionloss[dofs],
+            stiffness=model.actuator_gainprm[:, 0],
+            damping=-model.actuator_biasprm[:, 2],
+            torque_limit=np.where(limited, model.actuator_forcerange[:, 1], np.inf),
+            foot_friction=model.geom_friction[feet, 0],
+            floor_friction=float(model.geom_friction[floor, 0]),
+            foot_priority=model.geom_priority[feet] - model.geom_priority[floor],
+        ).describe()
+
+    def close(self) -> None:
+        """Drop the worlds."""
+        self._models.clear()
+
+
+def _first(over: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Position (1-based) of the first true entry of each row, 0 where there is none."""
+    return np.where(over.any(1), over.argmax(1) + 1, 0)
+
+
+def _merge(limp: NDArray[np.bool_], others: Records, records: Records) -> Records:
+    """Records of limp and other worlds, back in their common order."""
+    merged = {}
+    for name in RECORDED:
+        merged[name] = np.empty((len(limp), *records[name].shape[1:]))
+        merged[name][limp] = records[name]
+        merged[name][~limp] = others[name]
+    return merged

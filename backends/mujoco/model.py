@@ -1,0 +1,187 @@
+"""Builds MuJoCo models from a scene: the robot's own file, the motors' constants, the ground and the sensors that report contacts.
+
+Bodies added to the robot's model, all static: ``environment`` holds ``ground`` (floor and walls) and ``terrain`` (boxes and height
+field), so that contact sensors can tell the three apart.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ...terrains.base import Terrain
+from ..base import BackendError, Scene
+
+CONTACT_SLOTS = 12
+"""Ground contacts reported one by one, the strongest first; a robot that lies flat has about this many."""
+FOOT_SLOTS = 3
+"""Contacts reported one by one for each foot."""
+NOTHING: dict[str, Any] = {"contype": 2, "conaffinity": 0}
+"""Meets nothing, yet counts as a collision geom, so that all models of a layout have bounding-volume trees of one size."""
+PARKED: dict[str, Any] = {"size": [0.01, 0.01, 0.01], "pos": [0.0, 0.0, -1.0], **NOTHING}
+"""Unused boxes of a layout."""
+
+
+def robot_spec(scene: Scene) -> mujoco.MjSpec:
+    """The robot's model with the scene's joint constants, motors and solver options; no ground yet."""
+    robot, physics, constants = scene.robot, scene.physics, scene.parameters
+    spec = mujoco.MjSpec.from_file(str(robot.mjcf))
+    option = spec.option
+    option.timestep = physics.timestep
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    if physics.cone not in ("elliptic", "pyramidal"):
+        raise BackendError(
+            f"friction cone '{physics.cone}' does not exist; use 'elliptic' or 'pyramidal' (PhysicsOptions.cone)"
+        )
+    elliptic = physics.cone == "elliptic"
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.impratio = physics.impratio
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations = physics.iterations
+    option.ls_iterations = physics.ls_iterations
+    option.tolerance = physics.tolerance
+    for j, name in enumerate(robot.joint_names):
+        joint = spec.joint(name)
+        if joint is None:
+            raise BackendError(
+                f"joint '{name}' of robot '{robot.name}' is not in {robot.mjcf.name}; correct joint_names in robot.toml"
+            )
+        joint.armature = constants.armature[j]
+        joint.damping = np.array([constants.joint_damping[j], 0.0, 0.0])
+        joint.frictionloss = constants.friction_loss[j]
+    _set_motors(spec, scene)
+    for geom in list(spec.geoms):
+        if not (geom.contype or geom.conaffinity):
+            spec.delete(geom)  # visual only: costs time in every step
+            continue
+        if geom.name in robot.foot_names and physics.foot_condim is not None:
+            geom.condim = physics.foot_condim
+        if not physics.self_collision and (geom.contype or geom.conaffinity):
+            geom.contype, geom.conaffinity = 0, 1  # the ground's contype 1 still meets it, other robot geoms do not
+    return spec
+
+
+def _set_motors(spec: mujoco.MjSpec, scene: Scene) -> None:
+    """Replace the file's actuators by one position servo per joint, in the robot's joint order."""
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    limits = scene.parameters.torque_limit
+    for j, name in enumerate(scene.robot.joint_names):
+        kp, kd = scene.parameters.stiffness[j], scene.parameters.damping[j]
+        motor = spec.add_actuator(name=f"motor_{name}", target=name)
+        motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        motor.gaintype = mujoco.mjtGain.mjGAIN_FIXED
+        motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        motor.gainprm[0] = kp
+        motor.biasprm[:3] = (0.0, -kp, -kd)
+        motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if scene.physics.torque_limits:
+            motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            motor.forcerange = np.array([-limits[j], limits[j]])
+        else:
+            motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
+
+
+def add_terrain(
+    spec: mujoco.MjSpec, terrain: Terrain, *, walls: int, blocks: int, field_shape: tuple[int, int] | None
+) -> None:
+    """Add the ground of one world.
+
+    Args:
+        spec: the robot's model.
+        terrain: what to add.
+        walls: number of walls in the layout, at least as many as the terrain has; the rest meets nothing.
+        blocks: the same for the other boxes.
+        field_shape: (rows, columns) of the layout's height field, None for none. A terrain without one gets one that
+            meets nothing.
+    """
+    environment = spec.worldbody.add_body(name="environment")
+    ground = environment.add_body(name="ground")
+    ground.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+    body = environment.add_body(name="terrain")
+    for parent, label, slots, wall in ((ground, "wall", walls, True), (body, "box", blocks, False)):
+        boxes = [b for b in terrain.boxes if b.wall == wall]
+        for i in range(slots):
+            place = PARKED
+            if i < len(boxes):
+                place = {"size": boxes[i].half_size, "pos": boxes[i].center, "quat": boxes[i].quaternion}
+            parent.add_geom(name=f"{label}_{i}", type=mujoco.mjtGeom.mjGEOM_BOX, **place)
+    if field_shape is not None:
+        field = terrain.height_field
+        heights = np.zeros(field_shape) if field is None else field.heights
+        top = max(float(heights.max()), 1e-6)
+        hfield = spec.add_hfield(name="field", nrow=field_shape[0], ncol=field_shape[1])
+        half = (1.0, 1.0) if field is None else field.half_size
+        hfield.size = np.array([half[0], half[1], top, 0.1 if field is None else field.base])
+        hfield.userdata = (heights / top).astype(np.float32).ravel()
+        place = {"pos": [*field.center, 0.0]} if field is not None else NOTHING
+        body.add_geom(name="field", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field", **place)
+
+
+def add_report_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
+    """Add the sensors from which the engine reads foot velocities and ground contacts."""
+    robot = scene.robot
+
+    def contact(name: str, reduce: str, data: tuple[str, ...], slots: int, **objects: tuple[int, str]) -> None:
+        sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)
+        sensor.objtype, sensor.objname = objects["robot"]
+        sensor.reftype, sensor.refname = objects["other"]
+        kinds = ("found", "force", "torque", "dist", "pos", "normal", "tangent")
+        bits = sum(1 << kinds.index(d) for d in data)
+        sensor.intprm[:3] = (bits, ("none", "mindist", "maxforce", "netforce").index(reduce), slots)
+
+    body, geom, tree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_XBODY
+    everything = (tree, "environment")
+    for foot in robot.foot_names:
+        spec.add_sensor(
+            name=f"velocity_{foot}",
+            type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+            objtype=mujoco.mjtObj.mjOBJ_SITE,
+            objname=foot,
+        )
+        contact(f"net_{foot}", "netforce", ("force",), 1, robot=(geom, foot), other=everything)
+        contact(f"each_{foot}", "maxforce", ("force",), FOOT_SLOTS, robot=(geom, foot), other=everything)
+    for name in robot.collision_bodies:
+        contact(f"body_{name}", "netforce", ("force",), 1, robot=(body, name), other=everything)
+    for name in robot.trunk_shapes:
+        contact(f"trunk_{name}", "netforce", ("force",), 1, robot=(geom, name), other=everything)
+    whole = (tree, robot.base_body)
+    contact("ground_net", "netforce", ("force", "torque", "pos"), 1, robot=whole, other=everything)
+    contact("ground_each", "maxforce", ("found", "force", "pos"), CONTACT_SLOTS, robot=whole, other=everything)
+    if scene.physics.watch_penetration is not None:
+        contact("penetration", "mindist", ("found", "dist"), 1, robot=whole, other=(body, "terrain"))
+
+
+def build_models(scene: Scene) -> list[mujoco.MjModel]:
+    """One model per terrain of the scene's palette, all of one layout.
+
+    Raises:
+        BackendError: the palette's height fields differ in their number of nodes, or a name of the robot is missing in its file.
+    """
+    fields = {t.height_field.heights.shape for t in scene.terrains if t.height_field is not None}
+    if len(fields) > 1:
+        raise BackendError(
+            f"the height fields of one scene must have the same number of nodes, but have {sorted(fields)}; use one scene for each"
+        )
+    shape = next(iter(fields), None)
+    walls = max(sum(b.wall for b in t.boxes) for t in scene.terrains)
+    blocks = max(sum(not b.wall for b in t.boxes) for t in scene.terrains)
+    models = []
+    for terrain in scene.terrains:
+        spec = robot_spec(scene)
+        add_terrain(spec, terrain, walls=walls, blocks=blocks, field_shape=shape)
+        add_report_sensors(spec, scene)
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise BackendError(
+                f"MuJoCo cannot build terrain '{terrain.name}' level {terrain.level}: {error}"
+            ) from error
+        if shape is not None and terrain.height_field is not None:
+            # the compiler stretches heights to [0, 1]; what the height field says is what must stand
+            heights = terrain.height_field.heights
+            model.hfield_data[:] = (heights / max(float(heights.max()), 1e-6)).ravel()
+        models.append(model)
+    return models

@@ -1,0 +1,148 @@
+"""Repairs the height-field contacts of mujoco_warp 3.17, for every engine that steps it.
+
+Height fields are collided prism by prism, in a copy of MuJoCo's algorithm with three differences that matter:
+
+- The support function labels a prism's vertex as top or bottom by the sign of the search direction, not by the vertex. A
+  closest feature with both labels is taken for the prism's side, and its contact is replaced by a vertical one whose
+  depth is the unsigned height between the geom's lowest point and a corner of the prism. On uneven ground this happens
+  on top faces and edges, too: contacts that are centimetres too deep, or have a normal that points into the ground.
+- Prisms that are a little apart from the geom count as contacts, with the normal turned round: a foot is pulled down.
+- The field's surface is lifted by the contact margin and the geom inflated by half of it, but the distance between these
+  is reported: contacts would begin with a jolt, and feet stand that much too high.
+
+MuJoCo does none of this. Two functions of mujoco_warp are replaced: the support function, by one with one label for all
+vertices, so that the plain contact is used; and the narrow phase, by one that collides height fields itself, with no contact
+where a prism is apart, and distances without the margin, before mujoco_warp does the rest.
+
+It also shares the work otherwise. A geom's prisms are tested by one thread, in turn, in mujoco_warp: of thousands of robots one
+always lies on the ground, and its thread is what all the others wait for. Here every prism has a thread of its own, and
+searches for a distance (GJK) are made only where no plane of the prism separates the two and no closed form is known.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+from mujoco_warp import Data, Model
+from mujoco_warp._src import collision_convex, collision_driver, collision_gjk
+from mujoco_warp._src.collision_convex import convex_narrowphase as plain_narrowphase
+from mujoco_warp._src.collision_core import CollisionContext
+from mujoco_warp._src.math import upper_trid_index
+from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType, OverflowType
+
+from . import kernels
+from .contacts import Contacts, Materials, write_contacts
+from .prisms import support
+
+_PRISMS = (8, 64)
+"""Prisms that can be listed: for each contact that there is room for, and for each world besides."""
+_TOUCHES = (2, 64)
+"""Prisms that may touch, of all that are listed: likewise. More than become contacts, of which a shape has four at most."""
+_WARP = 32
+"""Threads that a GPU runs in step."""
+_SERIAL_THREADS = 64
+"""Threads on a CPU, where they run in turn."""
+_TEST_THREADS = 512
+"""Threads for each multiprocessor of a GPU that test prisms, each a few in turn."""
+SEARCH_THREADS = 256
+"""Threads for each multiprocessor that search: as many as fit at 255 registers. Each has its own scratch memory."""
+
+
+def colliding_kinds(model: Model, table: list[tuple[GeomType, GeomType]]) -> tuple[int, ...]:
+    """Types of the geoms that may meet a height field in this model."""
+    counts = model.geom_pair_type_count
+    return tuple(
+        int(other)
+        for field, other in table
+        if field == GeomType.HFIELD and counts[upper_trid_index(len(GeomType), int(field), int(other))]
+    )
+
+
+def scratch_memory(rows: int, iterations: int) -> kernels.Scratch:
+    """Memory for polytopes that are expanded so many times."""
+    vertices, faces = 10 + 2 * iterations, 6 + MJ_MAX_EPAFACES * iterations
+    points = wp.empty((rows, vertices + faces), dtype=wp.vec3)
+    numbers = wp.empty((rows, vertices + faces + MJ_MAX_EPAHORIZON), dtype=int)
+    scratch: Any = kernels.Scratch()
+    scratch.vertices, scratch.projections = points[:, :vertices], points[:, vertices:]
+    scratch.vertex_numbers, scratch.faces = numbers[:, :vertices], numbers[:, vertices : vertices + faces]
+    scratch.horizon = numbers[:, vertices + faces :]
+    scratch.squares = wp.empty((rows, faces), dtype=float)
+    return scratch
+
+
+def scratch_bytes(iterations: int) -> int:
+    """Size of the memory of one search [bytes]."""
+    with wp.ScopedDevice("cpu"):
+        scratch = scratch_memory(1, iterations)
+    parts = (
+        scratch.vertices,
+        scratch.projections,
+        scratch.vertex_numbers,
+        scratch.faces,
+        scratch.horizon,
+        scratch.squares,
+    )
+    return sum(part.size * wp.types.type_size_in_bytes(part.dtype) for part in parts)
+
+
+def empty_lists(contacts: int, worlds: int) -> kernels.Lists:
+    """Lists for so many worlds with room for so many contacts together."""
+    prisms, touches = (each * contacts + spare * worlds for each, spare in (_PRISMS, _TOUCHES))
+    lists = kernels.Lists()
+    lists.counts = wp.zeros(3, dtype=int)
+    lists.spans = wp.empty(contacts, dtype=wp.vec2i)
+    lists.prisms = wp.empty(prisms, dtype=wp.vec2i)
+    lists.touches = wp.empty(touches, dtype=kernels.Touch)
+    lists.searches = wp.empty(touches, dtype=wp.vec3i)
+    return lists
+
+
+def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: tuple[int, ...]) -> None:
+    """Write the contacts between height fields and geoms of these types; the lists are given back at the end.
+
+    Worlds of which contacts are lost, since a list is full, get mujoco_warp's alarm ``HFIELD``.
+    """
+    multiprocessors = data.ncollision.device.sm_count
+    testing = multiprocessors * _TEST_THREADS or _SERIAL_THREADS
+    searching = max(1, min(multiprocessors * SEARCH_THREADS or _SERIAL_THREADS, data.naccdmax))
+    shapes = _filled(kernels.Shapes(), model, model.opt, data, context)
+    materials = _filled(Materials(), model)
+    contacts = _filled(Contacts(), data.contact, data)
+    lists = empty_lists(data.naconmax, data.nworld)
+    scratch = scratch_memory(searching, model.opt.ccd_iterations)
+    test_prisms, search_prisms = kernels.prism_kernels(kinds)
+    printed = model.opt.warn_overflow
+    warn, warn_horizon = (bool(printed & bit) for bit in (OverflowType.HFIELD, OverflowType.EPA_HORIZON))
+    wp.launch(kernels.list_prisms, dim=data.naconmax, inputs=[shapes, lists, warn])
+    wp.launch(test_prisms, dim=testing, inputs=[shapes, lists, testing, warn])
+    iterations = [model.opt.ccd_iterations] * 2
+    inputs = [shapes, lists, scratch, searching, *iterations, warn_horizon]
+    # in small blocks, so that few searches still reach many processors
+    wp.launch(search_prisms, dim=searching, inputs=inputs, block_dim=_WARP)
+    wp.launch(write_contacts, dim=data.naconmax, inputs=[shapes, lists, materials, contacts])
+
+
+def convex_narrowphase(
+    model: Model, data: Data, context: CollisionContext, table: list[tuple[GeomType, GeomType]]
+) -> None:
+    """Collide height fields here, and all other convex shapes of the table in mujoco_warp."""
+    kinds = colliding_kinds(model, table)
+    if kinds:
+        collide_fields(model, data, context, kinds)
+    plain_narrowphase(model, data, context, [pair for pair in table if pair[0] != GeomType.HFIELD])
+
+
+def repair_height_fields() -> None:
+    """Let mujoco_warp use the functions above. To be called before its first collision kernel is built; idempotent."""
+    collision_gjk.support = collision_convex.support = support
+    collision_driver.convex_narrowphase = convex_narrowphase
+
+
+def _filled(struct: Any, *sources: object) -> Any:
+    """The struct with every field from the first source that has one of that name."""
+    for name in struct._cls.vars:
+        source = next(source for source in sources if hasattr(source, name))
+        setattr(struct, name, getattr(source, name))
+    return struct

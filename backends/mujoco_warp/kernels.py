@@ -1,0 +1,266 @@
+# mypy: ignore-errors
+# ruff: noqa: UP018 - a variable that changes in a kernel's loop must be made by float(), int() or bool()
+"""Warp kernels around mujoco_warp's step: motor law, latency, watches, terrain slots, pushes and resets.
+
+One thread per world, or per world and joint or terrain slot. Every kernel takes masks from device memory, so that none
+of them needs the host.
+"""
+
+# Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
+import warp as wp
+
+from ..warp.motor_law import motor_torque
+from .arrays import ContactArrays, Motion, Motors, Palette, Roles, StateArrays
+
+wp.set_module_options({"enable_backward": False})
+
+POSITION_LIMIT = wp.constant(1.0e5)
+"""A position beyond this [m, rad] means that the world has diverged."""
+VELOCITY_LIMIT = wp.constant(1.0e4)
+"""A velocity beyond this [m/s, rad/s] means that the world has diverged."""
+
+
+@wp.kernel
+def begin_period(active: wp.array[int], has_request: wp.array[int], motors: Motors, state: StateArrays) -> None:
+    """Shift the targets and clear the watches of the worlds that will step."""
+    world, joint = wp.tid()
+    if active[world] == 0:
+        return
+    motors.previous[world, joint] = motors.current[world, joint]
+    if has_request[0] != 0:
+        motors.current[world, joint] = motors.requested[world, joint]
+    if joint == 0:
+        motors.limp_before[world] = motors.limp[world]
+        if has_request[0] != 0:
+            motors.limp[world] = 0
+        state.tilt_substep[world] = wp.int64(0)
+        state.penetration_substep[world] = wp.int64(0)
+
+
+@wp.kernel
+def keep_inactive(
+    active: wp.array[int],
+    restore: int,
+    parked_qpos: wp.array[float],
+    motion: Motion,
+    kept: wp.array2d[float],
+    kept_overflow: wp.array[int],
+) -> None:
+    """Save (or restore) what a step changes in the worlds that must not step.
+
+    Meanwhile their robots are out of reach of everything, since collisions and contacts are what a step takes its time for.
+    """
+    world, i = wp.tid()
+    if active[world] != 0:
+        return
+    if restore == 0:
+        if i < motion.positions:
+            kept[world, i] = motion.qpos[world, i]
+            motion.qpos[world, i] = parked_qpos[i]
+        if i < motion.velocities:
+            kept[world, motion.positions + i] = motion.qvel[world, i]
+            kept[world, motion.positions + motion.velocities + i] = motion.warmstart[world, i]
+            motion.qvel[world, i] = 0.0
+            motion.warmstart[world, i] = 0.0
+        if i == 0:
+            kept[world, motion.positions + 2 * motion.velocities] = motion.time[world]
+            kept_overflow[world] = motion.overflow[world]
+    else:
+        if i < motion.positions:
+            motion.qpos[world, i] = kept[world, i]
+        if i < motion.velocities:
+            motion.qvel[world, i] = kept[world, motion.positions + i]
+            motion.warmstart[world, i] = kept[world, motion.positions + motion.velocities + i]
+        if i == 0:
+            motion.time[world] = kept[world, motion.positions + 2 * motion.velocities]
+            motion.overflow[world] = kept_overflow[world]
+
+
+@wp.kernel
+def motor_law(substep: int, motors: Motors, motion: Motion) -> None:
+    """The motor law with the target that acts in this substep (from 0)."""
+    world, joint = wp.tid()
+    target = motors.current[world, joint]
+    limp = motors.limp[world]
+    if substep < motors.delay[world]:
+        target = motors.previous[world, joint]
+        limp = motors.limp_before[world]
+    position = motion.qpos[world, motors.joint_q[joint]]
+    velocity = motion.qvel[world, motors.joint_v[joint]]
+    error = target + motors.offset[world, joint] - position
+    stiffness, damping, strength = (
+        motors.stiffness[world, joint],
+        motors.damping[world, joint],
+        motors.strength[world, joint],
+    )
+    torque = motor_torque(joint, error, velocity, stiffness, damping, strength, motors.limits)
+    if limp != 0:
+        torque = 0.0
+    motors.torque[world, joint] = torque
+    motion.applied[world, motors.joint_v[joint]] = torque
+
+
+@wp.kernel
+def end_substep(
+    substep: int,
+    upright_limit: float,
+    active: wp.array[int],
+    parked_qpos: wp.array[float],
+    motion: Motion,
+    state: StateArrays,
+) -> None:
+    """Catch worlds whose state became invalid, park them out of reach, and watch the tilt of the others."""
+    world = wp.tid()
+    if active[world] == 0:
+        return
+    valid = bool(True)
+    for i in range(motion.positions):
+        if not (wp.abs(motion.qpos[world, i]) < POSITION_LIMIT):  # false for NaN, too
+            valid = False
+    for i in range(motion.velocities):
+        if not (wp.abs(motion.qvel[world, i]) < VELOCITY_LIMIT):
+            valid = False
+    if state.diverged[world] or not valid:
+        state.diverged[world] = True
+        for i in range(motion.positions):
+            motion.qpos[world, i] = parked_qpos[i]
+        for i in range(motion.velocities):
+            motion.qvel[world, i] = 0.0
+            motion.warmstart[world, i] = 0.0
+        return
+    upright = 1.0 - 2.0 * (
+        motion.qpos[world, 4] * motion.qpos[world, 4] + motion.qpos[world, 5] * motion.qpos[world, 5]
+    )
+    if upright < upright_limit and state.tilt_substep[world] == wp.int64(0):
+        state.tilt_substep[world] = wp.int64(substep + 1)
+
+
+@wp.kernel
+def watch_penetration(
+    substep: int,
+    depth: float,
+    active: wp.array[int],
+    contacts: ContactArrays,
+    roles: Roles,
+    palette: Palette,
+    terrain: wp.array[int],
+    state: StateArrays,
+) -> None:
+    """Record the substep in which a part of the robot is deeper than ``depth`` in a terrain box or height field."""
+    contact = wp.tid()
+    if contact >= contacts.count[0]:
+        return
+    if contacts.distance[contact] >= -depth:
+        return
+    world = contacts.world[contact]
+    if active[world] == 0 or state.diverged[world]:
+        return
+    pair = contacts.geom[contact]
+    slot = wp.max(roles.slot[pair[0]], roles.slot[pair[1]])
+    if slot < 0:
+        return
+    if palette.wall[terrain[world], slot] != 0:
+        return
+    # several contacts of one world write the same number
+    if state.penetration_substep[world] == wp.int64(0):
+        state.penetration_substep[world] = wp.int64(substep + 1)
+
+
+@wp.kernel
+def reset_worlds(
+    active: wp.array[int],
+    has_held: wp.array[int],
+    pose: wp.array2d[float],
+    twist: wp.array2d[float],
+    joint_position: wp.array2d[float],
+    joint_velocity: wp.array2d[float],
+    motors: Motors,
+    motion: Motion,
+    state: StateArrays,
+) -> None:
+    """Put the masked worlds into the given state. ``requested`` holds the held targets."""
+    world, joint = wp.tid()
+    if active[world] == 0:
+        return
+    motion.qpos[world, motors.joint_q[joint]] = joint_position[world, joint]
+    motion.qvel[world, motors.joint_v[joint]] = joint_velocity[world, joint]
+    held = float(0.0)
+    if has_held[0] != 0:
+        held = motors.requested[world, joint]
+    motors.current[world, joint] = held
+    motors.previous[world, joint] = held
+    motors.torque[world, joint] = 0.0
+    if joint == 0:
+        w, x, y, z = pose[world, 3], pose[world, 4], pose[world, 5], pose[world, 6]
+        length = wp.sqrt(w * w + x * x + y * y + z * z)
+        for i in range(3):
+            motion.qpos[world, i] = pose[world, i]
+        for i in range(3, 7):
+            motion.qpos[world, i] = pose[world, i] / length
+        for i in range(6):
+            motion.qvel[world, i] = twist[world, i]
+        for i in range(motion.velocities):
+            motion.warmstart[world, i] = 0.0
+            motion.applied[world, i] = 0.0
+        for i in range(motion.bodies):
+            motion.external[world, i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        motors.limp[world] = 1 - has_held[0]
+        motors.limp_before[world] = 1 - has_held[0]
+        motion.time[world] = 0.0
+        motion.overflow[world] = 0
+        state.diverged[world] = False
+        state.overflowed[world] = False
+        state.tilt_substep[world] = wp.int64(0)
+        state.penetration_substep[world] = wp.int64(0)
+
+
+@wp.kernel
+def place_terrain(
+    active: wp.array[int],
+    requested: wp.array[int],
+    terrains: int,
+    slots: int,
+    slot_geom: wp.array[int],
+    palette: Palette,
+    terrain: wp.array[int],
+    geom_xpos: wp.array2d[wp.vec3],
+    geom_xmat: wp.array2d[wp.mat33],
+    geom_size: wp.array2d[wp.vec3],
+    geom_aabb: wp.array3d[wp.vec3],
+    geom_rbound: wp.array2d[float],
+    geom_dataid: wp.array2d[int],
+    has_field: int,
+) -> None:
+    """Write the boxes and the height field of the masked worlds' new terrains.
+
+    mujoco_warp computes poses of static geoms once, when its data are made, and never again: writing them here
+    suffices.
+    """
+    world, slot = wp.tid()
+    if active[world] == 0:
+        return
+    index = wp.clamp(requested[world], 0, terrains - 1)
+    if slot == 0:
+        terrain[world] = index
+    if slot >= slots:
+        return
+    geom = slot_geom[slot]
+    geom_xpos[world, geom] = palette.position[index, slot]
+    geom_xmat[world, geom] = palette.rotation[index, slot]
+    geom_size[world, geom] = palette.size[index, slot]
+    geom_aabb[world, geom, 0] = palette.bound_center[index, slot]
+    geom_aabb[world, geom, 1] = palette.bound_half[index, slot]
+    geom_rbound[world, geom] = palette.radius[index, slot]
+    if has_field != 0 and slot == slots - 1:
+        geom_dataid[world, geom] = palette.field[index]
+
+
+@wp.kernel
+def push_base(active: wp.array[int], twist: wp.array2d[float], motion: Motion) -> None:
+    """Set the base's motion.velocities; NaN keeps the present value."""
+    world, i = wp.tid()
+    if active[world] == 0:
+        return
+    value = twist[world, i]
+    if not wp.isnan(value):
+        motion.qvel[world, i] = value

@@ -1,0 +1,348 @@
+"""The model that all worlds of the mujoco_warp engine share, and the tables that give each world its own ground.
+
+The model holds the robot without what is only seen, a floor, as many box geoms as the palette's fullest terrain needs,
+and one height-field geom if any terrain has a field. A world's terrain is a set of poses and sizes of these geoms, the
+slots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ...terrains.base import Terrain
+from ..base import BackendError, Scene
+from ..mujoco.model import robot_spec
+
+PARKED = (0.0, 0.0, -1000.0)
+"""Where unused slots wait, out of reach of any robot."""
+PARKED_SIZE = 0.01
+"""Half size of an unused slot [m]."""
+DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
+"""Contacts per world for which room is made, by the hardest shape of the palette."""
+SPARE_CONTACTS = 256
+"""Room for contacts on top, shared by all worlds: a fallen robot has more than an average one."""
+
+SMALLEST_TOLERANCE = 1e-6
+"""Solver tolerance below which single precision goes on without getting nearer; mujoco_warp raises smaller ones to it."""
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaletteTables:
+    """Terrains as slot poses and sizes. T terrains, S slots: the boxes and, if a terrain has one, the height field."""
+
+    position: Floats
+    """[m], (T, S, 3)."""
+    rotation: Floats
+    """Rotation matrices, (T, S, 3, 3)."""
+    size: Floats
+    """Geom sizes as the engine defines them, (T, S, 3)."""
+    bound_center: Floats
+    """Centre of the bounding box in the slot's frame [m], (T, S, 3)."""
+    bound_half: Floats
+    """Half size of the bounding box [m], (T, S, 3)."""
+    radius: Floats
+    """Radius of the bounding sphere [m], (T, S)."""
+    field: Integers
+    """Index of the height field, 0 where there is none, (T,)."""
+    wall: Integers
+    """1 for boundary walls, (T, S)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FootChains:
+    """Links from the base to each foot. F feet, L links in all."""
+
+    start: Integers
+    """First link of each foot, and L at the end, (F + 1,)."""
+    position: Floats
+    """Fixed offset from the link before [m], (L, 3)."""
+    quaternion: Floats
+    """Fixed rotation from the link before, wxyz, (L, 4)."""
+    hinge: Integers
+    """Whether the link ends in a hinge, (L,)."""
+    axis: Floats
+    """Hinge axis in the link's frame, (L, 3)."""
+    anchor: Floats
+    """Point on the hinge axis [m], (L, 3)."""
+    address_q: Integers
+    """Of the hinge in qpos, (L,)."""
+    address_v: Integers
+    """Of the hinge in qvel, (L,)."""
+    zero: Floats
+    """Hinge angle at which the fixed rotation holds [rad], (L,)."""
+    foot: Floats
+    """Centre of each foot in its last link's frame [m], (F, 3)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedModel:
+    """The compiled model and what the kernels need to know about it. G geoms, B collision bodies, J joints."""
+
+    model: mujoco.MjModel
+    palette: PaletteTables
+    chains: FootChains
+    slot_geom: Integers
+    """Geom of each slot, (S,)."""
+    has_field: bool
+    geom_foot: Integers
+    """Index of the foot that a geom is, -1 for others, (G,)."""
+    geom_body: Integers
+    """Index of the collision body that a geom belongs to, -1 for others, (G,)."""
+    geom_trunk: Integers
+    """1 for the trunk's shapes, (G,)."""
+    geom_ground: Integers
+    """1 for floor, walls and terrain, (G,)."""
+    geom_slot: Integers
+    """Slot of a geom, -1 for robot and floor, (G,)."""
+    joint_q: Integers
+    """Address in qpos, (J,)."""
+    joint_v: Integers
+    """Address in qvel, (J,)."""
+    base: int
+    """Id of the base body."""
+    bodies: Integers
+    """Ids of the collision bodies, (B,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capacity:
+    """Sizes of the engine's fixed buffers."""
+
+    contacts: int
+    """Contacts (and candidate pairs) of all worlds together."""
+    convex: int
+    """Contacts of all worlds together that go through the iterative convex solver, for each pair of shapes."""
+    rows: int
+    """Constraint rows of one world."""
+
+
+def build_shared_model(scene: Scene) -> SharedModel:
+    """Compile the model that all worlds share.
+
+    Raises:
+        BackendError: a name of the robot is missing in its file, or the robot is no tree of hinges on one free base.
+    """
+    robot = scene.robot
+    slots = max((len(t.boxes) for t in scene.terrains), default=0)
+    has_field = any(t.height_field is not None for t in scene.terrains)
+    spec = robot_spec(scene)
+    _strip(spec)
+    slot_names = _add_slots(spec, scene.terrains, slots)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise BackendError(f"MuJoCo cannot build the model of robot '{robot.name}': {error}") from error
+    _write_fields(model, scene.terrains)
+    base = _body(model, scene, robot.base_body)
+    free = model.body_jntadr[base]
+    if free != 0 or model.jnt_type[free] != mujoco.mjtJoint.mjJNT_FREE:
+        raise BackendError(f"body '{robot.base_body}' of robot '{robot.name}' must carry a free joint and come first")
+    slot_geom = np.array([model.geom(name).id for name in slot_names], dtype=np.int32)
+    geom_slot = np.full(model.ngeom, -1, dtype=np.int32)
+    geom_slot[slot_geom] = np.arange(len(slot_geom))
+    bodies = np.array([_body(model, scene, name) for name in robot.collision_bodies], dtype=np.int32)
+    index = {int(b): i for i, b in enumerate(bodies)}
+    trunk = [_geom(model, scene, name) for name in scene.robot.trunk_shapes]
+    geom_foot = np.full(model.ngeom, -1, dtype=np.int32)
+    for i, name in enumerate(robot.foot_names):
+        geom_foot[_geom(model, scene, name)] = i
+    return SharedModel(
+        model=model,
+        palette=_palette(scene.terrains, slots, has_field),
+        chains=_foot_chains(model, scene, base),
+        slot_geom=slot_geom,
+        has_field=has_field,
+        geom_foot=geom_foot,
+        geom_body=np.array([index.get(int(b), -1) for b in model.geom_bodyid], dtype=np.int32),
+        geom_trunk=np.isin(np.arange(model.ngeom), trunk).astype(np.int32),
+        geom_ground=(model.geom_bodyid == 0).astype(np.int32),
+        geom_slot=geom_slot,
+        joint_q=np.array([model.joint(j).qposadr[0] for j in robot.joint_names], dtype=np.int32),
+        joint_v=np.array([model.joint(j).dofadr[0] for j in robot.joint_names], dtype=np.int32),
+        base=base,
+        bodies=bodies,
+    )
+
+
+def buffer_capacity(scene: Scene, shared: SharedModel) -> Capacity:
+    """Sizes of the buffers, from ``PhysicsOptions.contacts_per_world`` or the palette's shapes."""
+    model, physics = shared.model, scene.physics
+    shape = "height_field" if shared.has_field else "boxes" if len(shared.slot_geom) else "plane"
+    contacts = physics.contacts_per_world or DEFAULT_CONTACTS[shape]
+    if contacts < 1:
+        raise BackendError(
+            f"contacts_per_world is {contacts}, but must be at least 1 (PhysicsOptions.contacts_per_world)"
+        )
+    rows_of = (lambda d: d) if physics.cone == "elliptic" else (lambda d: max(1, 2 * (d - 1)))
+    feet = np.flatnonzero(shared.geom_foot >= 0)
+    foot_rows = sum(rows_of(max(int(model.geom_condim[g]), 3)) - rows_of(3) for g in feet)
+    rows = int(np.count_nonzero(model.dof_frictionloss > 0)) + int(model.jnt_limited.sum())
+    rows += contacts * rows_of(3) + 2 * foot_rows
+    collides = (shared.geom_ground == 0) & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+    same_shape = np.bincount(model.geom_type[collides]).max(initial=1)
+    total = scene.num_worlds * contacts + SPARE_CONTACTS
+    per_world = int(same_shape) if shared.has_field else max(8, contacts // 4)
+    return Capacity(
+        contacts=total, convex=min(scene.num_worlds * per_world + SPARE_CONTACTS, total), rows=16 * -(-rows // 16)
+    )
+
+
+def _strip(spec: mujoco.MjSpec) -> None:
+    """Remove what costs time in thousands of worlds: actuators (the motor law is ours) and what is only seen."""
+    for element in [*spec.actuators, *spec.sensors, *spec.lights, *spec.cameras]:
+        spec.delete(element)
+    inertial = all(body.explicitinertial for body in spec.bodies if body.name != "world")
+    if inertial:  # otherwise a visual geom may carry mass
+        for geom in list(spec.geoms):
+            if not geom.contype and not geom.conaffinity:
+                spec.delete(geom)
+
+
+def _add_slots(spec: mujoco.MjSpec, terrains: tuple[Terrain, ...], slots: int) -> list[str]:
+    """Add floor, box slots and height fields; the names of the slots' geoms, in order."""
+    world = spec.worldbody
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+    names = [f"box_{i}" for i in range(slots)]
+    for name in names:
+        world.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[PARKED_SIZE] * 3, pos=PARKED)
+    fields = [t for t in terrains if t.height_field is not None]
+    for i, terrain in enumerate(fields):
+        field = terrain.height_field
+        assert field is not None
+        hfield = spec.add_hfield(name=f"field_{i}", nrow=field.heights.shape[0], ncol=field.heights.shape[1])
+        hfield.size = np.array([*field.half_size, _top(field.heights), field.base])
+        hfield.userdata = field.heights.astype(np.float32).ravel()
+    if fields:
+        world.add_geom(name="field", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="field_0", pos=PARKED)
+        names.append("field")
+    return names
+
+
+def _top(heights: Floats) -> float:
+    """Height that the engine's unit elevation stands for [m]."""
+    return max(float(heights.max()), 1e-6)
+
+
+def _write_fields(model: mujoco.MjModel, terrains: tuple[Terrain, ...]) -> None:
+    """Write elevations as they are: MuJoCo's compiler would shift every field's lowest node to zero."""
+    fields = [t.height_field for t in terrains if t.height_field is not None]
+    for i, field in enumerate(fields):
+        address, size = model.hfield_adr[i], field.heights.size
+        model.hfield_data[address : address + size] = (field.heights / _top(field.heights)).ravel()
+
+
+def _palette(terrains: tuple[Terrain, ...], slots: int, has_field: bool) -> PaletteTables:
+    """Slot poses, sizes and bounds of every terrain."""
+    t, s = len(terrains), slots + int(has_field)
+    position = np.tile(np.array(PARKED), (t, s, 1))
+    rotation = np.tile(np.eye(3), (t, s, 1, 1))
+    size = np.full((t, s, 3), PARKED_SIZE)
+    center, half = np.zeros((t, s, 3)), np.full((t, s, 3), PARKED_SIZE)
+    radius = np.full((t, s), PARKED_SIZE * np.sqrt(3.0))
+    field_index, wall = np.zeros(t, dtype=np.int32), np.zeros((t, s), dtype=np.int32)
+    seen = 0
+    for i, terrain in enumerate(terrains):
+        for k, box in enumerate(terrain.boxes):
+            position[i, k] = box.center
+            matrix = np.zeros(9)
+            quaternion = np.asarray(box.quaternion) / np.linalg.norm(box.quaternion)
+            mujoco.mju_quat2Mat(matrix, quaternion)
+            rotation[i, k] = matrix.reshape(3, 3)
+            size[i, k] = half[i, k] = box.half_size
+            radius[i, k] = np.linalg.norm(box.half_size)
+            wall[i, k] = box.wall
+        field = terrain.height_field
+        if field is not None:
+            field_index[i], seen = seen, seen + 1
+            top, base = _top(field.heights), field.base
+            position[i, -1] = (*field.center, 0.0)
+            size[i, -1] = (*field.half_size, 0.25 * top + 0.5 * base)
+            center[i, -1] = (0.0, 0.0, 0.5 * (top - base))
+            half[i, -1] = (*field.half_size, 0.5 * (top + base))
+            radius[i, -1] = np.sqrt(np.sum(np.square(field.half_size)) + max(top, base) ** 2)
+    return PaletteTables(
+        position=position,
+        rotation=rotation,
+        size=size,
+        bound_center=center,
+        bound_half=half,
+        radius=radius,
+        field=field_index,
+        wall=wall,
+    )
+
+
+def _foot_chains(model: mujoco.MjModel, scene: Scene, base: int) -> FootChains:
+    """Follow each foot's body up to the base; one link for each body, and one more for each further joint of a body."""
+    start: list[int] = [0]
+    rows: list[tuple[Floats, Floats, int]] = []
+    feet: list[Floats] = []
+    unit = np.array([1.0, 0.0, 0.0, 0.0])
+    for name in scene.robot.foot_names:
+        geom = _geom(model, scene, name)
+        feet.append(model.geom_pos[geom].copy())
+        chain: list[int] = []
+        body = int(model.geom_bodyid[geom])
+        while body != base:
+            if body == 0:
+                raise BackendError(
+                    f"foot '{name}' of robot '{scene.robot.name}' does not hang on its base '{scene.robot.base_body}'"
+                )
+            chain.append(body)
+            body = int(model.body_parentid[body])
+        for body in reversed(chain):
+            first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+            joints = [first + i for i in range(number)] or [-1]
+            for i, joint in enumerate(joints):
+                if joint >= 0 and model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+                    raise BackendError(
+                        f"joint '{model.joint(joint).name}' of robot '{scene.robot.name}' must be a hinge"
+                    )
+                offset = (model.body_pos[body], model.body_quat[body]) if i == 0 else (np.zeros(3), unit)
+                rows.append((*offset, joint))
+        start.append(len(rows))
+    joint_of = [j for _, _, j in rows]
+
+    def of_joint(values: NDArray, empty: float | Floats) -> NDArray:
+        return np.array([values[j] if j >= 0 else empty for j in joint_of])
+
+    return FootChains(
+        start=np.array(start, dtype=np.int32),
+        position=np.array([p for p, _, _ in rows]).reshape(-1, 3),
+        quaternion=np.array([q for _, q, _ in rows]).reshape(-1, 4),
+        hinge=np.array([int(j >= 0) for j in joint_of], dtype=np.int32),
+        axis=of_joint(model.jnt_axis, np.array([0.0, 0.0, 1.0])).reshape(-1, 3),
+        anchor=of_joint(model.jnt_pos, np.zeros(3)).reshape(-1, 3),
+        address_q=of_joint(model.jnt_qposadr, 0).astype(np.int32),
+        address_v=of_joint(model.jnt_dofadr, 0).astype(np.int32),
+        zero=np.array([model.qpos0[model.jnt_qposadr[j]] if j >= 0 else 0.0 for j in joint_of]),
+        foot=np.array(feet).reshape(-1, 3),
+    )
+
+
+def _body(model: mujoco.MjModel, scene: Scene, name: str) -> int:
+    """Id of a body of the robot."""
+    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    if found < 0:
+        raise BackendError(
+            f"body '{name}' of robot '{scene.robot.name}' is not in {scene.robot.mjcf.name}; correct robot.toml"
+        )
+    return int(found)
+
+
+def _geom(model: mujoco.MjModel, scene: Scene, name: str) -> int:
+    """Id of a foot's geom."""
+    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
+    if found < 0:
+        raise BackendError(
+            f"foot '{name}' of robot '{scene.robot.name}' is no collision geom of {scene.robot.mjcf.name}; "
+            "correct robot.toml"
+        )
+    return int(found)

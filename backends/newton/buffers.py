@@ -1,0 +1,186 @@
+"""The memory that the Newton engine shares between torch and Warp: motors, masses, states, layout."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import newton
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import ArrayLike
+
+from ..base import PhysicsState, Scene
+from ..motor_law import MotorLimits
+from ..warp.motor_law import limit_arrays
+from . import kernels
+from .model import SlotTables, WorldLayout, WorldModel
+from .solvers import SolverAdapter, dry_friction_slope
+
+SMALLEST_MASS = 0.01
+"""A base never gets lighter than this [kg]."""
+
+
+def ints(values: ArrayLike, device: wp.Device) -> wp.array:
+    """A Warp array of whole numbers."""
+    return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=device)
+
+
+def floats(values: ArrayLike, device: wp.Device) -> wp.array:
+    """A Warp array of single-precision numbers."""
+    return wp.array(np.asarray(values, dtype=np.float32), dtype=float, device=device)
+
+
+def structure(kind: Any, **values: Any) -> Any:
+    """A Warp structure with its fields set."""
+    made = kind()
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made
+
+
+def layout_structure(layout: WorldLayout, device: wp.Device) -> Any:
+    """Where things are in a world, as the kernels see it."""
+    return structure(
+        kernels.Layout,
+        coordinates=layout.coordinates,
+        dofs=layout.dofs,
+        bodies=layout.bodies,
+        shapes=layout.shapes,
+        base=layout.base,
+        joint_q=ints(layout.joint_q, device),
+        joint_v=ints(layout.joint_v, device),
+        foot_body=ints(layout.foot_body, device),
+        foot_center=wp.array(layout.foot_center, dtype=wp.vec3, device=device),
+        shape_foot=ints(layout.shape_foot, device),
+        shape_body=ints(layout.shape_body, device),
+        shape_trunk=ints(layout.shape_trunk, device),
+        shape_ground=ints(layout.shape_ground, device),
+        shape_slot=ints(layout.shape_slot, device),
+    )
+
+
+def palette_structure(slots: SlotTables, device: wp.Device) -> Any:
+    """The palette's slots, as the kernels see them."""
+    return structure(
+        kernels.Palette,
+        pose=wp.array(slots.pose, dtype=wp.transform, device=device),
+        scale=wp.array(slots.scale, dtype=wp.vec3, device=device),
+        wall=wp.array(slots.wall, dtype=int, device=device),
+    )
+
+
+def contact_structure(contacts: newton.Contacts, force: Any, shape_body: Any) -> Any:
+    """Newton's contacts, as the kernels see them."""
+    return structure(
+        kernels.ContactArrays,
+        count=contacts.rigid_contact_count,
+        shape0=contacts.rigid_contact_shape0,
+        shape1=contacts.rigid_contact_shape1,
+        point0=contacts.rigid_contact_point0,
+        point1=contacts.rigid_contact_point1,
+        margin0=contacts.rigid_contact_margin0,
+        margin1=contacts.rigid_contact_margin1,
+        normal=contacts.rigid_contact_normal,
+        force=force,
+        shape_body=shape_body,
+    )
+
+
+def allocate_state(
+    worlds: int, *, joints: int, feet: int, bodies: int, device: torch.device
+) -> tuple[PhysicsState, Any]:
+    """A state of zeros, as tensors and as the kernels see the same memory."""
+    shapes: dict[str, tuple[int, ...]] = {
+        "base_quaternion_w": (4,),
+        "joint_position": (joints,),
+        "joint_velocity": (joints,),
+        "joint_torque": (joints,),
+        "foot_position_w": (feet, 3),
+        "foot_velocity_w": (feet, 3),
+        "foot_contact_force_w": (feet, 3),
+        "foot_normal_force": (feet,),
+        "foot_tangential_force": (feet,),
+        "body_contact_force_w": (bodies, 3),
+    }
+    whole = ("contact_count", "tilt_substep", "penetration_substep")
+    flags = ("diverged", "overflowed")
+    tensors, arrays = {}, kernels.StateArrays()
+    for field in fields(PhysicsState):
+        kind = torch.int64 if field.name in whole else torch.bool if field.name in flags else torch.float32
+        vector = field.name.endswith(("_w", "_b"))
+        rest = shapes.get(field.name, (3,) if vector else ())
+        tensor = tensors[field.name] = torch.zeros((worlds, *rest), dtype=kind, device=device)
+        seen = wp.from_torch(tensor, dtype={3: wp.vec3, 4: wp.vec4}[rest[-1]]) if vector else wp.from_torch(tensor)
+        setattr(arrays, field.name, seen)
+    return PhysicsState(**tensors), arrays
+
+
+class MotorTensors:
+    """Constants and targets of the motors of all worlds; torch writes them, kernels read them in ``structure``."""
+
+    def __init__(self, scene: Scene, world: WorldModel, *, own_dry_friction: bool, device: torch.device) -> None:
+        n, joints, constants = scene.num_worlds, scene.robot.num_joints, scene.parameters
+        on = wp.device_from_torch(device)
+        self.nominal_stiffness = torch.tensor(constants.stiffness, dtype=torch.float32, device=device)
+        self.nominal_damping = torch.tensor(constants.damping, dtype=torch.float32, device=device)
+        self.stiffness = self.nominal_stiffness.repeat(n, 1)
+        self.damping = self.nominal_damping.repeat(n, 1)
+        self.strength = torch.ones((n, joints), dtype=torch.float32, device=device)
+        self.offset = torch.zeros((n, joints), dtype=torch.float32, device=device)
+        self.requested = torch.zeros((n, joints), dtype=torch.float32, device=device)
+        self.delay = torch.zeros(n, dtype=torch.int32, device=device)
+        dofs = np.array([int(world.reference.joint(name).dofadr[0]) for name in scene.robot.joint_names])
+        self.structure = structure(
+            kernels.Motors,
+            limits=limit_arrays(MotorLimits.of(scene), on),
+            stiffness=wp.from_torch(self.stiffness),
+            damping=wp.from_torch(self.damping),
+            strength=wp.from_torch(self.strength),
+            offset=wp.from_torch(self.offset),
+            dry_friction=floats(np.zeros(joints) if own_dry_friction else constants.friction_loss, on),
+            dry_slope=floats(dry_friction_slope(world.reference, dofs, scene.physics.timestep), on),
+            requested=wp.from_torch(self.requested),
+            current=wp.zeros((n, joints), dtype=float, device=on),
+            previous=wp.zeros((n, joints), dtype=float, device=on),
+            limp=wp.ones(n, dtype=int, device=on),
+            limp_before=wp.ones(n, dtype=int, device=on),
+            delay=wp.from_torch(self.delay),
+            torque=wp.zeros((n, joints), dtype=float, device=on),
+        )
+
+
+class MassTensors:
+    """Views of a model's masses, inertias and friction, their nominal values and what randomization makes of them."""
+
+    def __init__(self, world: WorldModel, worlds: int, device: torch.device) -> None:
+        model, layout = world.model, world.layout
+        self._mass = wp.to_torch(model.body_mass).view(worlds, layout.bodies)
+        self._inverse_mass = wp.to_torch(model.body_inv_mass).view(worlds, layout.bodies)
+        self._inertia = wp.to_torch(model.body_inertia).view(worlds, layout.bodies, 3, 3)
+        self._inverse_inertia = wp.to_torch(model.body_inv_inertia).view(worlds, layout.bodies, 3, 3)
+        self._nominal_mass, self._nominal_inertia = self._mass[0].clone(), self._inertia[0].clone()
+        self._base = layout.base
+        self._order = torch.tensor(layout.collision_bodies, dtype=torch.int64, device=device)
+        self._scale = torch.ones((worlds, layout.bodies), dtype=torch.float32, device=device)
+        self.friction = wp.to_torch(model.shape_material_mu).view(worlds, layout.shapes)
+        """Sliding friction of every shape, (N, S)."""
+        self.base_offset = torch.zeros(worlds, dtype=torch.float32, device=device)
+        """Mass added to the base [kg], (N,)."""
+        self.link_scale = torch.ones((worlds, len(self._order)), dtype=torch.float32, device=device)
+        """Factor on mass and inertia of each collision body, (N, B); the base's is ignored."""
+        self.com_offset = torch.zeros((worlds, 3), dtype=torch.float32, device=device)
+        """Shift of the base's centre of mass [m], (N, 3)."""
+        self.nominal_com = wp.vec3(*world.reference.body_ipos[layout.base + 1])
+
+    def write(self, adapter: SolverAdapter) -> None:
+        """Write masses and inertias into the model and tell the solver."""
+        self._scale[:, self._order] = self.link_scale
+        self._scale[:, self._base] = 1.0
+        self._mass.copy_(self._nominal_mass * self._scale)
+        self._mass[:, self._base] = (self._nominal_mass[self._base] + self.base_offset).clamp(min=SMALLEST_MASS)
+        self._inertia.copy_(self._nominal_inertia * self._scale[..., None, None])
+        self._inverse_mass.copy_(1.0 / self._mass)
+        self._inverse_inertia.copy_(torch.linalg.inv(self._inertia))
+        adapter.inertia_changed()

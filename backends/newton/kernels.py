@@ -1,0 +1,479 @@
+# mypy: ignore-errors
+# ruff: noqa: ANN201, UP018
+"""Warp kernels around a Newton solver: motor law, latency, divergence, resets, terrain slots, pushes.
+
+They see Newton's own arrays only (joint coordinates, body poses and twists, contacts and contact forces), so that they
+serve every solver. Joints, bodies and shapes of all worlds lie one world after the other: entry ``world * per_world +
+local``.
+
+Newton's conventions: quaternions xyzw; a free joint's velocity is that of the body's centre of mass and its angular
+velocity, both in the world frame; ``body_qd`` likewise. The contract's are wxyz, the base's origin and the body frame.
+"""
+
+# Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
+import warp as wp
+
+from ..warp.motor_law import Limits, motor_torque
+
+wp.set_module_options({"enable_backward": False})
+
+POSITION_LIMIT = wp.constant(1.0e5)
+"""A coordinate beyond this [m, rad] means that the world has diverged."""
+VELOCITY_LIMIT = wp.constant(1.0e4)
+"""A velocity beyond this [m/s, rad/s] means that the world has diverged."""
+PARKED_HEIGHT = wp.constant(100.0)
+"""Where the base of a diverged world waits for its reset [m]."""
+
+
+@wp.struct
+class Layout:
+    """Where things are in a world's share of Newton's arrays."""
+
+    coordinates: int
+    dofs: int
+    bodies: int
+    shapes: int
+    base: int
+    joint_q: wp.array[int]
+    joint_v: wp.array[int]
+    foot_body: wp.array[int]
+    foot_center: wp.array[wp.vec3]
+    """Centre of the foot sphere in the frame of its body [m]."""
+    shape_foot: wp.array[int]
+    """Index of the foot that a shape is, -1 for others."""
+    shape_body: wp.array[int]
+    """Index of the collision body that a shape belongs to, -1 for the ground and others."""
+    shape_trunk: wp.array[int]
+    """1 for the trunk's shapes."""
+    shape_ground: wp.array[int]
+    """1 for floor, walls and terrain."""
+    shape_slot: wp.array[int]
+    """Terrain slot of a shape, -1 for robot and floor."""
+
+
+@wp.struct
+class Motors:
+    """Motor law and targets."""
+
+    limits: Limits
+    stiffness: wp.array2d[float]
+    damping: wp.array2d[float]
+    strength: wp.array2d[float]
+    offset: wp.array2d[float]
+    dry_friction: wp.array[float]
+    """Dry friction that the kernel adds for solvers without it [N·m], and its slope around zero speed [N·m·s/rad]."""
+    dry_slope: wp.array[float]
+    requested: wp.array2d[float]
+    current: wp.array2d[float]
+    previous: wp.array2d[float]
+    limp: wp.array[int]
+    limp_before: wp.array[int]
+    delay: wp.array[int]
+    torque: wp.array2d[float]
+
+
+@wp.struct
+class Palette:
+    """Shapes of the palette's terrains, by terrain and slot: the boxes and, where there is one, the height field."""
+
+    pose: wp.array2d[wp.transform]
+    scale: wp.array2d[wp.vec3]
+    wall: wp.array2d[int]
+
+
+@wp.struct
+class ContactArrays:
+    """Newton's contacts of all worlds and the forces that the solver found for them."""
+
+    count: wp.array[int]
+    shape0: wp.array[int]
+    shape1: wp.array[int]
+    point0: wp.array[wp.vec3]
+    point1: wp.array[wp.vec3]
+    margin0: wp.array[float]
+    margin1: wp.array[float]
+    normal: wp.array[wp.vec3]
+    force: wp.array[wp.spatial_vector]
+    shape_body: wp.array[int]
+    """Newton's body of each shape, -1 for the ground."""
+
+
+@wp.struct
+class StateArrays:
+    """The tensors of a ``PhysicsState``, seen by Warp."""
+
+    time: wp.array[float]
+    base_position_w: wp.array[wp.vec3]
+    base_quaternion_w: wp.array[wp.vec4]
+    base_linear_velocity_w: wp.array[wp.vec3]
+    base_angular_velocity_b: wp.array[wp.vec3]
+    joint_position: wp.array2d[float]
+    joint_velocity: wp.array2d[float]
+    joint_torque: wp.array2d[float]
+    foot_position_w: wp.array2d[wp.vec3]
+    foot_velocity_w: wp.array2d[wp.vec3]
+    foot_contact_force_w: wp.array2d[wp.vec3]
+    foot_normal_force: wp.array2d[float]
+    foot_tangential_force: wp.array2d[float]
+    body_contact_force_w: wp.array2d[wp.vec3]
+    trunk_contact_force_w: wp.array[wp.vec3]
+    ground_force_w: wp.array[wp.vec3]
+    ground_moment_w: wp.array[wp.vec3]
+    contact_center_w: wp.array[wp.vec3]
+    contact_count: wp.array[wp.int64]
+    tilt_substep: wp.array[wp.int64]
+    penetration_substep: wp.array[wp.int64]
+    diverged: wp.array[wp.bool]
+    overflowed: wp.array[wp.bool]
+
+
+@wp.func
+def root_rotation(joint_q: wp.array[float], start: int) -> wp.quat:
+    """Orientation of the base."""
+    q = wp.quat(joint_q[start + 3], joint_q[start + 4], joint_q[start + 5], joint_q[start + 6])
+    return wp.normalize(q)
+
+
+@wp.func
+def root_origin_velocity(
+    layout: Layout, world: int, joint_q: wp.array[float], joint_qd: wp.array[float], com: wp.array[wp.vec3]
+) -> wp.vec3:
+    """Velocity of the base's origin, world frame, from that of its centre of mass."""
+    v = world * layout.dofs
+    spin = wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
+    arm = wp.quat_rotate(root_rotation(joint_q, world * layout.coordinates), com[world * layout.bodies + layout.base])
+    return wp.vec3(joint_qd[v], joint_qd[v + 1], joint_qd[v + 2]) - wp.cross(spin, arm)
+
+
+@wp.func
+def park(
+    layout: Layout,
+    world: int,
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+):
+    """Put a world that diverged into a state that harms nobody: at rest, high above the ground."""
+    for i in range(layout.coordinates):
+        joint_q[world * layout.coordinates + i] = 0.0
+    joint_q[world * layout.coordinates + 2] = PARKED_HEIGHT
+    joint_q[world * layout.coordinates + 6] = 1.0
+    for i in range(layout.dofs):
+        joint_qd[world * layout.dofs + i] = 0.0
+    for i in range(layout.bodies):
+        body_q[world * layout.bodies + i] = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
+        body_qd[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@wp.func
+def state_is_valid(layout: Layout, world: int, joint_q: wp.array[float], joint_qd: wp.array[float]) -> bool:
+    """Whether all coordinates and velocities of a world are finite and of this world."""
+    valid = bool(True)
+    for i in range(layout.coordinates):
+        if not (wp.abs(joint_q[world * layout.coordinates + i]) < POSITION_LIMIT):  # false for NaN, too
+            valid = False
+    for i in range(layout.dofs):
+        if not (wp.abs(joint_qd[world * layout.dofs + i]) < VELOCITY_LIMIT):
+            valid = False
+    return valid
+
+
+@wp.kernel
+def begin_period(
+    layout: Layout,
+    active: wp.array[int],
+    has_request: wp.array[int],
+    joints: int,
+    motors: Motors,
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    state: StateArrays,
+):
+    """Shift the targets and clear the watches of the worlds that will step; park invalid ones."""
+    world = wp.tid()
+    if active[world] == 0:
+        return
+    valid = state_is_valid(layout, world, joint_q, joint_qd)
+    for joint in range(joints):
+        motors.previous[world, joint] = motors.current[world, joint]
+        if has_request[0] != 0:
+            motors.current[world, joint] = motors.requested[world, joint]
+            if not (wp.abs(motors.requested[world, joint]) < POSITION_LIMIT):
+                valid = False
+    motors.limp_before[world] = motors.limp[world]
+    if has_request[0] != 0:
+        motors.limp[world] = 0
+    state.tilt_substep[world] = wp.int64(0)
+    state.penetration_substep[world] = wp.int64(0)
+    if not valid:
+        state.diverged[world] = True
+    if state.diverged[world]:
+        park(layout, world, joint_q, joint_qd, body_q, body_qd)
+
+
+@wp.kernel
+def keep_inactive(
+    layout: Layout,
+    active: wp.array[int],
+    restore: int,
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    warm_start: wp.array2d[float],
+    kept_q: wp.array[float],
+    kept_qd: wp.array[float],
+    kept_body_q: wp.array[wp.transform],
+    kept_body_qd: wp.array[wp.spatial_vector],
+    kept_warm_start: wp.array2d[float],
+):
+    """Save (or restore) what a step changes in the worlds that must not step."""
+    world, i = wp.tid()
+    if active[world] != 0:
+        return
+    q = world * layout.coordinates + i
+    v = world * layout.dofs + i
+    b = world * layout.bodies + i
+    if i < layout.coordinates:
+        if restore == 0:
+            kept_q[q] = joint_q[q]
+        else:
+            joint_q[q] = kept_q[q]
+    if i < layout.dofs:
+        if restore == 0:
+            kept_qd[v] = joint_qd[v]
+        else:
+            joint_qd[v] = kept_qd[v]
+    if i < layout.bodies:
+        if restore == 0:
+            kept_body_q[b] = body_q[b]
+            kept_body_qd[b] = body_qd[b]
+        else:
+            body_q[b] = kept_body_q[b]
+            body_qd[b] = kept_body_qd[b]
+    if i < warm_start.shape[1]:
+        if restore == 0:
+            kept_warm_start[world, i] = warm_start[world, i]
+        else:
+            warm_start[world, i] = kept_warm_start[world, i]
+
+
+@wp.kernel
+def motor_law(
+    substep: int,
+    layout: Layout,
+    motors: Motors,
+    diverged: wp.array[wp.bool],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    joint_f: wp.array[float],
+):
+    """The motor law with the target that acts in this substep (from 0), and dry friction where the solver has none."""
+    world, joint = wp.tid()
+    target = motors.current[world, joint]
+    limp = motors.limp[world]
+    if substep < motors.delay[world]:
+        target = motors.previous[world, joint]
+        limp = motors.limp_before[world]
+    dof = world * layout.dofs + layout.joint_v[joint]
+    position = joint_q[world * layout.coordinates + layout.joint_q[joint]]
+    velocity = joint_qd[dof]
+    error = target + motors.offset[world, joint] - position
+    stiffness, damping, strength = (
+        motors.stiffness[world, joint],
+        motors.damping[world, joint],
+        motors.strength[world, joint],
+    )
+    torque = motor_torque(joint, error, velocity, stiffness, damping, strength, motors.limits)
+    if limp != 0 or diverged[world]:
+        torque = 0.0
+    motors.torque[world, joint] = torque
+    dry = motors.dry_friction[joint]
+    joint_f[dof] = torque - wp.clamp(motors.dry_slope[joint] * velocity, -dry, dry)
+
+
+@wp.kernel
+def end_substep(
+    substep: int,
+    upright_limit: float,
+    layout: Layout,
+    active: wp.array[int],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    warm_start: wp.array2d[float],
+    ticks: wp.array[int],
+    state: StateArrays,
+):
+    """Count the time, catch worlds whose state became invalid and park them, and watch the tilt of the others."""
+    world = wp.tid()
+    if active[world] == 0:
+        return
+    ticks[world] = ticks[world] + 1
+    if not state_is_valid(layout, world, joint_q, joint_qd):
+        state.diverged[world] = True
+    if state.diverged[world]:
+        park(layout, world, joint_q, joint_qd, body_q, body_qd)
+        for i in range(warm_start.shape[1]):
+            warm_start[world, i] = 0.0
+        return
+    q = world * layout.coordinates
+    upright = 1.0 - 2.0 * (joint_q[q + 3] * joint_q[q + 3] + joint_q[q + 4] * joint_q[q + 4])
+    if upright < upright_limit and state.tilt_substep[world] == wp.int64(0):
+        state.tilt_substep[world] = wp.int64(substep + 1)
+
+
+@wp.kernel
+def collect_overflow_bits(active: wp.array[int], bits: wp.array[int], mask: int, overflowed: wp.array[wp.bool]):
+    """Note the worlds in which a solver reports one of the masked overflows."""
+    world = wp.tid()
+    if active[world] != 0 and (bits[world] & mask) != 0:
+        overflowed[world] = True
+
+
+@wp.kernel
+def collect_overflow_flags(active: wp.array[int], flags: wp.array[wp.bool], overflowed: wp.array[wp.bool]):
+    """Note the worlds that a solver flags."""
+    world = wp.tid()
+    if active[world] != 0 and flags[world]:
+        overflowed[world] = True
+
+
+@wp.kernel
+def reset_worlds(
+    layout: Layout,
+    active: wp.array[int],
+    has_held: wp.array[int],
+    position: wp.array2d[float],
+    quaternion: wp.array2d[float],
+    linear: wp.array2d[float],
+    angular: wp.array2d[float],
+    joint_position: wp.array2d[float],
+    joint_velocity: wp.array2d[float],
+    body_com: wp.array[wp.vec3],
+    motors: Motors,
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    external: wp.array[wp.spatial_vector],
+    external_other: wp.array[wp.spatial_vector],
+    ticks: wp.array[int],
+    state: StateArrays,
+):
+    """Put the masked worlds into the given state. ``requested`` holds the held targets."""
+    world, joint = wp.tid()
+    if active[world] == 0:
+        return
+    joint_q[world * layout.coordinates + layout.joint_q[joint]] = joint_position[world, joint]
+    joint_qd[world * layout.dofs + layout.joint_v[joint]] = joint_velocity[world, joint]
+    held = float(0.0)
+    if has_held[0] != 0:
+        held = motors.requested[world, joint]
+    motors.current[world, joint] = held
+    motors.previous[world, joint] = held
+    motors.torque[world, joint] = 0.0
+    if joint == 0:
+        q = world * layout.coordinates
+        v = world * layout.dofs
+        rotation = wp.normalize(
+            wp.quat(quaternion[world, 1], quaternion[world, 2], quaternion[world, 3], quaternion[world, 0])
+        )
+        spin = wp.quat_rotate(rotation, wp.vec3(angular[world, 0], angular[world, 1], angular[world, 2]))
+        arm = wp.quat_rotate(rotation, body_com[world * layout.bodies + layout.base])
+        velocity = wp.vec3(linear[world, 0], linear[world, 1], linear[world, 2]) + wp.cross(spin, arm)
+        for i in range(3):
+            joint_q[q + i] = position[world, i]
+            joint_qd[v + i] = velocity[i]
+            joint_qd[v + 3 + i] = spin[i]
+        for i in range(4):
+            joint_q[q + 3 + i] = rotation[i]
+        for i in range(layout.bodies):
+            external[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            external_other[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        motors.limp[world] = 1 - has_held[0]
+        motors.limp_before[world] = 1 - has_held[0]
+        ticks[world] = 0
+        state.diverged[world] = False
+        state.overflowed[world] = False
+        state.tilt_substep[world] = wp.int64(0)
+        state.penetration_substep[world] = wp.int64(0)
+
+
+@wp.kernel
+def place_terrain(
+    layout: Layout,
+    active: wp.array[int],
+    requested: wp.array[int],
+    terrains: int,
+    slot_shape: wp.array[int],
+    palette: Palette,
+    terrain: wp.array[int],
+    shape_transform: wp.array[wp.transform],
+    shape_scale: wp.array[wp.vec3],
+):
+    """Write the boxes and the height field of the masked worlds' new terrains."""
+    world, slot = wp.tid()
+    if active[world] == 0:
+        return
+    index = wp.clamp(requested[world], 0, terrains - 1)
+    if slot == 0:
+        terrain[world] = index
+    if slot >= slot_shape.shape[0]:
+        return
+    shape = world * layout.shapes + slot_shape[slot]
+    shape_transform[shape] = palette.pose[index, slot]
+    shape_scale[shape] = palette.scale[index, slot]
+
+
+@wp.kernel
+def push_base(
+    layout: Layout,
+    active: wp.array[int],
+    linear: wp.array2d[float],
+    angular: wp.array2d[float],
+    body_com: wp.array[wp.vec3],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+):
+    """Set the base's velocities; NaN keeps the present value."""
+    world = wp.tid()
+    if active[world] == 0:
+        return
+    v = world * layout.dofs
+    rotation = root_rotation(joint_q, world * layout.coordinates)
+    velocity = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
+    spin = wp.quat_rotate_inv(rotation, wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5]))
+    for i in range(3):
+        if not wp.isnan(linear[world, i]):
+            velocity[i] = linear[world, i]
+        if not wp.isnan(angular[world, i]):
+            spin[i] = angular[world, i]
+    spin = wp.quat_rotate(rotation, spin)
+    velocity = velocity + wp.cross(spin, wp.quat_rotate(rotation, body_com[world * layout.bodies + layout.base]))
+    for i in range(3):
+        joint_qd[v + i] = velocity[i]
+        joint_qd[v + 3 + i] = spin[i]
+
+
+@wp.kernel
+def move_center_of_mass(
+    layout: Layout,
+    nominal: wp.vec3,
+    offset: wp.array2d[float],
+    body_com: wp.array[wp.vec3],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+):
+    """Shift the base's centre of mass; its velocity follows, so that the base itself goes on as it did."""
+    world = wp.tid()
+    velocity = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
+    center = nominal + wp.vec3(offset[world, 0], offset[world, 1], offset[world, 2])
+    body_com[world * layout.bodies + layout.base] = center
+    v = world * layout.dofs
+    spin = wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
+    velocity = velocity + wp.cross(spin, wp.quat_rotate(root_rotation(joint_q, world * layout.coordinates), center))
+    for i in range(3):
+        joint_qd[v + i] = velocity[i]

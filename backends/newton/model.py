@@ -1,0 +1,456 @@
+"""Builds Newton models from a scene, and checks what Newton's importer made of the robot's file.
+
+Every world holds the robot, a floor, as many boxes as the palette's fullest terrain needs and one height field if any
+terrain has one. Which boxes lie where is a matter of poses and sizes, called slots, that a reset may change.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import newton
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from ...terrains.base import HeightField, Terrain
+from ..base import BackendError, Scene
+from ..mujoco.model import robot_spec
+
+PARKED = (0.0, 0.0, -1000.0)
+"""Where unused slots wait, out of reach of any robot."""
+PARKED_SIZE = 0.01
+"""Half size of an unused box [m]."""
+BIRTH_HEIGHT = 50.0
+"""Height of the base in a fresh model [m]: buffers are sized there, and no contact must be in the way."""
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldLayout:
+    """Where things are in one world's share of Newton's arrays. J joints, F feet, S shapes, B bodies, K slots."""
+
+    coordinates: int
+    dofs: int
+    bodies: int
+    shapes: int
+    base: int
+    """Index of the base body."""
+    joint_q: Integers
+    """Coordinate of each joint, (J,)."""
+    joint_v: Integers
+    """Degree of freedom of each joint, (J,)."""
+    collision_bodies: Integers
+    """Bodies in the order of ``Robot.collision_bodies``."""
+    foot_body: Integers
+    foot_center: Floats
+    """Foot centres in their bodies' frames [m], (F, 3)."""
+    shape_foot: Integers
+    """(S,)."""
+    shape_body: Integers
+    """(S,)."""
+    shape_trunk: Integers
+    """(S,)."""
+    shape_ground: Integers
+    """(S,)."""
+    shape_slot: Integers
+    """(S,)."""
+    slot_shape: Integers
+    """Shape of each slot: boxes, then the height field if there is one, (K,)."""
+    spare_fields: Integers
+    """Shapes that only carry height fields of the palette into the model, where there are fewer worlds than fields."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlotTables:
+    """The palette's terrains as slots. T terrains, K slots."""
+
+    pose: Floats
+    """Positions [m] and rotations xyzw, (T, K, 7)."""
+    scale: Floats
+    """Half sizes of boxes [m]; height fields have ones, (T, K, 3)."""
+    wall: Integers
+    """1 for boundary walls, (T, K)."""
+    field: Integers
+    """Index of the terrain's height field among the palette's, 0 for none, (T,)."""
+    fields: tuple[HeightField, ...]
+    """Height fields of the palette."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModel:
+    """The Newton model of all worlds and what is known about it."""
+
+    model: Any
+    """A ``newton.Model``; Newton declares every one of its arrays as optional."""
+    layout: WorldLayout
+    slots: SlotTables
+    reference: mujoco.MjModel
+    """The robot as MuJoCo's compiler understands it."""
+
+
+def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> WorldModel:
+    """Build the model of all worlds.
+
+    Args:
+        scene: what to build.
+        device: where the model lives.
+        gap: distance at which contacts are looked for [m], for each shape.
+        skin: whether the robot file's contact margins are kept; they thicken the shapes of solvers with hard contacts.
+
+    Raises:
+        BackendError: the robot is no tree of hinges on a free base, or Newton cannot import it.
+    """
+    reference, source = _compiled_robot(scene)
+    world = newton.ModelBuilder()
+    world.rigid_gap = gap
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what the importer leaves out is checked below, field by field
+        try:
+            world.add_mjcf(source, parse_visuals=False, parse_sites=False, parse_mujoco_options=False)
+        except (ValueError, RuntimeError, NotImplementedError) as error:
+            raise BackendError(
+                f"Newton cannot import robot '{scene.robot.name}' ({scene.robot.mjcf.name}): {error}"
+            ) from error
+    _repair_import(world, reference, scene, gap=gap, skin=skin)
+    robot_shapes = len(world.shape_type)
+    slots = _slot_tables(scene.terrains)
+    slot_shapes, spare = _add_ground(world, slots, scene, gap=gap)
+    layout = _layout(world, reference, scene, robot_shapes, slot_shapes, spare)
+    everything = newton.ModelBuilder()
+    everything.rigid_gap = gap
+    everything.replicate(world, scene.num_worlds)
+    _distribute_fields(everything, layout, slots, scene)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = everything.finalize(device=device, skip_all_validations=True)
+    return WorldModel(model=model, layout=layout, slots=slots, reference=reference)
+
+
+def _compiled_robot(scene: Scene) -> tuple[mujoco.MjModel, str]:
+    """The robot with the scene's constants, less motors, sensors and what is only seen: compiled, and as MJCF text."""
+    spec = robot_spec(scene)
+    for element in [*spec.actuators, *spec.sensors, *spec.lights, *spec.cameras, *spec.keys]:
+        spec.delete(element)
+    if all(body.explicitinertial for body in spec.bodies if body.name != "world"):  # else a visual geom may carry mass
+        for geom in list(spec.geoms):
+            if not geom.contype and not geom.conaffinity:
+                spec.delete(geom)
+    try:
+        return spec.compile(), spec.to_xml()
+    except ValueError as error:
+        raise BackendError(f"MuJoCo cannot build the model of robot '{scene.robot.name}': {error}") from error
+
+
+def _leaf(label: str) -> str:
+    """Name of a body, joint or shape: Newton's labels are paths."""
+    return label.rpartition("/")[2]
+
+
+def _repair_import(
+    world: newton.ModelBuilder, reference: mujoco.MjModel, scene: Scene, *, gap: float, skin: bool
+) -> None:
+    """Give the imported robot MuJoCo's values wherever Newton has a place for them, in full precision.
+
+    Newton reads the file itself: six digits of it, its own defaults for what is not written, its own margins and gaps.
+    """
+    robot = scene.robot
+    bodies = [_leaf(label) for label in world.body_label]
+    expected = [reference.body(i).name for i in range(1, reference.nbody)]
+    if bodies != expected:
+        raise BackendError(f"Newton imports the bodies {bodies} of robot '{robot.name}', but MuJoCo has {expected}")
+    if world.joint_type[0] != newton.JointType.FREE or any(
+        t != newton.JointType.REVOLUTE for t in world.joint_type[1:]
+    ):
+        raise BackendError(f"robot '{robot.name}' must be one free base with hinge joints only to run in Newton")
+    matrix = np.zeros(9)
+    for i in range(len(bodies)):
+        mujoco.mju_quat2Mat(matrix, reference.body_iquat[i + 1])
+        turn = matrix.reshape(3, 3)
+        inertia = turn @ np.diag(reference.body_inertia[i + 1]) @ turn.T
+        world.body_mass[i] = float(reference.body_mass[i + 1])
+        world.body_inv_mass[i] = 1.0 / float(reference.body_mass[i + 1])
+        world.body_com[i] = wp.vec3(*reference.body_ipos[i + 1])
+        world.body_inertia[i] = wp.mat33(*inertia.ravel())
+        world.body_inv_inertia[i] = wp.mat33(*np.linalg.inv(inertia).ravel())
+    for i, label in enumerate(world.joint_label):
+        if i == 0:
+            continue
+        joint = reference.joint(_leaf(label))
+        dof, start = int(joint.dofadr[0]), world.joint_qd_start[i]
+        world.joint_armature[start] = float(reference.dof_armature[dof])
+        world.joint_friction[start] = float(reference.dof_frictionloss[dof])
+        world.joint_damping[start] = float(
+            reference.dof_damping[dof, 0] if reference.dof_damping.ndim > 1 else reference.dof_damping[dof]
+        )
+        if joint.limited[0]:
+            world.joint_limit_lower[start], world.joint_limit_upper[start] = map(float, joint.range)
+        # the motors are ours: no drive of Newton's, no effort limit
+        world.joint_target_ke[start] = world.joint_target_kd[start] = 0.0
+        world.joint_target_mode[start] = int(newton.JointTargetMode.EFFORT)
+        world.joint_effort_limit[start] = 1e6
+    for i, label in enumerate(world.shape_label):
+        geom = reference.geom(_leaf(label))
+        world.shape_gap[i] = gap
+        world.shape_margin[i] = float(geom.margin[0]) if skin else 0.0
+        world.shape_transform[i] = wp.transform(geom.pos, _xyzw(geom.quat))
+    world.joint_q[2] = BIRTH_HEIGHT
+    for name, angle in zip(robot.joint_names, robot.default_joint_position, strict=True):
+        world.joint_q[world.joint_q_start[_joint(world, name, robot.name)]] = float(angle)
+
+
+def _xyzw(quaternion: NDArray) -> wp.quat:
+    """Warp's quaternion of a MuJoCo one."""
+    w, x, y, z = (float(v) for v in quaternion)
+    return wp.quat(x, y, z, w)
+
+
+def _joint(world: newton.ModelBuilder, name: str, robot: str) -> int:
+    """Index of a joint."""
+    found = [i for i, label in enumerate(world.joint_label) if _leaf(label) == name]
+    if not found:
+        raise BackendError(
+            f"joint '{name}' of robot '{robot}' is not in its model file; correct joint_names in robot.toml"
+        )
+    return found[0]
+
+
+def _slot_tables(terrains: tuple[Terrain, ...]) -> SlotTables:
+    """Slot poses and sizes of every terrain."""
+    boxes = max((len(t.boxes) for t in terrains), default=0)
+    fields = tuple(t.height_field for t in terrains if t.height_field is not None)
+    count, slots = len(terrains), boxes + bool(fields)
+    pose = np.tile(np.array([*PARKED, 0.0, 0.0, 0.0, 1.0]), (count, slots, 1))
+    scale = np.full((count, slots, 3), PARKED_SIZE)
+    wall, field_index = np.zeros((count, slots), dtype=np.int32), np.zeros(count, dtype=np.int32)
+    seen = 0
+    for i, terrain in enumerate(terrains):
+        for k, box in enumerate(terrain.boxes):
+            w, x, y, z = np.asarray(box.quaternion) / np.linalg.norm(box.quaternion)
+            pose[i, k] = (*box.center, x, y, z, w)
+            scale[i, k] = box.half_size
+            wall[i, k] = box.wall
+        if fields:
+            scale[i, -1] = 1.0
+        if terrain.height_field is not None:
+            pose[i, -1, :3] = (*terrain.height_field.center, 0.0)
+            field_index[i], seen = seen, seen + 1
+    return SlotTables(pose=pose, scale=scale, wall=wall, field=field_index, fields=fields)
+
+
+def _add_ground(
+    world: newton.ModelBuilder, slots: SlotTables, scene: Scene, *, gap: float
+) -> tuple[list[int], list[int]]:
+    """Add floor, box slots and height field; returns the shapes of the slots and the spare fields."""
+    material = newton.ModelBuilder.ShapeConfig(mu=1.0, mu_torsional=0.005, mu_rolling=0.0001, gap=gap, margin=0.0)
+    world.add_ground_plane(cfg=material)
+    boxes = slots.pose.shape[1] - bool(slots.fields)
+    parked = wp.transform(wp.vec3(*PARKED), wp.quat_identity())
+    shapes = [
+        world.add_shape_box(-1, xform=parked, hx=PARKED_SIZE, hy=PARKED_SIZE, hz=PARKED_SIZE, cfg=material)
+        for _ in range(boxes)
+    ]
+    spare: list[int] = []
+    if slots.fields:
+        for i in range(-(-len(slots.fields) // scene.num_worlds)):
+            field = _newton_field(slots.fields[0])
+            shape = world.add_shape_heightfield(xform=parked, heightfield=field, cfg=material)
+            (shapes if i == 0 else spare).append(shape)
+    return shapes, spare
+
+
+def _newton_field(field: HeightField) -> newton.Heightfield:
+    """A height field in Newton's terms: rows run along +y and columns along +x in both."""
+    heights = np.asarray(field.heights, dtype=np.float64)
+    low, high = float(heights.min()), float(heights.max())
+    # a level field has no extent that its heights could be a share of
+    return newton.Heightfield(
+        data=heights,
+        nrow=heights.shape[0],
+        ncol=heights.shape[1],
+        hx=field.half_size[0],
+        hy=field.half_size[1],
+        min_z=low,
+        max_z=max(high, low + 1e-6),
+    )
+
+
+def _distribute_fields(everything: newton.ModelBuilder, layout: WorldLayout, slots: SlotTables, scene: Scene) -> None:
+    """Let the worlds' field shapes carry all fields of the palette into the model; which acts where is written later.
+
+    Newton copies a shape's field for every shape that bears it, so all but the carriers get a tiny one.
+    """
+    if not slots.fields:
+        return
+    tiny = _newton_field(HeightField(center=(0.0, 0.0), half_size=(0.01, 0.01), heights=np.zeros((2, 2))))
+    base: Any = everything.custom_attributes["mujoco:hfield_base"].values
+    for shape in (int(layout.slot_shape[-1]), *map(int, layout.spare_fields)):
+        for world in range(scene.num_worlds):
+            everything.shape_source[world * layout.shapes + shape] = tiny
+    for i, shape in enumerate(carriers(layout, slots, scene.num_worlds)):
+        field = slots.fields[i]
+        everything.shape_source[shape] = _newton_field(field)
+        # the solid below reaches down from the lowest node there, from height 0 here
+        base[shape] = field.base + float(np.min(field.heights))
+
+
+def carriers(layout: WorldLayout, slots: SlotTables, worlds: int) -> list[int]:
+    """The shape of the model that carries each height field of the palette."""
+    shapes = (int(layout.slot_shape[-1]), *map(int, layout.spare_fields))
+    return [(i % worlds) * layout.shapes + shapes[i // worlds] for i in range(len(slots.fields))]
+
+
+def _layout(
+    world: newton.ModelBuilder,
+    reference: mujoco.MjModel,
+    scene: Scene,
+    robot_shapes: int,
+    slot_shapes: list[int],
+    spare: list[int],
+) -> WorldLayout:
+    """Find the robot's parts in a world's arrays."""
+    robot = scene.robot
+    bodies = {_leaf(label): i for i, label in enumerate(world.body_label)}
+    shapes = {_leaf(label): i for i, label in enumerate(world.shape_label[:robot_shapes])}
+    for what, names, known in (
+        ("body", (robot.base_body, *robot.collision_bodies), bodies),
+        ("foot", robot.foot_names, shapes),
+        ("trunk shape", robot.trunk_shapes, shapes),
+    ):
+        missing = [name for name in names if name not in known]
+        if missing:
+            raise BackendError(
+                f"{what} '{missing[0]}' of robot '{robot.name}' is not in {robot.mjcf.name}; correct robot.toml"
+            )
+    if bodies[robot.base_body] != 0:
+        raise BackendError(f"body '{robot.base_body}' of robot '{robot.name}' must carry the free joint and come first")
+    joints = [_joint(world, name, robot.name) for name in robot.joint_names]
+    count = len(world.shape_type)
+    body_index = {bodies[name]: i for i, name in enumerate(robot.collision_bodies)}
+    foot, body = np.full(count, -1, dtype=np.int32), np.full(count, -1, dtype=np.int32)
+    trunk, ground = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.int32)
+    slot = np.full(count, -1, dtype=np.int32)
+    for i, name in enumerate(robot.foot_names):
+        foot[shapes[name]] = i
+    trunk[[shapes[name] for name in robot.trunk_shapes]] = 1
+    for shape in range(robot_shapes):
+        body[shape] = body_index.get(world.shape_body[shape], -1)
+    ground[robot_shapes:] = 1
+    slot[slot_shapes] = np.arange(len(slot_shapes))
+    feet = [shapes[name] for name in robot.foot_names]
+    return WorldLayout(
+        coordinates=len(world.joint_q),
+        dofs=len(world.joint_qd),
+        bodies=len(bodies),
+        shapes=count,
+        base=0,
+        joint_q=np.array([world.joint_q_start[j] for j in joints], dtype=np.int32),
+        joint_v=np.array([world.joint_qd_start[j] for j in joints], dtype=np.int32),
+        collision_bodies=np.array([bodies[name] for name in robot.collision_bodies], dtype=np.int32),
+        foot_body=np.array([world.shape_body[s] for s in feet], dtype=np.int32),
+        foot_center=np.array([reference.geom(name).pos for name in robot.foot_names]),
+        shape_foot=foot,
+        shape_body=body,
+        shape_trunk=trunk,
+        shape_ground=ground,
+        shape_slot=slot,
+        slot_shape=np.array(slot_shapes, dtype=np.int32),
+        spare_fields=np.array(spare, dtype=np.int32),
+    )
+
+
+def import_differences(found: mujoco.MjModel, expected: mujoco.MjModel, order: NDArray) -> list[str]:
+    """What a MuJoCo model that Newton made says otherwise than MuJoCo's own compiler, field by field.
+
+    Args:
+        found: the model made by Newton.
+        expected: the robot as MuJoCo compiles it.
+        order: geom of ``found`` for each geom of ``expected``.
+
+    Returns:
+        One sentence for each field that differs; empty where all is well.
+    """
+    wrong: list[str] = []
+    for name in BODY_AND_JOINT_FIELDS:
+        _compare(name, getattr(found, name), getattr(expected, name), wrong)
+    for name in GEOM_FIELDS:
+        _compare(name, getattr(found, name)[order], getattr(expected, name), wrong)
+    # the sizes that a round shape does not use are filled differently
+    used = np.arange(3) < np.array([_USED_SIZES.get(int(t), 3) for t in expected.geom_type])[:, None]
+    _compare("geom_size", np.where(used, found.geom_size[order], 0.0), np.where(used, expected.geom_size, 0.0), wrong)
+    pairs = [_colliding(found, order), _colliding(expected, np.arange(expected.ngeom))]
+    for a, b in sorted(pairs[0] ^ pairs[1]):
+        names = f"'{expected.geom(a).name}' and '{expected.geom(b).name}'"
+        wrong.append(f"geoms {names} {'collide' if (a, b) in pairs[0] else 'do not collide'}, unlike in MuJoCo")
+    return wrong
+
+
+BODY_AND_JOINT_FIELDS = (
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_pos",
+    "jnt_pos",
+    "jnt_axis",
+    "jnt_limited",
+    "jnt_range",
+    "jnt_stiffness",
+    "jnt_solref",
+    "jnt_solimp",
+    "jnt_margin",
+    "dof_armature",
+    "dof_damping",
+    "dof_frictionloss",
+    "dof_solref",
+    "dof_solimp",
+    "qpos0",
+)
+"""Model fields that must agree, bodies and joints in the same order in both models."""
+GEOM_FIELDS = (
+    "geom_type",
+    "geom_pos",
+    "geom_bodyid",
+    "geom_condim",
+    "geom_priority",
+    "geom_friction",
+    "geom_solref",
+    "geom_solimp",
+    "geom_solmix",
+)
+"""Model fields of geoms that must agree."""
+_USED_SIZES = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): 2,
+}
+
+
+def _compare(name: str, found: NDArray, expected: NDArray, wrong: list[str]) -> None:
+    """Note a field whose values differ by more than single precision explains."""
+    a, b = np.asarray(found, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    if a.shape != b.shape:
+        wrong.append(f"{name} has shape {a.shape} instead of {b.shape}")
+    elif not np.allclose(a, b, rtol=2e-5, atol=2e-6):
+        wrong.append(f"{name} is off by {np.abs(a - b).max():.3g}")
+
+
+def _colliding(model: mujoco.MjModel, order: NDArray) -> set[tuple[int, int]]:
+    """Pairs of robot geoms, numbered as in ``order``, that can collide."""
+    excluded = {int(s) for s in model.exclude_signature}
+    found = set()
+    for i in range(len(order)):
+        for j in range(i + 1, len(order)):
+            a, b = int(order[i]), int(order[j])
+            body = sorted((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])))
+            related = body[0] == body[1] or (body[0] != 0 and int(model.body_parentid[body[1]]) == body[0])
+            masks = (
+                model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]
+            )
+            if masks and not related and (body[0] << 16) + body[1] not in excluded:
+                found.add((i, j))
+    return found

@@ -1,0 +1,443 @@
+"""The Newton solvers that this project runs, each behind the same few calls.
+
+A solver is added by measuring that it holds and walks the robot, saying in ``capabilities`` what it cannot do, and
+naming it in ``SOLVERS``. What was measured on those that are not here is told in ``docs/newton.md``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import mujoco
+import mujoco_warp
+import newton
+import numpy as np
+import warp as wp
+
+from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
+from ..mujoco_warp.height_fields.repair import repair_height_fields
+from ..mujoco_warp.model import SMALLEST_TOLERANCE
+from . import kernels, solver_kernels
+from .model import WorldModel, carriers, import_differences
+
+repair_height_fields()
+
+DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
+"""Contacts per world for which room is made, by the palette's hardest shape; a robot that lies flat needs about 30."""
+
+_EXACT = Capability(support=Support.EXACT)
+
+
+def _declare(**others: Capability) -> dict[str, Capability]:
+    """Everything exact but what is named."""
+    return {name: others.get(name, _EXACT) for name in CAPABILITY_NAMES}
+
+
+class SolverAdapter(ABC):
+    """One Newton solver with its contacts."""
+
+    name: ClassVar[str]
+    """Name after the colon in ``newton:NAME``."""
+    capabilities: ClassVar[Mapping[str, Capability]]
+    gap: ClassVar[float]
+    """Distance at which the solver wants to hear of contacts, for each of the two shapes [m]."""
+    skin: ClassVar[bool]
+    """Whether the robot file's contact margins mean to this solver what they mean to MuJoCo."""
+    own_dry_friction: ClassVar[bool]
+    """Whether the solver knows the joints' dry friction; else the motor kernel adds it."""
+
+    warm_start: wp.array
+    """What the solver carries from step to step, (N, W); W is 1 and the entry unused where it carries nothing."""
+    contacts: newton.Contacts
+    observables: newton.solvers.SolverBase.Observables
+
+    @classmethod
+    def refuse(cls, scene: Scene) -> None:
+        """Raise ``BackendError`` where the scene asks for what the solver cannot do.
+
+        Raises:
+            BackendError: says what was asked for and what to change.
+        """
+        physics = scene.physics
+        for capability, asked, change in (
+            ("height_field", any(t.height_field is not None for t in scene.terrains), "use terrains of boxes"),
+            ("boxes", any(t.boxes for t in scene.terrains), "use flat terrains"),
+            ("foot_condim_6", physics.foot_condim == 6, "use PhysicsOptions(foot_condim=3), or None"),
+            ("elliptic_cone", physics.cone == "elliptic", "use PhysicsOptions(cone='pyramidal')"),
+            ("deterministic", physics.deterministic, "use PhysicsOptions(deterministic=False)"),
+        ):
+            if asked and cls.capabilities[capability].support is Support.NONE:
+                note = cls.capabilities[capability].note
+                raise BackendError(f"Newton's {cls.name} solver has no support for {capability} ({note}); {change}")
+
+    @classmethod
+    @abstractmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """See ``PhysicsBackend.solver_settings``."""
+
+    @abstractmethod
+    def __init__(self, world: WorldModel, scene: Scene) -> None:
+        """Make the solver and its contact buffers."""
+
+    @abstractmethod
+    def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
+        """One physics step. ``observe``: the contact forces are wanted."""
+
+    @abstractmethod
+    def collect_overflow(self, active: Any, overflowed: Any) -> None:
+        """Set the flags of the active worlds in which the last step dropped contacts or constraints."""
+
+    @abstractmethod
+    def reset(self, state: newton.State, mask: Any) -> None:
+        """Forget the past of the masked worlds; ``mask`` is (N + 1,) bool."""
+
+    @abstractmethod
+    def shapes_changed(self, terrain: Any) -> None:
+        """Take over poses, sizes and friction of the model's shapes; ``terrain`` is each world's, (N,)."""
+
+    @abstractmethod
+    def inertia_changed(self) -> None:
+        """Take over masses, inertias and centres of mass of the model's bodies."""
+
+
+def _contacts_per_world(scene: Scene, world: WorldModel) -> int:
+    """Contact capacity of a world."""
+    shape = "height_field" if world.slots.fields else "boxes" if len(world.layout.slot_shape) else "plane"
+    asked = scene.physics.contacts_per_world
+    if asked is not None and asked < 1:
+        raise BackendError(f"contacts_per_world is {asked}, but must be at least 1 (PhysicsOptions.contacts_per_world)")
+    return asked or DEFAULT_CONTACTS[shape]
+
+
+class MujocoAdapter(SolverAdapter):
+    """Newton's MuJoCo solver: mujoco_warp behind Newton's model, state and contacts."""
+
+    name = "mujoco"
+    capabilities = _declare(
+        deterministic=Capability(
+            support=Support.APPROXIMATE,
+            note="to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces",
+        ),
+    )
+    gap = 0.0
+    skin = True
+    own_dry_friction = True
+
+    @classmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """See ``SolverAdapter.solver_settings``: no tolerance below what single precision can reach."""
+        names = ("cone", "impratio", "iterations", "ls_iterations")
+        asked = {name: getattr(physics, name) for name in names}
+        return {**asked, "tolerance": max(physics.tolerance, SMALLEST_TOLERANCE)}
+
+    def __init__(self, world: WorldModel, scene: Scene) -> None:
+        physics, model = scene.physics, world.model
+        contacts = _contacts_per_world(scene, world)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the margins that it complains about are repaired below
+            self.solver: Any = newton.solvers.SolverMuJoCo(
+                model,
+                nconmax=contacts,
+                njmax=_constraint_rows(scene, world, contacts),
+                iterations=physics.iterations,
+                ls_iterations=physics.ls_iterations,
+                tolerance=physics.tolerance,
+                solver="newton",
+                integrator="euler",
+                cone=physics.cone,
+                impratio=physics.impratio,
+                enable_multiccd=True,  # as in MuJoCo
+                include_sites=False,
+            )
+        self._timestep = physics.timestep
+        self._data, self._model = self.solver.mjw_data, self.solver.mjw_model
+        if physics.deterministic:
+            # mujoco_warp's own mode; Newton's switch for it asks Warp for one in which Newton's kernels do not compile
+            self._model.opt.deterministic = int(mujoco_warp.DeterminismType.ATOMICS)
+        self._model.opt.warn_overflow = 0  # alarms are reported per world, not printed by the device
+        self._check_import(world, scene)
+        geoms = _geom_shapes(self.solver)
+        margin = np.zeros(geoms.shape, dtype=np.float32)
+        local = geoms[0] % world.layout.shapes
+        for geom, shape in enumerate(local):
+            if world.layout.shape_ground[shape] == 0:
+                margin[:, geom] = model.shape_margin.numpy()[shape]
+        self._margin: wp.array = wp.array(margin, dtype=float, device=model.device)
+        self._fields = _FieldGeom(self.solver, world, scene) if world.slots.fields else None
+        self.warm_start = self._data.qacc_warmstart
+        self.contacts = newton.Contacts(self.solver.get_max_contact_count(), 0, device=model.device)
+        self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
+        # iterations that run out are no loss of contacts
+        overflow = mujoco_warp.OverflowType
+        self._overflow_mask = int(overflow.ALL & ~(overflow.ITERATIONS | overflow.LS_ITERATIONS | overflow.EPA_HORIZON))
+
+    def _check_import(self, world: WorldModel, scene: Scene) -> None:
+        """Refuse a robot of which Newton's importer made something else than MuJoCo's compiler."""
+        shape_geom = {int(s): g for g, s in enumerate(_geom_shapes(self.solver)[0])}
+        order = np.array([shape_geom[s] for s in range(world.reference.ngeom)])
+        wrong = import_differences(self.solver.mj_model, world.reference, order)
+        if wrong:
+            raise BackendError(
+                f"Newton imports robot '{scene.robot.name}' unlike MuJoCo: {'; '.join(wrong)}; "
+                "use the backend 'mujoco-warp', or change the robot's model file"
+            )
+
+    def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
+        """See ``SolverAdapter.step``."""
+        self.solver.step(
+            before, after, control, self.contacts, self._timestep, observables=self.observables if observe else None
+        )
+
+    def collect_overflow(self, active: Any, overflowed: Any) -> None:
+        """See ``SolverAdapter.collect_overflow``."""
+        wp.launch(
+            kernels.collect_overflow_bits,
+            dim=active.shape[0],
+            inputs=[active, self._data.overflow, self._overflow_mask, overflowed],
+            device=active.device,
+        )
+
+    def reset(self, state: newton.State, mask: Any) -> None:
+        """See ``SolverAdapter.reset``."""
+        self.solver.reset(state, mask, flags=0)
+
+    def shapes_changed(self, terrain: Any) -> None:
+        """See ``SolverAdapter.shapes_changed``."""
+        self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+        # Newton zeroes margins for fear of an old limit of mujoco_warp
+        wp.copy(self._model.geom_margin, self._margin)
+        if self._fields is not None:
+            self._fields.place(terrain)
+
+    def inertia_changed(self) -> None:
+        """See ``SolverAdapter.inertia_changed``."""
+        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+
+
+def _geom_shapes(solver: Any) -> np.ndarray:
+    """Newton's shape of each MuJoCo geom in every world, (N, G)."""
+    return solver.mjc_geom_to_newton_shape.numpy()
+
+
+def _constraint_rows(scene: Scene, world: WorldModel, contacts: int) -> int:
+    """Constraint rows of one world: joint friction, joint limits and contacts, feet with their own dimension."""
+    reference, elliptic = world.reference, scene.physics.cone == "elliptic"
+    rows = int(np.count_nonzero(reference.dof_frictionloss > 0)) + int(reference.jnt_limited.sum())
+    for name in scene.robot.foot_names:
+        dimension = max(int(reference.geom(name).condim[0]), 3)
+        # a foot has two contacts at most times: the ground and another box
+        rows += 2 * ((dimension - 3) if elliptic else 2 * (dimension - 3))
+    rows += contacts * (3 if elliptic else 4)
+    return 16 * -(-rows // 16)
+
+
+class _FieldGeom:
+    """The height-field geom of Newton's MuJoCo solver, whose field differs between worlds."""
+
+    def __init__(self, solver: Any, world: WorldModel, scene: Scene) -> None:
+        self._solver, slots, layout = solver, world.slots, world.layout
+        device, count = world.model.device, len(slots.fields)
+        shape_geom = {int(s): g for g, s in enumerate(_geom_shapes(solver)[0])}
+        self._geom = shape_geom[int(layout.slot_shape[-1])]
+        ids = solver.mjw_model.geom_dataid.numpy()
+        asset = np.zeros(count, dtype=np.int32)
+        for i, shape in enumerate(carriers(layout, slots, scene.num_worlds)):
+            row, local = divmod(shape, layout.shapes)
+            asset[i] = ids[row % len(ids), shape_geom[local]]
+        present = np.array([t.height_field is not None for t in scene.terrains])
+        low = np.array([float(np.min(f.heights)) for f in slots.fields])[slots.field]
+        top = np.array([float(np.max(f.heights)) for f in slots.fields])[slots.field] - low
+        base = np.array([f.base for f in slots.fields])[slots.field] + low
+        half = np.array([f.half_size for f in slots.fields])[slots.field]
+        position = slots.pose[:, -1, :3].copy()
+        position[:, 2] += np.where(present, low, 0.0)
+        box = np.stack(
+            [np.c_[np.zeros((len(present), 2)), 0.5 * (top - base)], np.c_[half, 0.5 * (top + base)]], axis=1
+        )
+        radius = np.sqrt((half**2).sum(1) + np.maximum(top, base) ** 2)
+        self._asset: wp.array = wp.array(asset[slots.field], dtype=int, device=device)
+        self._position: wp.array = wp.array(position, dtype=wp.vec3, device=device)
+        self._box: wp.array = wp.array(box, dtype=wp.vec3, device=device)
+        self._radius: wp.array = wp.array(radius, dtype=float, device=device)
+
+    def place(self, terrain: Any) -> None:
+        """Give every world the field of its terrain."""
+        model, data = self._solver.mjw_model, self._solver.mjw_data
+        wp.launch(
+            solver_kernels.place_mujoco_field,
+            dim=terrain.shape[0],
+            inputs=[terrain, self._geom, self._asset, self._position, self._box, self._radius],
+            outputs=[model.geom_dataid, model.geom_pos, data.geom_xpos, model.geom_aabb, model.geom_rbound],
+            device=terrain.device,
+        )
+
+
+class _FieldShape:
+    """The height-field shape of Newton's own collision pipeline, whose field differs between worlds."""
+
+    def __init__(self, world: WorldModel, scene: Scene) -> None:
+        model, layout, slots = world.model, world.layout, world.slots
+        self._model, self._shapes, self._shape = model, layout.shapes, int(layout.slot_shape[-1])
+        shapes = np.array(carriers(layout, slots, scene.num_worlds))[slots.field]
+        half = np.array([f.half_size for f in slots.fields])[slots.field]
+        low, top = (
+            np.array([float(limit(f.heights)) for f in slots.fields])[slots.field] for limit in (np.min, np.max)
+        )
+        # replicated shapes share the bounds of the first, whatever field they bear
+        lower, upper = np.c_[-half, low], np.c_[half, top]
+        radius = np.linalg.norm(np.maximum(np.abs(lower), np.abs(upper)), axis=1)
+        device = model.device
+        self._tables: tuple[wp.array, ...] = (
+            wp.array(model.shape_heightfield_index.numpy()[shapes], dtype=int, device=device),
+            wp.array(model.shape_source_ptr.numpy()[shapes], dtype=wp.uint64, device=device),
+            wp.array(lower, dtype=wp.vec3, device=device),
+            wp.array(upper, dtype=wp.vec3, device=device),
+            wp.array(radius, dtype=float, device=device),
+        )
+        self._arrays = (
+            model.shape_heightfield_index,
+            model.shape_source_ptr,
+            model.shape_collision_aabb_lower,
+            model.shape_collision_aabb_upper,
+            model.shape_collision_radius,
+        )
+
+    def place(self, terrain: Any) -> None:
+        """Give every world the field of its terrain."""
+        wp.launch(
+            solver_kernels.place_newton_field,
+            dim=terrain.shape[0],
+            inputs=[terrain, self._shapes, self._shape, *self._tables],
+            outputs=list(self._arrays),
+            device=terrain.device,
+        )
+
+
+class SteelAdapter(SolverAdapter):
+    """Newton's Steel solver: joint coordinates, hard contacts by projected Gauss-Seidel, Newton's own collisions."""
+
+    name = "steel"
+    capabilities = _declare(
+        joint_friction=Capability(
+            support=Support.APPROXIMATE,
+            note="an explicit torque that changes sign over a small speed: a joint at rest creeps",
+        ),
+        elliptic_cone=Capability(
+            support=Support.APPROXIMATE,
+            note="friction is the exact cone of a hard contact; impratio has no meaning here",
+        ),
+        foot_condim_6=Capability(
+            support=Support.NONE, note="contacts slide, they have no torsional or rolling friction"
+        ),
+        contact_forces=Capability(
+            support=Support.APPROXIMATE, note="impulses of hard contacts divided by the timestep, without moments"
+        ),
+        deterministic=Capability(
+            support=Support.APPROXIMATE,
+            note="to the last bit on a CPU; on a GPU by Newton's mode, but for sums of contact forces",
+        ),
+    )
+    gap = 0.01
+    skin = False
+    own_dry_friction = False
+
+    @classmethod
+    def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
+        """See ``SolverAdapter.solver_settings``: a fixed number of sweeps over true cones."""
+        return {"cone": physics.cone, "iterations": physics.iterations}
+
+    @classmethod
+    def refuse(cls, scene: Scene) -> None:
+        """See ``SolverAdapter.refuse``; a pyramidal cone is refused too."""
+        super().refuse(scene)
+        if scene.physics.cone != "elliptic":
+            raise BackendError(
+                "Newton's steel solver has no pyramidal friction cone, its contacts slide on a true cone; "
+                "use PhysicsOptions(cone='elliptic')"
+            )
+
+    def __init__(self, world: WorldModel, scene: Scene) -> None:
+        physics, model = scene.physics, world.model
+        contacts = _contacts_per_world(scene, world)
+        self._timestep = physics.timestep
+        # one coefficient acts, and the mean of two equal ones is it: the feet's, until it is randomized
+        feet = float(np.mean([world.reference.geom(name).friction[0] for name in scene.robot.foot_names]))
+        model.shape_material_mu.fill_(feet)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.solver: Any = newton.solvers.SolverSteel(
+                model,
+                iterations=physics.iterations,
+                enable_joint_limits=True,
+                joint_limit_activation_gap=0.1,
+                # point friction and no warm start: nothing is carried over, so that resets and masks leave no trace
+                friction_anchor_beta=0.0,
+                contact_warmstart=False,
+                enable_restitution=False,
+                articulation_constraint_max=3 * contacts + scene.robot.num_joints,
+                free_body_constraint_max=1,
+                warn_constraint_overflow=False,
+                deterministic=wp.DeterministicMode.RUN_TO_RUN if physics.deterministic else None,
+            )
+            self._pipeline = newton.CollisionPipeline(
+                model, rigid_contact_max=contacts * scene.num_worlds + 256, deterministic=physics.deterministic
+            )
+        self._fields = _FieldShape(world, scene) if world.slots.fields else None
+        self.contacts = self._pipeline.contacts()
+        self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
+        self.warm_start = wp.zeros((scene.num_worlds, 1), dtype=float, device=model.device)
+
+    def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
+        """See ``SolverAdapter.step``."""
+        self._pipeline.collide(before, self.contacts)
+        self.solver.step(
+            before, after, control, self.contacts, self._timestep, observables=self.observables if observe else None
+        )
+
+    def collect_overflow(self, active: Any, overflowed: Any) -> None:
+        """See ``SolverAdapter.collect_overflow``."""
+        wp.launch(
+            kernels.collect_overflow_flags,
+            dim=active.shape[0],
+            inputs=[active, self.solver.constraint_overflow, overflowed],
+            device=active.device,
+        )
+
+    def reset(self, state: newton.State, mask: Any) -> None:
+        """See ``SolverAdapter.reset``."""
+        self.solver.reset(state, mask, flags=0)
+
+    def shapes_changed(self, terrain: Any) -> None:
+        """See ``SolverAdapter.shapes_changed``."""
+        self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+        if self._fields is not None:
+            self._fields.place(terrain)
+
+    def inertia_changed(self) -> None:
+        """See ``SolverAdapter.inertia_changed``."""
+        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+
+
+SOLVERS: Mapping[str, type[SolverAdapter]] = {each.name: each for each in (MujocoAdapter, SteelAdapter)}
+"""Solvers by name; the first is the default."""
+
+
+def dry_friction_slope(reference: mujoco.MjModel, dofs: np.ndarray, timestep: float) -> np.ndarray:
+    """Steepest slope of an explicit dry-friction torque around zero speed that does not overshoot [N·m·s/rad], (J,).
+
+    A slope of half the joint's own inertia per step keeps even three coupled joints of a leg stable.
+
+    Args:
+        reference: the robot.
+        dofs: degree of freedom of each joint, (J,).
+        timestep: length of a physics step [s].
+    """
+    data = mujoco.MjData(reference)
+    mujoco.mj_forward(reference, data)
+    inertia = np.zeros((reference.nv, reference.nv))
+    mujoco.mj_fullM(reference, data, inertia)
+    own = 1.0 / np.diag(np.linalg.inv(inertia))
+    return 0.5 * own[dofs] / timestep

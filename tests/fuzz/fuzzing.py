@@ -1,0 +1,184 @@
+"""A registry of parsers, and what every one of them must survive.
+
+A parser is fed what somebody else may have written: its seeds (``tests/fuzz/seeds``), cut, spliced, and with bytes changed. It
+may take it or raise an error of this package. Anything else fails the case: an error of another kind, over 20 s, over 2 GB,
+a file written outside the case's own folder. To add a parser, call ``register`` in a module named ``fuzz_<room>.py`` here.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from hypothesis import strategies as st
+
+SEEDS = Path(__file__).parent / "seeds"
+MOST_SECONDS = 20
+MOST_MEMORY = 2 * 10**9
+"""What a case may take beyond what the process has at its start [bytes]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parser:
+    """Something that reads what others wrote."""
+
+    name: str
+    feed: Callable[[bytes, Path], object]
+    """Reads the content; the folder is the case's own, empty."""
+    seeds: tuple[bytes, ...]
+    """Contents that it takes."""
+    words: tuple[bytes, ...]
+    """What is put in between."""
+
+
+PARSERS: dict[str, Parser] = {}
+
+_BYTES = (b"\x00", b"\xff", b"\x80", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8, b"\x7f" + b"\xff" * 8)
+_TEXTS = (b"null", b"-1", b"1e999", b"nan", b"[" * 2000, b"{" * 2000, b"9" * 400, b"\\ud800", "\u202e\x1b[31m".encode())
+
+
+def register(
+    name: str,
+    feed: Callable[[bytes, Path], object],
+    *,
+    seeds: Sequence[bytes] | None = None,
+    words: Sequence[bytes] = (),
+    text: bool = False,
+) -> None:
+    """Add a parser.
+
+    Args:
+        name: of the parser, and of the folder of its seeds.
+        feed: see ``Parser``.
+        seeds: None for the files in ``seeds/<name>``.
+        words: of the format, to put in between.
+        text: whether the format is a text.
+    """
+    found = seeds if seeds is not None else [f.read_bytes() for f in sorted((SEEDS / name).iterdir())]
+    assert found, f"parser '{name}' has no seeds"
+    PARSERS[name] = Parser(name=name, feed=feed, seeds=tuple(found), words=(*words, *(_TEXTS if text else _BYTES)))
+
+
+@st.composite
+def contents(draw: Any, parser: Parser) -> bytes:
+    """A seed of the parser, changed in up to eight places."""
+    data = bytearray(draw(st.sampled_from(parser.seeds)))
+    for _ in range(draw(st.integers(1, 8))):
+        at = int(draw(st.floats(0, 1, exclude_max=True)) * len(data))
+        length = draw(st.sampled_from((1, 1, 2, 4, 16, 256)))
+        match draw(st.sampled_from(("flip", "set", "insert", "delete", "repeat", "swap", "cut"))):
+            case "flip" if data:
+                data[at] ^= 1 << draw(st.integers(0, 7))
+            case "set":
+                data[at : at + length] = draw(st.sampled_from(parser.words))
+            case "insert":
+                data[at:at] = draw(st.sampled_from(parser.words) | st.binary(max_size=16))
+            case "delete":
+                del data[at : at + length]
+            case "repeat":
+                data[at:at] = data[at : at + length] * draw(st.integers(1, 50))
+            case "swap":
+                other = draw(st.sampled_from(parser.seeds))
+                begin = int(draw(st.floats(0, 1, exclude_max=True)) * len(other))
+                data[at : at + length] = other[begin : begin + length]
+            case "cut":
+                del data[at:]
+    return bytes(data)
+
+
+def check(parser: Parser, content: bytes) -> None:
+    """Feed a parser.
+
+    Raises:
+        AssertionError: it did what it must not.
+    """
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
+        folder = Path(name)
+        with _watched(folder) as written, _limits():
+            try:
+                parser.feed(content, folder)
+            except (ValueError, RuntimeError, OSError) as error:
+                if not _is_ours(error):
+                    raise
+                assert str(error).isprintable(), f"not one printable line: {error!r}"
+                assert len(str(error)) < 2000, "a sentence of over 2000 characters"
+        assert not written, f"written outside its folder: {written}"
+
+
+def _is_ours(error: BaseException) -> bool:
+    return any(kind.__module__.startswith("gaitgauge.") for kind in type(error).__mro__)
+
+
+class TooLongError(BaseException):
+    """A case took over ``MOST_SECONDS``; no error that anybody catches."""
+
+
+def _too_long(number: int, frame: FrameType | None) -> None:
+    raise TooLongError(f"over {MOST_SECONDS} s")
+
+
+@contextmanager
+def _limits() -> Iterator[None]:
+    """Limits of time and memory."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    statm = Path("/proc/self/statm")
+    if statm.exists():
+        resource.setrlimit(
+            resource.RLIMIT_AS, (int(statm.read_text().split()[0]) * resource.getpagesize() + MOST_MEMORY, hard)
+        )
+    before = signal.signal(signal.SIGALRM, _too_long)
+    signal.alarm(MOST_SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+_watch: tuple[Path, list[str], int] | None = None
+_CHANGES = {"os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod"}
+_CHANGES |= {"os.chown", "os.utime", "shutil.move", "shutil.rmtree", "shutil.copyfile", "os.system", "subprocess.Popen"}
+
+
+def _hook(event: str, arguments: tuple[Any, ...]) -> None:
+    if _watch is None or os.getpid() != _watch[2]:
+        return  # a process of a foreign program is locked up by the system itself
+    if event == "open":
+        path, mode, flags = arguments
+        changes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+        if not changes and not (isinstance(mode, str) and set(mode) & set("wax+")):
+            return
+    elif event in _CHANGES:
+        path = arguments[0]
+    else:
+        return
+    folder, written, _ = _watch
+    if isinstance(path, int) or str(path) == os.devnull or Path(os.fsdecode(path)).name.startswith("torchinductor_"):
+        return  # the last is a folder of torch's own, which it makes when it records a network
+    if not Path(os.fsdecode(path)).absolute().is_relative_to(folder):
+        written.append(f"{event} {path}")
+
+
+sys.addaudithook(_hook)
+
+
+@contextmanager
+def _watched(folder: Path) -> Iterator[list[str]]:
+    """Lists what is written outside a folder meanwhile."""
+    global _watch
+    written: list[str] = []
+    _watch = (folder, written, os.getpid())
+    try:
+        yield written
+    finally:
+        _watch = None

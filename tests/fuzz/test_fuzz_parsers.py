@@ -1,0 +1,60 @@
+"""Every registered parser against changed seeds; ``make fuzz`` runs many more cases, with a new start each time."""
+
+import importlib
+import os
+from pathlib import Path
+
+import pytest
+from fuzzing import PARSERS, Parser, check, contents
+from gaitgauge.policy.base import PolicyError
+from hypothesis import HealthCheck, given, settings
+
+for module in sorted(Path(__file__).parent.glob("fuzz_*.py")):
+    importlib.import_module(module.stem)
+
+CASES = int(os.environ.get("GAITGAUGE_FUZZ_CASES", "20"))
+"""Of each parser."""
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_seeds_are_taken(name):
+    for seed in PARSERS[name].seeds:
+        check(PARSERS[name], seed)
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_whatever_is_read_ends_well(name):
+    parser = PARSERS[name]
+
+    @settings(
+        max_examples=CASES,
+        deadline=None,
+        database=None,
+        derandomize="GAITGAUGE_FUZZ_CASES" not in os.environ,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(content=contents(parser))
+    def case(content: bytes) -> None:
+        check(parser, content)
+
+    case()
+
+
+def parser(feed) -> Parser:
+    return Parser(name="test", feed=feed, seeds=(b"",), words=(b"",))
+
+
+def test_the_harness_catches_what_it_is_for(tmp_path):
+    def sentence(content, folder):
+        (folder / "own").write_text("")
+        raise PolicyError("one sentence")
+
+    check(parser(sentence), b"")
+    with pytest.raises(KeyError):
+        check(parser(lambda content, folder: {}["x"]), b"")
+    with pytest.raises(MemoryError):
+        check(parser(lambda content, folder: bytearray(3 * 10**9)), b"")
+    with pytest.raises(AssertionError, match="outside"):
+        check(parser(lambda content, folder: (tmp_path / "x").write_text("")), b"")
+    with pytest.raises(AssertionError, match="outside"):
+        check(parser(lambda content, folder: os.mkdir(tmp_path / "y")), b"")
