@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-_WARM_UP = 3
-"""Calls of a part before it is recorded: what the device loads at first use must not be loaded while recording."""
+from ..backends.warp.graphs import RecordedFunction
+
 _MOST_RECORDINGS = 30
 """Recordings of one part after which it is not recorded again: memory that moves all the time is none to record."""
 
@@ -25,9 +25,7 @@ class StepRecording:
         """``enabled``: whether to record at all."""
         self.enabled = enabled
         """Whether functions are recorded, or will be."""
-        self._calls: dict[str, int] = {}
-        self._recordings: dict[str, int] = {}
-        self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
+        self._functions: dict[str, RecordedFunction[None]] = {}
         self._memory: tuple[tuple[int, tuple[int, ...]], ...] = ()
 
     def prepare(self, memory: Sequence[torch.Tensor]) -> None:
@@ -35,40 +33,32 @@ class StepRecording:
         places = tuple((tensor.data_ptr(), tuple(tensor.shape)) for tensor in memory)
         if places != self._memory:
             self._memory = places
-            self._graphs.clear()
+            for function in self._functions.values():
+                function.forget()
 
     def run(self, function: Callable[[], None]) -> None:
         """Run a function, or replay it."""
         if not self.enabled:
             function()
             return
-        name = function.__name__
-        calls = self._calls[name] = self._calls.get(name, 0) + 1
-        if calls <= _WARM_UP:
-            function()
+        recorded = self._functions.setdefault(function.__name__, RecordedFunction(function))
+        if recorded.due and recorded.recordings >= _MOST_RECORDINGS:
+            self._give_up(function, f"its memory moved {_MOST_RECORDINGS} times")
             return
-        if name not in self._graphs and not self._record(name, function):
-            function()
-            return
-        self._graphs[name].replay()
+        try:
+            recorded()
+        except RuntimeError as error:
+            if not recorded.due:  # it ran, and failed
+                raise
+            self._give_up(function, str(error).splitlines()[0] if str(error) else type(error).__name__)
 
-    def _record(self, name: str, function: Callable[[], None]) -> bool:
-        """Record a function, which does not run meanwhile; returns whether that was possible."""
-        recordings = self._recordings[name] = self._recordings.get(name, 0) + 1
-        reason = f"its memory moved {_MOST_RECORDINGS} times" if recordings > _MOST_RECORDINGS else ""
-        if not reason:
-            try:
-                graph = torch.cuda.CUDAGraph()
-                with torch.cuda.graph(graph):
-                    function()
-            except RuntimeError as error:
-                reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            else:
-                self._graphs[name] = graph
-                return True
+    def _give_up(self, function: Callable[[], None], reason: str) -> None:
+        """Run a function that cannot be recorded, and all from now on, as they are."""
         logging.getLogger(__name__).warning(
-            "control steps are not recorded as CUDA graphs, which makes them slower: '%s' cannot be: %s", name, reason
+            "control steps are not recorded as CUDA graphs, which makes them slower: '%s' cannot be: %s",
+            function.__name__,
+            reason,
         )
         self.enabled = False
-        self._graphs.clear()
-        return False
+        self._functions.clear()
+        function()

@@ -18,6 +18,7 @@ from tensordict import TensorDict
 
 from ..backends.base import PhysicsBackend, Scene
 from ..backends.registry import make_backend
+from ..backends.warp.graphs import WARM_UP, RecordedFunction
 from ..policy.contract import History, PolicyContract, go2_contract
 from ..robots.base import JointParameters, Robot
 from ..robots.registry import load_robot
@@ -30,7 +31,6 @@ from .events import EpisodeStart
 from .observations import Observations
 from .own_terms import resolve_own
 from .step import EnvironmentStep, StepResult
-from .step_graph import CapturedFunction
 from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
 
 STATE_VERSION = 1
@@ -165,13 +165,16 @@ class TrainingEnvironment(VecEnv):
         self._observations = self.parts.observe().clone()
 
     def _capture(self) -> None:
-        """Capture both torch parts; what their warm-up changes is put back."""
+        """Record both torch parts; what running them for it changes is put back."""
         memory, motors = self.parts.memory, self.parts.motors
         before = memory.snapshot()
         motors_before = motors.snapshot()
         with torch.no_grad():
-            self._after_physics = CapturedFunction(self._after_physics)
-            self._observe = CapturedFunction(self._observe)
+            self._after_physics = RecordedFunction(self._after_physics)
+            self._observe = RecordedFunction(self._observe)
+            for _ in range(WARM_UP + 1):
+                self._after_physics()
+                self._observe()
         memory.restore(before)
         motors.restore(motors_before)
 

@@ -52,7 +52,7 @@ class Tape:
 class Recorder(TorchDispatchMode):
     """Stands for ``torch.cuda.graph``: nothing has happened once it ends."""
 
-    def __init__(self, tape):
+    def __init__(self, tape, **settings):
         super().__init__()
         self.tape, self.before = tape, []
 

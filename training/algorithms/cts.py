@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from ...backends.warp.graphs import RecordedFunction
 from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
 from ..networks import CtsActor, CtsCritic, student_architecture
 from ..processes import Processes
@@ -26,7 +27,6 @@ from ..schedules import RampTable
 from .bootstrap import Bootstrap
 from .cts_losses import POLICY_LOSSES, STUDENT_LOSSES, CtsLosses
 from .gradients import FlatGradients, clip_gradients
-from .graphs import GraphedStep
 from .storage import EnvironmentSplit, RolloutStorage
 from .symmetry import Mirror, passes
 
@@ -294,7 +294,7 @@ class CTS:
         """One step of two halves. Between several processes each half is a CUDA graph of its own: a message inside a graph
         could not be given up when a process is lost.
         """
-        recorded: Callable[[Step], Step] = GraphedStep if self._graphs else (lambda step: step)
+        recorded: Callable[[Step], Step] = RecordedFunction if self._graphs else (lambda step: step)
 
         def whole(*rows: torch.Tensor) -> None:
             compute(*rows)

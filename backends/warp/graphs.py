@@ -1,0 +1,76 @@
+"""A fixed sequence of torch operations, recorded once as a CUDA graph and replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import torch
+
+WARM_UP = 3
+"""Calls before a function is recorded: what the device loads at first use must not be loaded while recording."""
+
+Result = TypeVar("Result")
+
+
+class RecordedFunction(Generic[Result]):
+    """A function of tensors whose first calls run as they are, and whose later ones replay a CUDA graph.
+
+    The function must have static shapes, read and write only its arguments and tensors that stay where they are, draw no
+    random numbers and never wait for the device. No call is made twice. From the first replay on every call returns the
+    same tensors with new contents.
+    """
+
+    def __init__(self, function: Callable[..., Result], *, warm_up: int = WARM_UP) -> None:
+        """``warm_up``: calls that run as they are, on a stream of their own, as recording asks for."""
+        self._function = function
+        self._left = warm_up
+        self._inputs: tuple[torch.Tensor, ...] = ()
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._result: Result
+        self.recordings = 0
+        """How often it was recorded."""
+
+    @property
+    def due(self) -> bool:
+        """Whether the next call records."""
+        return self._graph is None and self._left == 0
+
+    def __call__(self, *arguments: torch.Tensor) -> Result:
+        """Run the function with these arguments, which are copied; or record and replay it.
+
+        Raises:
+            RuntimeError: it cannot be recorded. It has not run then, and the next call tries again.
+        """
+        if self._graph is None:
+            if self._left > 0:
+                self._left -= 1
+                return self._run(arguments)
+            self._graph = self._record(arguments)
+        for static, argument in zip(self._inputs, arguments, strict=True):
+            static.copy_(argument)
+        self._graph.replay()
+        return self._result
+
+    def forget(self) -> None:
+        """Record anew at the next call: tensors that the function uses have moved."""
+        self._graph = None
+
+    def _run(self, arguments: tuple[torch.Tensor, ...]) -> Result:
+        if not torch.cuda.is_available():
+            return self._function(*arguments)
+        current, aside = torch.cuda.current_stream(), torch.cuda.Stream()
+        aside.wait_stream(current)
+        with torch.cuda.stream(aside):
+            result = self._function(*arguments)
+        current.wait_stream(aside)
+        return result
+
+    def _record(self, arguments: tuple[torch.Tensor, ...]) -> torch.cuda.CUDAGraph:
+        self._inputs = tuple(argument.clone() for argument in arguments)
+        graph = torch.cuda.CUDAGraph()
+        # other threads may talk to the device meanwhile
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            self._result = self._function(*self._inputs)
+        self.recordings += 1
+        return graph
