@@ -50,6 +50,7 @@ _PATTERNS = {
 Positive = Annotated[float, Field(gt=0.0, le=1e9)]
 NotNegative = Annotated[float, Field(ge=0.0, le=1e9)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Count = Annotated[int, Field(ge=1, lt=2**53)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)

@@ -12,6 +12,7 @@ from enum import Enum
 from pathlib import PurePath
 from typing import Any
 
+from ..files.parsing import Seed
 from .environment_configuration import Ramp
 
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
@@ -134,7 +135,7 @@ class RunConfiguration:
     """Name of the folder under ``logs/rsl_rl``."""
     run_name: str = ""
     """Appended to the date in the run directory's name."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of every random generator; rank r of a multi-GPU run uses seed + r."""
     steps_per_iteration: int = 24
     """Environment steps of every environment between two updates."""

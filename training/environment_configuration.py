@@ -8,11 +8,16 @@ every difference from the published code and its reason.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
 
 from ..backends.base import TRAINING_PHYSICS, PhysicsOptions
+from ..files.parsing import Count, NotNegative, Positive, Seed, Share
 from ..terrains.training_tiles import DEFAULT_SHAPE, NUM_TILE_LEVELS, TileShape
 
 Range = tuple[float, float]
+_Metres = Annotated[float, Field(gt=0.0, le=100.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,9 +28,9 @@ class Ramp:
     """Value until ``begin``."""
     end: float
     """Value from ``until`` on."""
-    begin: float = 0.0
+    begin: Share = 0.0
     """Fraction of the run at which the change begins."""
-    until: float = 1.0
+    until: Share = 1.0
     """Fraction of the run at which the change is complete."""
 
 
@@ -33,10 +38,10 @@ class Ramp:
 class ScheduleConfiguration:
     """What "a fraction of the run" means."""
 
-    horizon_steps: int = 240_000
+    horizon_steps: Count = 240_000
     """Environment steps, per environment, of the whole run: 24 steps times 10,000 iterations. Every ramp and stage is
     a fraction of it."""
-    begin: float = 0.0
+    begin: Share = 0.0
     """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin
     with the commands of a robot that cannot walk yet."""
 
@@ -104,13 +109,13 @@ class OwnEvent:
 class NoiseConfiguration:
     """Half-widths of the uniform noise that every observation gets, in physical units. 0 turns an entry off."""
 
-    base_angular_velocity: float = 0.8
+    base_angular_velocity: NotNegative = 0.8
     """[rad/s]. The gauge's value; the published training used 0.2."""
-    projected_gravity: float = 0.05
+    projected_gravity: NotNegative = 0.05
     """Per component of the unit vector. The gauge adds none."""
-    joint_position: float = 0.01
+    joint_position: NotNegative = 0.01
     """[rad]."""
-    joint_velocity: float = 3.0
+    joint_velocity: NotNegative = 3.0
     """[rad/s]. The gauge's value; the published training used 1.5."""
 
 
@@ -118,19 +123,19 @@ class NoiseConfiguration:
 class ObservationConfiguration:
     """What the networks see."""
 
-    history_length: int = 5
+    history_length: Annotated[int, Field(ge=1, le=1000)] = 5
     """Frames in the student's history, the current one included."""
     history_start: str = "repeat"
     """What the history holds at the start of an episode: ``repeat`` for copies of the first frame, as the robot's own
     controller fills it, or ``zeros`` as published. It becomes part of the policy contract."""
     noise: NoiseConfiguration = NoiseConfiguration()
-    scan_length: float = 1.6
+    scan_length: _Metres = 1.6
     """Extent of the height scan along the heading [m]."""
-    scan_width: float = 1.0
+    scan_width: _Metres = 1.0
     """Extent of the height scan across the heading [m]."""
-    scan_spacing: float = 0.1
+    scan_spacing: _Metres = 0.1
     """Distance between scan points [m]."""
-    scan_cell: float = 0.05
+    scan_cell: _Metres = 0.05
     """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
     own: tuple[OwnObservation, ...] = ()
     """Entries of one's own behind those of ``privileged``. The mirror images of ``training.algorithm.symmetry`` do not
@@ -189,7 +194,7 @@ class RewardConfiguration:
     termination: float = 0.0
     """Falls, counted once and not per second."""
 
-    tracking_sigma: float = 0.25
+    tracking_sigma: Positive = 0.25
     """Width of the tracking kernels, exp(-error²/sigma) [m²/s² and rad²/s²]."""
     dynamic_sigma: bool = True
     """Whether sigma grows with command and terrain level (paper, dynamic velocity tracking precision adjustment)."""
@@ -205,7 +210,7 @@ class RewardConfiguration:
     """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
     collision_force: float = 0.1
     """Contact force from which a thigh, a calf or the base counts as touching [N]."""
-    soft_limit: float = 0.9
+    soft_limit: Share = 0.9
     """Share of a joint's range, about its middle, that is free of the joint-limit penalty."""
     own: tuple[OwnReward, ...] = ()
     """Terms of one's own."""
@@ -215,7 +220,7 @@ class RewardConfiguration:
 class CommandStage:
     """Ranges that commands are drawn from, from a fraction of the run on."""
 
-    begin: float
+    begin: Share
     """Fraction of the run at which the stage begins."""
     forward: Range
     """Forward velocity [m/s]."""
@@ -235,28 +240,28 @@ class CommandConfiguration:
         CommandStage(begin=0.3, forward=(-2.0, 2.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
     )
     """Command curriculum; a terrain's own limits cap every stage."""
-    interval: float = 5.0
+    interval: Positive = 5.0
     """Time between two draws [s]."""
     dynamic: bool = True
     """Whether the smallest speed drawn makes sure that the robot can still leave its tile in the rest of the episode.
     """
     required_distance: float = 5.0
     """Distance that the commands of an episode shall add up to at least [m] (``dynamic``)."""
-    straight_probability: float = 0.3
+    straight_probability: Share = 0.3
     """Share of the uniform draws with zero yaw rate. Published: 0; the gauge's commands are all straight or a pure
     turn."""
-    extreme_probability: float = 0.2
+    extreme_probability: Share = 0.2
     """Share of draws with every axis at a limit or zero."""
     extreme_zero_probability: tuple[float, float, float] = (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)
     """Chance of the forward, lateral and yaw speed of an extreme command to be zero. Published: 0, 0 and 1/3, and 0, 1
     and 1/3 for the fast task."""
-    flip_probability: float = 0.2
+    flip_probability: Share = 0.2
     """Chance that an extreme command is followed by its opposite."""
     stationary_probability: Ramp = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
     """Share of stationary draws, without linear velocity."""
-    stationary_yaw_probability: float = 0.25
+    stationary_yaw_probability: Share = 0.25
     """Chance that a stationary command keeps its yaw rate, so that the robot turns on the spot. Published: always."""
-    stationary_longest: float = 3.0
+    stationary_longest: NotNegative = 3.0
     """Longest stationary command [s]."""
     generator: str = "gaitgauge.training.commands:CommandGenerator"
     """``module:class`` that draws commands, this one or one derived from it."""
@@ -268,11 +273,11 @@ class TileConfiguration:
 
     name: str
     """A kind out of ``terrains.training_tiles.TILE_KINDS``."""
-    share: float
+    share: NotNegative
     """Share of the environments, relative to the other kinds'; 0 leaves the kind out."""
     command_limits: tuple[float, float, float]
     """Largest forward, lateral [m/s] and yaw [rad/s] command on this kind."""
-    sigma: float
+    sigma: Positive
     """Largest tracking sigma on this kind (``RewardConfiguration.dynamic_sigma``)."""
     ends: bool = True
     """Whether the kind has an edge at which ``TerrainConfiguration.leave_distance`` acts."""
@@ -305,15 +310,15 @@ class TerrainConfiguration:
     """Kinds of training tile."""
     shape: TileShape = DEFAULT_SHAPE
     """Dimensions of the tiles."""
-    levels: int = NUM_TILE_LEVELS
+    levels: Annotated[int, Field(ge=1, le=1000)] = NUM_TILE_LEVELS
     """Number of levels, from the easiest."""
-    variants: int = 4
+    variants: Annotated[int, Field(ge=1, le=1000)] = 4
     """Different tiles per kind and level, where a kind has chance in it."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the tiles' chance."""
     curriculum: bool = True
     """Whether levels follow success; otherwise every episode draws its level."""
-    highest_start_level: int = 5
+    highest_start_level: Annotated[int, Field(ge=0)] = 5
     """Levels at the start are uniform from 0 to this."""
     promotion_distance: float = 4.0
     """Distance from the tile's middle (larger of |x|, |y|) beyond which the level rises [m]; 4 is the tile's edge."""
@@ -326,7 +331,7 @@ class TerrainConfiguration:
     edge there is only level ground, on which the published robots had the next tile."""
     spawn_jitter: float = 1.0
     """Episodes start up to this far from the tile's middle, in x and in y [m]."""
-    spread_probability: float = 0.1
+    spread_probability: Share = 0.1
     """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; they do not move
     levels."""
     spread_distance: float = 3.0
@@ -375,11 +380,11 @@ class RandomizationConfiguration:
 class PushConfiguration:
     """Sudden changes of the base's velocity."""
 
-    interval: float = 4.0
+    interval: NotNegative = 4.0
     """Time between pushes of one world [s]; 0 for none."""
-    linear: float = 0.4
+    linear: NotNegative = 0.4
     """Largest change of the horizontal velocity per axis [m/s]."""
-    angular: float = 0.6
+    angular: NotNegative = 0.6
     """Largest change of the angular velocity per axis [rad/s]."""
     add: bool = True
     """Whether the change is added; otherwise it replaces the velocity, as published, which stops a fast robot dead."""
@@ -410,11 +415,11 @@ class EnvironmentConfiguration:
 
     robot: str = "go2"
     """Registry name of the robot, or the path of its description."""
-    num_envs: int = 8192
+    num_envs: Annotated[int, Field(ge=1, le=10_000_000)] = 8192
     """Number of worlds."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of every draw the environment makes."""
-    episode_length: float = 25.0
+    episode_length: Positive = 25.0
     """Longest episode [s]."""
     physics: PhysicsOptions = TRAINING_PHYSICS
     joints: JointConfiguration = JointConfiguration()
@@ -429,5 +434,5 @@ class EnvironmentConfiguration:
     termination: TerminationConfiguration = TerminationConfiguration()
     events: tuple[OwnEvent, ...] = ()
     """Events of one's own."""
-    log_interval: int = 8
+    log_interval: Count = 8
     """Environment steps between two logs of finished episodes; each log costs the learner's logger time."""

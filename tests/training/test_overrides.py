@@ -145,3 +145,22 @@ def test_task_name_cannot_be_overridden():
     with pytest.raises(TaskError, match="unknown setting 'name'"):
         find_task("go2-cts", ["name=x"])
     assert replace(TASKS["go2-cts"], name="x") != TASKS["go2-cts"]
+
+
+@pytest.mark.parametrize(
+    ("override", "rule"),
+    [
+        ("environment.num_envs=0", "greater than or equal to 1"),
+        ("environment.seed=-1", "greater than or equal to 0"),
+        (f"training.run.seed={10**300}", "less than"),
+        ("environment.terrain.levels=0", "greater than or equal to 1"),
+        ("environment.observations.history_length=1000000000", "less than or equal to 1000"),
+        ("environment.commands.flip_probability=1.5", "less than or equal to 1"),
+        ("environment.schedule.horizon_steps=0", "greater than or equal to 1"),
+        ("environment.physics.iterations=0", "greater than or equal to 1"),
+        ("environment.terrain.tiles.flat.share=-1", "greater than or equal to 0"),
+    ],
+)
+def test_settings_have_ranges(override, rule):
+    with pytest.raises(TaskError, match=f"{override.partition('=')[0]}' is .*; it must be {rule}"):
+        find_task("go2-moe-cts", [override])
