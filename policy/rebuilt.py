@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import logging
+
 import torch
 
 from .base import PolicyError, PolicySession
@@ -45,13 +48,20 @@ def rebuilt(policy: FilePolicy) -> FilePolicy:
         return policy
     try:
         made = RebuiltPolicy(policy.contract, file, _program(policy, file), path=policy.path)
+        if _acts_alike(policy, made):
+            return made
+        policy.not_rebuilt = "what was rebuilt of it acts differently"
     except NotUnderstoodError as reason:
         policy.not_rebuilt = str(reason)
-        return policy
-    if _acts_alike(policy, made):
-        return made
-    policy.not_rebuilt = "what was rebuilt of it acts differently"
+    _say(policy.path, policy.not_rebuilt)
     return policy
+
+
+@functools.cache  # once, and not again in each process that is forked from this one
+def _say(path: str, reason: str) -> None:
+    logging.getLogger(__name__).warning(
+        "'%s' is run with its own code, which is slower than a network of which the weights are known: %s", path, reason
+    )
 
 
 def _program(policy: FilePolicy, file: ForeignFile) -> Program:

@@ -8,6 +8,8 @@ trial; a policy for which they matter goes through its network row by row, which
 
 from __future__ import annotations
 
+import logging
+
 import torch
 
 from .base import Policy, PolicySession
@@ -53,6 +55,7 @@ def steady_session(policy: Policy, num_episodes: int) -> tuple[PolicySession, bo
         The session, and whether it may also be asked for the actions of any multiple of eight rows.
     """
     if not _same(policy, ROWS):
+        logging.getLogger(__name__).warning("'%s' goes through its network row by row, which is slow", policy.path)
         return policy.rowwise_session(num_episodes), False
     fewer = all(_same(policy, count) for count in range(8, ROWS, 8))
     if num_episodes == ROWS:

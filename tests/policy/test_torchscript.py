@@ -182,6 +182,12 @@ def test_batch_equals_single_modules(tmp_path, cts_network, observations, name, 
                 np.testing.assert_allclose(actions[step, row], expected[0], atol=1e-5)
 
 
+def test_what_is_not_rebuilt_is_said(tmp_path, cts_network, caplog):
+    policy = load_policy(save(modules(cts_network)["counting"], tmp_path / "policy.pt"))
+    assert policy.not_rebuilt == "it changes 'steps', which is no tensor"
+    assert policy.not_rebuilt in caplog.text and policy.path in caplog.text
+
+
 @pytest.mark.parametrize("name", ["history", "recurrent", "fixed", "counting"])
 def test_reset_rows_and_repeat(tmp_path, cts_network, observations, name, run):
     policy = load_policy(save(modules(cts_network)[name], tmp_path / "policy.pt"))

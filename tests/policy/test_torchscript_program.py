@@ -145,6 +145,16 @@ def test_acts_as_the_file(module, contract, run):
                 assert torch.allclose(actions[step, row], expected.reshape(-1), atol=1e-6)
 
 
+@pytest.mark.parametrize("module", [SharedHead, GroupedHeads, Loop], ids=lambda module: module.__name__)
+def test_all_of_it_moves_to_another_device(module, contract):
+    """The device without numbers stands for a GPU: whatever stayed behind would be refused."""
+    elsewhere = torch.device("meta")
+    session = ProgramSession(torchscript_program(script(module()), 45, source="file"), EPISODES, contract, elsewhere)
+    session.reset(torch.zeros(EPISODES, dtype=torch.bool, device=elsewhere))
+    action = session.act(torch.zeros(EPISODES, 45, device=elsewhere))
+    assert action.shape == (EPISODES, 12) and action.device == elsewhere
+
+
 def test_no_robot_influences_another(contract, run):
     program = torchscript_program(script(GroupedHeads()), 45, source="file")
     observations = torch.randn(10, EPISODES, 45, generator=torch.Generator().manual_seed(2))
