@@ -12,7 +12,7 @@ from typing import Any
 import typer
 from rich.text import Text
 
-from ..gauge.consistency.page import FIELD_LABELS, TESTS, verdict, write_page
+from ..gauge.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
 from ..gauge.consistency.study import Request, Status, prepare_study, study
 from .console import Terminal, make_table, shell_command
 from .progress import ProgressDisplay
@@ -82,7 +82,7 @@ def print_study(console: Terminal, results: Mapping[str, Any]) -> None:
         _print_attribution(console, policy["attribution"])
         _print_gaps(console, policy)
         for label, pair in policy["pairs"].items():
-            console.say(Text.assemble((label, "bold"), f": {verdict(pair['overall'])}"))
+            console.say(Text.assemble((label, "bold"), f": {verdict(pair['overall'], results['margin'])}"))
         for label, health in policy["health"].items():
             troubles = [
                 f"{health[k]} {word}"
@@ -139,10 +139,9 @@ def _print_open_loop(console: Terminal, block: Mapping[str, Any]) -> None:
 
 
 def _print_pair(console: Terminal, reference: str, label: str, pair: Mapping[str, Any]) -> None:
-    columns = ("terrain", reference, label, "gap", "floor", "difference", "95 % interval", "same fall", "same reach")
-    table = make_table(
-        f"closed loop: quality (mean@50) of the same episodes, {label} against {reference}", *columns, numbers=True
-    )
+    columns = ("terrain", reference, label, "gap", "floor", "excess", "difference", "95 % interval", "verdict")
+    title = f"closed loop: quality (mean@50) of the same episodes, {label} against {reference}"
+    table = make_table(title, *columns, "same fall", "same reach", numbers=True)
     for place, row in {**pair["terrains"], "overall": pair["overall"]}.items():
         low, high = row["difference"]["interval"]
         outcomes = [row["outcomes"][k] for k in ("fell", "reached")]
@@ -152,8 +151,10 @@ def _print_pair(console: Terminal, reference: str, label: str, pair: Mapping[str
             f"{row['compared_score']:.4f}",
             _small(row["gap"]["value"]),
             "" if row["floor"] is None else _small(row["floor"]["value"]),
+            "" if row["excess"] is None else _signed(row["excess"]["value"]),
             _signed(row["difference"]["value"]),
             _range(low, high),
+            row["verdict"],
             *("" if o is None else f"{100 * o['same']:.0f} %" for o in outcomes),
         )
     console.print(table)
@@ -188,7 +189,8 @@ def _print_attribution(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> 
         cells = []
         for engine in engines:
             to = row["to"].get(engine)
-            cells.append("" if to is None else f"{_small(to['gap_before'])} → {_small(to['gap_after'])}")
+            change = "" if to is None else f"{_small(to['gap_before'])} → {_small(to['gap_after'])}, {cause(to)}"
+            cells.append(change)
         table.add_row(row["title"], row["engine"], _signed(row["difference"]["value"]), _range(low, high), *cells)
     console.print(table)
     for row in rows:

@@ -236,6 +236,10 @@ def consistency(
         list[str] | None,
         typer.Option(help="Factor that the attribution switches; repeatable. Default: all (docs/consistency.md)."),
     ] = None,
+    margin: Annotated[
+        float,
+        typer.Option(min=0.0, help="Difference of quality that does not matter: below it engines are equivalent."),
+    ] = 0.02,
     attribution: Annotated[bool, typer.Option(help="Switch one factor at a time and see what it does.")] = True,
     threads: Annotated[
         int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")
@@ -261,6 +265,7 @@ def consistency(
         frictions=tuple(friction or ()),
         levels=tuple(level or ()),
         seeds=seeds,
+        margin=margin,
         factors=tuple(factor or ()),
         attribution=attribution,
         threads=threads,

@@ -28,6 +28,7 @@ from ..policy.base import Policy
 from ..policy.contract import check_robot
 from ..policy.loading import find_policy, load_policy
 from ..robots import Robot, RobotError, load_robot
+from ..robots.loading import robot_digest
 from ..terrains.registry import make_terrain, terrain_names
 from .dispatcher import Dispatcher, Speculation, play
 from .episodes import QUALITY, Episode
@@ -203,6 +204,7 @@ def identity(prepared: Prepared) -> dict[str, Any]:
         "backend": request.backend,
         "device": torch.device(request.device).type,
         "robot": request.robot,
+        "robot_digest": robot_digest(prepared.robot),
         "level": request.level,
         "environments": [e.key for e in prepared.environments],
         "seeds": list(prepared.seeds),
@@ -269,7 +271,11 @@ def evaluate(
             command=command,
             device=request.device,
             threads=request.threads,
-            digests={"policy": policy_digest(request.policy), "suite": suite.digest},
+            digests={
+                "policy": policy_digest(request.policy),
+                "suite": suite.digest,
+                "robot": robot_digest(prepared.robot),
+            },
             seconds=round(time.perf_counter() - began, 2),
             physics_steps=effort.physics_steps,
             processes=count,

@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import islice
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -32,6 +33,14 @@ from .world_buffers import SegmentCounts
 POLL_INTERVAL = 10
 """Control steps between two polls of a GPU. A poll waits for the device and moves robots with one more physics step of all
 worlds; until it comes, a segment that has ended keeps its world for some steps. Ten make either a small part of the time."""
+
+
+@runtime_checkable
+class EpisodeAware(Protocol):
+    """A backend that wants to know what its worlds play."""
+
+    def assign(self, worlds: Sequence[int], names: Sequence[str]) -> None:
+        """Called before some worlds are reset for other segments, with names that are those segments' own."""
 
 
 class Rollout:
@@ -208,6 +217,8 @@ class Rollout:
             step.samples.reserve(math.ceil(substeps / suite.metrics.interval) + 2)
         step.samples.clear(step.buffers.mask(worlds))
         self._randomize(worlds, episodes)
+        if isinstance(self.backend, EpisodeAware):
+            self.backend.assign(worlds, [f"{s.episode.key} {s.goal} {s.sub_command}" for s in segments])
         most = max(rules.most_steps(s) for s in segments)
         step.read_noise(worlds, episodes, [rules.noise_start(s) for s in segments], most)
         self._segments.update(zip(worlds, segments, strict=True))

@@ -17,7 +17,9 @@ from .errors import ConsistencyError
 from .variants import Value, Variant
 
 PERTURBATION = 1e-7
-"""Relative change of the state at each reset that shows what chaos alone does: one rounding of float32."""
+"""Relative change of the state at each reset, and of the targets, that shows what chaos alone does: one rounding of float32."""
+FLOOR_DRAWS = 3
+"""Times that the reference engine is perturbed, each time otherwise: one draw would take its own luck for the floor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +32,7 @@ class Factor:
     """Field of ``PhysicsOptions``; empty for a perturbed state."""
     value: Value = None
     perturbation: float = 0.0
-    """Relative change of the state at each reset, where there is no option."""
+    """Relative change of the state at each reset, where there is no option; 0 for single precision all along."""
     fixed_buffers_only: bool = False
     """Whether it means something only to engines that hold contacts in buffers of fixed size."""
 
@@ -44,16 +46,23 @@ class Factor:
 
     def switch(self, variant: Variant) -> Variant:
         """The engine with the factor switched."""
-        return variant.switched(self.option, self.value) if self.option else perturbed(variant, self.perturbation)
+        if self.option:
+            return variant.switched(self.option, self.value)
+        return perturbed(variant, self.perturbation) if self.perturbation else rounded(variant)
 
 
-def perturbed(variant: Variant, magnitude: float = PERTURBATION) -> Variant:
+def perturbed(variant: Variant, magnitude: float) -> Variant:
     """The same engine from states put off by a relative amount."""
     return replace(variant, perturbation=magnitude, draw=1)
 
 
+def rounded(variant: Variant, draw: int = 1) -> Variant:
+    """The same engine with state and targets put off as single precision puts them off."""
+    return replace(variant, perturbation=PERTURBATION, draw=draw, rounding=True)
+
+
 FACTORS: tuple[Factor, ...] = (
-    Factor(name="precision", title="initial state off by 1e-7, as in float32", perturbation=PERTURBATION),
+    Factor(name="precision", title="state and targets off by 1e-7, as in float32"),
     Factor(name="state-1e-5", title="initial state off by 1e-5", perturbation=1e-5),
     Factor(name="state-1e-3", title="initial state off by 1e-3", perturbation=1e-3),
     Factor(name="timestep-1ms", title="timestep 1 ms", option="timestep", value=0.001),
@@ -100,7 +109,7 @@ def effect_of_switch(
     Returns:
         Plain data: ``gap`` and signed ``difference`` of the engine to itself, ``metrics`` with their signed differences, and
         for each other engine the ``gap_before`` and ``gap_after`` the switch with the paired ``change``: where its interval lies
-        below zero, the switch brings the engines together.
+        below zero, the switch brings the engines together; where it is ``equivalent`` to none, the factor is no cause.
     """
     first, second = design.table(base), design.table(switched)
     shift = second.column(QUALITY) - first.column(QUALITY)
@@ -112,7 +121,7 @@ def effect_of_switch(
         to[label] = {
             "gap_before": design.mean(before),
             "gap_after": design.mean(after),
-            "change": design.estimate(after - before, f"{name}/{label}/change").plain(),
+            **design.judged(after - before, f"{name}/{label}/change", key="change"),
         }
     return {
         "score": design.mean(second.column(QUALITY)),

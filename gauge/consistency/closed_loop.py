@@ -26,7 +26,16 @@ from ..scoring import run_statistics
 from ..segments import count_segments
 from ..suite import Suite
 from ..workers import Job, local_workers, start_workers
-from .statistics import Array, Estimate, effect_size, outcome_agreement, paired_mean, terrain_weights
+from .statistics import (
+    MARGIN,
+    Array,
+    Estimate,
+    OutcomeAgreement,
+    effect_size,
+    outcome_agreement,
+    paired_mean,
+    terrain_weights,
+)
 from .variants import MakeBackend, Variant
 
 _WORLDS = 24
@@ -152,6 +161,8 @@ class Design:
     suite: Suite
     cells: tuple[Cell, ...]
     seeds: tuple[int, ...]
+    margin: float = MARGIN
+    """Difference of quality that does not matter."""
 
     @property
     def shared_draws(self) -> bool:
@@ -186,6 +197,13 @@ class Design:
             magnitude=magnitude,
         )
 
+    def judged(
+        self, values: Array, name: str, rows: Sequence[int] | None = None, *, key: str = "difference"
+    ) -> dict[str, Any]:
+        """A signed estimate under its key, and its ``verdict``."""
+        found = self.estimate(values, name, rows)
+        return {key: found.plain(), "verdict": found.verdict(self.margin)}
+
     def mean(self, values: Array, rows: Sequence[int] | None = None) -> float:
         """The same mean without its interval."""
         chosen = list(range(len(self.cells)) if rows is None else rows)
@@ -193,7 +211,7 @@ class Design:
 
 
 def compare(
-    design: Design, reference: Records, compared: Records, *, floor: Records | None = None, name: str
+    design: Design, reference: Records, compared: Records, *, floor: Sequence[Records] = (), name: str
 ) -> dict[str, Any]:
     """Compare two runs of the same episodes.
 
@@ -201,16 +219,16 @@ def compare(
         design: the episodes.
         reference: records of the one run.
         compared: records of the other.
-        floor: records of the reference engine from a state put off by a hair: what chaos alone does.
+        floor: records of the reference engine put off by a hair, once for each draw: what chaos alone does.
         name: seeds the intervals' generators.
 
     Returns:
         Plain data: ``overall`` and ``terrains``, each with ``gap`` (mean |Δ| of the quality's mean@50), ``difference`` (its
-        signed mean, compared less reference), the ``floor`` gap and the ``excess`` of the gap over it, the metrics' signed
-        differences and effect sizes, and how often falls and reached targets agree; ``episodes``, one row each.
+        signed mean, compared less reference) and its ``verdict``, the ``floor`` gap and the ``excess`` of the gap over it, the
+        metrics' signed differences and effect sizes, and how often falls and reached targets agree; ``episodes``, one row each.
     """
     first, second = design.table(reference), design.table(compared)
-    chaos = None if floor is None else np.abs(design.table(floor).column(QUALITY) - first.column(QUALITY))
+    chaos = _chaos(design, reference, floor) if floor else None
 
     def block(rows: Sequence[int], label: str) -> dict[str, Any]:
         key = f"{name}/{label}"
@@ -221,15 +239,13 @@ def compare(
             "reference_score": design.mean(first.column(QUALITY), picked),
             "compared_score": design.mean(second.column(QUALITY), picked),
             "gap": design.estimate(gap, f"{key}/gap", picked, magnitude=True).plain(),
-            "difference": design.estimate(difference, f"{key}/difference", picked).plain(),
+            **design.judged(difference, f"{key}/difference", picked),
             "effect_size": effect_size(difference[picked]),
             "floor": None if chaos is None else design.estimate(chaos, f"{key}/floor", picked, magnitude=True).plain(),
             "excess": None if chaos is None else design.estimate(gap - chaos, f"{key}/excess", picked).plain(),
             "metrics": {},
             "outcomes": _outcomes(design, reference, compared, picked),
         }
-        low, high = entry["difference"]["interval"]
-        entry["agrees"] = low <= 0.0 <= high
         for metric in first.columns[:-1]:
             shift = second.column(metric) - first.column(metric)
             entry["metrics"][metric] = {
@@ -240,12 +256,7 @@ def compare(
             }
         return entry
 
-    terrains = dict.fromkeys(c.terrain for c in design.cells)
-    return {
-        "overall": block(range(len(design.cells)), "overall"),
-        "terrains": {t: block([i for i, c in enumerate(design.cells) if c.terrain == t], t) for t in terrains},
-        "episodes": _rows(design, reference, compared, first, second),
-    }
+    return {**_by_terrain(design, block), "episodes": _rows(design, reference, compared, first, second)}
 
 
 def gap_only(design: Design, first: Records, second: Records, name: str) -> dict[str, Any]:
@@ -255,9 +266,30 @@ def gap_only(design: Design, first: Records, second: Records, name: str) -> dict
     def block(rows: Sequence[int], label: str) -> dict[str, Any]:
         return {
             "gap": design.estimate(np.abs(difference), f"{name}/{label}/gap", rows, magnitude=True).plain(),
-            "difference": design.estimate(difference, f"{name}/{label}/difference", rows).plain(),
+            **design.judged(difference, f"{name}/{label}/difference", rows),
         }
 
+    return _by_terrain(design, block)
+
+
+def floor_only(design: Design, reference: Records, draws: Sequence[Records], name: str) -> dict[str, Any]:
+    """The gap of an engine to itself put off by a hair, the mean over draws: overall and for each terrain."""
+    chaos = _chaos(design, reference, draws)
+
+    def block(rows: Sequence[int], label: str) -> dict[str, Any]:
+        return {"gap": design.estimate(chaos, f"{name}/{label}/gap", rows, magnitude=True).plain()}
+
+    return _by_terrain(design, block)
+
+
+def _chaos(design: Design, reference: Records, draws: Sequence[Records]) -> Array:
+    """Mean over draws of how far each episode's quality comes from the reference's, (C, S)."""
+    base = design.table(reference).column(QUALITY)
+    found: Array = np.mean([np.abs(design.table(records).column(QUALITY) - base) for records in draws], axis=0)
+    return found
+
+
+def _by_terrain(design: Design, block: Callable[[Sequence[int], str], dict[str, Any]]) -> dict[str, Any]:
     terrains = dict.fromkeys(c.terrain for c in design.cells)
     return {
         "overall": block(range(len(design.cells)), "overall"),
@@ -283,8 +315,16 @@ def _outcomes(design: Design, reference: Records, compared: Records, rows: Seque
     ]
     walks = [(a, b) for a, b in pairs if a.episode.stage == "eval"]
     crossings = [(a, b) for a, b in pairs if a.episode.stage == "search"]
-    fell = outcome_agreement([a.falls > 0 for a, _ in walks], [b.falls > 0 for _, b in walks])
-    reached = outcome_agreement([bool(a.success) for a, _ in crossings], [bool(b.success) for _, b in crossings])
+
+    def agreement(
+        chosen: Sequence[tuple[Record, Record]], outcome: Callable[[Record], bool]
+    ) -> OutcomeAgreement | None:
+        seeds = [a.episode.seed for a, _ in chosen]
+        first, second = [outcome(a) for a, _ in chosen], [outcome(b) for _, b in chosen]
+        return outcome_agreement(first, second, seeds, shared=design.shared_draws)
+
+    fell = agreement(walks, lambda record: record.falls > 0)
+    reached = agreement(crossings, lambda record: bool(record.success))
     return {"fell": None if fell is None else fell.plain(), "reached": None if reached is None else reached.plain()}
 
 

@@ -14,6 +14,7 @@ from ..charts import number, terrain_label
 from ..report import TEMPLATES, metric_label
 from ..store import StoreError
 from . import charts
+from .statistics import DIFFERENT, EQUIVALENT
 from .study import SCHEMA
 
 CURVES = {
@@ -107,16 +108,18 @@ def page_data(results: Mapping[str, Any]) -> dict[str, Any]:
         "skipped": results["skipped"],
         "shared_draws": results["shared_draws"],
         "seeds": len(results["seeds"]),
-        "policies": [_policy(p, results["reference"]) for p in results["policies"]],
+        "policies": [_policy(p, results["reference"], results["margin"]) for p in results["policies"]],
         "fields": FIELD_LABELS,
         "devices": results["devices"],
         "suite": suite,
         "resamples": results["resamples"],
+        "margin": results["margin"],
+        "draws": results["draws"],
         "provenance": provenance,
     }
 
 
-def _policy(block: Mapping[str, Any], reference: str) -> dict[str, Any]:
+def _policy(block: Mapping[str, Any], reference: str, margin: float) -> dict[str, Any]:
     """One policy's part of the page."""
     gaps = [{"pair": g["pair"], "place": "overall", **g["overall"]} for g in block["gaps"]]
     scale = charts.common_scale([g["gap"] for g in gaps] + [block["floor"]["overall"]["gap"]], signed=False)
@@ -129,7 +132,9 @@ def _policy(block: Mapping[str, Any], reference: str) -> dict[str, Any]:
         "gaps": gaps,
         "gap_scale": charts.strip_scale(scale),
         "floor": block["floor"]["overall"]["gap"],
-        "verdicts": [{"label": label, "text": verdict(pair["overall"])} for label, pair in block["pairs"].items()],
+        "verdicts": [
+            {"label": label, "text": verdict(pair["overall"], margin)} for label, pair in block["pairs"].items()
+        ],
         "pairs": {label: _pair(pair) for label, pair in block["pairs"].items()},
         "models": block["models"],
         "open_loop": _open_loop(block["open_loop"], reference),
@@ -139,21 +144,43 @@ def _policy(block: Mapping[str, Any], reference: str) -> dict[str, Any]:
     }
 
 
-def verdict(overall: Mapping[str, Any]) -> str:
-    """What a comparison says, in one sentence."""
-    difference = overall["difference"]
+def verdict(overall: Mapping[str, Any], margin: float) -> str:
+    """What a comparison says, in one sentence.
+
+    Args:
+        overall: of a pair of engines.
+        margin: difference of quality that does not matter.
+    """
+    difference, excess = overall["difference"], overall["excess"]
     low, high = difference["interval"]
-    if overall["agrees"]:
-        text = f"The scores agree within the interval: the difference lies between {_signed(low)} and {_signed(high)}"
-    else:
+    where = f"{_signed(low)} to {_signed(high)}"
+    if overall["verdict"] == EQUIVALENT:
+        text = f"The qualities are equivalent: their difference ({where}) lies within ±{margin:g}"
+    elif overall["verdict"] == DIFFERENT:
         side = "higher" if difference["value"] > 0 else "lower"
-        text = f"The score is {side} by {_fixed(abs(difference['value']))} ({_signed(low)} to {_signed(high)})"
-    excess = overall["excess"]
+        text = f"The quality is {side} by {_fixed(abs(difference['value']))} ({where})"
+    else:
+        text = f"Whether the qualities differ is open: the difference lies between {_signed(low)} and {_signed(high)}"
     if excess is None:
         return text + "."
-    if excess["interval"][0] > 0.0:
-        return f"{text}; single episodes differ by more than chaos makes them differ in the reference engine alone."
-    return f"{text}; single episodes differ no more than chaos makes them differ in the reference engine alone."
+    low, high = excess["interval"]
+    if low > 0.0:
+        return f"{text}; single episodes differ by more than single precision makes them differ in the reference engine alone."
+    if high < margin:
+        return (
+            f"{text}; single episodes differ by no more than single precision makes them differ in the reference engine alone, "
+            f"to within {margin:g}."
+        )
+    return f"{text}; single episodes may differ by up to {_fixed(high)} more than single precision explains: more seeds would tell."
+
+
+def cause(to: Mapping[str, Any]) -> str:
+    """What a switch's change of the gap to another engine says of it."""
+    if to["verdict"] == EQUIVALENT:
+        return "no cause"
+    if to["verdict"] == DIFFERENT:
+        return "a cause" if to["change"]["value"] < 0.0 else "drives apart"
+    return str(to["verdict"])
 
 
 def _pair(pair: Mapping[str, Any]) -> dict[str, Any]:
@@ -217,7 +244,10 @@ def _attribution(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         {
             **r,
             "strip": charts.strip(r["difference"], scale),
-            "to": {label: {**t, "strip": charts.strip(t["change"], changes)} for label, t in r["to"].items()},
+            "to": {
+                label: {**t, "cause": cause(t), "strip": charts.strip(t["change"], changes)}
+                for label, t in r["to"].items()
+            },
         }
         for r in played
     ]

@@ -19,6 +19,7 @@ from ...files.writing import write_atomically
 from ...policy.base import Policy
 from ...robots import Robot
 from ...robots.geometry import total_mass
+from ...robots.loading import robot_digest
 from ...terrains.registry import gauge_terrain_names
 from ..evaluate import Request as EvaluateRequest
 from ..evaluate import policy_digest, prepare
@@ -26,14 +27,15 @@ from ..plan import Records
 from ..sampling import GRAVITY
 from ..store import RunFolder, StoreError
 from ..suite import Suite, SuiteError, load_suite
-from .attribution import Factor, choose_factors, effect_of_switch, perturbed
-from .closed_loop import Cell, Design, compare, gap_only, health_of, make_cells, play_variant
+from .attribution import FLOOR_DRAWS, Factor, choose_factors, effect_of_switch, rounded
+from .closed_loop import Cell, Design, compare, floor_only, gap_only, health_of, make_cells, play_variant
 from .errors import ConsistencyError
 from .models import compare_models
 from .open_loop import Trajectory, compare_trajectories, record_targets, replay
+from .statistics import MARGIN
 from .variants import MakeBackend, Variant, parse_variant, place
 
-SCHEMA = 1
+SCHEMA = 2
 LEVEL = 3
 """Level of terrains that have levels, where none is asked for."""
 SEEDS_CPU, SEEDS_GPU = 3, 10
@@ -61,6 +63,8 @@ class Request:
     """Empty: the nominal one on a CPU, all of the suite's where every engine but the reference runs on a GPU."""
     seeds: int | None = None
     """Number of seeds, at least 2; None: 3 on a CPU, 10 on a GPU."""
+    margin: float = MARGIN
+    """Difference of quality that does not matter: engines whose difference surely lies within it are equivalent."""
     attribution: bool = True
     factors: tuple[str, ...] = ()
     """Factors to switch; empty: all."""
@@ -106,7 +110,7 @@ class _Prepared:
     @property
     def design(self) -> Design:
         """What is compared."""
-        return Design(suite=self.suite, cells=tuple(self.cells), seeds=self.seeds)
+        return Design(suite=self.suite, cells=tuple(self.cells), seeds=self.seeds, margin=self.request.margin)
 
     @property
     def engines(self) -> list[Variant]:
@@ -261,6 +265,8 @@ def study(
         "seeds": list(prepared.seeds),
         "shared_draws": prepared.design.shared_draws,
         "resamples": prepared.suite.scoring.bootstrap,
+        "margin": request.margin,
+        "draws": FLOOR_DRAWS,
         "policies": blocks,
         "provenance": provenance(
             command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)
@@ -296,14 +302,15 @@ class _Policy:
         """All layers; the closed loop comes first, since it finds out which engines can play these terrains."""
         prepared = self._prepared
         switches = self._switches()
-        self._parts += 1 + len(switches)
+        draws = [rounded(prepared.reference, draw) for draw in range(1, FLOOR_DRAWS + 1)]
+        self._parts += len({v.label for v in (*draws, *(factor.switch(v) for factor, v in switches))})
         for variant in prepared.engines:
             try:
                 self._play(variant)
             except BackendError as error:
                 self._unable[variant.label] = str(error)
                 prepared.drop(variant, str(error))
-        floor = self._play(perturbed(prepared.reference))
+        floor = [self._play(draw) for draw in draws]
         models, open_loop = self._open_loop()
         attribution = [self._attribute(factor, variant) for factor, variant in switches]
         reference, design = prepared.reference.label, prepared.design
@@ -329,7 +336,7 @@ class _Policy:
             "models": models,
             "open_loop": open_loop,
             "gaps": gaps,
-            "floor": gap_only(design, self._records[reference], floor, f"{self._name}/floor"),
+            "floor": floor_only(design, self._records[reference], floor, f"{self._name}/floor"),
             "pairs": pairs,
             "attribution": attribution,
             "health": {label: health_of(records) for label, records in self._records.items()},
@@ -371,12 +378,13 @@ class _Policy:
         prepared = self._prepared
         return {
             "suite": f"{prepared.suite.name} {prepared.suite.version}",
+            "suite_digest": prepared.suite.digest,
             "policy": self._policy.contract.hash,
             "policy_file": self._digest,
             "pipeline": "consistency",
             "variant": variant.label,
             "device": torch.device(variant.device).type,
-            "robot": prepared.request.robot,
+            "robot": robot_digest(prepared.robot),
             "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in prepared.cells],
             "seeds": list(prepared.seeds),
         }
@@ -431,7 +439,7 @@ class _Policy:
         targets = record_targets(prepared.reference, policy=self._policy, **settings)
         runs: dict[str, Trajectory] = {}
         descriptions: dict[str, Mapping[str, list[float]] | None] = {}
-        floor = perturbed(prepared.reference)
+        floor = rounded(prepared.reference)
         for variant in [*prepared.engines, floor]:
             runs[variant.label], descriptions[variant.label] = replay(variant, targets, **settings)
         del descriptions[floor.label]

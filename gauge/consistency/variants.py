@@ -32,12 +32,18 @@ class Variant:
     """Largest relative change of the state at each reset."""
     draw: int = 0
     """Number of the perturbation."""
+    rounding: bool = False
+    """Whether joint targets are put off as much in every control step, as single precision would."""
 
     @property
     def label(self) -> str:
         """Name for people, and the text that ``parse_variant`` reads back but for perturbations."""
         changed = "".join(f"@{name}={_shown(value)}" for name, value in self.overrides)
-        return self.backend + changed + (f"~{self.perturbation:g}#{self.draw}" if self.perturbation else "")
+        return self.backend + changed + self._perturbation
+
+    @property
+    def _perturbation(self) -> str:
+        return f"~{self.perturbation:g}{'r' if self.rounding else ''}#{self.draw}" if self.perturbation else ""
 
     @property
     def folder(self) -> str:
@@ -91,7 +97,7 @@ class Variant:
         if physics.timestep != scene.physics.timestep:
             backend = RetimedBackend(backend, scene)
         if self.perturbation:
-            backend = PerturbedBackend(backend, self.perturbation, draw=self.draw)
+            backend = PerturbedBackend(backend, self.perturbation, draw=self.draw, targets=self.rounding)
         return backend
 
 

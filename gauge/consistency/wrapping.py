@@ -1,12 +1,13 @@
 """Backends that stand before another one and change a single thing, so that the runner of episodes need not know.
 
-``RetimedBackend`` lets an engine run with another timestep under a protocol that counts substeps; ``PerturbedBackend`` moves
-the state at a reset by a hair, to see what chaos alone makes of an episode.
+``RetimedBackend`` lets an engine run with another timestep under a protocol that counts substeps; ``PerturbedBackend`` puts
+state and targets off by a hair, to see what chaos alone makes of an episode.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -21,6 +22,7 @@ from ...backends.base import (
     Scene,
     Support,
 )
+from ..noise import uniform_hash
 
 
 class WrappedBackend(PhysicsBackend):
@@ -88,32 +90,62 @@ class WrappedBackend(PhysicsBackend):
 
 
 class PerturbedBackend(WrappedBackend):
-    """Every reset puts joints and base height off by a relative amount: always the same, whatever the world or episode."""
+    """Every reset puts joints and base height off by a relative amount, by another one in every episode and segment of it.
 
-    def __init__(self, inner: PhysicsBackend, magnitude: float, *, draw: int = 0) -> None:
+    With ``targets`` the joint targets are put off as well, in every control step: single precision does not round at the start
+    alone.
+    """
+
+    def __init__(self, inner: PhysicsBackend, magnitude: float, *, draw: int = 0, targets: bool = False) -> None:
         """Perturb ``inner``.
 
         Args:
             inner: the engine.
             magnitude: largest relative change. It never is below four roundings of the engine's numbers.
             draw: number of the perturbation; each has other signs and sizes.
+            targets: whether the joint targets are put off too.
         """
         super().__init__(inner)
-        robot = inner.scene.robot
-        magnitude = max(magnitude, 4.0 * torch.finfo(inner.dtype).eps)
-        generator = torch.Generator().manual_seed(draw)
-        unit = 2.0 * torch.rand(robot.num_joints + 1, generator=generator, dtype=torch.float64) - 1.0
-        factor = (1.0 + magnitude * unit).to(inner.device, inner.dtype)
-        self._joints, self._height = factor[:-1], factor[-1]
-        self._pose = torch.tensor(robot.default_joint_position, dtype=inner.dtype, device=inner.device)
+        robot, device = inner.scene.robot, inner.device
+        self._magnitude = max(magnitude, 4.0 * torch.finfo(inner.dtype).eps)
+        self._draw, self._targets = draw, targets
+        self._pose = torch.tensor(robot.default_joint_position, dtype=inner.dtype, device=device)
+        self._index = torch.arange(robot.num_joints + 1, device=device)
+        self._key = torch.zeros(inner.num_worlds, dtype=torch.int64, device=device)
+        self._step = torch.zeros_like(self._key)
+        self.assign(range(inner.num_worlds), [""] * inner.num_worlds)
+
+    def assign(self, worlds: Sequence[int], names: Sequence[str]) -> None:
+        """Say what worlds play from the next reset on; the name decides about the perturbation."""
+        keys = [zlib.crc32(f"{self._draw} {name}".encode()) for name in names]
+        self._key[torch.tensor(list(worlds), device=self.device)] = torch.tensor(keys, device=self.device)
+
+    def _factors(self) -> torch.Tensor:
+        """One plus what is off in this step, for joints and base height, (K, J + 1)."""
+        unit = 2.0 * uniform_hash(self._key[:, None], self._step[:, None], self._index) - 1.0
+        return 1.0 + self._magnitude * unit.to(self.dtype)
 
     def reset(self, worlds: torch.Tensor | None = None, **arguments: Any) -> None:
         """See ``PhysicsBackend.reset``."""
+        if worlds is None:
+            self._step.zero_()
+        else:
+            self._step.masked_fill_(worlds, 0)
+        factors = self._factors()
         position = arguments["base_position"].to(self.dtype).clone()
-        position[:, 2] *= self._height
+        position[:, 2] *= factors[:, -1]
         asked = arguments.get("joint_position")
         joints = self._pose.expand(self.num_worlds, -1) if asked is None else asked.to(self.dtype)
-        self.inner.reset(worlds, **(arguments | {"base_position": position, "joint_position": joints * self._joints}))
+        self.inner.reset(
+            worlds, **(arguments | {"base_position": position, "joint_position": joints * factors[:, :-1]})
+        )
+
+    def step(self, joint_targets: torch.Tensor | None, **arguments: Any) -> None:
+        """See ``PhysicsBackend.step``."""
+        if self._targets and joint_targets is not None:
+            self._step += 1
+            joint_targets = joint_targets.to(self.dtype) * self._factors()[:, :-1]
+        self.inner.step(joint_targets, **arguments)
 
 
 class RetimedBackend(WrappedBackend):

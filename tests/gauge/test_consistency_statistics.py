@@ -5,14 +5,20 @@ import math
 import numpy as np
 import pytest
 from gaitgauge.gauge.consistency.statistics import (
+    DIFFERENT,
+    EQUIVALENT,
+    UNDECIDED,
+    Estimate,
     effect_size,
     outcome_agreement,
     paired_mean,
     replicates,
+    sign_flip,
     spread_of_mean,
     tail_probability,
     terrain_weights,
 )
+from scipy import stats
 
 
 def estimate(values, terrains=None, *, shared=False, resamples=4000):
@@ -31,7 +37,7 @@ def test_every_terrain_weighs_the_same_whatever_its_environments():
 def test_no_difference_has_the_interval_zero_to_zero():
     found = estimate(np.zeros((4, 3)))
     assert (found.value, found.low, found.high) == (0.0, 0.0, 0.0)
-    assert found.contains_zero
+    assert found.verdict(0.01) == EQUIVALENT
 
 
 def test_tail_is_that_of_the_expanded_percentile_interval():
@@ -117,12 +123,77 @@ def test_effect_size():
 def test_agreement_of_outcomes():
     reference = [True] * 5 + [False] * 5 + [True] * 3 + [False] * 7
     compared = [False] * 5 + [False] * 5 + [True] * 3 + [False] * 7
-    found = outcome_agreement(reference, compared)
+    found = outcome_agreement(reference, compared, range(20), shared=False)
     assert (found.both, found.only_reference, found.only_compared, found.neither) == (3, 5, 0, 12)
     assert found.share == pytest.approx(0.75)
     # Wilson: (p + z²/2n ± z sqrt(p(1-p)/n + z²/4n²)) / (1 + z²/n) with p = 0.75, n = 20, z = 1.95996
     assert found.interval == pytest.approx((0.531299, 0.888138), abs=1e-4)
     # five lone falls, all in one engine: 2 · (1/2)^5
     assert found.p_value == pytest.approx(0.0625)
-    assert outcome_agreement([], []) is None
-    assert outcome_agreement([True], [True]).p_value == 1.0
+    assert outcome_agreement([], [], [], shared=True) is None
+    assert outcome_agreement([True], [True], [0], shared=False).p_value == 1.0
+
+
+def test_episodes_of_one_seed_are_one_witness_where_they_share_its_noise():
+    """Ten environments that all fall with seed 0, in one engine alone, are one accident and not ten."""
+    seeds = np.repeat([0, 1, 2], 10)
+    reference, compared = np.zeros(30, bool), seeds == 0
+    apart = outcome_agreement(reference, compared, seeds, shared=False)
+    together = outcome_agreement(reference, compared, seeds, shared=True)
+    assert apart.p_value == pytest.approx(2 * 0.5**10)
+    assert together.p_value == 1.0
+    assert together.interval[0] < 0.2 < apart.interval[0]
+    assert apart.share == together.share
+
+
+def test_a_share_of_one_seed_could_be_any():
+    assert outcome_agreement([True, True], [True, True], [0, 0], shared=True).interval == (0.0, 1.0)
+
+
+def test_sign_flips_by_hand():
+    # of the eight sums of ±3 ±2 ±1 only 6 and -6 are as far from zero as 6; four of 4, 2, 0, -2, -4, … reach 4
+    assert sign_flip(np.array([3, 2, 1])) == pytest.approx(2 / 8)
+    assert sign_flip(np.array([3, 2, -1])) == pytest.approx(4 / 8)
+    assert sign_flip(np.array([0, 0])) == 1.0
+    lone = np.array([1] * 8 + [-1] * 2)
+    assert sign_flip(lone) == pytest.approx(stats.binomtest(8, 10).pvalue)
+
+
+def test_false_alarms_of_clustered_outcomes_stay_rare():
+    """Two engines that fall alike, seeds being lucky or not as a whole: McNemar alone calls that different every third time."""
+    generator = np.random.default_rng(4)
+    alarms = {True: 0, False: 0}
+    seeds = np.repeat(np.arange(10), 12)
+    for _ in range(200):
+        lucky = generator.random((2, 10, 1)) < 0.5
+        fell = (generator.random((2, 10, 12)) < np.where(lucky, 0.1, 0.7)).reshape(2, -1)
+        for shared in alarms:
+            alarms[shared] += outcome_agreement(*fell, seeds, shared=shared).p_value < 0.05
+    assert alarms[True] <= 0.08 * 200
+    assert alarms[False] > 0.2 * 200
+
+
+def test_shares_of_clusters_are_covered():
+    generator = np.random.default_rng(5)
+    hits = 0
+    for _ in range(300):
+        chance = generator.beta(8.0, 2.0, size=(6, 1))
+        same = generator.random((6, 10)) < chance
+        found = outcome_agreement([True] * 60, same.ravel(), np.repeat(np.arange(6), 10), shared=True)
+        hits += found.interval[0] <= 0.8 <= found.interval[1]
+    assert 0.92 <= hits / 300 <= 0.995
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "word"),
+    [
+        (-0.01, 0.015, EQUIVALENT),
+        (0.001, 0.01, EQUIVALENT),
+        (0.001, 0.03, DIFFERENT),
+        (-0.3, -0.02, DIFFERENT),
+        (-0.001, 0.03, UNDECIDED),
+        (-0.4, 0.5, UNDECIDED),
+    ],
+)
+def test_no_difference_is_said_only_where_none_that_matters_can_hide(low, high, word):
+    assert Estimate(value=(low + high) / 2, low=low, high=high).verdict(0.02) == word

@@ -14,7 +14,7 @@ from gaitgauge.gauge.consistency import open_loop
 from gaitgauge.gauge.consistency.attribution import choose_factors
 from gaitgauge.gauge.consistency.closed_loop import Design, make_cells
 from gaitgauge.gauge.consistency.errors import ConsistencyError
-from gaitgauge.gauge.consistency.page import render, write_page
+from gaitgauge.gauge.consistency.page import render, verdict, write_page
 from gaitgauge.gauge.consistency.statistics import Estimate
 from gaitgauge.gauge.consistency.study import Request, study
 from gaitgauge.gauge.store import StoreError
@@ -115,7 +115,7 @@ def test_identical_engines_have_no_gap(request_of, tmp_path):
     pair = only_pair(results)
     for block in (pair["overall"], *pair["terrains"].values()):
         assert zero(block["gap"]) and zero(block["difference"])
-        assert block["agrees"] and block["effect_size"] == 0.0
+        assert block["verdict"] == "equivalent" and block["effect_size"] == 0.0
         assert all(zero(m["difference"]) and m["effect_size"] == 0.0 for m in block["metrics"].values())
         assert block["outcomes"]["fell"]["same"] == 1.0
     assert set(pair["terrains"]) == {"flat", "slope_fd"}
@@ -135,7 +135,7 @@ def test_shifted_engine_is_found_out(request_of, tmp_path):
     assert overall["gap"]["value"] > 0.01
     assert overall["gap"]["interval"][0] > 0.0
     assert overall["excess"]["interval"][0] > 0.0
-    assert not overall["agrees"]
+    assert overall["verdict"] == "different"
     # 1 - ‖v - v*‖ / limit of a robot that stands, or drifts: only velocity tracking can tell
     assert overall["metrics"]["lin_vel_err"]["difference"]["interval"][1] < 0.0
     assert overall["difference"]["interval"][1] < 0.0
@@ -182,6 +182,7 @@ def test_attribution_switches_one_factor_and_finds_the_one_that_matters(request_
     assert zero(tolerance["to"]["fake@cone=pyramidal"]["change"])
     assert cone["gap"]["interval"][0] > 0.0
     switched = cone["to"]["fake@cone=pyramidal"]
+    assert (tolerance["to"]["fake@cone=pyramidal"]["verdict"], switched["verdict"]) == ("equivalent", "different")
     assert switched["gap_after"] == 0.0
     assert switched["change"]["interval"][1] < 0.0
     # the switched reference is the compared engine, and no episode was played twice
@@ -189,7 +190,9 @@ def test_attribution_switches_one_factor_and_finds_the_one_that_matters(request_
         "fake",
         "fake@cone=pyramidal",
         "fake@tolerance=1e-05",
-        "fake~1e-07#1",
+        "fake~1e-07r#1",
+        "fake~1e-07r#2",
+        "fake~1e-07r#3",
     ]
 
 
@@ -323,3 +326,49 @@ def test_several_policies_have_folders_of_their_own(request_of, tmp_path):
     folders = sorted(p.name for p in (tmp_path / "out").iterdir() if p.is_dir())
     assert [f[0] for f in folders] == ["1", "2"]
     assert (tmp_path / "out" / folders[1] / "fake" / "episodes").is_dir()
+
+
+# ---- what is said ---------------------------------------------------------------------------------------------------
+
+
+def judged(difference, excess, verdict_word):
+    estimates = {
+        name: {"value": sum(ends) / 2, "interval": list(ends)}
+        for name, ends in (("difference", difference), ("excess", excess))
+    }
+    return verdict({**estimates, "verdict": verdict_word}, 0.02)
+
+
+def test_two_seeds_do_not_say_no_more_than_chaos():
+    """Their excess may be anything: zero lies within, and so does ten times the margin."""
+    text = judged((-0.2, 0.25), (-0.3, 0.31), "undecided")
+    assert "no more than" not in text
+    assert "Whether the qualities differ is open" in text and "may differ by up to 0.3100 more" in text
+
+
+def test_no_difference_is_said_within_the_margin_alone():
+    text = judged((-0.003, 0.004), (-0.002, 0.005), "equivalent")
+    assert "equivalent" in text and "within ±0.02" in text and "by no more than single precision" in text
+    assert "lower by 0.0500" in judged((-0.08, -0.02), (0.01, 0.02), "different")
+    assert "by more than single precision" in judged((-0.08, -0.02), (0.01, 0.02), "different")
+
+
+def test_every_episode_and_draw_of_the_floor_has_a_perturbation_of_its_own(request_of, tmp_path):
+    resets = {}
+
+    class Listener(FakeBackend):
+        def reset(self, worlds=None, **arguments):
+            joints = arguments.get("joint_position")
+            if joints is not None:
+                resets.setdefault(id(self), set()).update(tuple(row) for row in joints.tolist())
+            super().reset(worlds, **arguments)
+
+    def make(name, scene, *, device, threads):
+        return Listener(scene)
+
+    request = request_of(backends=("fake", "fake@cone=pyramidal"), terrains=("flat",))
+    results = study(request, tmp_path / "out", make=make)
+    assert results["draws"] == 3
+    states = set().union(*resets.values())
+    # three draws; in each two seeds and every sub-command of two goals begin otherwise
+    assert len(states) >= 3 * len(results["seeds"]) * 2

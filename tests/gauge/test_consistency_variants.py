@@ -97,7 +97,7 @@ class Spy(FakeBackend):
         self.asked = []
 
     def step(self, joint_targets, **arguments):
-        self.asked.append(arguments)
+        self.asked.append(arguments | {"joint_targets": joint_targets})
         super().step(joint_targets, **arguments)
 
     def reset(self, worlds=None, **arguments):
@@ -142,17 +142,47 @@ def test_retimed_backend_keeps_the_control_period():
         RetimedBackend(FakeBackend(scene(timestep=0.005, substeps=3)), scene())
 
 
-def test_perturbation_is_small_the_same_for_all_worlds_and_differs_between_draws():
-    first, second = (PerturbedBackend(Spy(scene(3)), 1e-7, draw=d) for d in (1, 2))
-    for backend in (first, second):
-        backend.reset(**standing(backend))
-    pose = torch.tensor(GO2.default_joint_position, dtype=first.dtype)
-    off = first.inner.given["joint_position"] / pose - 1.0
+def perturbed(draw=1, names=("a", "b", "a"), **options):
+    backend = PerturbedBackend(Spy(scene(3)), 1e-7, draw=draw, **options)
+    backend.assign(range(3), names)
+    backend.reset(**standing(backend))
+    return backend
+
+
+def test_perturbations_are_small_and_the_episodes_own():
+    backend = perturbed()
+    pose = torch.tensor(GO2.default_joint_position, dtype=backend.dtype)
+    off = backend.inner.given["joint_position"] / pose - 1.0
     assert 0.0 < off.abs().max() <= 1e-7
-    assert torch.equal(off[0], off[2])
-    assert not torch.equal(first.inner.given["joint_position"], second.inner.given["joint_position"])
-    height = first.inner.given["base_position"][:, 2]
+    assert torch.equal(off[0], off[2]), "one episode, whatever its world"
+    assert not torch.equal(off[0], off[1]), "another episode"
+    assert abs(float(off.mean())) < 0.5e-7, "to either side"
+    height = backend.inner.given["base_position"][:, 2]
     assert 0.0 < (height - 0.4).abs().max() <= 1e-7
+    assert not torch.equal(backend.inner.given["joint_position"], perturbed(2).inner.given["joint_position"]), "draws"
+
+
+def test_rounding_puts_every_target_off_and_begins_anew_with_a_reset():
+    backend = perturbed(targets=True)
+    target = torch.full((3, 12), 0.5, dtype=backend.dtype)
+
+    def steps(count):
+        backend.inner.asked.clear()
+        for _ in range(count):
+            backend.step(target)
+        return [asked["joint_targets"] / target - 1.0 for asked in backend.inner.asked]
+
+    first, second = steps(2)
+    assert 0.0 < first.abs().max() <= 1e-7
+    assert not torch.equal(first, second)
+    backend.reset(torch.tensor([True, False, False]), **standing(backend))
+    again = steps(1)[0]
+    assert torch.equal(again[0], first[0])
+    assert not torch.equal(again[2], first[2]), "its episode goes on"
+    plain = perturbed()
+    plain.step(target)
+    assert torch.equal(plain.inner.asked[0]["joint_targets"], target)
+    plain.step(None, substeps=1)
 
 
 def test_variant_builds_what_it_says():

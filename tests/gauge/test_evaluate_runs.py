@@ -139,6 +139,11 @@ def test_a_whole_run(request_for, tmp_path, base):
     assert set(results["groups"]) == set(results["groups_interval"]) == {"tracking", "safety", "quality"}
     assert results["terrains"]["slope_fd"]["score"] == pytest.approx(0.09 + 0.19 * slope["quality"]["mean50"], abs=2e-4)
     assert results["health"] == {"episodes": 4, "falls": 0, "diverged": 0, "overflowed": 0}
+    assert results["suite"]["digest"] == results["provenance"]["digests"]["suite"]
+    assert {len(d) for d in results["provenance"]["digests"].values()} == {64}
+    assert results["provenance"]["digests"].keys() == {"policy", "suite", "robot"}
+    assert results["chance"]["seeds"] == [0, 1] and results["chance"]["search_seeds"] == [100, 101, 102]
+    assert results["provenance"]["processor"]
     # every episode that was played is a row, those of the level tests too
     lines = list(csv.DictReader((folder / "episodes.csv").open()))
     rows = [r for r in lines if r["command"] == "all"]
