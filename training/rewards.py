@@ -2,7 +2,7 @@
 ``REWARD_TERMS`` names them.
 
 Formulas follow the paper's table of rewards in the reading of the published code; where they differ,
-``docs/training.md`` says which was taken.
+``docs/training-choices.md`` says which was taken.
 """
 
 from __future__ import annotations

@@ -82,12 +82,18 @@ _ALL_TERRAINS_LEARNING = AlgorithmConfiguration(
 )
 
 
+_ALL_TERRAINS_ITERATIONS = 5000
+"""Two billion steps of 16,384 worlds, in all."""
+
+
 def _moe_cts() -> Task:
     return Task(
         name="go2-moe-cts",
         title="Unitree Go2 on all terrains, Mixture-of-Experts student (the paper's method)",
         environment=_ALL_TERRAINS,
-        training=TrainingConfiguration(algorithm=_ALL_TERRAINS_LEARNING),
+        training=TrainingConfiguration(
+            algorithm=_ALL_TERRAINS_LEARNING, run=RunConfiguration(iterations=_ALL_TERRAINS_ITERATIONS)
+        ),
     )
 
 
@@ -99,7 +105,7 @@ def _cts() -> Task:
         training=TrainingConfiguration(
             algorithm=_ALL_TERRAINS_LEARNING,
             network=NetworkConfiguration(student_encoder="mlp"),
-            run=RunConfiguration(experiment="go2_cts"),
+            run=RunConfiguration(experiment="go2_cts", iterations=_ALL_TERRAINS_ITERATIONS),
         ),
     )
 

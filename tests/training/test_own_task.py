@@ -8,8 +8,10 @@ import pytest
 import torch
 from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.robots import load_robot
+from gaitgauge.terrains import training_tiles
 from gaitgauge.training.algorithms.symmetry import SymmetryError, build_mirror
 from gaitgauge.training.configuration import ConfigurationError
+from gaitgauge.training.curriculum import build_palette
 from gaitgauge.training.environment import TrainingEnvironment, training_contract
 from gaitgauge.training.environment_configuration import (
     EnvironmentConfiguration,
@@ -17,6 +19,8 @@ from gaitgauge.training.environment_configuration import (
     OwnTermination,
     RewardConfiguration,
     TerminationConfiguration,
+    TerrainConfiguration,
+    TileConfiguration,
 )
 from gaitgauge.training.own_terms import resolve
 from gaitgauge.training.tasks import TaskError, find_task
@@ -108,3 +112,16 @@ def test_rules_that_settings_name_are_there():
     settings = EnvironmentConfiguration()
     assert resolve(settings.commands.generator, "").__name__ == "CommandGenerator"
     assert resolve(settings.terrain.level_rule, "").__name__ == "next_level"
+
+
+def test_the_guide_shows_the_example_and_its_tile_can_be_built(monkeypatch):
+    guide = (FOLDER.parents[1] / "docs" / "your-task.md").read_text()
+    shown = guide.split("```python\n")[1].partition("```")[0]
+    example = (FOLDER / "quiet_walk.py").read_text()
+    assert all(part.strip() in example for part in shown.split("\n\n\n"))
+    monkeypatch.setitem(training_tiles.TILE_KINDS, "kerb", None)  # taken out again at the end
+    exec(compile(guide.split("```python\n")[3].partition("```")[0], "your-task.md", "exec"), {})
+    tile = training_tiles.make_tile("kerb", 10)
+    assert [float(tile.height(x, 0.0)) for x in (0.0, 2.5, 3.5)] == [0.0, pytest.approx(0.2), 0.0]
+    kinds = (TileConfiguration(name="kerb", share=1.0, command_limits=(1.0, 0.5, 1.5), sigma=0.5),)
+    assert build_palette(TerrainConfiguration(tiles=kinds, levels=3)).index[0, 2].unique().numel() == 1
