@@ -146,6 +146,7 @@ def evaluate(
     Raises:
         SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, StoreError: one sentence.
     """
+    from .backends.registry import choose_device
     from .gauge.evaluate import Request
     from .gauge.evaluate import evaluate as run
     from .gauge.report import write_report
@@ -156,7 +157,7 @@ def evaluate(
         suite=str(suite),
         pipeline=pipeline,
         backend=backend,
-        device=device or "cpu",
+        device=choose_device(backend, device),
         robot=robot,
         terrains=tuple(terrains),
         level=level,

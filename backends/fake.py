@@ -25,6 +25,7 @@ from .base import (
     Scene,
     Support,
 )
+from .devices import find_device
 from .motor_law import MotorLimits, motor_torque
 
 GRAVITY = 9.81
@@ -122,12 +123,8 @@ class FakeBackend(PhysicsBackend):
             raise BackendError(
                 f"backend 'fake' knows robots with {len(FOOT_POINTS)} feet, '{scene.robot.name}' has {feet}"
             )
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            raise BackendError(
-                f"backend 'fake' was asked for device '{device}', but torch finds no CUDA device; use 'cpu'"
-            )
         self.scene = scene
-        self.device = torch.device(device)
+        self.device = find_device(device, self.name)
         self.dtype = torch.float64
         self.script = script or FakeScript()
         robot, worlds = scene.robot, scene.num_worlds

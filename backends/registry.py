@@ -109,9 +109,35 @@ def find_backend(name: str, device: str) -> type[PhysicsBackend]:
         BackendError: unknown engine or variant, missing package, or a device that is not there or that the engine
             cannot use.
     """
+    from .devices import find_device  # listing engines must not wait for torch
+
     found = _with_variant(name)
-    _check_device(found, device)
+    find_device(device, found.name, gpu=_can_use_gpu(found))
     return found
+
+
+def choose_device(name: str, asked: str | None = None) -> str:
+    """Where an engine runs: the device asked for, else a GPU where it can use one, else the CPU.
+
+    Raises:
+        BackendError: as ``find_backend``, or an engine that is made for a GPU on a machine without one.
+    """
+    from torch import cuda
+
+    found = find_backend(name, asked or "cpu")
+    if asked is not None:
+        return asked
+    made_for_gpu = _ABOUT.get(name.partition(":")[0], ("", (), ""))[0] == "GPU"
+    if made_for_gpu and not cuda.is_available():
+        raise BackendError(
+            f"backend '{name}' wants a GPU and this machine has none; add --device cpu (slow), or use --backend mujoco"
+        )
+    plugin = name.partition(":")[0] not in _OWN
+    return "cuda" if made_for_gpu or (plugin and _can_use_gpu(found) and cuda.is_available()) else "cpu"
+
+
+def _can_use_gpu(found: type[PhysicsBackend]) -> bool:
+    return found.capabilities()["gpu"].support is not Support.NONE
 
 
 def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int = 1) -> PhysicsBackend:
@@ -136,25 +162,3 @@ def _with_variant(name: str) -> type[PhysicsBackend]:
             f"backend '{found.name}' has no solvers to choose from, so '{name}' cannot be built; use '{found.name}'"
         )
     return with_variant(variant)
-
-
-def _check_device(found: type[PhysicsBackend], device: str) -> None:
-    """Refuse devices that do not exist, and a GPU for an engine that does not run on one."""
-    import torch  # listing engines must not wait for it
-
-    try:
-        wanted = torch.device(device)
-    except RuntimeError as error:
-        raise BackendError(f"there is no device '{device}'; give cpu, cuda or cuda:N (--device)") from error
-    if wanted.type not in ("cpu", "cuda"):
-        raise BackendError(f"device '{device}' is not supported; give cpu, cuda or cuda:N (--device)")
-    if wanted.type == "cpu":
-        return
-    if found.capabilities()["gpu"].support is Support.NONE:
-        raise BackendError(
-            f"backend '{found.name}' runs on the CPU, not on '{device}'; use --device cpu, or mujoco-warp"
-        )
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if (wanted.index or 0) >= count:
-        have = f"torch finds {count}" if count else "torch finds none (see 'gaitgauge doctor')"
-        raise BackendError(f"there is no GPU for device '{device}': {have}; use --device cpu")

@@ -12,11 +12,12 @@ from typing import Any
 import typer
 from rich.text import Text
 
+from ..backends.registry import choose_device
 from ..gauge.comparing import compare_all
 from ..gauge.comparison import format_p
 from ..gauge.evaluate import Request
 from .console import Terminal, make_table, shell_command
-from .evaluate import default_device, shower
+from .evaluate import shower
 from .progress import ProgressDisplay
 
 
@@ -36,7 +37,7 @@ def run_comparison(
         policy=contestants[0],
         suite=suite,
         backend=backend,
-        device=device or default_device(backend),
+        device=choose_device(backend, device),
         threads=threads or os.cpu_count() or 1,
         **choices,
     )

@@ -12,10 +12,10 @@ from typing import Any
 import typer
 from rich.text import Text
 
+from ..backends.registry import choose_device
 from ..gauge.evaluate import Request, Status, evaluate, prepare
 from ..gauge.report import write_report
 from .console import Terminal, make_table, shell_command
-from .errors import UserError
 from .progress import ProgressDisplay, duration
 
 
@@ -38,7 +38,7 @@ def run_evaluation(
         pipeline=pipeline,
         suite=suite,
         backend=backend,
-        device=device or default_device(backend),
+        device=choose_device(backend, device),
         threads=threads or os.cpu_count() or 1,
         **choices,
     )
@@ -61,23 +61,6 @@ def run_evaluation(
     console = Terminal()
     print_results(console, results)
     console.say(f"results  {folder / 'results.json'}\nepisodes {folder / 'episodes.csv'}\nreport   {report}")
-
-
-def default_device(backend: str) -> str:
-    """Where an engine runs by default: cuda for the Warp engines where there is one, else cpu.
-
-    Raises:
-        UserError: a Warp engine on a machine without a GPU.
-    """
-    if backend.partition(":")[0] not in ("mujoco-warp", "newton"):
-        return "cpu"
-    import torch
-
-    if torch.cuda.is_available():
-        return "cuda"
-    raise UserError(
-        f"backend '{backend}' wants a GPU and this machine has none; add --device cpu (slow), or use --backend mujoco"
-    )
 
 
 def shower(display: ProgressDisplay) -> Callable[[Status], None]:

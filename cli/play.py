@@ -60,12 +60,12 @@ def run_play(
     if chosen == "video":
         check_video_path(video)
         choose_renderer()  # before MuJoCo is imported
+    from ..backends.registry import choose_device
     from ..gauge.suite import load_suite
     from ..policy.loading import load_policy
     from ..robots import load_robot
     from ..terrains.gauge_terrains import LEVELS
     from ..terrains.registry import gauge_terrain_names, make_terrain
-    from .evaluate import default_device
     from .play_session import PlaySession, PlaySettings
     from .policies import policy_file
 
@@ -77,7 +77,7 @@ def run_play(
     robot = load_robot(policy.contract.robot)
     settings = PlaySettings(
         backend=backend,
-        device=device or default_device(backend),
+        device=choose_device(backend, device),
         friction=friction,
         seed=seed,
         suite=load_suite("gaitgauge-1"),

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from ..backends.registry import find_backend, list_backends
+from ..backends.registry import choose_device
 from ..files.parsing import build
 from ..gauge.suite import load_suite
 from ..policy.loading import find_policy
@@ -139,7 +139,6 @@ def prepare(request: TrainRequest) -> TrainPlan:
         task = find_task(request.task, [*begun, *own])
     check_logger(task.training.run.logger)
     device = _device(request.device, backend)
-    find_backend(backend, device)
     if request.capture and not device.startswith("cuda"):
         raise ConfigurationError(f"--capture replays CUDA graphs and the device is '{device}'; leave it out")
     settings = {
@@ -241,19 +240,7 @@ def _device(asked: str | None, backend: str) -> str:
     Raises:
         ConfigurationError: there is no such device here.
     """
-    engine = backend.partition(":")[0]
-    gpu_engine = any(each.name == engine and each.device == "GPU" for each in list_backends())
-    if asked is None:
-        if gpu_engine and not torch.cuda.is_available():
-            raise ConfigurationError(
-                f"backend '{backend}' wants a GPU and this machine has none; add --device cpu (slow), or use "
-                "--backend mujoco"
-            )
-        asked = "cuda" if gpu_engine else "cpu"
-    if asked != "cpu" and not torch.cuda.is_available():
-        raise ConfigurationError(
-            f"device '{asked}' was asked for and this machine has no CUDA device; use --device cpu"
-        )
+    asked = choose_device(backend, asked)
     if asked != "cuda":
         return asked
     place, gpus = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()

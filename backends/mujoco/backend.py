@@ -32,6 +32,7 @@ from ..base import (
     Support,
 )
 from ..description import ModelFields
+from ..devices import find_device
 from ..motor_law import MotorLimits
 from .model import CONTACT_SLOTS, FOOT_SLOTS, build_models
 from .state import RECORDED, BatchState, Records, StateLayout
@@ -64,12 +65,8 @@ class MujocoBackend(PhysicsBackend):
         return exact
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
-        if torch.device(device).type != "cpu":
-            raise BackendError(
-                f"backend 'mujoco' runs on the CPU, not on device '{device}'; use --device cpu, or mujoco-warp"
-            )
+        self.device = find_device(device, self.name, gpu=False)
         self.scene = scene
-        self.device = torch.device("cpu")
         self.dtype = torch.float64
         n, robot = scene.num_worlds, scene.robot
         self._limits = MotorLimits.of(scene)

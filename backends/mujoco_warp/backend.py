@@ -30,6 +30,7 @@ from ..base import (
     Scene,
     Support,
 )
+from ..devices import find_device
 from . import kernels, readout
 from .arrays import (
     StateArrays,
@@ -42,7 +43,7 @@ from .arrays import (
     shared_array,
     to_warp,
 )
-from .device import DeviceScope, bytes_per_world, find_device, is_memory_error, memory_advice
+from .device import DeviceScope, bytes_per_world, is_memory_error, memory_advice
 from .height_fields.repair import repair_height_fields
 from .model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model
 from .order import CanonicalOrder
@@ -91,7 +92,7 @@ class MujocoWarpBackend(PhysicsBackend):
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         self.scene = scene
-        self.device = find_device(device)
+        self.device = find_device(device, self.name)
         self.dtype = torch.float32
         self._scope = DeviceScope(self.device)
         self._graphs: dict[tuple[int, bool], wp.Graph] = {}

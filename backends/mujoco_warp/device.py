@@ -10,7 +10,6 @@ import mujoco_warp
 import torch
 import warp as wp
 
-from ..base import BackendError
 from .height_fields.repair import SEARCH_THREADS, scratch_bytes
 from .model import Capacity
 
@@ -20,30 +19,6 @@ _CONVEX_BYTES = 6600
 """Scratch memory of the convex solver for each contact that it has room for, with 35 iterations [bytes]."""
 _OWN_BYTES = 8000
 """This engine's own buffers, and the model fields that every world has for itself [bytes]."""
-
-
-def find_device(name: str) -> torch.device:
-    """The torch device of that name (``cpu``, ``cuda``, ``cuda:1``).
-
-    Raises:
-        BackendError: the machine has no such device.
-    """
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise BackendError(f"device '{name}' does not exist; use 'cuda', 'cuda:0' or 'cpu'") from error
-    if device.type == "cpu":
-        return torch.device("cpu")
-    if device.type != "cuda":
-        raise BackendError(f"backend 'mujoco-warp' runs on 'cuda' or 'cpu', not on device '{name}'")
-    if not torch.cuda.is_available():
-        raise BackendError(
-            f"device '{name}' was asked for, but this machine has no CUDA device; use device 'cpu' (--device cpu)"
-        )
-    index = torch.cuda.current_device() if device.index is None else device.index
-    if index >= torch.cuda.device_count():
-        raise BackendError(f"device '{name}' is not there: this machine has {torch.cuda.device_count()} CUDA devices")
-    return torch.device("cuda", index)
 
 
 class DeviceScope:

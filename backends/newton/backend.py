@@ -19,6 +19,7 @@ import torch
 import warp as wp
 
 from ..base import BackendError, Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, Scene
+from ..devices import find_device
 from ..mujoco_warp.device import is_memory_error, memory_advice
 from . import kernels
 from . import readout_kernels as readout
@@ -77,13 +78,11 @@ class NewtonBackend(PhysicsBackend):
         Raises:
             BackendError: no such device, or something that the solver cannot do.
         """
-        _check_device(device)
+        found = find_device(device, self.name)
         self.adapter.refuse(scene)
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
         wp.init()
-        self.scene, self.device, self.dtype = scene, torch.device(device), torch.float32
-        if self.device.type == "cuda" and self.device.index is None:
-            self.device = torch.device("cuda", torch.cuda.current_device())
+        self.scene, self.device, self.dtype = scene, found, torch.float32
         self._warp_device = wp.device_from_torch(self.device)
         self._graphs: dict[tuple[int, bool, bool], Any] = {}
         try:
@@ -517,16 +516,3 @@ class NewtonBackend(PhysicsBackend):
     def close(self) -> None:
         """Free the graphs."""
         self._graphs.clear()
-
-
-def _check_device(device: str) -> None:
-    """Raise where the device does not exist.
-
-    Raises:
-        BackendError: says which device to use.
-    """
-    kind = device.partition(":")[0]
-    if kind not in ("cpu", "cuda"):
-        raise BackendError(f"Newton has no device '{device}'; use 'cpu', 'cuda' or 'cuda:N'")
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise BackendError(f"there is no GPU for device '{device}'; use device 'cpu'")

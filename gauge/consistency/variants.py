@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import get_type_hints
 
-from ...backends.base import BackendError, PhysicsBackend, PhysicsOptions, Scene, Support
-from ...backends.registry import find_backend, make_backend
+from ...backends.base import PhysicsBackend, PhysicsOptions, Scene, Support
+from ...backends.registry import choose_device, find_backend, make_backend
 from ...files.parsing import from_text, one_line, shown
 from .errors import ConsistencyError
 from .wrapping import PerturbedBackend, RetimedBackend
@@ -132,21 +132,8 @@ def place(variant: Variant, device: str | None) -> Variant:
     Raises:
         BackendError: the engine is not there, or wants a GPU and there is none.
     """
-    if device is not None and device != "cpu":
-        engine = find_backend(variant.backend, "cpu")
-        on_gpu = engine.capabilities()["gpu"].support is not Support.NONE
-        wanted = device if on_gpu else "cpu"
-    elif device == "cpu" or find_backend(variant.backend, "cpu").capabilities()["gpu"].support is Support.NONE:
-        wanted = "cpu"
-    else:
-        import torch
-
-        if not torch.cuda.is_available():
-            raise BackendError(
-                f"backend '{variant.backend}' wants a GPU and this machine has none; add --device cpu (slow)"
-            )
-        wanted = "cuda"
-    find_backend(variant.backend, wanted)
+    on_gpu = find_backend(variant.backend, "cpu").capabilities()["gpu"].support is not Support.NONE
+    wanted = "cpu" if device == "cpu" or not on_gpu else choose_device(variant.backend, device)
     return replace(variant, device=wanted)
 
 

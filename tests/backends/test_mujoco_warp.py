@@ -17,7 +17,6 @@ from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
 from gaitgauge.backends.mujoco_warp.device import (
     DeviceScope,
     bytes_per_world,
-    find_device,
     is_memory_error,
     memory_advice,
 )
@@ -147,18 +146,6 @@ def test_capacity_follows_option_cone_and_number_of_worlds():
 
 
 # ---- errors --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["tpu9", "mps", "cuda:99"])
-def test_device_that_is_not_there(name):
-    with pytest.raises(BackendError, match=name):
-        find_device(name)
-
-
-def test_no_gpu_is_one_sentence(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(BackendError, match="no CUDA device; use device 'cpu'"):
-        MujocoWarpBackend(scene(FLAT), device="cuda")
 
 
 def test_memory_advice_names_a_number_that_fits():

@@ -82,7 +82,7 @@ def test_refusals_say_what_to_change(solver, physics, says):
 
 
 def test_devices_that_do_not_exist():
-    with pytest.raises(BackendError, match="use 'cpu', 'cuda' or 'cuda:N'"):
+    with pytest.raises(BackendError, match="no device 'tpu'; give cpu, cuda or cuda:N"):
         make_backend("newton", scene(), device="tpu")
 
 

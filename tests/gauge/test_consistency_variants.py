@@ -82,7 +82,7 @@ def test_place_chooses_devices(monkeypatch):
     assert place(Variant(backend="mujoco"), "cuda").device == "cpu"  # it has no use for a GPU, whatever the others get
     assert place(Variant(backend="fake"), "cpu").device == "cpu"
     with pytest.raises(BackendError, match="--device cpu"):
-        place(Variant(backend="fake"), None)
+        place(Variant(backend="mujoco-warp"), None)
     with pytest.raises(BackendError, match="no GPU"):
         place(Variant(backend="fake"), "cuda")
     with pytest.raises(BackendError, match="unknown backend"):

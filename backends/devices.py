@@ -1,0 +1,35 @@
+"""Which device an engine computes on."""
+
+from __future__ import annotations
+
+import torch
+
+from .base import BackendError
+
+
+def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
+    """The torch device of that name, with its number where it is a GPU.
+
+    Args:
+        name: ``cpu``, ``cuda`` or ``cuda:N``.
+        backend: the engine that asks, for the message.
+        gpu: whether the engine runs on GPUs.
+
+    Raises:
+        BackendError: the machine has no such device, or the engine does not run on it.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise BackendError(f"there is no device '{name}'; give cpu, cuda or cuda:N (--device)") from error
+    if device.type not in ("cpu", "cuda"):
+        raise BackendError(f"device '{name}' is not supported; give cpu, cuda or cuda:N (--device)")
+    if device.type == "cpu":
+        return torch.device("cpu")
+    if not gpu:
+        raise BackendError(f"backend '{backend}' runs on the CPU, not on '{name}'; use --device cpu, or mujoco-warp")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if (device.index or 0) >= count:
+        have = f"torch finds {count}" if count else "torch finds none (see 'gaitgauge doctor')"
+        raise BackendError(f"there is no GPU for device '{name}': {have}; use --device cpu")
+    return torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
