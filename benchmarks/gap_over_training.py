@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from gaitgauge.backends.base import PhysicsOptions
 from gaitgauge.files.writing import write_atomically
-from gaitgauge.gauge.evaluate import Request, evaluate, policy_digest, prepare
+from gaitgauge.gauge.evaluate import Request, evaluate, file_digest, prepare
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import Suite, SuiteError, load_suite
 from gaitgauge.policy.base import PolicyError
@@ -414,7 +414,7 @@ def run(options: argparse.Namespace) -> None:
             "stretch": str(checkpoint.stretch),
             "iteration": str(checkpoint.iteration),
             "environment_steps_millions": f"{checkpoint.steps:.2f}",
-            "policy_sha256": policy_digest(str(checkpoint.path)),
+            "policy_sha256": file_digest(str(checkpoint.path)),
             "protocol": " ".join(words),
             "training_physics": load_suite(training).digest[:12] if "mujoco-warp" in engines else "",
         }

@@ -8,8 +8,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -22,11 +20,13 @@ import torch
 
 from ..backends.base import PhysicsBackend
 from ..backends.registry import find_backend, make_backend
-from ..files.provenance import provenance
-from ..files.writing import write_atomically
-from ..policy.base import Policy
+from ..files.parsing import shown
+from ..files.provenance import digest, plugins, provenance, versions
+from ..files.writing import json_text, write_atomically
 from ..policy.contract import check_robot
+from ..policy.digest import policy_digest
 from ..policy.loading import find_policy, load_policy
+from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
 from ..robots.loading import robot_digest
 from ..terrains.registry import make_terrain, terrain_names
@@ -94,7 +94,7 @@ class Prepared:
     request: Request
     suite: Suite
     robot: Robot
-    policy: Policy
+    policy: FilePolicy
     environments: tuple[Environment, ...]
     seeds: tuple[int, ...]
     """Seeds of the quality episodes."""
@@ -129,8 +129,10 @@ def prepare(request: Request) -> Prepared:
         if not -5.0 <= payload <= 50.0:
             raise SuiteError(f"payload {payload:g} kg is not possible; give -5 to 50 kg (--payload)")
     for seed in request.seeds:
-        if seed < 0:
-            raise SuiteError(f"seed {seed} is not possible; give a whole number of at least 0 (--seed)")
+        if not 0 <= seed < 2**63:
+            raise SuiteError(
+                f"seed {shown(seed)} is not possible; give a whole number of at least 0 and below 2^63 (--seed)"
+            )
     frictions, payloads, seeds = request.frictions, request.payloads, request.seeds or suite.matrix.seeds
     if request.pipeline == "base":
         frictions = frictions or (suite.matrix.nominal_friction,)
@@ -198,23 +200,24 @@ def identity(prepared: Prepared) -> dict[str, Any]:
     return {
         "suite": f"{suite.name} {suite.version}",
         "suite_digest": suite.digest,
-        "policy": prepared.policy.contract.hash,
-        "policy_file": policy_digest(request.policy),
+        "policy": policy_digest(prepared.policy),
+        "robot_digest": robot_digest(prepared.robot),
         "pipeline": request.pipeline,
         "backend": request.backend,
         "device": torch.device(request.device).type,
         "robot": request.robot,
-        "robot_digest": robot_digest(prepared.robot),
         "level": request.level,
         "environments": [e.key for e in prepared.environments],
         "seeds": list(prepared.seeds),
         "noise": "by segment",  # runs begun before episodes fell into segments drew theirs otherwise
+        "versions": versions(),
+        "plugins": plugins(),
     }
 
 
-def policy_digest(name: str) -> str:
+def file_digest(name: str) -> str:
     """SHA-256 of a policy's file, hexadecimal."""
-    return hashlib.sha256(find_policy(name).read_bytes()).hexdigest()
+    return digest([find_policy(name)])
 
 
 def evaluate(
@@ -259,7 +262,7 @@ def evaluate(
         results["policy"] = {
             "path": prepared.policy.path,
             "contract_hash": prepared.policy.contract.hash,
-            "file_sha256": policy_digest(request.policy),
+            "file_sha256": file_digest(request.policy),
             "provenance": dict(prepared.policy.contract.provenance),
         }
         results["pipeline"] = request.pipeline
@@ -272,18 +275,19 @@ def evaluate(
             device=request.device,
             threads=request.threads,
             digests={
-                "policy": policy_digest(request.policy),
-                "suite": suite.digest,
+                "policy": policy_digest(prepared.policy),
                 "robot": robot_digest(prepared.robot),
+                "suite": suite.digest,
             },
             seconds=round(time.perf_counter() - began, 2),
             physics_steps=effort.physics_steps,
             processes=count,
+            set_aside=[path.name for path in store.damaged],
         )
         if effort.engine_seconds is not None:
             results["provenance"]["engine_seconds"] = round(effort.engine_seconds, 2)
         write_atomically(folder / "episodes.csv", rows_csv(counted), StoreError)
-        write_atomically(folder / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n", StoreError)
+        write_atomically(folder / "results.json", json_text(results), StoreError)
         store.discard_all_but([record.episode for record in counted])
     return results
 

@@ -7,8 +7,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..files.writing import LOCK, lock_folder, write_atomically
-from .episodes import Episode, Record
+from ..files.parsing import one_line, parse_json, read_text, shown
+from ..files.writing import LOCK, lock_folder, write_atomically, write_failure
+from .episodes import Episode, Record, read_records
 
 
 class StoreError(ValueError):
@@ -31,7 +32,6 @@ class RunFolder:
 
         Raises:
             StoreError: the folder belongs to another run, holds a run and ``resume`` is not asked for, or is in use.
-            RecordError: an episode's file is damaged.
         """
         self._episodes = folder / "episodes"
         wanted = json.loads(json.dumps(request))
@@ -44,9 +44,11 @@ class RunFolder:
         try:
             if present != wanted:
                 write_atomically(folder / "request.json", json.dumps(wanted, indent=1) + "\n", StoreError)
-            found = (Record.load(path) for path in sorted(self._episodes.glob("*.npz")))
-            self.records: dict[Episode, Record] = {record.episode: record for record in found}
-            """Episodes that have ended; ``put`` does not add to them."""
+            self.records, self.damaged = read_records(self._episodes)
+            """Episodes that have ended, to which ``put`` does not add; files that were damaged and are set aside."""
+        except OSError as error:
+            self._lock.release()
+            raise StoreError(write_failure(folder, error)) from error
         except BaseException:
             self._lock.release()
             raise
@@ -79,18 +81,15 @@ def _present_request(folder: Path, wanted: Mapping[str, Any], *, resume: bool) -
             raise StoreError(f"{folder} is not empty and holds no run; give another folder with --out")
         return None
     try:
-        present = json.loads(marker.read_text(encoding="utf-8"))
+        present = parse_json(read_text(marker, "request", StoreError, largest=10**8), "it", StoreError)
         if not isinstance(present, dict):
-            raise ValueError("it holds no table")
-    except (OSError, ValueError) as error:
+            raise StoreError("it holds no table")
+    except StoreError as error:
         raise StoreError(f"{marker} is damaged ({error}); give another folder with --out") from error
     different = sorted(k for k in wanted.keys() | present.keys() if wanted.get(k) != present.get(k))
     if different and any((folder / "episodes").glob("*.npz")):  # else it ended before its first episode did
-        key = different[0]
-        raise StoreError(
-            f"{folder} belongs to another run ({_difference(key, present.get(key), wanted.get(key))}); "
-            "give another folder with --out"
-        )
+        found = "; ".join(_differences(present, wanted))
+        raise StoreError(f"{folder} belongs to another run ({found}); give another folder with --out")
     if not different and not resume:
         raise StoreError(f"{folder} already holds this run; go on with --resume, or give another folder with --out")
     return present
@@ -103,8 +102,18 @@ def _left_by_a_kill(path: Path) -> bool:
     return path.name == LOCK or path.name.endswith(".partial")
 
 
-def _difference(key: str, present: Any, wanted: Any) -> str:
-    shown = [json.dumps(v) for v in (present, wanted)]
-    if max(map(len, shown)) > 60:
-        return f"{key} differs"
-    return f"{key} was {shown[0]}, now {shown[1]}"
+def _differences(present: Mapping[str, Any], wanted: Mapping[str, Any], path: str = "") -> list[str]:
+    """What differs between two requests, entry by entry."""
+    found = []
+    for key in sorted(present.keys() | wanted.keys()):
+        old, new = present.get(key), wanted.get(key)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += _differences(old, new, f"{path}{key}.")
+        elif old != new:
+            whole = f"{path}{one_line(key, 80)} was {shown(old)}, now {shown(new)}"
+            found.append(whole if len(whole) <= 120 else f"{path}{one_line(key, 80)} differs")
+    return found if path else found[:_NAMED]
+
+
+_NAMED = 4
+"""Differences that a sentence names."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,15 +13,17 @@ import torch
 
 from ...backends.base import BackendError
 from ...backends.registry import make_backend
-from ...files.provenance import provenance
-from ...files.writing import write_atomically
+from ...files.provenance import plugins, provenance, versions
+from ...files.writing import json_text, write_atomically
 from ...policy.base import Policy
+from ...policy.digest import policy_digest
+from ...policy.native import FilePolicy
 from ...robots import Robot
 from ...robots.geometry import total_mass
 from ...robots.loading import robot_digest
 from ...terrains.registry import gauge_terrain_names
 from ..evaluate import Request as EvaluateRequest
-from ..evaluate import policy_digest, prepare
+from ..evaluate import prepare
 from ..plan import Records
 from ..sampling import GRAVITY
 from ..store import RunFolder, StoreError
@@ -272,7 +273,7 @@ def study(
             command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)
         ),
     }
-    write_atomically(folder / "consistency.json", json.dumps(results, indent=1, allow_nan=False) + "\n", StoreError)
+    write_atomically(folder / "consistency.json", json_text(results), StoreError)
     return results
 
 
@@ -283,7 +284,7 @@ class _Policy:
         self,
         prepared: _Prepared,
         name: str,
-        policy: Policy,
+        policy: FilePolicy,
         folder: Path,
         *,
         resume: bool,
@@ -296,7 +297,7 @@ class _Policy:
         self._records: dict[str, Records] = {}
         self._unable: dict[str, str] = {}
         self._part, self._parts = 0, len(prepared.engines)
-        self._digest = policy_digest(name)
+        self._digest = policy_digest(policy)
 
     def run(self) -> dict[str, Any]:
         """All layers; the closed loop comes first, since it finds out which engines can play these terrains."""
@@ -379,14 +380,16 @@ class _Policy:
         return {
             "suite": f"{prepared.suite.name} {prepared.suite.version}",
             "suite_digest": prepared.suite.digest,
-            "policy": self._policy.contract.hash,
-            "policy_file": self._digest,
+            "policy": self._digest,
+            "robot_digest": robot_digest(prepared.robot),
             "pipeline": "consistency",
             "variant": variant.label,
             "device": torch.device(variant.device).type,
-            "robot": robot_digest(prepared.robot),
+            "robot": prepared.request.robot,
             "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in prepared.cells],
             "seeds": list(prepared.seeds),
+            "versions": versions(),
+            "plugins": plugins(),
         }
 
     # ---- attribution ----------------------------------------------------------------------------------------------

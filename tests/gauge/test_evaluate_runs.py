@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import torch
 from gaitgauge.backends import make_backend
 from gaitgauge.backends.base import BackendError
 from gaitgauge.backends.fake import FakeScript
+from gaitgauge.files.provenance import versions
 from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.evaluate import Request, identity, prepare
@@ -268,17 +270,48 @@ def test_a_finished_run_resumes_to_itself_without_playing(request_for, tmp_path,
     assert without_provenance(tmp_path / "run") == before
 
 
-def test_a_damaged_episode_is_one_sentence_and_costs_nothing_else(request_for, tmp_path):
+def test_a_damaged_episode_is_set_aside_and_played_again(request_for, tmp_path):
     evaluate(request_for(), tmp_path / "run")
-    before = (tmp_path / "run" / "results.json").read_bytes()
+    before = without_provenance(tmp_path / "run")
     file = next((tmp_path / "run" / "episodes").glob("eval-flat*s1*"))
-    file.write_bytes(file.read_bytes()[:100])
-    with pytest.raises(ValueError, match=f"episode file .*{file.name[:12]}.* is damaged .*; delete it and run again"):
+    whole = file.read_bytes()
+    file.write_bytes(whole[:100])
+    results = evaluate(request_for(), tmp_path / "run", resume=True)
+    assert without_provenance(tmp_path / "run") == before
+    assert file.read_bytes() == whole
+    assert results["provenance"]["set_aside"] == [file.name + ".damaged"]
+    assert file.with_name(file.name + ".damaged").read_bytes() == whole[:100]
+
+
+def test_results_are_written_whatever_the_provenance_holds(request_for, tmp_path):
+    contract = replace(go2_contract(GO2), provenance={"note": float("nan"), "name": "\ud800", "[/x]": [float("inf")]})
+    request = request_for()
+    prepared = prepare(request)
+    prepared.policy.contract = contract
+    results = evaluate(prepared, tmp_path / "run", command=["gaitgauge", "a b", "\udcff"])
+    written = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert written["score"] == results["score"]
+    assert written["policy"]["provenance"] == {"note": "nan", "name": "\\ud800", "[/x]": ["inf"]}
+    assert written["provenance"]["command"] == "gaitgauge 'a b' '\\udcff'"
+
+
+def test_a_run_does_not_go_on_with_another_robot(request_for, tmp_path):
+    folder = tmp_path / "robot"
+    shutil.copytree(GO2.mjcf.parent, folder)
+    request = request_for(robot=str(folder))
+    evaluate(request, tmp_path / "run")
+    evaluate(request, tmp_path / "run", resume=True)
+    file = folder / "robot.toml"
+    file.write_text(file.read_text().replace("stiffness = 20.0", "stiffness = 20.5", 1))
+    with pytest.raises(StoreError, match=r"belongs to another run \(robot_digest differs\)"):
+        evaluate(request, tmp_path / "run", resume=True)
+
+
+def test_a_run_does_not_go_on_with_another_engine_version(request_for, tmp_path, monkeypatch):
+    evaluate(request_for(), tmp_path / "run")
+    monkeypatch.setattr(evaluation, "versions", lambda: {**versions(), "mujoco": "0.0"})
+    with pytest.raises(StoreError, match=r"versions.mujoco was '[0-9.]+', now '0.0'"):
         evaluate(request_for(), tmp_path / "run", resume=True)
-    assert (tmp_path / "run" / "results.json").read_bytes() == before
-    file.unlink()
-    evaluate(request_for(), tmp_path / "run", resume=True)
-    assert json.loads(before)["score"] == json.loads((tmp_path / "run" / "results.json").read_text())["score"]
 
 
 @pytest.mark.parametrize(

@@ -104,9 +104,12 @@ def test_a_damaged_record_is_one_sentence(tmp_path, kind):
     file = tmp_path / "episodes" / f"{record.episode.key}.npz"
     file.write_bytes(damaged(kind, file.read_bytes()))
     with pytest.raises(RecordError, match=r"is damaged .*; delete it and run again with --resume") as caught:
-        records(tmp_path)
+        Record.load(file)
     assert "\n" not in str(caught.value)
     assert str(file) in str(caught.value)
+    broken = file.read_bytes()
+    assert records(tmp_path) == {}
+    assert file.with_name(file.name + ".damaged").read_bytes() == broken
 
 
 def test_a_record_under_another_episodes_name_is_damaged(tmp_path):
@@ -115,7 +118,8 @@ def test_a_record_under_another_episodes_name_is_damaged(tmp_path):
     other = episode(DIAGONAL)
     (tmp_path / "episodes" / f"{record.episode.key}.npz").rename(tmp_path / "episodes" / f"{other.key}.npz")
     with pytest.raises(RecordError, match=re.escape(f"it holds episode {record.episode.key}")):
-        records(tmp_path)
+        Record.load(tmp_path / "episodes" / f"{other.key}.npz")
+    assert records(tmp_path) == {}
 
 
 def test_a_record_runs_no_code_when_it_is_read(tmp_path):
@@ -137,13 +141,22 @@ def test_a_folder_is_taken_up_again_only_when_asked(tmp_path):
     opened(tmp_path / "run", resume=True)
 
 
+def test_every_difference_is_named(tmp_path):
+    old = {**REQUEST, "versions": {"mujoco": "3.16", "torch": "2.13"}, "robot_digest": "a" * 64}
+    new = {**REQUEST, "versions": {"mujoco": "3.17", "torch": "2.13"}, "robot_digest": "b" * 64}
+    with RunFolder(tmp_path, old, resume=False) as folder:
+        folder.put(full_record())
+    with pytest.raises(StoreError, match=r"\(robot_digest differs; versions.mujoco was '3.16', now '3.17'\)"):
+        RunFolder(tmp_path, new, resume=True)
+
+
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_folder_of_another_run_is_refused_and_left_as_it_is(tmp_path, resume):
     put(tmp_path, full_record())
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     with pytest.raises(StoreError, match=r"belongs to another run \(seeds was \[0, 1\], now \[2\]\)"):
         RunFolder(tmp_path, {**REQUEST, "seeds": [2]}, resume=resume)
-    with pytest.raises(StoreError, match=r"belongs to another run \(policy was null, now \"x\"\)"):
+    with pytest.raises(StoreError, match=r"belongs to another run \(policy was None, now 'x'\)"):
         RunFolder(tmp_path, {**REQUEST, "policy": "x"}, resume=resume)
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
