@@ -11,7 +11,6 @@ from ..terrains.base import Terrain
 VISUAL_GROUP = 2
 """Geom group of what is seen of a robot."""
 COLLISION_GROUP = 3
-GROUND_COLOR = (0.78, 0.80, 0.82, 1.0)
 FIELD_COLOR = (0.72, 0.76, 0.74, 1.0)
 BOX_COLORS = ((0.66, 0.70, 0.76, 1.0), (0.58, 0.62, 0.69, 1.0))
 """Neighbouring boxes differ a little, so that steps can be told apart."""

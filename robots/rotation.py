@@ -27,44 +27,6 @@ def _rotate(w: torch.Tensor, axis: torch.Tensor, vector: torch.Tensor) -> torch.
     return vector + w * twice + torch.linalg.cross(axis, twice)
 
 
-def conjugate(quaternion: torch.Tensor) -> torch.Tensor:
-    """The opposite rotation, (…, 4)."""
-    return torch.cat((quaternion[..., :1], -quaternion[..., 1:]), dim=-1)
-
-
-def multiply(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Hamilton product, (…, 4): turns by ``second`` and then, in the world, by ``first``."""
-    w1, x1, y1, z1 = first.unbind(-1)
-    w2, x2, y2, z2 = second.unbind(-1)
-    return torch.stack(
-        (
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ),
-        dim=-1,
-    )
-
-
-def from_euler(roll: torch.Tensor, pitch: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
-    """Roll about x, then pitch about y, then yaw about z, all about the world's axes [rad], each (…); returns (…,
-    4).
-    """
-    cr, sr = torch.cos(roll / 2), torch.sin(roll / 2)
-    cp, sp = torch.cos(pitch / 2), torch.sin(pitch / 2)
-    cy, sy = torch.cos(yaw / 2), torch.sin(yaw / 2)
-    return torch.stack(
-        (
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ),
-        dim=-1,
-    )
-
-
 def from_yaw(yaw: torch.Tensor) -> torch.Tensor:
     """Rotation about the world's z axis [rad], (…) to (…, 4)."""
     zero = torch.zeros_like(yaw)

@@ -9,8 +9,8 @@ import torch
 from gaitgauge.backends import PhysicsState
 from gaitgauge.gauge.goals import Schedule, check_terrain, target_command, target_offset
 from gaitgauge.gauge.suite import Goal, SuiteError, load_suite
-from gaitgauge.robots.rotation import from_euler
 from gaitgauge.terrains.registry import make_terrain
+from scipy.spatial.transform import Rotation
 from scripted_gauge import ground
 
 REFERENCE, OWN = load_suite("robogauge-1.1"), load_suite("gaitgauge-1")
@@ -152,7 +152,8 @@ def test_walking_backward(angle, distance, expected):
 
 
 def state_at(position, roll=0.0, pitch=0.0, yaw=0.0):
-    turned = from_euler(*(torch.tensor([v], dtype=torch.float64) for v in (roll, pitch, yaw)))
+    turn = Rotation.from_euler("xyz", [roll, pitch, yaw])
+    turned = torch.from_numpy(turn.as_quat(scalar_first=True))[None]
     state = object.__new__(PhysicsState)
     state.base_position_w = torch.tensor([position], dtype=torch.float64)
     state.base_quaternion_w = turned

@@ -9,7 +9,6 @@ from gaitgauge.backends.fake import FakeScript
 from gaitgauge.policy.contract import History
 from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.rotation import from_euler
 from gaitgauge.terrains.training_tiles import make_tile
 from gaitgauge.training.environment_configuration import (
     NoiseConfiguration,
@@ -18,6 +17,7 @@ from gaitgauge.training.environment_configuration import (
 )
 from gaitgauge.training.height_scan import HeightRasters, heading, place_pattern, scan_pattern
 from gaitgauge.training.observations import push_history
+from scipy.spatial.transform import Rotation
 from small_environment import STAIRS, gliding, make
 
 SILENT = NoiseConfiguration(base_angular_velocity=0.0, projected_gravity=0.0, joint_position=0.0, joint_velocity=0.0)
@@ -110,7 +110,9 @@ def test_scan_pattern_has_x_as_the_slow_index():
 
 def test_scan_turns_with_the_heading_alone():
     yaw = torch.tensor([0.5, -2.0])
-    tilted = from_euler(torch.tensor([0.4, 0.0]), torch.tensor([-0.3, 0.6]), yaw)
+    tilted = torch.from_numpy(
+        Rotation.from_euler("xyz", [[0.4, -0.3, yaw[0]], [0.0, 0.6, yaw[1]]]).as_quat(scalar_first=True)
+    ).to(yaw)
     direction = heading(tilted)
     assert torch.allclose(torch.atan2(direction[:, 1], direction[:, 0]), yaw, atol=1e-5)
     assert torch.allclose(direction.norm(dim=1), torch.ones(2))
