@@ -61,6 +61,10 @@ class ObservationBuilder:
         )
         limits = [self._tensor(_clip(t)).expand(w) for t, w in zip(contract.observation, self._widths, strict=True)]
         self._limit = None if all(t.clip is None for t in contract.observation) else torch.cat(limits)
+        # where each entry of a history term by term is in one frame by frame
+        places = torch.arange(contract.history.length * contract.frame_width).view(-1, contract.frame_width)
+        terms = [block.flatten() for block in places.split(self._widths, dim=1)]
+        self._term_major = torch.cat(terms).to(self.device)
         self._frames = torch.zeros(num_episodes, contract.history.length, contract.frame_width, device=self.device)
         self._fresh = torch.ones(num_episodes, dtype=torch.bool, device=self.device)
 
@@ -152,7 +156,7 @@ class ObservationBuilder:
         self._fresh.fill_(False)
         order = self.contract.history.order
         if order == "term-major":
-            return torch.cat([block.flatten(1) for block in frames.split(self._widths, dim=2)], dim=1)
+            return frames.flatten(1).index_select(1, self._term_major)
         if order == "frame-major-newest-first":
             frames = frames.flip(1)
         return frames.reshape(self.num_episodes, -1)
