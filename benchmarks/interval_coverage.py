@@ -14,16 +14,16 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gaitgauge.files.writing import write_atomically
-from gaitgauge.gauge.comparison import compare
+from gaitgauge.gauge.comparison import chance_rules_of, compare
 from gaitgauge.gauge.evaluate import Request, evaluate
-from gaitgauge.gauge.intervals import ChanceRules, Evidence
+from gaitgauge.gauge.intervals import Chance, ChanceRules, Evidence
 from gaitgauge.gauge.level_chance import bisect
 from gaitgauge.gauge.results import SCHEMA, environment_weights
 from gaitgauge.gauge.store import StoreError
@@ -67,7 +67,7 @@ def record(count: int, folder: Path, threads: int) -> list[Results]:
         suite.write_text(SUITE.format(index=index, seeds=seeds[:3], search_seeds=seeds))
         request = Request(policy="pretrained", suite=str(suite), threads=threads)
         results = evaluate(request, folder / f"run-{index}", resume=True)
-        print(f"{index}: {results['score']:.4f}, {results['score_interval']}", flush=True)
+        print(f"{index}: {results['score']:.4f}", flush=True)
         found.append(trimmed(results))
     return found
 
@@ -79,9 +79,11 @@ def trimmed(results: Mapping[str, Any]) -> Results:
         | {"runs": {s: {**run, "commands": {}} for s, run in row["runs"].items()}}
         for row in results["environments"]
     ]
-    kept = ("schema", "score", "score_interval", "level", "level_interval", "groups", "group_metrics", "metrics")
-    kept += ("terrains", "chance", "pipeline", "backend", "robot")
+    kept = ("schema", "score", "level", "groups", "group_metrics", "chance", "pipeline", "backend", "robot")
     return {k: results[k] for k in kept} | {
+        "score_interval": None,  # follows from the rows, by the code of today
+        "metrics": {m: {"mean50": v["mean50"]} for m, v in results["metrics"].items()},
+        "terrains": {t: {"score": v["score"], "level": v["level"]} for t, v in results["terrains"].items()},
         "suite": {"name": "repeated", "version": results["suite"]["version"], "digest": ""},
         "policy": {k: results["policy"][k] for k in ("path", "file_sha256")},
         "environments": rows,
@@ -270,22 +272,36 @@ def alarm(pair: Sequence[Results]) -> NDArray[np.float64]:
 # ---- judging --------------------------------------------------------------------------------------------------------
 
 
-def judge(recorded: Sequence[Results]) -> dict[str, tuple[float, float, float, float]]:
+Figures = tuple[float, float, float, float]
+
+
+def judge(recorded: Sequence[Results]) -> dict[str, Figures]:
     """Of each quantity: mean, 1.96 σ over the evaluations, median half width of the intervals, share that holds the mean."""
 
-    def row(pairs: Sequence[tuple[float, Sequence[float]]]) -> tuple[float, float, float, float]:
+    def figures(pairs: Sequence[tuple[float, Any]]) -> Figures:
         values, ends = np.array([v for v, _ in pairs]), np.array([e for _, e in pairs])
         held = (ends[:, 0] <= values.mean()) & (values.mean() <= ends[:, 1])
         return values.mean(), 1.96 * values.std(ddof=1), float(np.median(np.ptp(ends, axis=1) / 2)), held.mean()
 
-    found = {"score": row([(r["score"], r["score_interval"]) for r in recorded])}
-    found["level"] = row([(r["level"], r["level_interval"]) for r in recorded])
-    for terrain in recorded[0]["terrains"]:
-        of = [r["terrains"][terrain] for r in recorded]
-        found[terrain] = row([(t["score"], t["interval"]) for t in of])
-        found[f"{terrain}, level"] = row([(t["level"], t["level_interval"]) for t in of])
+    evidence = [Evidence(r["environments"], chance_rules_of(r)) for r in recorded]
+    terrains = [row["terrain"] for row in recorded[0]["environments"]]
+    even = environment_weights(terrains)
+
+    def measured(value: Callable[[Results], float], chance: Callable[[Evidence], Chance], most: float = 1.0) -> Figures:
+        values = [value(r) for r in recorded]
+        return figures([(v, chance(e).interval(v, (0.0, most))) for v, e in zip(values, evidence, strict=True)])
+
+    found = {"score": measured(lambda r: r["score"], lambda e: e.chance(even))}
+    found["level"] = measured(lambda r: r["level"], lambda e: e.level_chance(even), 10.0)
+    for at, terrain in enumerate(terrains):
+        one = np.eye(len(terrains))[at]
+        found[terrain] = measured(lambda r, t=terrain: r["terrains"][t]["score"], lambda e, w=one: e.chance(w))
+        level = measured(lambda r, t=terrain: r["terrains"][t]["level"], lambda e, w=one: e.level_chance(w), 10.0)
+        found[f"{terrain}, level"] = level
     for metric in recorded[0]["metrics"]:
-        found[metric] = row([(r["metrics"][metric]["mean50"], r["metrics"][metric]["interval"]) for r in recorded])
+        found[metric] = measured(
+            lambda r, m=metric: r["metrics"][m]["mean50"], lambda e, m=metric: e.chance(even, (m,))
+        )
     return found
 
 

@@ -23,7 +23,7 @@ _CENTRE_STEP, _BEYOND = 0.25, 3.0
 the last level, for what is never or always passed."""
 _WIDTHS = np.geomspace(0.1, 2.5, 17)
 """Levels within which the odds of a success fall by a factor e: from a bar too high for every seed to waves that get a little worse."""
-_USUAL_WIDTH = 0.6
+_USUAL_WIDTH = 0.7
 """Median of the width beforehand [levels]."""
 _WIDTH_SPREAD, _TERRAIN_SPREAD = 0.4, 0.4
 """Standard deviations of the logarithm of the width: beforehand of a policy's usual one, and of its terrains' around that."""
@@ -104,32 +104,30 @@ def shared_luck(searches: Sequence[Trials], curves: Array) -> float:
 
     Where the environments of a seed share its random numbers, a seed may be easy or hard everywhere. The estimate compares the
     products of residuals of one seed in two environments with what they would be if its luck were the same (method of moments);
-    correlations of outcomes become those of the normal variable behind them.
+    correlations of outcomes become those of the normal variable behind them. What lies within one standard error of zero is
+    taken for zero: many environments of few seeds would turn its noise into a far too wide interval.
 
     Args:
         searches: trials of each environment.
         curves: their ``success_curves``, (searches, levels).
     """
-    residuals: dict[int, list[float]] = {}
-    spreads: dict[int, list[float]] = {}
-    own_products = own_spreads = 0.0
+    sums: dict[int, list[tuple[float, float, float]]] = {}
     for trials, curve in zip(searches, curves, strict=True):
-        of_seed: dict[int, tuple[float, float]] = {}
+        of_seed: dict[int, list[tuple[float, float]]] = {}
         for level, outcomes in trials.items():
-            chance = curve[level - 1]
             for seed, reached in outcomes.items():
-                residual, spread = of_seed.get(seed, (0.0, 0.0))
-                of_seed[seed] = residual + reached - chance, spread + math.sqrt(chance * (1.0 - chance))
-        for seed, (residual, spread) in of_seed.items():
-            residuals.setdefault(seed, []).append(residual)
-            spreads.setdefault(seed, []).append(spread)
-            own_products += residual**2
-            own_spreads += spread**2
-    most = sum(sum(values) ** 2 for values in spreads.values()) - own_spreads
-    if most <= 1e-9:
+                of_seed.setdefault(seed, []).append(
+                    (reached - curve[level - 1], curve[level - 1] * (1.0 - curve[level - 1]))
+                )
+        for seed, played in of_seed.items():
+            residuals, variances = np.array(played).T
+            sums.setdefault(seed, []).append((residuals.sum(), np.sqrt(variances).sum(), variances.sum()))
+    tables = [np.array(of_environments) for of_environments in sums.values()]
+    # over pairs of environments of a seed: products of residuals, of their standard deviations, and of their variances
+    seen, most, variance = sum((t.sum(0) ** 2 - (t**2).sum(0) for t in tables), np.zeros(3))
+    if most <= 1e-9 or seen <= math.sqrt(2.0 * variance):
         return 0.0
-    correlation = (sum(sum(values) ** 2 for values in residuals.values()) - own_products) / most
-    return min(math.sin(0.5 * math.pi * min(max(correlation, 0.0), 1.0)), 0.95)
+    return min(math.sin(0.5 * math.pi * min(seen / most, 1.0)), 0.95)
 
 
 def redraw_levels(

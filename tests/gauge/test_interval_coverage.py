@@ -25,14 +25,6 @@ def test_intervals_of_repeated_evaluations_hold_their_mean(recorded):
         assert 0.7 * reach < printed < 1.6 * reach, name
 
 
-def test_the_data_are_folded_as_results_are(recorded):
-    """The intervals that the data carry are those that the code of today makes of their trials and runs."""
-    for results in recorded[:3]:
-        rows = results["environments"]
-        chance = Evidence(rows, chance_rules_of(results)).chance(environment_weights([r["terrain"] for r in rows]))
-        assert chance.interval(results["score"]) == pytest.approx(results["score_interval"], abs=1e-6)
-
-
 def test_levels_held_fixed_would_tell_runs_of_one_policy_apart(recorded):
     """What the interval was before: that of the quality seeds at the levels found."""
     scores = np.array([r["score"] for r in recorded])
