@@ -42,7 +42,9 @@ def test_gravity_and_tilt(sample):
 
 def test_tilt_is_precise_near_upright_in_single_precision():
     angle = torch.tensor([1e-3, 1e-4, torch.pi - 1e-3])
-    made = torch.from_numpy(Rotation.from_euler("x", angle.numpy()[:, None]).as_quat(scalar_first=True)).to(torch.float32)
+    made = torch.from_numpy(Rotation.from_euler("x", angle.numpy()[:, None]).as_quat(scalar_first=True)).to(
+        torch.float32
+    )
     np.testing.assert_allclose(rotation.tilt(made), angle, rtol=1e-3, atol=1e-6)
 
 
