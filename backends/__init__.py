@@ -7,6 +7,7 @@ from .base import (
     PhysicsOptions,
     PhysicsState,
     Randomization,
+    ResetState,
     Scene,
     Support,
 )
@@ -19,6 +20,7 @@ __all__ = [
     "PhysicsOptions",
     "PhysicsState",
     "Randomization",
+    "ResetState",
     "Scene",
     "Support",
     "backend_class",

@@ -167,6 +167,28 @@ class PhysicsState:
         return replace(self, **{f.name: getattr(self, f.name).clone() for f in fields(self)})
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ResetState:
+    """The state into which worlds are put. N worlds, J joints."""
+
+    base_position: torch.Tensor
+    """World frame [m], (N, 3)."""
+    base_quaternion: torch.Tensor
+    """Orientation of the base, wxyz, (N, 4)."""
+    joint_position: torch.Tensor | None = None
+    """[rad], (N, J); None for the robot's default pose."""
+    base_linear_velocity: torch.Tensor | None = None
+    """World frame [m/s], (N, 3); None for rest."""
+    base_angular_velocity: torch.Tensor | None = None
+    """Body frame [rad/s], (N, 3); None for rest."""
+    joint_velocity: torch.Tensor | None = None
+    """[rad/s], (N, J); None for rest."""
+    held_target: torch.Tensor | None = None
+    """Joint targets that act until the first step's own take effect [rad], (N, J); None leaves the motors limp."""
+    terrain_index: torch.Tensor | None = None
+    """New terrain of each world, (N,) int64, into ``scene.terrains``; None keeps it."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
     """Per-world changes of the model; a field left None stays as it is. W worlds are those passed along with it."""
@@ -305,33 +327,14 @@ class PhysicsBackend(ABC):
         """State snapshot asked for with ``step(sample_at=…)``; rows of worlds that asked for none are stale."""
 
     @abstractmethod
-    def reset(
-        self,
-        worlds: torch.Tensor | None = None,
-        *,
-        base_position: torch.Tensor,
-        base_quaternion: torch.Tensor,
-        joint_position: torch.Tensor | None = None,
-        base_linear_velocity: torch.Tensor | None = None,
-        base_angular_velocity: torch.Tensor | None = None,
-        joint_velocity: torch.Tensor | None = None,
-        held_target: torch.Tensor | None = None,
-        terrain_index: torch.Tensor | None = None,
-    ) -> None:
+    def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """Put worlds into a state; ``state`` is fresh afterwards (positions, velocities; forces are zero).
 
         Randomization persists. External forces and the watches are cleared.
 
         Args:
-            worlds: mask (N,) bool of the worlds to reset, None for all. All other arguments have N rows; only the masked rows count.
-            base_position: [m], (N, 3), world frame.
-            base_quaternion: wxyz, (N, 4).
-            joint_position: [rad], (N, J); None for the robot's default pose.
-            base_linear_velocity: world frame [m/s], (N, 3); None for rest.
-            base_angular_velocity: body frame [rad/s], (N, 3); None for rest.
-            joint_velocity: [rad/s], (N, J); None for rest.
-            held_target: joint targets that act until the first step's own take effect, (N, J); None leaves the motors limp.
-            terrain_index: new terrain of each world, (N,) int64, into ``scene.terrains``; None keeps it.
+            start: N rows in every field; only the masked worlds' count.
+            worlds: mask (N,) bool of the worlds to reset, None for all.
         """
 
     @abstractmethod

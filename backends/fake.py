@@ -22,6 +22,7 @@ from .base import (
     PhysicsBackend,
     PhysicsState,
     Randomization,
+    ResetState,
     Scene,
     Support,
 )
@@ -197,37 +198,27 @@ class FakeBackend(PhysicsBackend):
         """State after the substep asked for with ``sample_at``."""
         return self._sample
 
-    def reset(
-        self,
-        worlds: torch.Tensor | None = None,
-        *,
-        base_position: torch.Tensor,
-        base_quaternion: torch.Tensor,
-        joint_position: torch.Tensor | None = None,
-        base_linear_velocity: torch.Tensor | None = None,
-        base_angular_velocity: torch.Tensor | None = None,
-        joint_velocity: torch.Tensor | None = None,
-        held_target: torch.Tensor | None = None,
-        terrain_index: torch.Tensor | None = None,
-    ) -> None:
+    def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """Put worlds into a state, as the contract says."""
         mask, state = self._mask(worlds), self._state
         for f in fields(PhysicsState):
             getattr(state, f.name)[mask] = 0
-        state.base_position_w[mask] = self._rows(base_position, mask)
-        state.base_quaternion_w[mask] = self._rows(base_quaternion, mask)
-        state.joint_position[mask] = self._rows(self.default_pose if joint_position is None else joint_position, mask)
-        if base_linear_velocity is not None:
-            state.base_linear_velocity_w[mask] = self._rows(base_linear_velocity, mask)
-        if base_angular_velocity is not None:
-            state.base_angular_velocity_b[mask] = self._rows(base_angular_velocity, mask)
-        if joint_velocity is not None:
-            state.joint_velocity[mask] = self._rows(joint_velocity, mask)
-        if terrain_index is not None:
-            self.terrain_index[mask] = terrain_index.to(self.device, torch.int64)[mask]
-        self.limp[mask] = held_target is None
-        if held_target is not None:
-            self.targets[mask] = self._rows(held_target, mask)
+        state.base_position_w[mask] = self._rows(start.base_position, mask)
+        state.base_quaternion_w[mask] = self._rows(start.base_quaternion, mask)
+        state.joint_position[mask] = self._rows(
+            self.default_pose if start.joint_position is None else start.joint_position, mask
+        )
+        if start.base_linear_velocity is not None:
+            state.base_linear_velocity_w[mask] = self._rows(start.base_linear_velocity, mask)
+        if start.base_angular_velocity is not None:
+            state.base_angular_velocity_b[mask] = self._rows(start.base_angular_velocity, mask)
+        if start.joint_velocity is not None:
+            state.joint_velocity[mask] = self._rows(start.joint_velocity, mask)
+        if start.terrain_index is not None:
+            self.terrain_index[mask] = start.terrain_index.to(self.device, torch.int64)[mask]
+        self.limp[mask] = start.held_target is None
+        if start.held_target is not None:
+            self.targets[mask] = self._rows(start.held_target, mask)
         self.force_w[mask] = 0.0
         self._substeps_since_reset[mask] = 0
         self.resets[mask] += 1

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from gaitgauge.backends import PhysicsBackend, PhysicsOptions, Scene, make_backend
+from gaitgauge.backends import PhysicsBackend, PhysicsOptions, ResetState, Scene, make_backend
 from gaitgauge.backends.base import TRAINING_PHYSICS
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation import ObservationBuilder
@@ -103,7 +103,7 @@ def walk(engine: str, ground: str, physics: PhysicsOptions, *, worlds: int, seco
     position = torch.tensor([p.position for p in places], dtype=backend.dtype)
     position[:, 2] += robot.stand_height + 0.02
     heading = from_yaw(torch.tensor([p.yaw for p in places], dtype=backend.dtype))
-    backend.reset(base_position=position, base_quaternion=heading)
+    backend.reset(ResetState(base_position=position, base_quaternion=heading))
     random = torch.Generator().manual_seed(0)
     sideways, turning = torch.rand(2, worlds, generator=random) - 0.5
     command = torch.stack([torch.linspace(0.4, 1.2, worlds), 0.3 * sideways, 0.6 * turning], dim=1)

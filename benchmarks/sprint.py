@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from gaitgauge.backends.base import PhysicsState, Randomization, Scene
+from gaitgauge.backends.base import PhysicsState, Randomization, ResetState, Scene
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.loading import load_policy
@@ -80,7 +80,7 @@ def run(policy_path: str, *, speed: float, runway: float, friction: float, robot
         position = torch.tensor([0.0, 0.0, robot.stand_height]).expand(robots, 3)
         upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(robots, 4)
         default = torch.tensor(robot.default_joint_position).expand(robots, -1)
-        physics.reset(base_position=position, base_quaternion=upright, held_target=default)
+        physics.reset(ResetState(base_position=position, base_quaternion=upright, held_target=default))
         period = scene.physics.control_period
         longest = STAND + 2.0 * runway / speed + 3.0 + BRAKE
         speeds, commands, joints = [], [], []

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from gaitgauge.backends.base import PhysicsOptions, Scene
+from gaitgauge.backends.base import PhysicsOptions, ResetState, Scene
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
 from gaitgauge.backends.mujoco_warp.model import SMALLEST_TOLERANCE
 from gaitgauge.gauge.suite import load_suite
@@ -180,7 +180,7 @@ class Walkers:
 
     def reset(self, mask: torch.Tensor) -> None:
         """Put the masked robots back to their start."""
-        self.backend.reset(mask, base_position=self._spawn, base_quaternion=self._heading)
+        self.backend.reset(ResetState(base_position=self._spawn, base_quaternion=self._heading), mask)
         self._builder.reset(mask)
         self._session.reset(mask)
         self._action.masked_fill_(mask[:, None], 0.0)
@@ -264,7 +264,7 @@ def kernel_table(walkers: Walkers, case: Case) -> dict[str, Any]:
 
     def period() -> None:
         with walkers.backend._scope():
-            walkers.backend._control_period(substeps, sampled=case.sampled)
+            walkers.backend._control_period(substeps, masked=True, sampled=case.sampled)
 
     if walkers.device.type != "cuda":
         with host_clock() as seen:

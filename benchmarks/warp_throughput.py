@@ -28,7 +28,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gaitgauge.backends.base import Scene
+    from gaitgauge.backends.base import ResetState, Scene
 
 SIZES = (1024, 2048, 4096, 8192, 16384, 32768, 65536)
 GROUNDS = ("plane", "boxes", "field")
@@ -124,7 +124,7 @@ def measure(name: str, ground: str, worlds: int, device: str, steps: int) -> dic
         position[:, :2] = 1.2 * torch.rand((worlds, 2), device=device) - 0.6
         position[:, 2] = robot.stand_height
         index = torch.randint(len(terrains), (worlds,), device=device)
-        backend.reset(mask, base_position=position, base_quaternion=quaternion, terrain_index=index)
+        backend.reset(ResetState(base_position=position, base_quaternion=quaternion, terrain_index=index), mask)
 
     def random_parameters(mask: torch.Tensor | None) -> None:
         def scale(low: float, high: float) -> torch.Tensor:

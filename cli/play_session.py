@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..backends.base import PhysicsState, Randomization, Scene
+from ..backends.base import PhysicsState, Randomization, ResetState, Scene
 from ..backends.registry import make_backend
 from ..gauge.goals import target_command, target_offset
 from ..gauge.suite import Suite
@@ -109,9 +109,11 @@ class PlaySession:
         yaw = torch.tensor([pose.yaw + self._random.uniform(-0.05, 0.05)], device=device, dtype=dtype)
         held = torch.tensor([self.robot.default_joint_position], device=device, dtype=dtype)
         self.backend.reset(
-            base_position=torch.tensor([[x, y, z + self.robot.stand_height]], device=device, dtype=dtype),
-            base_quaternion=from_yaw(yaw),
-            held_target=held,
+            ResetState(
+                base_position=torch.tensor([[x, y, z + self.robot.stand_height]], device=device, dtype=dtype),
+                base_quaternion=from_yaw(yaw),
+                held_target=held,
+            )
         )
         self._builder.reset()
         self._network.reset()

@@ -16,7 +16,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from ..backends.base import PhysicsBackend, Scene
+from ..backends.base import PhysicsBackend, ResetState, Scene
 from ..backends.registry import make_backend
 from ..backends.warp.graphs import WARM_UP, RecordedFunction
 from ..policy.contract import History, PolicyContract, go2_contract
@@ -241,14 +241,16 @@ class TrainingEnvironment(VecEnv):
     def _reset(self, start: EpisodeStart) -> None:
         self.parts.motors.apply(self.backend)
         self.backend.reset(
+            ResetState(
+                base_position=start.base_position,
+                base_quaternion=start.base_quaternion,
+                joint_position=start.joint_position,
+                base_linear_velocity=start.base_linear_velocity,
+                base_angular_velocity=start.base_angular_velocity,
+                held_target=self.parts.default_pose.expand(self.num_envs, -1),
+                terrain_index=self.parts.memory.terrain_index,
+            ),
             start.worlds,
-            base_position=start.base_position,
-            base_quaternion=start.base_quaternion,
-            joint_position=start.joint_position,
-            base_linear_velocity=start.base_linear_velocity,
-            base_angular_velocity=start.base_angular_velocity,
-            held_target=self.parts.default_pose.expand(self.num_envs, -1),
-            terrain_index=self.parts.memory.terrain_index,
         )
 
     def _pack(self, observations: Observations) -> TensorDict:
@@ -320,14 +322,16 @@ class TrainingEnvironment(VecEnv):
         physics = {name: value.to(self.device) for name, value in state["physics"].items()}
         parts.action.copy_(parts.memory.action)
         self.backend.reset(
-            base_position=physics["base_position_w"],
-            base_quaternion=physics["base_quaternion_w"],
-            joint_position=physics["joint_position"],
-            base_linear_velocity=physics["base_linear_velocity_w"],
-            base_angular_velocity=physics["base_angular_velocity_b"],
-            joint_velocity=physics["joint_velocity"],
-            held_target=parts.targets(),
-            terrain_index=parts.memory.terrain_index,
+            ResetState(
+                base_position=physics["base_position_w"],
+                base_quaternion=physics["base_quaternion_w"],
+                joint_position=physics["joint_position"],
+                base_linear_velocity=physics["base_linear_velocity_w"],
+                base_angular_velocity=physics["base_angular_velocity_b"],
+                joint_velocity=physics["joint_velocity"],
+                held_target=parts.targets(),
+                terrain_index=parts.memory.terrain_index,
+            )
         )
         self._read(AFTER_RESET)
 

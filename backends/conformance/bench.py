@@ -14,7 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...robots.base import JointParameters, Robot
 from ...terrains.base import Terrain
-from ..base import Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, Scene, Support
+from ..base import (
+    Capability,
+    PhysicsBackend,
+    PhysicsOptions,
+    PhysicsState,
+    Randomization,
+    ResetState,
+    Scene,
+    Support,
+)
 
 FLAT = Terrain(name="conformance_flat", family="flat")
 WORLDS = 4
@@ -90,12 +99,13 @@ class Worlds:
         return _snapshot(self.backend.sample)
 
     def reset(self, worlds: ArrayLike | None = None, **arguments: Any) -> None:
-        """``PhysicsBackend.reset``; the base is upright at (0, 0, 1) where no pose is given."""
+        """``PhysicsBackend.reset`` with the fields of ``ResetState``; the base is upright at (0, 0, 1) where no pose is given."""
         arguments.setdefault("base_position", np.tile([0.0, 0.0, 1.0], (self.count, 1)))
         arguments.setdefault("base_quaternion", np.tile([1.0, 0.0, 0.0, 0.0], (self.count, 1)))
         terrain_index = arguments.pop("terrain_index", None)
         tensors = {name: self._tensor(value) for name, value in arguments.items() if value is not None}
-        self.backend.reset(self._mask(worlds), terrain_index=self._whole(terrain_index), **tensors)
+        start = ResetState(terrain_index=self._whole(terrain_index), **tensors)
+        self.backend.reset(start, self._mask(worlds))
 
     def step(
         self,

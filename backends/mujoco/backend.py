@@ -28,6 +28,7 @@ from ..base import (
     PhysicsBackend,
     PhysicsState,
     Randomization,
+    ResetState,
     Scene,
     Support,
 )
@@ -107,7 +108,11 @@ class MujocoBackend(PhysicsBackend):
         self._everyone = np.arange(n)
         self._rooms: dict[tuple[int, int], tuple[Array, Records]] = {}
         stand = torch.tensor([0.0, 0.0, robot.stand_height], dtype=torch.float64).repeat(n, 1)
-        self.reset(base_position=stand, base_quaternion=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, 1))
+        self.reset(
+            ResetState(
+                base_position=stand, base_quaternion=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, 1)
+            )
+        )
 
     # ---- layout -------------------------------------------------------------------------------------------------
 
@@ -148,38 +153,28 @@ class MujocoBackend(PhysicsBackend):
             )
         return np.flatnonzero(worlds.numpy())
 
-    def reset(
-        self,
-        worlds: torch.Tensor | None = None,
-        *,
-        base_position: torch.Tensor,
-        base_quaternion: torch.Tensor,
-        joint_position: torch.Tensor | None = None,
-        base_linear_velocity: torch.Tensor | None = None,
-        base_angular_velocity: torch.Tensor | None = None,
-        joint_velocity: torch.Tensor | None = None,
-        held_target: torch.Tensor | None = None,
-        terrain_index: torch.Tensor | None = None,
-    ) -> None:
+    def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.reset``."""
         rows = self._rows(worlds)
         if len(rows) == 0:
             return
-        if terrain_index is not None:
-            self._switch_terrain(rows, terrain_index.numpy())
+        if start.terrain_index is not None:
+            self._switch_terrain(rows, start.terrain_index.numpy())
         self._batch.reset(rows.astype(np.int32), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-        self._qpos[rows, 0:3] = base_position.numpy()[rows]
-        self._qpos[rows, 3:7] = base_quaternion.numpy()[rows]
+        self._qpos[rows, 0:3] = start.base_position.numpy()[rows]
+        self._qpos[rows, 3:7] = start.base_quaternion.numpy()[rows]
         pose = np.asarray(self.scene.robot.default_joint_position)
-        self._qpos[np.ix_(rows, self._joint_q)] = pose if joint_position is None else joint_position.numpy()[rows]
+        self._qpos[np.ix_(rows, self._joint_q)] = (
+            pose if start.joint_position is None else start.joint_position.numpy()[rows]
+        )
         for columns, value in (
-            (np.arange(0, 3), base_linear_velocity),
-            (np.arange(3, 6), base_angular_velocity),
-            (self._joint_v, joint_velocity),
+            (np.arange(0, 3), start.base_linear_velocity),
+            (np.arange(3, 6), start.base_angular_velocity),
+            (self._joint_v, start.joint_velocity),
         ):
             self._qvel[np.ix_(rows, columns)] = 0.0 if value is None else value.numpy()[rows]
-        self._limp[rows] = held_target is None
-        self._held[rows] = 0.0 if held_target is None else held_target.numpy()[rows]
+        self._limp[rows] = start.held_target is None
+        self._held[rows] = 0.0 if start.held_target is None else start.held_target.numpy()[rows]
         self._batch.forward(rows.astype(np.int32), stage=_STAGE)
         self._warned[rows] = self._warning_counts(rows)
         for flags in self._state.flags.values():

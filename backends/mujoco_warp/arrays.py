@@ -5,49 +5,16 @@ N worlds, J joints, F feet, G geoms, S terrain slots. Numbers are float32 and in
 """
 
 # Warp reads the annotations of structs: no ``from __future__ import annotations`` here.
-from dataclasses import fields
 from typing import Any
 
 import mujoco_warp
 import numpy as np
-import torch
 import warp as wp
 
-from ..base import PhysicsState
-from ..warp.motor_law import Limits
 from .model import FootChains, PaletteTables, SharedModel
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 """mujoco_warp's five friction coefficients of a contact: sliding twice, torsional, rolling twice."""
-
-
-@wp.struct
-class StateArrays:
-    """The tensors of a ``PhysicsState``, seen by Warp."""
-
-    time: wp.array[float]
-    base_position_w: wp.array[wp.vec3]
-    base_quaternion_w: wp.array[wp.vec4]
-    base_linear_velocity_w: wp.array[wp.vec3]
-    base_angular_velocity_b: wp.array[wp.vec3]
-    joint_position: wp.array2d[float]
-    joint_velocity: wp.array2d[float]
-    joint_torque: wp.array2d[float]
-    foot_position_w: wp.array2d[wp.vec3]
-    foot_velocity_w: wp.array2d[wp.vec3]
-    foot_contact_force_w: wp.array2d[wp.vec3]
-    foot_normal_force: wp.array2d[float]
-    foot_tangential_force: wp.array2d[float]
-    body_contact_force_w: wp.array2d[wp.vec3]
-    trunk_contact_force_w: wp.array[wp.vec3]
-    ground_force_w: wp.array[wp.vec3]
-    ground_moment_w: wp.array[wp.vec3]
-    contact_center_w: wp.array[wp.vec3]
-    contact_count: wp.array[wp.int64]
-    tilt_substep: wp.array[wp.int64]
-    penetration_substep: wp.array[wp.int64]
-    diverged: wp.array[wp.bool]
-    overflowed: wp.array[wp.bool]
 
 
 @wp.struct
@@ -59,6 +26,10 @@ class Motion:
     velocities: int
     """Length of qvel."""
     bodies: int
+    joint_q: wp.array[int]
+    """Address of each joint in qpos."""
+    joint_v: wp.array[int]
+    """Address of each joint in qvel."""
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
     warmstart: wp.array2d[float]
@@ -70,30 +41,6 @@ class Motion:
     time: wp.array[float]
     overflow: wp.array[int]
     """mujoco_warp's alarms, one bit each."""
-
-
-@wp.struct
-class Motors:
-    """Motor law and targets of every world and joint."""
-
-    joint_q: wp.array[int]
-    """Address of each joint in qpos."""
-    joint_v: wp.array[int]
-    """Address of each joint in qvel."""
-    limits: Limits
-    stiffness: wp.array2d[float]
-    damping: wp.array2d[float]
-    strength: wp.array2d[float]
-    offset: wp.array2d[float]
-    requested: wp.array2d[float]
-    """Targets handed to the present step."""
-    current: wp.array2d[float]
-    previous: wp.array2d[float]
-    """Target that still acts while the delay lasts."""
-    limp: wp.array[int]
-    limp_before: wp.array[int]
-    delay: wp.array[int]
-    torque: wp.array2d[float]
 
 
 @wp.struct
@@ -176,37 +123,11 @@ def to_warp(values: np.ndarray, dtype: type) -> Any:
     return wp.array(np.ascontiguousarray(values), dtype=dtype)
 
 
-def shared_array(tensor: torch.Tensor, dtype: type | None = None) -> Any:
-    """The tensor's memory as a Warp array; ``dtype`` makes vectors of the last axis."""
-    return wp.from_torch(tensor, dtype=dtype)
-
-
-def allocate_state(
-    worlds: int, joints: int, feet: int, bodies: int, device: torch.device
-) -> tuple[PhysicsState, StateArrays]:
-    """A state of zeros: its tensors, and the same memory for the kernels."""
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("joint_position", "joint_velocity", "joint_torque"), (joints,))
-    shapes |= dict.fromkeys(("foot_position_w", "foot_velocity_w", "foot_contact_force_w"), (feet, 3))
-    shapes |= dict.fromkeys(("foot_normal_force", "foot_tangential_force"), (feet,))
-    shapes |= {"body_contact_force_w": (bodies, 3), "base_quaternion_w": (4,)}
-    scalars = {"time": torch.float32, "diverged": torch.bool, "overflowed": torch.bool}
-    scalars |= dict.fromkeys(("contact_count", "tilt_substep", "penetration_substep"), torch.int64)
-    tensors: dict[str, torch.Tensor] = {}
-    arrays = StateArrays()
-    for item in fields(PhysicsState):
-        shape = () if item.name in scalars else shapes.get(item.name, (3,))
-        tensor = torch.zeros((worlds, *shape), dtype=scalars.get(item.name, torch.float32), device=device)
-        vector = item.name not in scalars and item.name.endswith(("_w", "_b"))
-        dtype = (wp.vec4 if shape == (4,) else wp.vec3) if vector else None
-        setattr(arrays, item.name, shared_array(tensor, dtype))
-        tensors[item.name] = tensor
-    return PhysicsState(**tensors), arrays
-
-
-def motion_arrays(model: mujoco_warp.Model, data: mujoco_warp.Data) -> Motion:
+def motion_arrays(model: mujoco_warp.Model, data: mujoco_warp.Data, shared: SharedModel) -> Motion:
     """mujoco_warp's own state arrays."""
     motion = Motion()
     motion.positions, motion.velocities, motion.bodies = model.nq, model.nv, model.nbody
+    motion.joint_q, motion.joint_v = to_warp(shared.joint_q, int), to_warp(shared.joint_v, int)
     motion.qpos, motion.qvel, motion.warmstart = data.qpos, data.qvel, data.qacc_warmstart
     motion.applied, motion.external = data.qfrc_applied, data.xfrc_applied
     motion.time, motion.overflow = data.time, data.overflow

@@ -9,8 +9,9 @@ of them needs the host.
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from ..warp.motor_law import motor_torque
-from .arrays import ContactArrays, Motion, Motors, Palette, Roles, StateArrays
+from ..warp.motors import Motors, begin_world, hold_target, motor_torque, reset_world, take_target
+from ..warp.state import StateArrays
+from .arrays import ContactArrays, Motion, Palette, Roles
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,15 +27,9 @@ def begin_period(active: wp.array[int], has_request: wp.array[int], motors: Moto
     world, joint = wp.tid()
     if active[world] == 0:
         return
-    motors.previous[world, joint] = motors.current[world, joint]
-    if has_request[0] != 0:
-        motors.current[world, joint] = motors.requested[world, joint]
+    take_target(motors, world, joint, has_request[0])
     if joint == 0:
-        motors.limp_before[world] = motors.limp[world]
-        if has_request[0] != 0:
-            motors.limp[world] = 0
-        state.tilt_substep[world] = wp.int64(0)
-        state.penetration_substep[world] = wp.int64(0)
+        begin_world(motors, world, has_request[0], state)
 
 
 @wp.kernel
@@ -80,24 +75,11 @@ def keep_inactive(
 def motor_law(substep: int, motors: Motors, motion: Motion) -> None:
     """The motor law with the target that acts in this substep (from 0)."""
     world, joint = wp.tid()
-    target = motors.current[world, joint]
-    limp = motors.limp[world]
-    if substep < motors.delay[world]:
-        target = motors.previous[world, joint]
-        limp = motors.limp_before[world]
-    position = motion.qpos[world, motors.joint_q[joint]]
-    velocity = motion.qvel[world, motors.joint_v[joint]]
-    error = target + motors.offset[world, joint] - position
-    stiffness, damping, strength = (
-        motors.stiffness[world, joint],
-        motors.damping[world, joint],
-        motors.strength[world, joint],
-    )
-    torque = motor_torque(joint, error, velocity, stiffness, damping, strength, motors.limits)
-    if limp != 0:
-        torque = 0.0
+    position = motion.qpos[world, motion.joint_q[joint]]
+    velocity = motion.qvel[world, motion.joint_v[joint]]
+    torque = motor_torque(motors, world, joint, substep, position, velocity)
     motors.torque[world, joint] = torque
-    motion.applied[world, motors.joint_v[joint]] = torque
+    motion.applied[world, motion.joint_v[joint]] = torque
 
 
 @wp.kernel
@@ -182,14 +164,9 @@ def reset_worlds(
     world, joint = wp.tid()
     if active[world] == 0:
         return
-    motion.qpos[world, motors.joint_q[joint]] = joint_position[world, joint]
-    motion.qvel[world, motors.joint_v[joint]] = joint_velocity[world, joint]
-    held = float(0.0)
-    if has_held[0] != 0:
-        held = motors.requested[world, joint]
-    motors.current[world, joint] = held
-    motors.previous[world, joint] = held
-    motors.torque[world, joint] = 0.0
+    motion.qpos[world, motion.joint_q[joint]] = joint_position[world, joint]
+    motion.qvel[world, motion.joint_v[joint]] = joint_velocity[world, joint]
+    hold_target(motors, world, joint, has_held[0])
     if joint == 0:
         w, x, y, z = pose[world, 3], pose[world, 4], pose[world, 5], pose[world, 6]
         length = wp.sqrt(w * w + x * x + y * y + z * z)
@@ -204,14 +181,9 @@ def reset_worlds(
             motion.applied[world, i] = 0.0
         for i in range(motion.bodies):
             motion.external[world, i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        motors.limp[world] = 1 - has_held[0]
-        motors.limp_before[world] = 1 - has_held[0]
         motion.time[world] = 0.0
         motion.overflow[world] = 0
-        state.diverged[world] = False
-        state.overflowed[world] = False
-        state.tilt_substep[world] = wp.int64(0)
-        state.penetration_substep[world] = wp.int64(0)
+        reset_world(motors, world, has_held[0], state)
 
 
 @wp.kernel

@@ -8,7 +8,8 @@ Floating-point sums run inside one thread in the order of the constraint rows: n
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from .arrays import ContactArrays, Links, Motion, Motors, Roles, StateArrays
+from ..warp.state import StateArrays
+from .arrays import ContactArrays, Links, Motion, Roles
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,7 +19,6 @@ def read_joints(
     select: wp.array[int],
     value: int,
     overflow_mask: int,
-    motors: Motors,
     motion: Motion,
     live: StateArrays,
     out: StateArrays,
@@ -27,8 +27,8 @@ def read_joints(
     world, joint = wp.tid()
     if select[world] != value:
         return
-    out.joint_position[world, joint] = motion.qpos[world, motors.joint_q[joint]]
-    out.joint_velocity[world, joint] = motion.qvel[world, motors.joint_v[joint]]
+    out.joint_position[world, joint] = motion.qpos[world, motion.joint_q[joint]]
+    out.joint_velocity[world, joint] = motion.qvel[world, motion.joint_v[joint]]
     if joint == 0:
         out.time[world] = motion.time[world]
         out.base_position_w[world] = wp.vec3(motion.qpos[world, 0], motion.qpos[world, 1], motion.qpos[world, 2])
@@ -180,36 +180,3 @@ def read_contacts(
     out.ground_moment_w[world] = moment
     out.contact_center_w[world] = center
     out.contact_count[world] = wp.int64(count)
-
-
-@wp.kernel
-def read_torques(select: wp.array[int], value: int, motors: Motors, out: StateArrays) -> None:
-    """Motor torques of the last substep; zero in a world that diverged."""
-    world, joint = wp.tid()
-    if select[world] != value:
-        return
-    torque = motors.torque[world, joint]
-    if out.diverged[world]:
-        torque = 0.0
-    out.joint_torque[world, joint] = torque
-
-
-@wp.kernel
-def clear_forces(active: wp.array[int], joints: int, feet: int, bodies: int, out: StateArrays) -> None:
-    """Zero all forces of the masked worlds' state."""
-    world = wp.tid()
-    if active[world] == 0:
-        return
-    for joint in range(joints):
-        out.joint_torque[world, joint] = 0.0
-    for foot in range(feet):
-        out.foot_contact_force_w[world, foot] = wp.vec3(0.0)
-        out.foot_normal_force[world, foot] = 0.0
-        out.foot_tangential_force[world, foot] = 0.0
-    for body in range(bodies):
-        out.body_contact_force_w[world, body] = wp.vec3(0.0)
-    out.trunk_contact_force_w[world] = wp.vec3(0.0)
-    out.ground_force_w[world] = wp.vec3(0.0)
-    out.ground_moment_w[world] = wp.vec3(0.0)
-    out.contact_center_w[world] = wp.vec3(0.0)
-    out.contact_count[world] = wp.int64(0)

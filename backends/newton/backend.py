@@ -1,43 +1,33 @@
 """The Newton engine: its MuJoCo solver as ``newton``, its other solvers as ``newton:NAME``.
 
 Poses and twists live in Newton's state; kernels of ours write the motors' torques into ``Control.joint_f`` before every
-physics step and read state and contacts out afterwards. On a GPU a whole control period is one CUDA graph and no call
-waits for the device.
+physics step and read state and contacts out afterwards.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
-from math import cos, pi
 from typing import Any, ClassVar
 
 import newton
+import numpy as np
 import torch
 import warp as wp
 
-from ..base import BackendError, Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, Scene
-from ..devices import find_device
-from ..mujoco_warp.device import is_memory_error, memory_advice
+from ..base import BackendError, Capability, PhysicsOptions, Randomization, Scene
+from ..warp.backend import WarpBackend
+from ..warp.device import is_memory_error, memory_advice
 from . import kernels
 from . import readout_kernels as readout
-from .buffers import (
-    MassTensors,
-    MotorTensors,
-    allocate_state,
-    contact_structure,
-    ints,
-    layout_structure,
-    palette_structure,
-)
+from .buffers import MassTensors, contact_structure, floats, ints, layout_structure, palette_structure
 from .description import describe_newton
 from .model import BIRTH_HEIGHT, build_world_model
-from .solvers import SOLVERS, SolverAdapter
+from .solvers import SOLVERS, SolverAdapter, dry_friction_slope
 
 
-class NewtonBackend(PhysicsBackend):
+class NewtonBackend(WarpBackend):
     """N worlds of one robot in Newton."""
 
     name: ClassVar[str] = "newton"
@@ -78,15 +68,11 @@ class NewtonBackend(PhysicsBackend):
         Raises:
             BackendError: no such device, or something that the solver cannot do.
         """
-        found = find_device(device, self.name)
+        self._open(scene, device)
         self.adapter.refuse(scene)
-        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-        wp.init()
-        self.scene, self.device, self.dtype = scene, found, torch.float32
-        self._warp_device = wp.device_from_torch(self.device)
-        self._graphs: dict[tuple[int, bool, bool], Any] = {}
+        self._warp_device = self._scope.warp_device
         try:
-            with self._on_device():
+            with self._scope():
                 self._build()
                 self._warm_up()
         except RuntimeError as error:  # torch's and Warp's out-of-memory errors are such
@@ -96,7 +82,7 @@ class NewtonBackend(PhysicsBackend):
 
     def _memory_advice(self) -> str:
         """The sentence for worlds that do not fit: how many would, measured on small copies."""
-        self.__dict__ = {name: self.__dict__[name] for name in ("scene", "device", "dtype", "_warp_device")}
+        self.__dict__ = {name: self.__dict__[name] for name in ("scene", "device", "dtype", "_scope", "_warp_device")}
         gc.collect()
 
         def free() -> int:
@@ -121,8 +107,7 @@ class NewtonBackend(PhysicsBackend):
         world = build_world_model(scene, device=str(on), gap=self.adapter.gap, skin=self.adapter.skin)
         self._world, self._model = world, world.model
         self._solver = self.adapter(world, scene)
-        robot = scene.robot
-        self._sizes = (robot.num_joints, len(robot.foot_names), len(robot.collision_bodies))
+        self._allocate()
         self._now, self._next = self._model.state(), self._model.state()
         self._control = self._model.control()
         self._layout = layout_structure(world.layout, on)
@@ -130,49 +115,25 @@ class NewtonBackend(PhysicsBackend):
         self._slot_shape = ints(world.layout.slot_shape, on)
         force = self._solver.observables.contact_f
         self._contacts = contact_structure(self._solver.contacts, force, self._model.shape_body)
-        self._motors = MotorTensors(scene, world, own_dry_friction=self.adapter.own_dry_friction, device=self.device)
+        dry = np.zeros(self._joints) if self.adapter.own_dry_friction else np.asarray(scene.parameters.friction_loss)
+        dofs = np.array([int(world.reference.joint(name).dofadr[0]) for name in scene.robot.joint_names])
+        self._dry_friction = floats(dry, on)
+        self._dry_slope = floats(dry_friction_slope(world.reference, dofs, scene.physics.timestep), on)
         self._masses = MassTensors(world, n, self.device)
-        joints, feet, bodies = self._sizes
-        sizes = {"joints": joints, "feet": feet, "bodies": bodies, "device": self.device}
-        self._state, self._state_arrays = allocate_state(n, **sizes)
-        self._sample, self._sample_arrays = allocate_state(n, **sizes)
-        self._active = torch.ones(n, dtype=torch.int32, device=self.device)
-        self._mask = torch.zeros(n + 1, dtype=torch.bool, device=self.device)
-        self._sample_at = torch.zeros(n, dtype=torch.int32, device=self.device)
-        self._requested_terrain = torch.tensor(scene.terrain_index, dtype=torch.int32, device=self.device)
-        self._terrain = self._requested_terrain.clone()
-        self._flag = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self._pose = torch.tensor(robot.default_joint_position, dtype=torch.float32, device=self.device)
+        self._mask = torch.ones(n + 1, dtype=torch.bool, device=self.device)
         self._ticks = wp.zeros(n, dtype=int, device=on)
         kept = (*self._coordinates(self._now), self._solver.warm_start)
         self._kept = tuple(wp.zeros_like(array) for array in kept)
 
     def _warm_up(self) -> None:
         """Compile everything, while a graph cannot be in the way, and put all worlds at the origin."""
-        n = self.num_worlds
-        upright = torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=self.device).repeat(n, 1)
-        terrain = self._requested_terrain.to(torch.int64)
-        origin = torch.zeros((n, 3), device=self.device)
-        high = origin + torch.tensor([0.0, 0.0, BIRTH_HEIGHT], device=self.device)
-        self.reset(base_position=high, base_quaternion=upright, terrain_index=terrain)
-        self._run_period(1, masked=True, sampled=True)
+        self._reset_to_default(BIRTH_HEIGHT)
+        self._control_period(1, masked=True, sampled=True)
         self._solver.inertia_changed()
         self.push()
-        self.reset(base_position=origin, base_quaternion=upright, terrain_index=terrain)
+        self._reset_to_default(0.0)
 
     # ---- running kernels ----------------------------------------------------------------------------------------
-
-    @contextmanager
-    def _on_device(self) -> Iterator[None]:
-        """Run Warp where torch runs: on the backend's device, in torch's present stream."""
-        if self.device.type == "cpu":
-            yield
-            return
-        with (
-            wp.ScopedDevice(self._warp_device),
-            wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.device))),
-        ):
-            yield
 
     def _launch(self, kernel: Any, dim: int | tuple[int, ...], *inputs: Any) -> None:
         wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._warp_device)
@@ -180,11 +141,10 @@ class NewtonBackend(PhysicsBackend):
     def _coordinates(self, state: Any) -> tuple[Any, Any, Any, Any]:
         return state.joint_q, state.joint_qd, state.body_q, state.body_qd
 
-    def _run_period(self, substeps: int, *, masked: bool, sampled: bool) -> None:
-        """One control period, kernel by kernel; what it reads is in the tensors that ``step`` filled."""
-        n, (joints, _, _) = self.num_worlds, self._sizes
-        physics, state = self.scene.physics, self._state_arrays
-        active = wp.from_torch(self._active)
+    def _control_period(self, total: int, *, masked: bool, sampled: bool) -> None:
+        """See ``WarpBackend``."""
+        n, joints = self.num_worlds, self._joints
+        physics, state, motors, active = self.scene.physics, self._live, self._motors.arrays, self._active_array
         now, after = self._now, self._next
         keep = (*self._coordinates(now), self._solver.warm_start, *self._kept)
         width = max(self._world.layout.coordinates, self._world.layout.bodies, self._solver.warm_start.shape[1])
@@ -193,28 +153,29 @@ class NewtonBackend(PhysicsBackend):
         arguments = (
             self._layout,
             active,
-            wp.from_torch(self._flag),
+            self._request_array,
             joints,
-            self._motors.structure,
+            motors,
             *self._coordinates(now),
             state,
         )
         self._launch(kernels.begin_period, n, *arguments)
-        upright = -2.0 if physics.watch_tilt is None else cos(min(physics.watch_tilt, pi))
-        for substep in range(substeps):
+        for substep in range(total):
             self._launch(
                 kernels.motor_law,
                 (n, joints),
                 substep,
                 self._layout,
-                self._motors.structure,
+                motors,
+                self._dry_friction,
+                self._dry_slope,
                 state.diverged,
                 now.joint_q,
                 now.joint_qd,
                 self._control.joint_f,
             )
             watched = physics.watch_penetration is not None
-            last = substep == substeps - 1
+            last = substep == total - 1
             self._solver.step(now, after, self._control, observe=last or sampled or watched)
             self._solver.collect_overflow(active, state.overflowed)
             if watched:
@@ -227,7 +188,7 @@ class NewtonBackend(PhysicsBackend):
                     active,
                     self._contacts,
                     self._palette,
-                    wp.from_torch(self._terrain),
+                    self._terrain_array,
                     now.body_q,
                     state,
                 )
@@ -235,7 +196,7 @@ class NewtonBackend(PhysicsBackend):
                 kernels.end_substep,
                 n,
                 substep,
-                upright,
+                self._upright_limit,
                 self._layout,
                 active,
                 *self._coordinates(after),
@@ -244,7 +205,7 @@ class NewtonBackend(PhysicsBackend):
                 state,
             )
             if sampled:
-                self._read(wp.from_torch(self._sample_at), substep + 1, after, self._sample_arrays, contacts_of=now)
+                self._read(self._sample_array, substep + 1, after, self._sampled, contacts_of=now)
             now, after = after, now
         # the contacts were found in the poses before the last substep
         self._read(active, 1, now, state, contacts_of=after)
@@ -256,13 +217,12 @@ class NewtonBackend(PhysicsBackend):
 
     def _read(self, select: Any, value: int, state: Any, out: Any, *, contacts_of: Any) -> None:
         """Write the state of the worlds whose ``select`` equals ``value``; without ``contacts_of`` forces are zero."""
-        n, (joints, feet, bodies) = self.num_worlds, self._sizes
-        live = self._state_arrays
+        n, live = self.num_worlds, self._live
         self._read_motion(select, value, state, out)
-        self._launch(readout.clear_forces, n, select, value, joints, feet, bodies, out)
+        self._clear_forces(select, value, out)
         if contacts_of is None:
             return
-        self._launch(readout.read_torques, (n, joints), select, value, self._motors.structure, out)
+        self._read_torques(select, value, out)
         count = self._solver.contacts.rigid_contact_max
         poses = contacts_of.body_q
         self._launch(
@@ -272,8 +232,8 @@ class NewtonBackend(PhysicsBackend):
 
     def _read_motion(self, select: Any, value: int, state: Any, out: Any) -> None:
         """Write poses, velocities and flags."""
-        n, (joints, feet, _) = self.num_worlds, self._sizes
-        live, com = self._state_arrays, self._model.body_com
+        n, joints, feet = self.num_worlds, self._joints, self._feet
+        live, com = self._live, self._model.body_com
         timestep = self.scene.physics.timestep
         ticks = self._ticks
         moving = (state.joint_q, state.joint_qd, com)
@@ -282,169 +242,80 @@ class NewtonBackend(PhysicsBackend):
         )
         self._launch(readout.read_feet, (n, feet), select, value, self._layout, state.body_q, state.body_qd, com, out)
 
-    def _graph(self, key: tuple[int, bool, bool]) -> Any:
-        """The CUDA graph of a control period, captured at its first use."""
-        if key not in self._graphs:
-            torch.cuda.synchronize(self.device)
-            # nothing runs while recording; recording in torch's default stream is impossible
-            with wp.ScopedStream(wp.Stream(self._warp_device)), wp.ScopedCapture(force_module_load=False) as capture:
-                self._run_period(key[0], masked=key[1], sampled=key[2])
-            self._graphs[key] = capture.graph
-        return self._graphs[key]
+    def _place_robots(self) -> None:
+        """See ``WarpBackend``."""
+        self._mask[:-1].copy_(self._active)
+        self._launch(
+            kernels.reset_worlds,
+            (self.num_worlds, self._joints),
+            self._layout,
+            self._active_array,
+            self._request_array,
+            *self._reset_arrays,
+            self._model.body_com,
+            self._motors.arrays,
+            self._now.joint_q,
+            self._now.joint_qd,
+            self._now.body_f,
+            self._next.body_f,
+            self._ticks,
+            self._live,
+        )
+        self._solver.reset(self._now, wp.from_torch(self._mask))
+        newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
+        self._read(self._active_array, 1, self._now, self._live, contacts_of=None)
 
-    # ---- the contract -------------------------------------------------------------------------------------------
-
-    @property
-    def state(self) -> PhysicsState:
-        """State after the last call; the tensors change with the next one."""
-        return self._state
-
-    @property
-    def sample(self) -> PhysicsState:
-        """Snapshot taken by the last ``step(sample_at=…)``."""
-        return self._sample
-
-    def _select(self, worlds: torch.Tensor | None) -> None:
-        """Note which worlds the present call is for."""
-        if worlds is None:
-            self._active.fill_(1)
-            self._mask.fill_(True)
-            return
-        if worlds.dtype != torch.bool or worlds.shape != (self.num_worlds,):
-            raise BackendError(
-                f"the mask of worlds must be {self.num_worlds} booleans, not {tuple(worlds.shape)} of {worlds.dtype}"
-            )
-        self._active.copy_(worlds)
-        self._mask[:-1].copy_(worlds)
-
-    def _rows(self, name: str, value: torch.Tensor | None, width: int, default: float | torch.Tensor = 0.0) -> Any:
-        """An argument with one row per world as a Warp array."""
-        if value is None:
-            rows = torch.zeros((self.num_worlds, width), dtype=torch.float32, device=self.device) + default
-        else:
-            if value.shape != (self.num_worlds, width):
-                raise BackendError(f"{name} must have the shape {(self.num_worlds, width)}, not {tuple(value.shape)}")
-            rows = value.to(device=self.device, dtype=torch.float32).contiguous()
-        return wp.from_torch(rows)
-
-    def reset(
-        self,
-        worlds: torch.Tensor | None = None,
-        *,
-        base_position: torch.Tensor,
-        base_quaternion: torch.Tensor,
-        joint_position: torch.Tensor | None = None,
-        base_linear_velocity: torch.Tensor | None = None,
-        base_angular_velocity: torch.Tensor | None = None,
-        joint_velocity: torch.Tensor | None = None,
-        held_target: torch.Tensor | None = None,
-        terrain_index: torch.Tensor | None = None,
-    ) -> None:
-        """See ``PhysicsBackend.reset``."""
-        joints = self._sizes[0]
-        with self._on_device():
-            self._select(worlds)
-            active = wp.from_torch(self._active)
-            if terrain_index is not None:
-                self._requested_terrain.copy_(terrain_index)
-                self._place_terrain(active)
-            self._flag.fill_(held_target is not None)
-            if held_target is not None:
-                self._motors.requested.copy_(held_target)
-            self._launch(
-                kernels.reset_worlds,
-                (self.num_worlds, joints),
-                self._layout,
-                active,
-                wp.from_torch(self._flag),
-                self._rows("base_position", base_position, 3),
-                self._rows("base_quaternion", base_quaternion, 4),
-                self._rows("base_linear_velocity", base_linear_velocity, 3),
-                self._rows("base_angular_velocity", base_angular_velocity, 3),
-                self._rows("joint_position", joint_position, joints, self._pose),
-                self._rows("joint_velocity", joint_velocity, joints),
-                self._model.body_com,
-                self._motors.structure,
-                self._now.joint_q,
-                self._now.joint_qd,
-                self._now.body_f,
-                self._next.body_f,
-                self._ticks,
-                self._state_arrays,
-            )
-            self._solver.reset(self._now, wp.from_torch(self._mask))
-            newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
-            self._read(active, 1, self._now, self._state_arrays, contacts_of=None)
-
-    def _place_terrain(self, active: Any) -> None:
-        """Give the active worlds the terrains in ``_requested_terrain``."""
+    def _place_terrain(self) -> None:
+        """See ``WarpBackend``."""
         self._launch(
             kernels.place_terrain,
             (self.num_worlds, max(1, len(self._world.layout.slot_shape))),
             self._layout,
-            active,
-            wp.from_torch(self._requested_terrain),
+            self._active_array,
+            self._new_terrain_array,
             len(self.scene.terrains),
             self._slot_shape,
             self._palette,
-            wp.from_torch(self._terrain),
+            self._terrain_array,
             self._model.shape_transform,
             self._model.shape_scale,
         )
-        self._solver.shapes_changed(wp.from_torch(self._terrain))
+        self._solver.shapes_changed(self._terrain_array)
 
-    def step(
-        self,
-        joint_targets: torch.Tensor | None,
-        *,
-        delay: torch.Tensor | None = None,
-        sample_at: torch.Tensor | None = None,
-        worlds: torch.Tensor | None = None,
-        substeps: int | None = None,
-    ) -> None:
-        """See ``PhysicsBackend.step``."""
-        count = self.scene.physics.substeps if substeps is None else substeps
-        with self._on_device():
-            self._select(worlds)
-            self._flag.fill_(joint_targets is not None)
-            if joint_targets is not None:
-                self._motors.requested.copy_(joint_targets)
-            if delay is None or joint_targets is None:
-                self._motors.delay.zero_()
-            else:
-                self._motors.delay.copy_(delay)
-            if sample_at is not None:
-                self._sample_at.copy_(sample_at)
-                self._sample_at.mul_(self._active)
-            key = (count, worlds is not None, sample_at is not None)
-            if self.device.type == "cpu":
-                self._run_period(count, masked=key[1], sampled=key[2])
-            else:
-                wp.capture_launch(self._graph(key))
+    def _push_base(self) -> None:
+        """See ``WarpBackend``."""
+        self._launch(
+            kernels.push_base,
+            self.num_worlds,
+            self._layout,
+            self._active_array,
+            self._twist_array,
+            self._model.body_com,
+            self._now.joint_q,
+            self._now.joint_qd,
+        )
+        newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
+        self._read_motion(self._active_array, 1, self._now, self._live)
+
+    # ---- the contract -------------------------------------------------------------------------------------------
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``."""
-        motors, masses = self._motors, self._masses
-        targets: dict[str, tuple[torch.Tensor, torch.Tensor | float]] = {
-            "friction": (masses.friction, 1.0),
-            "base_mass_offset": (masses.base_offset, 1.0),
-            "link_mass_scale": (masses.link_scale, 1.0),
-            "base_com_offset": (masses.com_offset, 1.0),
-            "stiffness_scale": (motors.stiffness, motors.nominal_stiffness),
-            "damping_scale": (motors.damping, motors.nominal_damping),
-            "motor_strength": (motors.strength, 1.0),
-            "motor_offset": (motors.offset, 1.0),
-        }
-        with self._on_device():
-            self._select(worlds)
-            asked = [name for name in targets if getattr(randomization, name) is not None]
-            for name in asked:
-                tensor, unit = targets[name]
-                value = getattr(randomization, name).to(self.device, torch.float32)
-                self._write_rows(name, tensor, (value.unsqueeze(-1) if name == "friction" else value) * unit, worlds)
-            if "friction" in asked:
-                self._solver.shapes_changed(wp.from_torch(self._terrain))
-            if "base_com_offset" in asked:
+        masses, rows = self._masses, self._changes(randomization, worlds)
+        self._write_motors(rows)
+        if "friction" in rows:
+            self._write(masses.friction, rows["friction"][:, None])
+        for name, target in (
+            ("base_mass_offset", masses.base_offset),
+            ("link_mass_scale", masses.link_scale),
+            ("base_com_offset", masses.com_offset),
+        ):
+            if name in rows:
+                self._write(target, rows[name])
+        with self._scope():
+            if "friction" in rows:
+                self._solver.shapes_changed(self._terrain_array)
+            if "base_com_offset" in rows:
                 self._launch(
                     kernels.move_center_of_mass,
                     self.num_worlds,
@@ -456,63 +327,19 @@ class NewtonBackend(PhysicsBackend):
                     self._now.joint_qd,
                 )
                 newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
-            if {"base_mass_offset", "link_mass_scale", "base_com_offset"} & set(asked):
+            if {"base_mass_offset", "link_mass_scale", "base_com_offset"} & set(rows):
                 masses.write(self._solver)
-
-    def _write_rows(self, name: str, tensor: torch.Tensor, rows: torch.Tensor, worlds: torch.Tensor | None) -> None:
-        """Write one row for each masked world into a tensor with a row for every world."""
-        # counting the mask would wait for a GPU
-        wanted = self.num_worlds
-        if worlds is not None:
-            wanted = int(worlds.sum()) if self.device.type == "cpu" else len(rows)
-        if len(rows) != wanted:
-            raise BackendError(f"Randomization.{name} has {len(rows)} rows for {wanted} worlds; give one row for each")
-        rows = rows.expand(len(rows), *tensor.shape[1:]).contiguous()
-        if worlds is None:
-            tensor.copy_(rows)
-        else:
-            mask = worlds.to(self.device).view(-1, *([1] * (tensor.dim() - 1))).expand_as(tensor)
-            tensor.masked_scatter_(mask, rows)
-
-    def push(
-        self,
-        worlds: torch.Tensor | None = None,
-        *,
-        linear_velocity_w: torch.Tensor | None = None,
-        angular_velocity_b: torch.Tensor | None = None,
-    ) -> None:
-        """See ``PhysicsBackend.push``."""
-        with self._on_device():
-            self._select(worlds)
-            active = wp.from_torch(self._active)
-            self._launch(
-                kernels.push_base,
-                self.num_worlds,
-                self._layout,
-                active,
-                self._rows("linear_velocity_w", linear_velocity_w, 3, float("nan")),
-                self._rows("angular_velocity_b", angular_velocity_b, 3, float("nan")),
-                self._model.body_com,
-                self._now.joint_q,
-                self._now.joint_qd,
-            )
-            newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
-            self._read_motion(active, 1, self._now, self._state_arrays)
 
     def apply_force(self, force_w: torch.Tensor) -> None:
         """See ``PhysicsBackend.apply_force``."""
         n, layout = self.num_worlds, self._world.layout
         if force_w.shape != (n, 3):
             raise BackendError(f"force_w must have the shape {(n, 3)}, not {tuple(force_w.shape)}")
-        with self._on_device():
+        with self._scope():
             for state in (self._now, self._next):
                 wrenches = wp.to_torch(state.body_f).view(n, layout.bodies, 6)
                 wrenches[:, layout.base, :3] = force_w.to(self.device, torch.float32)
 
     def describe(self) -> Mapping[str, list[float]]:
         """See ``PhysicsBackend.describe``."""
-        return describe_newton(self.scene, self._world, self._motors)
-
-    def close(self) -> None:
-        """Free the graphs."""
-        self._graphs.clear()
+        return describe_newton(self.scene, self._world, self._motors, self._dry_friction.numpy())

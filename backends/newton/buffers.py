@@ -1,8 +1,7 @@
-"""The memory that the Newton engine shares between torch and Warp: motors, masses, states, layout."""
+"""The memory that the Newton engine shares between torch and Warp: masses, layout."""
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import newton
@@ -11,12 +10,9 @@ import torch
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..base import PhysicsState, Scene
-from ..motor_law import MotorLimits
-from ..warp.motor_law import limit_arrays
 from . import kernels
 from .model import SlotTables, WorldLayout, WorldModel
-from .solvers import SolverAdapter, dry_friction_slope
+from .solvers import SolverAdapter
 
 SMALLEST_MASS = 0.01
 """A base never gets lighter than this [kg]."""
@@ -86,69 +82,6 @@ def contact_structure(contacts: newton.Contacts, force: Any, shape_body: Any) ->
         force=force,
         shape_body=shape_body,
     )
-
-
-def allocate_state(
-    worlds: int, *, joints: int, feet: int, bodies: int, device: torch.device
-) -> tuple[PhysicsState, Any]:
-    """A state of zeros, as tensors and as the kernels see the same memory."""
-    shapes: dict[str, tuple[int, ...]] = {
-        "base_quaternion_w": (4,),
-        "joint_position": (joints,),
-        "joint_velocity": (joints,),
-        "joint_torque": (joints,),
-        "foot_position_w": (feet, 3),
-        "foot_velocity_w": (feet, 3),
-        "foot_contact_force_w": (feet, 3),
-        "foot_normal_force": (feet,),
-        "foot_tangential_force": (feet,),
-        "body_contact_force_w": (bodies, 3),
-    }
-    whole = ("contact_count", "tilt_substep", "penetration_substep")
-    flags = ("diverged", "overflowed")
-    tensors, arrays = {}, kernels.StateArrays()
-    for field in fields(PhysicsState):
-        kind = torch.int64 if field.name in whole else torch.bool if field.name in flags else torch.float32
-        vector = field.name.endswith(("_w", "_b"))
-        rest = shapes.get(field.name, (3,) if vector else ())
-        tensor = tensors[field.name] = torch.zeros((worlds, *rest), dtype=kind, device=device)
-        seen = wp.from_torch(tensor, dtype={3: wp.vec3, 4: wp.vec4}[rest[-1]]) if vector else wp.from_torch(tensor)
-        setattr(arrays, field.name, seen)
-    return PhysicsState(**tensors), arrays
-
-
-class MotorTensors:
-    """Constants and targets of the motors of all worlds; torch writes them, kernels read them in ``structure``."""
-
-    def __init__(self, scene: Scene, world: WorldModel, *, own_dry_friction: bool, device: torch.device) -> None:
-        n, joints, constants = scene.num_worlds, scene.robot.num_joints, scene.parameters
-        on = wp.device_from_torch(device)
-        self.nominal_stiffness = torch.tensor(constants.stiffness, dtype=torch.float32, device=device)
-        self.nominal_damping = torch.tensor(constants.damping, dtype=torch.float32, device=device)
-        self.stiffness = self.nominal_stiffness.repeat(n, 1)
-        self.damping = self.nominal_damping.repeat(n, 1)
-        self.strength = torch.ones((n, joints), dtype=torch.float32, device=device)
-        self.offset = torch.zeros((n, joints), dtype=torch.float32, device=device)
-        self.requested = torch.zeros((n, joints), dtype=torch.float32, device=device)
-        self.delay = torch.zeros(n, dtype=torch.int32, device=device)
-        dofs = np.array([int(world.reference.joint(name).dofadr[0]) for name in scene.robot.joint_names])
-        self.structure = structure(
-            kernels.Motors,
-            limits=limit_arrays(MotorLimits.of(scene), on),
-            stiffness=wp.from_torch(self.stiffness),
-            damping=wp.from_torch(self.damping),
-            strength=wp.from_torch(self.strength),
-            offset=wp.from_torch(self.offset),
-            dry_friction=floats(np.zeros(joints) if own_dry_friction else constants.friction_loss, on),
-            dry_slope=floats(dry_friction_slope(world.reference, dofs, scene.physics.timestep), on),
-            requested=wp.from_torch(self.requested),
-            current=wp.zeros((n, joints), dtype=float, device=on),
-            previous=wp.zeros((n, joints), dtype=float, device=on),
-            limp=wp.ones(n, dtype=int, device=on),
-            limp_before=wp.ones(n, dtype=int, device=on),
-            delay=wp.from_torch(self.delay),
-            torque=wp.zeros((n, joints), dtype=float, device=on),
-        )
 
 
 class MassTensors:

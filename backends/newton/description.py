@@ -6,12 +6,15 @@ import numpy as np
 
 from ..base import Scene
 from ..description import ModelFields
-from .buffers import MotorTensors
+from ..warp.motors import MotorTensors
 from .model import WorldModel
 
 
-def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors) -> dict[str, list[float]]:
-    """The first world as ``PhysicsBackend.describe`` says, read from Newton's arrays."""
+def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors, dry: np.ndarray) -> dict[str, list[float]]:
+    """The first world as ``PhysicsBackend.describe`` says, read from Newton's arrays.
+
+    ``dry`` is the dry friction in the motor kernel [N·m], (J,): that of solvers without one of their own.
+    """
     model, layout = world.model, world.layout
     dofs, bodies = layout.joint_v, layout.collision_bodies
 
@@ -24,8 +27,6 @@ def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors) -> di
     feet = [int(np.flatnonzero(layout.shape_foot == f)[0]) for f in range(len(scene.robot.foot_names))]
     # the floor is the first shape of the ground
     floor = int(np.flatnonzero(layout.shape_ground)[0])
-    # a solver without dry friction of its own has it in the motor kernel
-    dry = motors.structure.dry_friction.numpy()
     strength = motors.strength[0].cpu().numpy()
     return ModelFields(
         total_mass=float(mass.sum()),
@@ -37,7 +38,7 @@ def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors) -> di
         joint_friction_loss=np.maximum(dry, first("joint_friction", layout.dofs)[dofs]),
         stiffness=motors.stiffness[0].cpu().numpy() * strength,
         damping=motors.damping[0].cpu().numpy() * strength,
-        torque_limit=motors.structure.limits.torque.numpy() * strength,
+        torque_limit=motors.torque_limit.cpu().numpy() * strength,
         foot_friction=friction[feet],
         floor_friction=float(friction[floor]),
     ).describe()

@@ -13,7 +13,8 @@ velocity, both in the world frame; ``body_qd`` likewise. The contract's are wxyz
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from ..warp.motor_law import Limits, motor_torque
+from ..warp.motors import Motors, begin_world, hold_target, motor_torque, reset_world, take_target
+from ..warp.state import StateArrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,27 +53,6 @@ class Layout:
 
 
 @wp.struct
-class Motors:
-    """Motor law and targets."""
-
-    limits: Limits
-    stiffness: wp.array2d[float]
-    damping: wp.array2d[float]
-    strength: wp.array2d[float]
-    offset: wp.array2d[float]
-    dry_friction: wp.array[float]
-    """Dry friction that the kernel adds for solvers without it [N·m], and its slope around zero speed [N·m·s/rad]."""
-    dry_slope: wp.array[float]
-    requested: wp.array2d[float]
-    current: wp.array2d[float]
-    previous: wp.array2d[float]
-    limp: wp.array[int]
-    limp_before: wp.array[int]
-    delay: wp.array[int]
-    torque: wp.array2d[float]
-
-
-@wp.struct
 class Palette:
     """Shapes of the palette's terrains, by terrain and slot: the boxes and, where there is one, the height field."""
 
@@ -96,35 +76,6 @@ class ContactArrays:
     force: wp.array[wp.spatial_vector]
     shape_body: wp.array[int]
     """Newton's body of each shape, -1 for the ground."""
-
-
-@wp.struct
-class StateArrays:
-    """The tensors of a ``PhysicsState``, seen by Warp."""
-
-    time: wp.array[float]
-    base_position_w: wp.array[wp.vec3]
-    base_quaternion_w: wp.array[wp.vec4]
-    base_linear_velocity_w: wp.array[wp.vec3]
-    base_angular_velocity_b: wp.array[wp.vec3]
-    joint_position: wp.array2d[float]
-    joint_velocity: wp.array2d[float]
-    joint_torque: wp.array2d[float]
-    foot_position_w: wp.array2d[wp.vec3]
-    foot_velocity_w: wp.array2d[wp.vec3]
-    foot_contact_force_w: wp.array2d[wp.vec3]
-    foot_normal_force: wp.array2d[float]
-    foot_tangential_force: wp.array2d[float]
-    body_contact_force_w: wp.array2d[wp.vec3]
-    trunk_contact_force_w: wp.array[wp.vec3]
-    ground_force_w: wp.array[wp.vec3]
-    ground_moment_w: wp.array[wp.vec3]
-    contact_center_w: wp.array[wp.vec3]
-    contact_count: wp.array[wp.int64]
-    tilt_substep: wp.array[wp.int64]
-    penetration_substep: wp.array[wp.int64]
-    diverged: wp.array[wp.bool]
-    overflowed: wp.array[wp.bool]
 
 
 @wp.func
@@ -198,16 +149,10 @@ def begin_period(
         return
     valid = state_is_valid(layout, world, joint_q, joint_qd)
     for joint in range(joints):
-        motors.previous[world, joint] = motors.current[world, joint]
-        if has_request[0] != 0:
-            motors.current[world, joint] = motors.requested[world, joint]
-            if not (wp.abs(motors.requested[world, joint]) < POSITION_LIMIT):
-                valid = False
-    motors.limp_before[world] = motors.limp[world]
-    if has_request[0] != 0:
-        motors.limp[world] = 0
-    state.tilt_substep[world] = wp.int64(0)
-    state.penetration_substep[world] = wp.int64(0)
+        take_target(motors, world, joint, has_request[0])
+        if has_request[0] != 0 and not (wp.abs(motors.requested[world, joint]) < POSITION_LIMIT):
+            valid = False
+    begin_world(motors, world, has_request[0], state)
     if not valid:
         state.diverged[world] = True
     if state.diverged[world]:
@@ -266,33 +211,26 @@ def motor_law(
     substep: int,
     layout: Layout,
     motors: Motors,
+    dry_friction: wp.array[float],
+    dry_slope: wp.array[float],
     diverged: wp.array[wp.bool],
     joint_q: wp.array[float],
     joint_qd: wp.array[float],
     joint_f: wp.array[float],
 ):
-    """The motor law with the target that acts in this substep (from 0), and dry friction where the solver has none."""
+    """The motor law and, for solvers without it, the joints' dry friction [N·m] with its slope around zero speed
+    [N·m·s/rad].
+    """
     world, joint = wp.tid()
-    target = motors.current[world, joint]
-    limp = motors.limp[world]
-    if substep < motors.delay[world]:
-        target = motors.previous[world, joint]
-        limp = motors.limp_before[world]
     dof = world * layout.dofs + layout.joint_v[joint]
     position = joint_q[world * layout.coordinates + layout.joint_q[joint]]
     velocity = joint_qd[dof]
-    error = target + motors.offset[world, joint] - position
-    stiffness, damping, strength = (
-        motors.stiffness[world, joint],
-        motors.damping[world, joint],
-        motors.strength[world, joint],
-    )
-    torque = motor_torque(joint, error, velocity, stiffness, damping, strength, motors.limits)
-    if limp != 0 or diverged[world]:
+    torque = motor_torque(motors, world, joint, substep, position, velocity)
+    if diverged[world]:
         torque = 0.0
     motors.torque[world, joint] = torque
-    dry = motors.dry_friction[joint]
-    joint_f[dof] = torque - wp.clamp(motors.dry_slope[joint] * velocity, -dry, dry)
+    dry = dry_friction[joint]
+    joint_f[dof] = torque - wp.clamp(dry_slope[joint] * velocity, -dry, dry)
 
 
 @wp.kernel
@@ -348,10 +286,8 @@ def reset_worlds(
     layout: Layout,
     active: wp.array[int],
     has_held: wp.array[int],
-    position: wp.array2d[float],
-    quaternion: wp.array2d[float],
-    linear: wp.array2d[float],
-    angular: wp.array2d[float],
+    pose: wp.array2d[float],
+    twist: wp.array2d[float],
     joint_position: wp.array2d[float],
     joint_velocity: wp.array2d[float],
     body_com: wp.array[wp.vec3],
@@ -369,23 +305,16 @@ def reset_worlds(
         return
     joint_q[world * layout.coordinates + layout.joint_q[joint]] = joint_position[world, joint]
     joint_qd[world * layout.dofs + layout.joint_v[joint]] = joint_velocity[world, joint]
-    held = float(0.0)
-    if has_held[0] != 0:
-        held = motors.requested[world, joint]
-    motors.current[world, joint] = held
-    motors.previous[world, joint] = held
-    motors.torque[world, joint] = 0.0
+    hold_target(motors, world, joint, has_held[0])
     if joint == 0:
         q = world * layout.coordinates
         v = world * layout.dofs
-        rotation = wp.normalize(
-            wp.quat(quaternion[world, 1], quaternion[world, 2], quaternion[world, 3], quaternion[world, 0])
-        )
-        spin = wp.quat_rotate(rotation, wp.vec3(angular[world, 0], angular[world, 1], angular[world, 2]))
+        rotation = wp.normalize(wp.quat(pose[world, 4], pose[world, 5], pose[world, 6], pose[world, 3]))
+        spin = wp.quat_rotate(rotation, wp.vec3(twist[world, 3], twist[world, 4], twist[world, 5]))
         arm = wp.quat_rotate(rotation, body_com[world * layout.bodies + layout.base])
-        velocity = wp.vec3(linear[world, 0], linear[world, 1], linear[world, 2]) + wp.cross(spin, arm)
+        velocity = wp.vec3(twist[world, 0], twist[world, 1], twist[world, 2]) + wp.cross(spin, arm)
         for i in range(3):
-            joint_q[q + i] = position[world, i]
+            joint_q[q + i] = pose[world, i]
             joint_qd[v + i] = velocity[i]
             joint_qd[v + 3 + i] = spin[i]
         for i in range(4):
@@ -393,13 +322,8 @@ def reset_worlds(
         for i in range(layout.bodies):
             external[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
             external_other[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        motors.limp[world] = 1 - has_held[0]
-        motors.limp_before[world] = 1 - has_held[0]
         ticks[world] = 0
-        state.diverged[world] = False
-        state.overflowed[world] = False
-        state.tilt_substep[world] = wp.int64(0)
-        state.penetration_substep[world] = wp.int64(0)
+        reset_world(motors, world, has_held[0], state)
 
 
 @wp.kernel
@@ -432,8 +356,7 @@ def place_terrain(
 def push_base(
     layout: Layout,
     active: wp.array[int],
-    linear: wp.array2d[float],
-    angular: wp.array2d[float],
+    twist: wp.array2d[float],
     body_com: wp.array[wp.vec3],
     joint_q: wp.array[float],
     joint_qd: wp.array[float],
@@ -447,10 +370,10 @@ def push_base(
     velocity = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
     spin = wp.quat_rotate_inv(rotation, wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5]))
     for i in range(3):
-        if not wp.isnan(linear[world, i]):
-            velocity[i] = linear[world, i]
-        if not wp.isnan(angular[world, i]):
-            spin[i] = angular[world, i]
+        if not wp.isnan(twist[world, i]):
+            velocity[i] = twist[world, i]
+        if not wp.isnan(twist[world, 3 + i]):
+            spin[i] = twist[world, 3 + i]
     spin = wp.quat_rotate(rotation, spin)
     velocity = velocity + wp.cross(spin, wp.quat_rotate(rotation, body_com[world * layout.bodies + layout.base]))
     for i in range(3):

@@ -5,7 +5,8 @@
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from .kernels import ContactArrays, Layout, Motors, Palette, StateArrays, root_origin_velocity, root_rotation
+from ..warp.state import StateArrays
+from .kernels import ContactArrays, Layout, Palette, root_origin_velocity, root_rotation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -112,27 +113,6 @@ def read_feet(
 
 
 @wp.kernel
-def clear_forces(select: wp.array[int], value: int, joints: int, feet: int, bodies: int, out: StateArrays):
-    """Zero all forces of the selected worlds."""
-    world = wp.tid()
-    if select[world] != value:
-        return
-    for joint in range(joints):
-        out.joint_torque[world, joint] = 0.0
-    for foot in range(feet):
-        out.foot_contact_force_w[world, foot] = wp.vec3(0.0)
-        out.foot_normal_force[world, foot] = 0.0
-        out.foot_tangential_force[world, foot] = 0.0
-    for body in range(bodies):
-        out.body_contact_force_w[world, body] = wp.vec3(0.0)
-    out.trunk_contact_force_w[world] = wp.vec3(0.0)
-    out.ground_force_w[world] = wp.vec3(0.0)
-    out.ground_moment_w[world] = wp.vec3(0.0)
-    out.contact_center_w[world] = wp.vec3(0.0)
-    out.contact_count[world] = wp.int64(0)
-
-
-@wp.kernel
 def add_contacts(
     select: wp.array[int],
     value: int,
@@ -208,11 +188,3 @@ def finish_contacts(
     center = out.contact_center_w[world] / float(count)
     out.ground_moment_w[world] = out.ground_moment_w[world] - wp.cross(center, out.ground_force_w[world])
     out.contact_center_w[world] = center + base
-
-
-@wp.kernel
-def read_torques(select: wp.array[int], value: int, motors: Motors, out: StateArrays):
-    """Motor torques of the last substep."""
-    world, joint = wp.tid()
-    if select[world] == value:
-        out.joint_torque[world, joint] = motors.torque[world, joint]

@@ -16,6 +16,7 @@ from gaitgauge.backends import (
     PhysicsBackend,
     PhysicsState,
     Randomization,
+    ResetState,
     Scene,
     Support,
 )
@@ -76,7 +77,7 @@ class PlainMujocoBackend(PhysicsBackend):
         self._state, self._arrays = self._allocate()
         self._sample, self._sample_arrays = self._allocate()
         upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
-        self.reset(base_position=torch.zeros(n, 3), base_quaternion=upright)
+        self.reset(ResetState(base_position=torch.zeros(n, 3), base_quaternion=upright))
 
     def _build(self, terrain: Terrain) -> mujoco.MjModel:
         """Model of the robot on one terrain; whatever is fixed to the world body is ground."""
@@ -142,35 +143,23 @@ class PlainMujocoBackend(PhysicsBackend):
     def _rows(self, worlds: torch.Tensor | None) -> list[int]:
         return list(range(self.num_worlds)) if worlds is None else torch.nonzero(worlds).flatten().tolist()
 
-    def reset(
-        self,
-        worlds: torch.Tensor | None = None,
-        *,
-        base_position: torch.Tensor,
-        base_quaternion: torch.Tensor,
-        joint_position: torch.Tensor | None = None,
-        base_linear_velocity: torch.Tensor | None = None,
-        base_angular_velocity: torch.Tensor | None = None,
-        joint_velocity: torch.Tensor | None = None,
-        held_target: torch.Tensor | None = None,
-        terrain_index: torch.Tensor | None = None,
-    ) -> None:
+    def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """Put worlds into a state."""
         for row in self._rows(worlds):
-            if terrain_index is not None and int(terrain_index[row]) != self._terrain[row]:
-                self._terrain[row] = int(terrain_index[row])
+            if start.terrain_index is not None and int(start.terrain_index[row]) != self._terrain[row]:
+                self._terrain[row] = int(start.terrain_index[row])
                 self._models[row] = copy.copy(self._palette[self._terrain[row]])
                 self._data[row] = mujoco.MjData(self._models[row])
                 self._change_model(row)
             data, pose = self._data[row], self.scene.robot.default_joint_position
             mujoco.mj_resetData(self._models[row], data)
-            data.qpos[0:3], data.qpos[3:7] = base_position[row], base_quaternion[row]
-            data.qpos[self._at_q] = pose if joint_position is None else joint_position[row]
-            data.qvel[0:3] = 0.0 if base_linear_velocity is None else base_linear_velocity[row]
-            data.qvel[3:6] = 0.0 if base_angular_velocity is None else base_angular_velocity[row]
-            data.qvel[self._at_v] = 0.0 if joint_velocity is None else joint_velocity[row]
-            self._limp[row] = held_target is None
-            self._target[row] = np.nan if held_target is None else held_target[row]
+            data.qpos[0:3], data.qpos[3:7] = start.base_position[row], start.base_quaternion[row]
+            data.qpos[self._at_q] = pose if start.joint_position is None else start.joint_position[row]
+            data.qvel[0:3] = 0.0 if start.base_linear_velocity is None else start.base_linear_velocity[row]
+            data.qvel[3:6] = 0.0 if start.base_angular_velocity is None else start.base_angular_velocity[row]
+            data.qvel[self._at_v] = 0.0 if start.joint_velocity is None else start.joint_velocity[row]
+            self._limp[row] = start.held_target is None
+            self._target[row] = np.nan if start.held_target is None else start.held_target[row]
             for array in self._arrays.values():
                 array[row] = 0
             self._publish(row, self._arrays)

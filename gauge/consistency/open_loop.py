@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...backends.base import PhysicsBackend, PhysicsState, Randomization, Scene
+from ...backends.base import PhysicsBackend, PhysicsState, Randomization, ResetState, Scene
 from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...policy.observation import ObservationBuilder
@@ -179,7 +179,7 @@ def _begin(backend: PhysicsBackend, friction: float) -> None:
     position[0, 2] = AIR_HEIGHT
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0], **kind).repeat(n, 1)
     pose = torch.tensor(robot.default_joint_position, **kind).repeat(n, 1)
-    backend.reset(base_position=position, base_quaternion=upright, joint_position=pose, held_target=pose)
+    backend.reset(ResetState(base_position=position, base_quaternion=upright, joint_position=pose, held_target=pose))
 
 
 def replay(

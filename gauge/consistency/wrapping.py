@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -19,6 +20,7 @@ from ...backends.base import (
     PhysicsBackend,
     PhysicsState,
     Randomization,
+    ResetState,
     Scene,
     Support,
 )
@@ -52,9 +54,9 @@ class WrappedBackend(PhysicsBackend):
         """See ``PhysicsBackend.sample``."""
         return self.inner.sample
 
-    def reset(self, worlds: torch.Tensor | None = None, **arguments: Any) -> None:
+    def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.reset``."""
-        self.inner.reset(worlds, **arguments)
+        self.inner.reset(start, worlds)
 
     def step(
         self,
@@ -125,20 +127,18 @@ class PerturbedBackend(WrappedBackend):
         unit = 2.0 * uniform_hash(self._key[:, None], self._step[:, None], self._index) - 1.0
         return 1.0 + self._magnitude * unit.to(self.dtype)
 
-    def reset(self, worlds: torch.Tensor | None = None, **arguments: Any) -> None:
+    def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.reset``."""
         if worlds is None:
             self._step.zero_()
         else:
             self._step.masked_fill_(worlds, 0)
         factors = self._factors()
-        position = arguments["base_position"].to(self.dtype).clone()
+        position = start.base_position.to(self.dtype).clone()
         position[:, 2] *= factors[:, -1]
-        asked = arguments.get("joint_position")
+        asked = start.joint_position
         joints = self._pose.expand(self.num_worlds, -1) if asked is None else asked.to(self.dtype)
-        self.inner.reset(
-            worlds, **(arguments | {"base_position": position, "joint_position": joints * factors[:, :-1]})
-        )
+        self.inner.reset(replace(start, base_position=position, joint_position=joints * factors[:, :-1]), worlds)
 
     def step(self, joint_targets: torch.Tensor | None, **arguments: Any) -> None:
         """See ``PhysicsBackend.step``."""

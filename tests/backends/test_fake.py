@@ -10,6 +10,7 @@ from gaitgauge.backends import (
     PhysicsOptions,
     PhysicsState,
     Randomization,
+    ResetState,
     Scene,
     backend_names,
     make_backend,
@@ -35,7 +36,7 @@ def scene(worlds=3, **physics):
 def started(script=None, worlds=3, **physics):
     backend = FakeBackend(scene(worlds, **physics), script=script)
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(worlds, 1)
-    backend.reset(base_position=torch.tensor([0.0, 0.0, 0.3]).repeat(worlds, 1), base_quaternion=upright)
+    backend.reset(ResetState(base_position=torch.tensor([0.0, 0.0, 0.3]).repeat(worlds, 1), base_quaternion=upright))
     return backend
 
 
@@ -142,7 +143,7 @@ def test_divergence_penetration_and_overflow_come_at_their_times():
     assert state.penetration_substep.tolist() == [0, 3, 0]
     assert state.overflowed.tolist() == [False, False, True]
     start = torch.zeros(3, 3)
-    backend.reset(base_position=start, base_quaternion=torch.tensor([1.0, 0, 0, 0]).repeat(3, 1))
+    backend.reset(ResetState(base_position=start, base_quaternion=torch.tensor([1.0, 0, 0, 0]).repeat(3, 1)))
     for field in fields(PhysicsState):
         assert getattr(backend.state, field.name).isfinite().all(), field.name
     assert not backend.state.diverged.any() and not backend.state.overflowed.any()
@@ -191,10 +192,12 @@ def test_external_force_and_terrain_are_kept_until_a_reset():
     backend.step(None)
     torch.testing.assert_close(backend.state.base_linear_velocity_w[:, 0], times(0.02, 0.02, 0.02))
     backend.reset(
+        ResetState(
+            base_position=torch.zeros(3, 3),
+            base_quaternion=torch.tensor([1.0, 0, 0, 0]).repeat(3, 1),
+            terrain_index=torch.tensor([1, 1, 1]),
+        ),
         torch.tensor([True, False, False]),
-        base_position=torch.zeros(3, 3),
-        base_quaternion=torch.tensor([1.0, 0, 0, 0]).repeat(3, 1),
-        terrain_index=torch.tensor([1, 1, 1]),
     )
     backend.step(None)
     torch.testing.assert_close(backend.state.base_linear_velocity_w[:, 0], times(0.0, 0.04, 0.04))

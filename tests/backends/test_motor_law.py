@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends import BackendError, PhysicsOptions, Scene, make_backend
+from gaitgauge.backends import BackendError, PhysicsOptions, ResetState, Scene, make_backend
 from gaitgauge.backends.motor_law import MotorLimits, motor_torque
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Terrain
@@ -69,7 +69,7 @@ def walk(physics, target):
     backend = make_backend("mujoco", scene(worlds=2, **physics))
     pose = torch.tensor(GO2.default_joint_position, dtype=torch.float64)
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(2, 1)
-    backend.reset(base_position=torch.tensor([0.0, 0.0, 1.0]).repeat(2, 1), base_quaternion=upright)
+    backend.reset(ResetState(base_position=torch.tensor([0.0, 0.0, 1.0]).repeat(2, 1), base_quaternion=upright))
     speeds = []
     for step in range(5):
         backend.step((pose + target * (-1) ** step).repeat(2, 1), delay=torch.tensor([0, 4]))

@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from gaitgauge.backends.base import PhysicsOptions, PhysicsState, Scene
+from gaitgauge.backends.base import PhysicsOptions, PhysicsState, ResetState, Scene
 from gaitgauge.backends.mujoco import MujocoBackend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains import make_terrain
@@ -29,7 +29,7 @@ def start(scene: Scene, held: torch.Tensor | None, worlds: torch.Tensor | None, 
     lift = torch.linspace(0.0, 0.1, WORLDS, dtype=torch.float64)
     position = torch.stack((lift * 0.0, lift * 0.0, scene.robot.stand_height + lift), dim=1)
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(WORLDS, 1)
-    backend.reset(worlds, base_position=position, base_quaternion=upright, held_target=held)
+    backend.reset(ResetState(base_position=position, base_quaternion=upright, held_target=held), worlds)
 
 
 @pytest.mark.parametrize("substeps", [None, 1, 4])
@@ -78,7 +78,7 @@ def test_a_step_is_eventful_exactly_where_a_flag_is_set(scene: Scene, cause: str
     pose = torch.tensor(scene.robot.default_joint_position, dtype=torch.float64).repeat(WORLDS, 1)
     high = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64).repeat(WORLDS, 1)
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(WORLDS, 1)
-    backend.reset(base_position=high, base_quaternion=upright, held_target=pose)
+    backend.reset(ResetState(base_position=high, base_quaternion=upright, held_target=pose))
     backend.step(pose)
     assert not backend.eventful
     if cause == "tilt":
@@ -87,7 +87,7 @@ def test_a_step_is_eventful_exactly_where_a_flag_is_set(scene: Scene, cause: str
         high[2, 2] = 0.1
     else:
         pose[2, 3] = torch.nan
-    backend.reset(base_position=high, base_quaternion=upright)
+    backend.reset(ResetState(base_position=high, base_quaternion=upright))
     backend.step(pose)
     assert backend.eventful
     pose[2, 3] = 0.0

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends import BackendError, PhysicsOptions, Randomization, Scene, Support
+from gaitgauge.backends import BackendError, PhysicsOptions, Randomization, ResetState, Scene, Support
 from gaitgauge.backends.base import CAPABILITY_NAMES
 from gaitgauge.backends.mujoco.model import robot_spec
 from gaitgauge.backends.newton import NewtonBackend
@@ -149,9 +149,11 @@ def stand(name, *, height=0.36, friction=0.6, periods=25, **physics):
     kind = engine.dtype
     engine.randomize(Randomization(friction=torch.full((2,), friction, dtype=kind)))
     engine.reset(
-        base_position=torch.tensor([[0.0, 0.0, height], [0.0, 0.0, height + 0.2]], dtype=kind),
-        base_quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=kind).repeat(2, 1),
-        held_target=torch.tensor(ROBOT.default_joint_position, dtype=kind).repeat(2, 1),
+        ResetState(
+            base_position=torch.tensor([[0.0, 0.0, height], [0.0, 0.0, height + 0.2]], dtype=kind),
+            base_quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=kind).repeat(2, 1),
+            held_target=torch.tensor(ROBOT.default_joint_position, dtype=kind).repeat(2, 1),
+        )
     )
     for _ in range(periods):
         engine.step(None)

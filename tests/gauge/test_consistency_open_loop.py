@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends import make_backend
+from gaitgauge.backends import ResetState, make_backend
 from gaitgauge.backends.base import DESCRIPTION_KEYS, Randomization
 from gaitgauge.gauge.consistency.models import compare_models, entry_names
 from gaitgauge.gauge.consistency.open_loop import (
@@ -40,7 +40,7 @@ def test_energy_is_that_of_mechanics():
         position = torch.tensor([0.0, 0.0, height], dtype=torch.float64).repeat(3, 1)
         upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(3, 1)
         tensors = {k: torch.tensor(v, dtype=torch.float64).expand(3, -1) for k, v in velocity.items()}
-        backend.reset(base_position=position, base_quaternion=upright, **tensors)
+        backend.reset(ResetState(base_position=position, base_quaternion=upright, **tensors))
         return meter.measure(backend.state)
 
     low = energy()
@@ -57,7 +57,9 @@ def test_energy_is_kept_in_free_fall_without_motors():
     meter, backend = EnergyMeter(scene), make_backend("mujoco", scene)
     position = torch.tensor([0.0, 0.0, 20.0], dtype=torch.float64).repeat(3, 1)
     backend.reset(
-        base_position=position, base_quaternion=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(3, 1)
+        ResetState(
+            base_position=position, base_quaternion=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(3, 1)
+        )
     )
     before = meter.measure(backend.state)
     for _ in range(50):

@@ -357,11 +357,11 @@ def test_every_episode_and_draw_of_the_floor_has_a_perturbation_of_its_own(reque
     resets = {}
 
     class Listener(FakeBackend):
-        def reset(self, worlds=None, **arguments):
-            joints = arguments.get("joint_position")
+        def reset(self, start, worlds=None):
+            joints = start.joint_position
             if joints is not None:
                 resets.setdefault(id(self), set()).update(tuple(row) for row in joints.tolist())
-            super().reset(worlds, **arguments)
+            super().reset(start, worlds)
 
     def make(name, scene, *, device, threads):
         return Listener(scene)

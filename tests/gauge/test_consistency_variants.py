@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from gaitgauge.backends import Scene
+from gaitgauge.backends import ResetState, Scene
 from gaitgauge.backends.base import BackendError, PhysicsOptions
 from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.consistency.errors import ConsistencyError
@@ -100,16 +100,16 @@ class Spy(FakeBackend):
         self.asked.append(arguments | {"joint_targets": joint_targets})
         super().step(joint_targets, **arguments)
 
-    def reset(self, worlds=None, **arguments):
-        self.given = arguments
-        super().reset(worlds, **arguments)
+    def reset(self, start, worlds=None):
+        self.given = start
+        super().reset(start, worlds)
 
 
 def test_retimed_backend_rounds_to_the_engines_own_grid():
     outer = scene(10)
     backend = RetimedBackend(Spy(scene(10, timestep=0.005, substeps=4)), outer)
     assert backend.scene is outer
-    backend.reset(**standing(backend))
+    backend.reset(ResetState(**standing(backend)))
     target = torch.zeros(10, 12, dtype=backend.dtype)
     backend.step(target, delay=torch.arange(10), sample_at=torch.arange(10) + torch.tensor([0] * 9 + [1]))
     asked = backend.inner.asked[0]
@@ -128,7 +128,7 @@ def test_retimed_backend_counts_watches_in_outer_substeps():
         script=FakeScript(penetration_time=torch.tensor([0.005, 0.01, 0.02, 9.0])),
     )
     backend = RetimedBackend(inner, scene(4))
-    backend.reset(**standing(backend))
+    backend.reset(ResetState(**standing(backend)))
     backend.step(torch.zeros(4, 12, dtype=backend.dtype))
     # after 5, 10 and 20 ms: the third, fifth and tenth substep of 2 ms
     assert backend.state.penetration_substep.tolist() == [3, 5, 10, 0]
@@ -145,21 +145,21 @@ def test_retimed_backend_keeps_the_control_period():
 def perturbed(draw=1, names=("a", "b", "a"), **options):
     backend = PerturbedBackend(Spy(scene(3)), 1e-7, draw=draw, **options)
     backend.assign(range(3), names)
-    backend.reset(**standing(backend))
+    backend.reset(ResetState(**standing(backend)))
     return backend
 
 
 def test_perturbations_are_small_and_the_episodes_own():
     backend = perturbed()
     pose = torch.tensor(GO2.default_joint_position, dtype=backend.dtype)
-    off = backend.inner.given["joint_position"] / pose - 1.0
+    off = backend.inner.given.joint_position / pose - 1.0
     assert 0.0 < off.abs().max() <= 1e-7
     assert torch.equal(off[0], off[2]), "one episode, whatever its world"
     assert not torch.equal(off[0], off[1]), "another episode"
     assert abs(float(off.mean())) < 0.5e-7, "to either side"
-    height = backend.inner.given["base_position"][:, 2]
+    height = backend.inner.given.base_position[:, 2]
     assert 0.0 < (height - 0.4).abs().max() <= 1e-7
-    assert not torch.equal(backend.inner.given["joint_position"], perturbed(2).inner.given["joint_position"]), "draws"
+    assert not torch.equal(backend.inner.given.joint_position, perturbed(2).inner.given.joint_position), "draws"
 
 
 def test_rounding_puts_every_target_off_and_begins_anew_with_a_reset():
@@ -175,7 +175,7 @@ def test_rounding_puts_every_target_off_and_begins_anew_with_a_reset():
     first, second = steps(2)
     assert 0.0 < first.abs().max() <= 1e-7
     assert not torch.equal(first, second)
-    backend.reset(torch.tensor([True, False, False]), **standing(backend))
+    backend.reset(ResetState(**standing(backend)), torch.tensor([True, False, False]))
     again = steps(1)[0]
     assert torch.equal(again[0], first[0])
     assert not torch.equal(again[2], first[2]), "its episode goes on"

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends import Randomization, Scene, make_backend
+from gaitgauge.backends import Randomization, ResetState, Scene, make_backend
 from gaitgauge.backends.mujoco.model import build_models
 from gaitgauge.gauge.metrics import (
     METRIC_NAMES,
@@ -263,11 +263,13 @@ def put(backend, height, *, quaternion=None, joint_velocity=None, **motion):
     pose = rows(*backend.scene.robot.default_joint_position)
     quaternion = rows(1, 0, 0, 0) if quaternion is None else quaternion
     backend.reset(
-        base_position=rows(0, 0, height),
-        base_quaternion=quaternion,
-        held_target=pose,
-        joint_velocity=joint_velocity,
-        **motion,
+        ResetState(
+            base_position=rows(0, 0, height),
+            base_quaternion=quaternion,
+            held_target=pose,
+            joint_velocity=joint_velocity,
+            **motion,
+        )
     )
     return pose
 
@@ -442,9 +444,11 @@ def test_a_block_on_an_incline_has_the_margin_of_the_textbook(block, angle, fric
     backend = make_backend("mujoco", scene(block, terrain))
     backend.randomize(Randomization(friction=scalar(friction)))
     backend.reset(
-        base_position=rows(*(0.05 * up + lift)),
-        base_quaternion=rows(*tilt),
-        held_target=torch.zeros(1, 1, dtype=torch.float64),
+        ResetState(
+            base_position=rows(*(0.05 * up + lift)),
+            base_quaternion=rows(*tilt),
+            held_target=torch.zeros(1, 1, dtype=torch.float64),
+        )
     )
     for _ in range(25):
         backend.step(torch.zeros(1, 1, dtype=torch.float64))

@@ -1,0 +1,105 @@
+"""What differs between the worlds of the mujoco_warp engine beside the motors: friction and masses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import mujoco_warp
+import numpy as np
+import torch
+import warp as wp
+
+from ..description import ModelFields
+from ..warp.motors import MotorTensors
+from .model import SharedModel
+
+BATCHED_FIELDS = (
+    "geom_friction",
+    "geom_size",
+    "geom_aabb",
+    "geom_rbound",
+    "geom_dataid",
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+)
+"""Model fields of which every world has its own."""
+_SMALLEST_MASS = 0.01
+"""Mass that a base keeps, whatever is taken from it [kg]."""
+
+
+class WorldMasses:
+    """Friction and masses: tensors over mujoco_warp's own memory."""
+
+    def __init__(self, shared: SharedModel, model: mujoco_warp.Model, device: torch.device) -> None:
+        self._base = shared.base
+        self._friction = wp.to_torch(model.geom_friction)
+        self._mass, self._inertia = wp.to_torch(model.body_mass), wp.to_torch(model.body_inertia)
+        self._com = wp.to_torch(model.body_ipos)
+        self._nominal_mass, self._nominal_inertia = self._mass.clone(), self._inertia.clone()
+        self._nominal_com = self._com.clone()
+        others = [i for i, body in enumerate(shared.bodies) if body != shared.base]
+        self._others = torch.tensor(others, dtype=torch.int64, device=device)
+        self._other_bodies = torch.tensor(shared.bodies[others], dtype=torch.int64, device=device)
+
+    def write(
+        self, rows: Mapping[str, torch.Tensor], mask: torch.Tensor, write: Callable[[torch.Tensor, torch.Tensor], None]
+    ) -> bool:
+        """Write fields of a ``Randomization``.
+
+        Args:
+            rows: one row for every world, by the field's name.
+            mask: the worlds to change, (N,) bool.
+            write: writes the masked rows of its second argument into the first.
+
+        Returns:
+            Whether masses changed, so that constants which follow from them must be computed anew.
+        """
+        if "friction" in rows:
+            # in every geom, so that neither the larger coefficient nor the higher priority can win with another one
+            write(self._friction[:, :, 0], rows["friction"][:, None].expand(-1, self._friction.shape[1]))
+        base, bodies = self._base, self._other_bodies
+        if "link_mass_scale" in rows:
+            scale, column = rows["link_mass_scale"][:, self._others], mask[:, None]
+            mass, inertia = self._mass[:, bodies], self._inertia[:, bodies]
+            self._mass[:, bodies] = torch.where(column, self._nominal_mass[:, bodies] * scale, mass)
+            scaled = self._nominal_inertia[:, bodies] * scale[:, :, None]
+            self._inertia[:, bodies] = torch.where(column[:, :, None], scaled, inertia)
+        if "base_mass_offset" in rows:
+            mass = (self._nominal_mass[:, base] + rows["base_mass_offset"]).clamp(min=_SMALLEST_MASS)
+            write(self._mass[:, base], mass)
+        if "base_com_offset" in rows:
+            write(self._com[:, base], self._nominal_com[:, base] + rows["base_com_offset"])
+        return bool({"link_mass_scale", "base_mass_offset", "base_com_offset"} & set(rows))
+
+
+def describe_model(model: mujoco_warp.Model, shared: SharedModel, motors: MotorTensors) -> dict[str, list[float]]:
+    """The first world as ``PhysicsBackend.describe`` says, read from the engine's own arrays."""
+
+    def first(name: str) -> np.ndarray:
+        return getattr(model, name).numpy()[0]  # an array of all worlds, or of one that stands for all
+
+    bodies, dofs = shared.bodies, shared.joint_v
+    joints = [int(shared.model.dof_jntid[d]) for d in dofs]
+    limited = shared.model.jnt_limited[joints, None].astype(bool)
+    feet = [int(np.flatnonzero(shared.geom_foot == f)[0]) for f in range(int(shared.geom_foot.max()) + 1)]
+    floor, priority = shared.model.geom("floor").id, model.geom_priority.numpy()
+    friction, strength = first("geom_friction"), motors.strength[0].cpu().numpy()
+    return ModelFields(
+        total_mass=float(first("body_mass").sum()),
+        body_mass=first("body_mass")[bodies],
+        body_inertia=first("body_inertia")[bodies],
+        joint_range=np.where(limited, first("jnt_range")[joints], [-np.inf, np.inf]),
+        joint_armature=first("dof_armature")[dofs],
+        joint_damping=first("dof_damping")[dofs],
+        joint_friction_loss=first("dof_frictionloss")[dofs],
+        stiffness=motors.stiffness[0].cpu().numpy() * strength,
+        damping=motors.damping[0].cpu().numpy() * strength,
+        torque_limit=motors.torque_limit.cpu().numpy() * strength,
+        foot_friction=friction[feet, 0],
+        floor_friction=float(friction[floor, 0]),
+        foot_priority=priority[feet] - priority[floor],
+    ).describe()

@@ -1,0 +1,150 @@
+# mypy: ignore-errors
+# ruff: noqa: ANN201, UP018
+"""Targets, latency and law of the motors of all worlds: ``gaitgauge.backends.motor_law`` for kernels."""
+
+# Warp reads the annotations of structs and functions: no ``from __future__ import annotations`` here.
+import torch
+import warp as wp
+
+from ..base import Scene
+from ..motor_law import MotorLimits
+from .state import StateArrays
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Motors:
+    """Law and targets of every world and joint, (N, J) but for limits (J,) and (N,)."""
+
+    torque_limit: wp.array[float]
+    driving_limit: wp.array[float]
+    no_load_speed: wp.array[float]
+    fall: wp.array[float]
+    """Limits as in ``MotorLimits``, (J,)."""
+    stiffness: wp.array2d[float]
+    damping: wp.array2d[float]
+    strength: wp.array2d[float]
+    offset: wp.array2d[float]
+    requested: wp.array2d[float]
+    """Targets handed to the present step or reset."""
+    current: wp.array2d[float]
+    previous: wp.array2d[float]
+    """Target that still acts while the delay lasts."""
+    limp: wp.array[int]
+    limp_before: wp.array[int]
+    delay: wp.array[int]
+    torque: wp.array2d[float]
+
+
+class MotorTensors:
+    """The tensors of the motors; torch writes them, kernels read them in ``arrays``. N worlds, J joints."""
+
+    def __init__(self, scene: Scene, device: torch.device) -> None:
+        shape, limits = (scene.num_worlds, scene.robot.num_joints), MotorLimits.of(scene)
+        on = wp.device_from_torch(device)
+
+        def tensor(values: object) -> torch.Tensor:
+            return torch.tensor(values, dtype=torch.float32, device=device)
+
+        self.nominal_stiffness = tensor(scene.parameters.stiffness)
+        """Of the parameter set, (J,)."""
+        self.nominal_damping = tensor(scene.parameters.damping)
+        """Of the parameter set, (J,)."""
+        self.torque_limit = tensor(limits.torque)
+        """At rest, (J,)."""
+        self.stiffness = self.nominal_stiffness.repeat(shape[0], 1)
+        self.damping = self.nominal_damping.repeat(shape[0], 1)
+        self.strength = torch.ones(shape, dtype=torch.float32, device=device)
+        self.offset = torch.zeros(shape, dtype=torch.float32, device=device)
+        self.requested = torch.zeros(shape, dtype=torch.float32, device=device)
+        """Targets of the present step or reset, (N, J)."""
+        self.delay = torch.zeros(shape[0], dtype=torch.int32, device=device)
+        """Substeps for which the previous target still acts, (N,)."""
+        self.arrays = arrays = Motors()
+        for name in ("torque_limit", "stiffness", "damping", "strength", "offset", "requested", "delay"):
+            setattr(arrays, name, wp.from_torch(getattr(self, name)))
+        self._speed = [tensor(getattr(limits, name)) for name in ("driving", "no_load_speed", "fall")]
+        arrays.driving_limit, arrays.no_load_speed, arrays.fall = map(wp.from_torch, self._speed)
+        for name in ("current", "previous", "torque"):
+            setattr(arrays, name, wp.zeros(shape, dtype=float, device=on))
+        arrays.limp, arrays.limp_before = (wp.ones(shape[0], dtype=int, device=on) for _ in range(2))
+
+
+@wp.func
+def take_target(motors: Motors, world: int, joint: int, has_request: int):
+    """Shift a joint's targets at the start of a control period."""
+    motors.previous[world, joint] = motors.current[world, joint]
+    if has_request != 0:
+        motors.current[world, joint] = motors.requested[world, joint]
+
+
+@wp.func
+def begin_world(motors: Motors, world: int, has_request: int, state: StateArrays):
+    """The same for what a world has once, and clear its watches."""
+    motors.limp_before[world] = motors.limp[world]
+    if has_request != 0:
+        motors.limp[world] = 0
+    state.tilt_substep[world] = wp.int64(0)
+    state.penetration_substep[world] = wp.int64(0)
+
+
+@wp.func
+def hold_target(motors: Motors, world: int, joint: int, has_held: int):
+    """Let a joint hold ``requested`` after a reset, or nothing."""
+    held = float(0.0)
+    if has_held != 0:
+        held = motors.requested[world, joint]
+    motors.current[world, joint] = held
+    motors.previous[world, joint] = held
+    motors.torque[world, joint] = 0.0
+
+
+@wp.func
+def reset_world(motors: Motors, world: int, has_held: int, state: StateArrays):
+    """The same for what a world has once, and clear its flags."""
+    motors.limp[world] = 1 - has_held
+    motors.limp_before[world] = 1 - has_held
+    state.diverged[world] = False
+    state.overflowed[world] = False
+    state.tilt_substep[world] = wp.int64(0)
+    state.penetration_substep[world] = wp.int64(0)
+
+
+@wp.func
+def motor_torque(motors: Motors, world: int, joint: int, substep: int, position: float, velocity: float) -> float:
+    """The motor law with the target that acts in this substep (from 0); an invalid target or state gives NaN, which a
+    clamp would hide.
+    """
+    target = motors.current[world, joint]
+    limp = motors.limp[world]
+    if substep < motors.delay[world]:
+        target = motors.previous[world, joint]
+        limp = motors.limp_before[world]
+    if limp != 0:
+        return 0.0
+    error = target + motors.offset[world, joint] - position
+    torque = motors.stiffness[world, joint] * error - motors.damping[world, joint] * velocity
+    if wp.isnan(torque):
+        return torque
+    share = wp.clamp((motors.no_load_speed[joint] - wp.abs(velocity)) / motors.fall[joint], 0.0, 1.0)
+    driving = motors.driving_limit[joint] * share
+    lower = -motors.torque_limit[joint]
+    upper = motors.torque_limit[joint]
+    if velocity <= 0.0:
+        lower = -driving
+    if velocity >= 0.0:
+        upper = driving
+    return wp.clamp(torque, lower, upper) * motors.strength[world, joint]
+
+
+@wp.kernel
+def read_torques(select: wp.array[int], value: int, motors: Motors, out: StateArrays) -> None:
+    """Torques of the last substep in the worlds whose ``select`` equals ``value``; zero where the world diverged."""
+    world, joint = wp.tid()
+    if select[world] != value:
+        return
+    torque = motors.torque[world, joint]
+    if out.diverged[world]:
+        torque = 0.0
+    out.joint_torque[world, joint] = torque
