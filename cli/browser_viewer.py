@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import ipaddress
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
 from typing import Any
+from urllib.parse import urlsplit
 
 import mujoco
 import numpy as np
 import trimesh
 import viser
+import websockets.asyncio.server
 
 from .console import Terminal
 from .errors import UserError
@@ -132,16 +138,65 @@ class Panel:
         return forward, lateral, yaw
 
 
-def serve(session: PlaySession, command: Command | None, seconds: float | None, port: int) -> None:
+def is_loopback(host: str) -> bool:
+    """Whether a host name or address is this machine's own."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def is_own_request(headers: Any, host: str) -> bool:
+    """Whether a request may come from the viewer's own page.
+
+    Args:
+        headers: of the request, by name.
+        host: the interface that is listened on. On a loopback one a request must be addressed to this machine, so that no page
+            of another server gets here by giving its own name this machine's address.
+    """
+    addressed = headers.get("Host") or ""
+    origin = headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != addressed:
+        return False
+    return not is_loopback(host) or is_loopback(urlsplit(f"//{addressed}").hostname or "")
+
+
+@contextmanager
+def own_requests_only(host: str) -> Iterator[None]:
+    """Servers of web sockets that are started meanwhile refuse what does not come from their own page: viser takes any origin
+    and has no setting for it.
+    """
+    library: Any = websockets.asyncio.server
+    original: Callable[..., Any] = library.serve
+
+    def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            if not is_own_request(request.headers, host):
+                return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return original(*arguments, process_request=check, **options)
+
+    library.serve = guarded
+    try:
+        yield
+    finally:
+        library.serve = original
+
+
+def serve(session: PlaySession, command: Command | None, seconds: float | None, port: int, host: str) -> None:
     """Serve the page until Ctrl-C or until the time is over.
 
     Raises:
-        UserError: the port is taken.
+        UserError: the port is taken, or the host is none of this machine's.
     """
     try:
-        server = viser.ViserServer(port=port, verbose=False)
+        with own_requests_only(host):
+            server = viser.ViserServer(host=host, port=port, verbose=False)
     except OSError as error:
-        raise UserError(f"port {port} cannot be used: {error.strerror}; choose another --port") from error
+        raise UserError(
+            f"port {port} of {host} cannot be used: {error.strerror or error}; choose another --port or --host"
+        ) from error
     model = visual_model(session.robot, session.terrain)
     data = mujoco.MjData(model)
     stage, panel = Stage(server, model), Panel(server, session.limits, command)
@@ -150,7 +205,10 @@ def serve(session: PlaySession, command: Command | None, seconds: float | None, 
     server.initial_camera.position = middle + np.array([-1.2, -1.8, 0.9])
     server.initial_camera.look_at = middle
     console = Terminal()
-    console.say(f"open http://localhost:{server.get_port()} in a browser; Ctrl-C ends")
+    shown = "localhost" if is_loopback(host) else host
+    console.say(f"open http://{shown}:{server.get_port()} in a browser; Ctrl-C ends")
+    if not is_loopback(host):
+        console.say(f"everybody who reaches {host} can steer this robot; leave --host out to serve this machine alone")
     due, sent = time.monotonic(), 0.0
     try:
         while seconds is None or session.time < seconds:

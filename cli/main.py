@@ -422,6 +422,9 @@ def play(
     backend: Annotated[str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.")] = "mujoco",
     device: Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")] = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,
+    host: Annotated[
+        str, typer.Option(help="Interface of the browser's viewer; 0.0.0.0 lets other machines in.")
+    ] = "127.0.0.1",
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
     trust: TrustOption = False,
 ) -> None:
@@ -441,6 +444,7 @@ def play(
         friction=friction,
         seed=seed,
         port=port,
+        host=host,
         gamepad=gamepad,
         trust=trust,
     )

@@ -38,6 +38,7 @@ def run_play(
     friction: float,
     seed: int,
     port: int,
+    host: str = "127.0.0.1",
     gamepad: bool = False,
     trust: bool = False,
 ) -> None:
@@ -101,7 +102,7 @@ def run_play(
         else:
             from .browser_viewer import serve
 
-            serve(session, command, seconds, port)
+            serve(session, command, seconds, port, host)
     finally:
         session.close()
 

@@ -77,12 +77,14 @@ class ControlStep:
         self._must_clip = any(x < fastest or y < LATERAL_SPEED for x, y, _ in (commands.flat, commands.levelled))
         # which worlds are at work: as ``arrange`` says where that saves something, any of them elsewhere
         self._any_target = self._any_sampled = not early_outs
-        self._everyone = self._refused = False
+        self._everyone, self._count = False, 0
+        self.refused = False
+        """Whether an early out found that the policy's answer is not finite."""
         self._rows_to_play: torch.Tensor | None = None
         self._nothing = self._whole_step = torch.zeros_like(self.buffers.tick)
         self._action = torch.zeros_like(self.buffers.action)
-        self.world_steps = torch.zeros(1, device=device, dtype=torch.int64)
-        """Control steps since the last poll, added up over worlds."""
+        # control steps since they were asked for, added up over worlds: a plain number where values may be read
+        self._world_steps = 0 if early_outs else torch.zeros(1, device=device, dtype=torch.int64)
         self.recording = StepRecording(enabled=capture and not early_outs and device.type == "cuda")
 
     # ---- between control steps ------------------------------------------------------------------------------------
@@ -101,12 +103,19 @@ class ControlStep:
             return
         buffers, count = self.buffers, self.backend.num_worlds
         self._any_target, self._any_sampled = targets, bool((buffers.sampled & buffers.active).any())
-        self._everyone, self._whole_step = len(at_work) == count, buffers.active * self._substeps
+        self._count = len(at_work)
+        self._everyone, self._whole_step = self._count == count, buffers.active * self._substeps
         # rows that need an action, filled up to a multiple of eight
         self._rows_to_play, rows = None, (len(at_work) + 7) // 8 * 8
         if self._few_rows_suffice and rows < count:
             free = [world for world in range(count) if world not in at_work]
             self._rows_to_play = torch.tensor((sorted(at_work) + free)[:rows], device=self.backend.device)
+
+    def take_world_steps(self) -> int:
+        """Control steps since the last call, added up over worlds."""
+        steps = int(self._world_steps)
+        self._world_steps *= 0
+        return steps
 
     def reset(self, mask: torch.Tensor) -> None:
         """Put worlds back to their spawn, (K,) bool; the robot hangs limp for one physics step, then settles."""
@@ -141,9 +150,13 @@ class ControlStep:
             recording.run(self._observe)
             # a captured observation is overwritten by the next one, and a policy may keep what it is given
             seen = self._observation.clone() if recording.enabled else self._observation
-            self._action.copy_(self._session.act(seen, self._rows_to_play))
+            answer = self._session.act(seen, self._rows_to_play)
+            if recording.enabled:
+                self._action.copy_(answer)
+            else:
+                self._action = answer
             recording.run(self._act)
-            if self._refused:
+            if self.refused:
                 return
             worlds = None if self._everyone else buffers.active
             self.backend.step(self._targets, delay=self._delay, sample_at=self._sample_at, worlds=worlds)
@@ -189,10 +202,10 @@ class ControlStep:
         """Take the policy's actions, and plan the samples."""
         buffers = self.buffers
         self._check_action()
-        if self._refused:
+        if self.refused:
             return
         buffers.control_steps += buffers.active
-        self.world_steps += buffers.active.sum()
+        self._world_steps += self._count if self.early_outs else buffers.active.sum()
         self._due, self._sample_at = None, self._nothing
         if self._any_sampled:
             interval = self.suite.metrics.interval
@@ -213,7 +226,7 @@ class ControlStep:
         refused = buffers.active & ~torch.isfinite(action).all(1) & torch.isfinite(self._observation).all(1)
         buffers.not_finite |= refused
         buffers.active &= ~refused
-        self._refused = self.early_outs and bool(refused.any())
+        self.refused = self.early_outs and bool(refused.any())
 
     def _judge(self) -> None:
         """What came of the step: events, samples, ends."""

@@ -172,15 +172,15 @@ class Rollout:
             return []
         self._launched = False
         step, buffers = self._step, self._step.buffers
-        flags = torch.stack((buffers.ended, buffers.respawn, buffers.not_finite))
-        if step.early_outs and not bool(flags.any()):
+        if step.early_outs and not step.refused and not bool((buffers.ended | buffers.respawn).any()):
             return []
+        flags = torch.stack((buffers.ended, buffers.respawn, buffers.not_finite)).tolist()
         ended, respawn, not_finite = (
-            [world for world, flag in enumerate(row) if flag and world in self._segments] for row in flags.tolist()
+            [world for world, flag in enumerate(row) if flag and world in self._segments] for row in flags
         )
-        self.physics_steps += int(step.world_steps) * self.backend.scene.physics.substeps
-        for tensor in (buffers.ended, buffers.respawn, step.world_steps):
-            tensor.zero_()
+        buffers.ended.zero_()
+        buffers.respawn.zero_()
+        self.physics_steps += step.take_world_steps() * self.backend.scene.physics.substeps
         if not_finite:
             raise self._policy_error(not_finite[0])
         self._respawn.update(respawn)

@@ -255,10 +255,12 @@ class LocalProcesses:
         _ = job.scene  # made here, once
         self._processes: list[BaseProcess] = []
         self._pipes: list[Connection] = []
+        self._open: dict[Connection, int] = {}  # workers that have not stopped
         try:
             for number in range(count):
                 ours, theirs = _CONTEXT.Pipe()
                 self._pipes.append(ours)
+                self._open[ours] = number
                 with theirs:
                     process = _CONTEXT.Process(
                         target=_run_worker, args=(job, theirs, tuple(self._pipes)), name=f"worker-{number}"
@@ -278,14 +280,17 @@ class LocalProcesses:
 
     def receive(self) -> list[tuple[int, Finished | Progress | Failed]]:
         """See ``Transport.receive``."""
-        messages = []
-        for pipe in wait(self._pipes):
-            worker = self._pipes.index(pipe)  # type: ignore[arg-type]
+        messages: list[tuple[int, Finished | Progress | Failed]] = []
+        for pipe in wait(list(self._open)):
+            assert isinstance(pipe, Connection)
+            worker = self._open[pipe]
             try:
-                message = self._pipes[worker].recv()
+                messages.append((worker, pipe.recv()))
             except (EOFError, OSError) as error:
                 raise self._gone(worker) from error
-            messages.append((worker, message))
+            last = messages[-1][1]
+            if isinstance(last, Progress) and last.stopped:
+                del self._open[pipe]
         return messages
 
     def _gone(self, worker: int) -> BackendError:

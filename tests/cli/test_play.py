@@ -12,7 +12,7 @@ import pytest
 import torch
 from gaitgauge.backends import ResetState
 from gaitgauge.cli import scenery
-from gaitgauge.cli.browser_viewer import Stage, geom_color, geom_mesh, serve
+from gaitgauge.cli.browser_viewer import Stage, geom_color, geom_mesh, is_own_request, serve
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.play_session import PlaySession, PlaySettings
 from gaitgauge.cli.video import Video, choose_renderer
@@ -239,8 +239,50 @@ def test_page_is_served_and_ends(session, monkeypatch):
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
-    serve(session(), (0.0, 0.0, 0.0), 0.1, port)
+    serve(session(), (0.0, 0.0, 0.0), 0.1, port, "127.0.0.1")
     assert len(moved) == 2
+
+
+def test_only_this_machine_and_only_the_own_page(session, monkeypatch):
+    """The page listened on every interface and took any origin."""
+    from http.client import HTTPConnection
+
+    answers = {}
+
+    def ask(name: str, **headers: str) -> None:
+        connection = HTTPConnection("127.0.0.1", port, timeout=10)
+        upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+        key = {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": "viser-v0"}
+        connection.request("GET", "/", headers=upgrade | key | headers)
+        answers[name] = connection.sock and connection.getresponse().status
+        connection.close()
+
+    def look(self, data):
+        if answers:
+            return
+        own = f"localhost:{port}"
+        ask("own page", Host=own, Origin=f"http://{own}")
+        ask("no browser", Host=own)
+        ask("other page", Host=own, Origin="http://evil.example")
+        ask("other name", Host=f"evil.example:{port}", Origin=f"http://evil.example:{port}")
+        others = [a[4][0] for a in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+        for address in (a for a in others if not a.startswith("127.")):
+            with pytest.raises(OSError):
+                socket.create_connection((address, port), timeout=5).close()
+
+    monkeypatch.setattr(Stage, "move", look)
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        port = probe.getsockname()[1]
+    serve(session(), (0.0, 0.0, 0.0), 0.1, port, "127.0.0.1")
+    assert answers == {"own page": 101, "no browser": 101, "other page": 403, "other name": 403}
+
+
+def test_requests_from_other_machines_are_welcome_where_asked_for():
+    page = {"Host": "robot.lan:8080", "Origin": "http://robot.lan:8080"}
+    assert is_own_request(page, "0.0.0.0")
+    assert not is_own_request(page, "127.0.0.1")
+    assert not is_own_request(page | {"Origin": "http://evil.example"}, "0.0.0.0")
 
 
 # ---- video ----------------------------------------------------------------------------------------------------------

@@ -191,10 +191,11 @@ def test_worlds_that_are_invalid_from_the_start_end_as_results(name):
     script = FakeScript(diverge_time=at(0.0))
     episodes = [episode(DIAGONAL, MAXIMUM), episode(TARGET, stage="search")]
     records = play(short_suite(name), episodes, script, terrain=ground((5.0, 0.0, 0.4)), policy=policy)
-    assert [r.diverged for r in records] == [True, True]
-    assert records[1].success is False
-    assert not records[0].samples.any()
-    assert len(records[0].samples) == (14 * 4 if name == OWN else 0)
+    crossing, walk = records
+    assert (crossing.diverged, walk.diverged) == (True, True)
+    assert crossing.success is False
+    assert not walk.samples.any()
+    assert len(walk.samples) == (14 * 4 if name == OWN else 0)
 
 
 def test_an_overflow_is_recorded_and_interrupts_nothing():
