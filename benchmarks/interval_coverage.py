@@ -5,9 +5,10 @@ synthetic ones whose truth is known. And how often a policy is told apart from i
     python benchmarks/interval_coverage.py --synthetic 1000                   # and 1000 synthetic evaluations of each kind
     python benchmarks/interval_coverage.py --record 30 --folder /tmp/repeated # play the evaluations again, and write the data
 
-Recorded are evaluations of the shipped policy by the rules of ``robogauge-1.1``, on waves and obstacles at friction 0.6. They
-differ in their seeds alone: evaluation k has the quality seeds 10k, 10k+1, 10k+2 and the search seeds 10k … 10k+4. One takes about
-a minute of one core; what the folder holds is not played again. Their truth is their mean.
+Recorded are evaluations of a policy that was ``pretrained`` once (the data hold its digest), by the rules of ``robogauge-1.1``,
+on waves and obstacles at friction 0.6. They differ in their seeds alone: evaluation k has the quality seeds 10k, 10k+1, 10k+2 and
+the search seeds 10k … 10k+4. One takes about a minute of one core; what the folder holds is not played again. Their truth is
+their mean.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ Results = dict[str, Any]
 # ---- recorded -------------------------------------------------------------------------------------------------------
 
 
-def record(count: int, folder: Path, threads: int) -> list[Results]:
+def record(count: int, policy: str, folder: Path, threads: int) -> list[Results]:
     """Play whole evaluations with fresh seeds, and keep what intervals and comparisons read."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
@@ -65,7 +66,7 @@ def record(count: int, folder: Path, threads: int) -> list[Results]:
         suite = folder / f"repeated-{index}.toml"
         seeds = [10 * index + s for s in range(5)]
         suite.write_text(SUITE.format(index=index, seeds=seeds[:3], search_seeds=seeds))
-        request = Request(policy="pretrained", suite=str(suite), threads=threads)
+        request = Request(policy=policy, suite=str(suite), threads=threads)
         results = evaluate(request, folder / f"run-{index}", resume=True)
         print(f"{index}: {results['score']:.4f}", flush=True)
         found.append(trimmed(results))
@@ -305,10 +306,19 @@ def judge(recorded: Sequence[Results]) -> dict[str, Figures]:
     return found
 
 
+def quality_by_level(recorded: Sequence[Results]) -> dict[str, float]:
+    """Mean quality of all runs on a terrain at a level."""
+    found: dict[str, list[float]] = {}
+    for row in (row for results in recorded for row in results["environments"]):
+        found.setdefault(f"{row['terrain']} {row['level']}", []).extend(r["quality"] for r in row["runs"].values())
+    return {place: float(np.mean(values)) for place, values in sorted(found.items())}
+
+
 def main() -> None:
     """Record if asked to, judge, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--record", type=int, metavar="COUNT", help="play so many evaluations and write the data")
+    parser.add_argument("--policy", default="pretrained", help="which is played")
     parser.add_argument("--folder", type=Path, help="where they are played")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--data", type=Path, default=DATA)
@@ -317,13 +327,14 @@ def main() -> None:
     if arguments.record:
         if arguments.folder is None:
             parser.error("--record needs a --folder to play in")
-        recorded = record(arguments.record, arguments.folder, arguments.threads)
+        recorded = record(arguments.record, arguments.policy, arguments.folder, arguments.threads)
         write_atomically(arguments.data, json.dumps(recorded, separators=(",", ":")) + "\n", StoreError)
     recorded = json.loads(arguments.data.read_text())
     print(f"{len(recorded)} whole evaluations with fresh seeds\n")
     print(f"{'':24}{'mean':>9}{'1.96 σ':>9}{'printed':>9}{'covered':>9}")
     for name, (mean, reach, printed, held) in judge(recorded).items():
         print(f"{name:24}{mean:9.4f}{reach:9.4f}{printed:9.4f}{held:9.3f}")
+    print("\nmean quality by level: " + ", ".join(f"{k} {v:.3f}" for k, v in quality_by_level(recorded).items()))
     pairs = list(zip(recorded[::2], recorded[1::2], strict=False))
     alarms = np.sum([alarm(pair) for pair in pairs], axis=0)
     print(f"\ntold apart from itself: {alarms[0]:.0f} of {len(pairs)} by the score, {alarms[1]:.0f} by a detail")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,9 @@ Row = Mapping[str, Any]
 CONFIDENCE = 0.95
 _QUALITY_STEP = 0.85
 """What is left of the quality one level higher: 0.84 on waves and 0.79 on obstacles of ``docs/data/repeated_evaluations.json``."""
+_LEVEL_FREEDOM = 8.0
+"""Degrees of freedom of the variance of one environment's level, which rests on a dozen trials: so many keep rare false alarms
+as rare as they should be (``benchmarks/interval_coverage.py --synthetic``)."""
 _UNKNOWN_QUALITY = 0.5
 """Quality at the levels that an environment might have reached, where no quality was measured anywhere."""
 
@@ -35,7 +38,9 @@ class Chance:
     """What chance does to a weighted sum over environments: independent parts whose variances add up."""
 
     levels: Array
-    """Deviation in each replicate of the level searches, (B,); without any where levels were given, zeros."""
+    """Deviation in each replicate of the level searches, (B,); zeros where levels were given."""
+    level_freedom: float = math.inf
+    """Degrees of freedom of their variance."""
     seeds: tuple[Array, ...]
     """Tables of deviations of the quality seeds from their mean, (independent streams, S); a stream's seeds are paired."""
 
@@ -44,26 +49,23 @@ class Chance:
         """Whether it can be estimated: one seed shows no spread."""
         return all(table.shape[1] > 1 for table in self.seeds)
 
-    def _parts(self) -> tuple[float, Array, Array]:
-        """Variance from levels; variances from seeds, and their degrees of freedom."""
+    def _parts(self) -> tuple[Array, Array]:
+        """Variances that add up, of levels and of every stream of seeds, and their degrees of freedom."""
         tables = [t for t in self.seeds if t.size]
         variances = [(t**2).sum(1) / (t.shape[1] * (t.shape[1] - 1)) for t in tables]
         freedom = [np.full(len(t), t.shape[1] - 1.0) for t in tables]
-        empty = np.zeros(0)
-        return float(self.levels.var()), np.concatenate([empty, *variances]), np.concatenate([empty, *freedom])
+        levels = np.array([self.levels.var()])
+        return np.concatenate([levels, *variances]), np.concatenate([[self.level_freedom], *freedom])
 
     @property
     def error(self) -> float:
         """Standard error."""
-        levels, seeds, _ = self._parts()
-        return math.sqrt(levels + float(seeds.sum()))
+        return math.sqrt(float(self._parts()[0].sum()))
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom of the standard error (Welch and Satterthwaite); infinite where levels alone are chance."""
-        levels, seeds, freedom = self._parts()
-        uncertain = float((seeds**2 / freedom).sum()) if seeds.size else 0.0
-        return (levels + float(seeds.sum())) ** 2 / uncertain if uncertain > 0.0 else math.inf
+        """Degrees of freedom of the standard error (Welch and Satterthwaite)."""
+        return welch(*self._parts())
 
     def interval(self, value: float, bounds: tuple[float, float] | None = (0.0, 1.0)) -> tuple[float, float] | None:
         """Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread."""
@@ -92,7 +94,17 @@ class Chance:
             seeds = tuple(a - b for a, b in zip(self.seeds, other.seeds, strict=True))
         else:
             seeds = (*self.seeds, *other.seeds)
-        return Chance(levels=self.levels - other.levels, seeds=seeds)
+        variances, freedoms = zip(
+            (self.levels.var(), self.level_freedom), (other.levels.var(), other.level_freedom), strict=True
+        )
+        freedom = welch(np.array(variances), np.array(freedoms))
+        return Chance(levels=self.levels - other.levels, level_freedom=freedom, seeds=seeds)
+
+
+def welch(variances: Array, freedoms: Array) -> float:
+    """Degrees of freedom of a sum of estimated variances (Welch and Satterthwaite); infinite for none."""
+    uncertain = float((variances**2 / freedoms).sum())
+    return float(variances.sum()) ** 2 / uncertain if uncertain > 0.0 else math.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,9 +192,9 @@ class Evidence:
             away = np.where(self._reached > 0, self.redrawn.T - self._reached, 0).T
             means = np.minimum(means * _QUALITY_STEP**away, 1.0)
         at_levels = rules.level_weight * (self.redrawn - 1) + rules.quality_weight * means
-        levels = weights @ np.where(self._flat[:, None] | (self.redrawn == 0), 0.0, at_levels)
+        levels = weights[:, None] * np.where(self._flat[:, None] | (self.redrawn == 0), 0.0, at_levels)
         at_reached = self.chance_at_levels(weights * np.where(self._flat, 1.0, rules.quality_weight), columns)
-        return Chance(levels=levels - levels.mean(), seeds=(*at_reached.seeds, self._search_seeds(weights)))
+        return replace(at_reached, **self._of_levels(levels), seeds=(*at_reached.seeds, self._search_seeds(weights)))
 
     def chance_at_levels(self, weights: Array, columns: Sequence[str]) -> Chance:
         """Chance in a weighted sum over environments of values as measured at the levels reached, see ``chance``."""
@@ -202,8 +214,13 @@ class Evidence:
 
     def level_chance(self, weights: Array) -> Chance:
         """Chance in a weighted sum of the environments' levels, ``weights`` (E,). Quality seeds play no part."""
-        levels = weights @ self.redrawn
-        return Chance(levels=levels - levels.mean(), seeds=(self._search_seeds(weights),))
+        return Chance(**self._of_levels(weights[:, None] * self.redrawn), seeds=(self._search_seeds(weights),))
+
+    def _of_levels(self, levels: Array) -> dict[str, Any]:
+        """Part of the levels in ``Chance``, from what each environment adds in each replicate, (E, B)."""
+        freedom = welch(levels.var(axis=1), np.full(len(levels), _LEVEL_FREEDOM))
+        total = levels.sum(0)
+        return {"levels": total - total.mean(), "level_freedom": freedom}
 
     def _search_seeds(self, weights: Array) -> Array:
         """No deviations, of as many seeds as stand behind the levels; two where the levels were given, and are certain."""

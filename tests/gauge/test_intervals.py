@@ -57,7 +57,7 @@ def test_one_seed_has_no_interval_and_no_p_value():
 
 def test_the_levels_of_one_quality_seed_still_have_an_interval():
     low, high = Evidence([levelled(8, SEARCH, 0.4)], rules(seeds=(0,))).level_chance(np.ones(1)).interval(8.0, (0, 10))
-    assert 6.0 < low < 7.5 and 8.5 < high < 9.5
+    assert 6.0 < low < 7.5 and 8.5 < high < 9.7
 
 
 def test_one_search_seed_has_no_interval():
@@ -127,6 +127,16 @@ def test_a_paired_difference_knows_what_both_have_in_common():
     assert one.minus(other, paired=True).p_value(0.1) == pytest.approx(0.0, abs=1e-9)
     assert one.minus(other, paired=False).error == pytest.approx(0.1 * math.sqrt(2 / 3))
     assert one.minus(other, paired=False).freedom == pytest.approx(4.0)
+
+
+def test_the_variance_of_a_level_is_known_from_a_dozen_trials_alone():
+    """Eight degrees of freedom for each environment, and more of them know more."""
+    one = Evidence([levelled(8, SEARCH, 0.4, 0.4, 0.4)], rules()).level_chance(np.ones(1))
+    assert one.freedom == pytest.approx(8.0)
+    three = Evidence([levelled(8, SEARCH, 0.4, 0.4, 0.4)] * 3, rules()).level_chance(np.full(3, 1 / 3))
+    assert three.freedom == pytest.approx(24.0, rel=0.01)
+    other = Evidence([levelled(8, SEARCH, 0.4, 0.4, 0.4)], rules(), name="other").level_chance(np.ones(1))
+    assert one.minus(other, paired=True).freedom == pytest.approx(16.0, rel=0.01)
 
 
 def test_p_value_and_interval_agree():
