@@ -175,7 +175,7 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
     order = list(suite.matrix.terrains)
     chosen = sorted(set(request.terrains), key=lambda t: (order.index(t) if t in order else len(order), t))
     if request.pipeline in ("base", "multi"):
-        chosen = chosen or ["flat"]
+        chosen = chosen or order[:1]
     if request.level is not None and chosen and all(t == "flat" for t in chosen):
         raise SuiteError(f"terrain 'flat' has no levels, so --level {request.level} means nothing; leave it out")
     if request.pipeline in ("base", "multi"):

@@ -320,6 +320,12 @@ def _check(suite: Suite, source: str) -> None:
     for name in ("terrains", "frictions", "payloads", "seeds", "search_seeds"):
         values = getattr(matrix, name)
         rules[f"matrix.{name} has an entry twice: {shown(list(values))}"] = len(set(values)) == len(values)
+    for one, among in (("nominal_friction", "frictions"), ("nominal_payload", "payloads")):
+        nominal, values = getattr(matrix, one), getattr(matrix, among)
+        rules[
+            f"matrix.{one} ({nominal:g}) is none of matrix.{among} ({', '.join(f'{v:g}' for v in values)}); add it there, or "
+            f"let {one} be one of them"
+        ] = nominal in values
     for rule, kept in rules.items():
         if not kept:
             raise SuiteError(f"{source}: {rule}")

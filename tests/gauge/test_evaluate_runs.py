@@ -396,6 +396,20 @@ def test_a_base_run_is_one_episode(request_for, tmp_path):
     assert "search" not in results["environments"][0]
 
 
+@pytest.mark.parametrize("pipeline", ["base", "multi"])
+def test_a_single_run_takes_the_suites_own_ground(request_for, tmp_path, pipeline):
+    request = request_for(pipeline=pipeline)
+    own = TINY.format(base="gaitgauge-1").replace('["flat", "slope_fd"]', '["slope_fd", "wave"]')
+    own = own.replace("frictions = [0.6]", "frictions = [0.3]\nnominal_friction = 0.3")
+    Path(request.suite).write_text(own)
+    with pytest.raises(
+        SuiteError, match=f"pipeline '{pipeline}' plays one level of terrain 'slope_fd'; say which with"
+    ):
+        prepare(request)
+    (environment,) = prepare(replace(request, level=2)).environments
+    assert environment.key == "slope_fd-f0.3-m0"
+
+
 # ---- real kills and real physics --------------------------------------------------------------------------------------------
 
 CHILD = """

@@ -61,12 +61,22 @@ def test_the_own_suite_has_eight_metrics_and_acting_torque_limits():
     assert OWN.matrix.frictions == REFERENCE.matrix.frictions
 
 
+def test_checkpoints_are_chosen_on_seeds_that_no_benchmark_scores():
+    mid = load_suite("mid").matrix
+    for suite in (REFERENCE, OWN):
+        scored = {*suite.matrix.seeds, *suite.matrix.search_seeds}
+        assert scored.isdisjoint({*mid.seeds, *mid.search_seeds})
+    assert load_suite("mid").version == "2.0.0"
+
+
 def test_a_suite_of_ones_own_changes_what_it_names_and_nothing_else(suite_file):
-    suite = load_suite(suite_file(mine("[matrix]\nfrictions = [0.5, 1]\n[events]\nfall = 'close-goal'")))
+    suite = load_suite(
+        suite_file(mine("[matrix]\nfrictions = [0.5, 1]\nnominal_friction = 0.5\n[events]\nfall = 'close-goal'"))
+    )
     assert suite == replace(
         OWN,
         name="mine",
-        matrix=replace(OWN.matrix, frictions=(0.5, 1.0)),
+        matrix=replace(OWN.matrix, frictions=(0.5, 1.0), nominal_friction=0.5),
         events=replace(OWN.events, fall="close-goal"),
     )
     assert isinstance(suite.matrix.frictions[1], float)
@@ -115,6 +125,12 @@ def test_a_suite_may_limit_torque_by_speed(suite_file):
         ("[matrix]\nseeds = [1000000000000000000000]", r"matrix.seeds\[0\] is 1000000000000000000000; .* 2\^63"),
         ("[matrix]\nseeds = [-1]", "greater than or equal to 0"),
         ("[matrix]\nnominal_friction = inf", "matrix.nominal_friction is inf; it must be a finite number"),
+        (
+            "[matrix]\nfrictions = [0.2, 0.4]",
+            r"matrix.nominal_friction \(0.6\) is none of matrix.frictions \(0.2, 0.4\); add it there, or let",
+        ),
+        ("[matrix]\npayloads = [2]", r"matrix.nominal_payload \(0\) is none of matrix.payloads \(2\)"),
+        ("goals = [{ name = 'jump', phases = [] }]", r"goals\[0\].name is 'jump'; it must be 'diagonal_velocity', "),
         ("[commands]\nflat = [1.0, 2.0]", r"commands.flat is \[1.0, 2.0\]; more entries are needed"),
         ("[commands]\nflat = [1.0, 2.0, 3.0, 4.0]", "commands.flat is .*; it must have at most 3 items"),
         ("[commands]\ntarget_radius = inf", "commands.target_radius is inf; it must be a finite number"),
