@@ -13,7 +13,7 @@ import typer
 from rich.text import Text
 
 from ..gauge.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
-from ..gauge.consistency.study import Request, Status, prepare_study, study
+from ..gauge.consistency.study import StudyRequest, StudyStatus, prepare_study, study
 from .console import Terminal, make_table, shell_command
 from .progress import ProgressDisplay
 
@@ -29,7 +29,7 @@ def run_consistency(
     **choices: Any,
 ) -> None:
     """Make the study, show progress, print the tables and where the files are."""
-    request = Request(
+    request = StudyRequest(
         policies=tuple(policies),
         backends=tuple(b.strip() for b in backends.split(",") if b.strip()),
         threads=threads or os.cpu_count() or 1,
@@ -59,10 +59,10 @@ def run_consistency(
     console.say(f"results  {folder / 'consistency.json'}\npage     {page}")
 
 
-def _shower(display: ProgressDisplay) -> Callable[[Status], None]:
+def _shower(display: ProgressDisplay) -> Callable[[StudyStatus], None]:
     """What a study is watched with."""
 
-    def show(status: Status) -> None:
+    def show(status: StudyStatus) -> None:
         share = (status.part - 1 + status.done / status.episodes) / status.parts
         text = f"run {status.part} of {status.parts}, {status.variant}: {status.done} of {status.episodes} episodes"
         display.update(share, text, {"policy": status.policy})

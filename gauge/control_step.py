@@ -29,7 +29,7 @@ from .suite import Suite
 from .world_buffers import WorldBuffers
 
 
-class Events(NamedTuple):
+class StepEvents(NamedTuple):
     """What happened in a control step, (K,) each."""
 
     fall: torch.Tensor
@@ -259,7 +259,7 @@ class ControlStep:
         if not self.early_outs:
             buffers.active &= ~(buffers.respawn | ended)
 
-    def _find_events(self, due: torch.Tensor | None) -> Events | None:
+    def _find_events(self, due: torch.Tensor | None) -> StepEvents | None:
         """Falls, and penetrations that make a target goal start again; None where nothing happened.
 
         The first penetration of a velocity goal's segment interrupts nothing and is remembered.
@@ -303,9 +303,9 @@ class ControlStep:
             buffers.penetrated |= deep
             buffers.watched &= ~deep
         substeps = torch.minimum(torch.where(restart, deep_at, fell_at), never - 1) * active
-        return Events(fall, restart, substeps)
+        return StepEvents(fall, restart, substeps)
 
-    def _count_falls(self, events: Events, commanded: torch.Tensor) -> None:
+    def _count_falls(self, events: StepEvents, commanded: torch.Tensor) -> None:
         """Count falls; where they cost the rest of the sub-command, work out how many samples that is."""
         buffers = self.buffers
         buffers.falls += events.fall
@@ -321,7 +321,7 @@ class ControlStep:
         buffers.lost_samples.copy_(torch.where(costs, lost, buffers.lost_samples))
 
     def _follow_target(
-        self, events: Events | None, commanded: torch.Tensor, settled: torch.Tensor, full: torch.Tensor
+        self, events: StepEvents | None, commanded: torch.Tensor, settled: torch.Tensor, full: torch.Tensor
     ) -> tuple[torch.Tensor | None, torch.Tensor]:
         """Lead robots to their targets.
 

@@ -19,6 +19,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..backends.base import PhysicsBackend, Randomization
 from ..policy.base import Policy, PolicyError
@@ -186,10 +187,7 @@ class Rollout:
         self._respawn.update(respawn)
         if not ended:
             return []
-        outcomes = {
-            self._segments[world]: self._outcome(self._segments[world], counts, samples)
-            for world, (counts, samples) in zip(ended, self._measured(ended), strict=True)
-        }
+        outcomes = self._outcomes(ended)
         records, hidden = self._queue.finish(outcomes)
         over = outcomes.keys() | hidden
         self._leave([world for world, segment in self._segments.items() if segment in over])
@@ -263,41 +261,42 @@ class Rollout:
             f"{segment.episode.key}; a policy must return finite numbers"
         )
 
-    def _measured(self, worlds: Sequence[int]) -> list[tuple[SegmentCounts, Samples | None]]:
-        """What some worlds counted and sampled, None for no samples."""
+    def _outcomes(self, worlds: Sequence[int]) -> dict[Segment, SegmentOutcome]:
+        """What came of the segments in some worlds, which have ended."""
         buffers, table = self._step.buffers, self._step.samples
-        counts = buffers.counts(worlds, table.count)
-        sampled = {world: c.samples for world, c in zip(worlds, counts, strict=True) if c.samples}
+        counts = dict(zip(worlds, buffers.counts(worlds, table.count), strict=True))
+        sampled = {world: c.samples for world, c in counts.items() if c.samples}
         samples: dict[int, Samples] = {}
         if sampled:
             tables = table.read(list(sampled), list(sampled.values()), buffers.limits, buffers.friction)
             samples = dict(zip(sampled, tables, strict=True))
-        return [(c, samples.get(world)) for world, c in zip(worlds, counts, strict=True)]
+        nothing = np.zeros((0, self._columns), dtype=np.float32), np.zeros(0, dtype=np.bool_)
+        segments = self._segments
+        return {segments[w]: _outcome(segments[w], c, *samples.get(w, nothing)) for w, c in counts.items()}
 
-    def _outcome(self, segment: Segment, counts: SegmentCounts, sampled: Samples | None) -> SegmentOutcome:
-        """What came of a segment that has ended."""
-        samples = np.zeros((counts.lost_samples, self._columns), dtype=np.float32)
-        keep = np.zeros(0, dtype=np.bool_)
-        if sampled is not None:
-            values, keep = sampled
-            samples = np.concatenate((values[keep], samples))
-        aims = segment.goal == TARGET
-        outcome = SegmentOutcome(
-            samples=samples,
-            control_steps=counts.control_steps,
-            physics_steps=counts.substeps,
-            falls=counts.falls,
-            diverged=counts.diverged,
-            overflowed=counts.overflowed,
-            reached=counts.reached,
-            restarted=counts.penetrated and aims,
-        )
-        if not counts.penetrated or aims:
-            return outcome
-        beginning = outcome.cut_short(
-            samples=int(keep[: counts.penetration_samples].sum()),
-            control_steps=counts.penetration_control_steps,
-            physics_steps=counts.penetration_substeps,
-            overflowed=counts.penetration_overflowed,
-        )
-        return replace(outcome, until_penetration=beginning)
+
+def _outcome(
+    segment: Segment, counts: SegmentCounts, values: NDArray[np.float32], keep: NDArray[np.bool_]
+) -> SegmentOutcome:
+    """What came of a segment: its counts, and its samples, (T, columns), of which those to keep, (T,), count."""
+    aims = segment.goal == TARGET
+    lost = np.zeros((counts.lost_samples, values.shape[1]), dtype=np.float32)
+    outcome = SegmentOutcome(
+        samples=np.concatenate((values[keep], lost)),
+        control_steps=counts.control_steps,
+        physics_steps=counts.substeps,
+        falls=counts.falls,
+        diverged=counts.diverged,
+        overflowed=counts.overflowed,
+        reached=counts.reached,
+        restarted=counts.penetrated and aims,
+    )
+    if not counts.penetrated or aims:
+        return outcome
+    beginning = outcome.cut_short(
+        samples=int(keep[: counts.penetration_samples].sum()),
+        control_steps=counts.penetration_control_steps,
+        physics_steps=counts.penetration_substeps,
+        overflowed=counts.penetration_overflowed,
+    )
+    return replace(outcome, until_penetration=beginning)

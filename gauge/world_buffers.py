@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, get_type_hints
 
 import torch
 
@@ -38,117 +38,105 @@ class SegmentCounts(NamedTuple):
     penetration_overflowed: bool
 
 
+# Shape behind the worlds, and kind; None for that of the physics.
+Flags = Annotated[torch.Tensor, (), torch.bool]
+Counts = Annotated[torch.Tensor, (), torch.int64]
+Numbers = Annotated[torch.Tensor, (), None]
+Vectors = Annotated[torch.Tensor, (3,), None]
+Quaternions = Annotated[torch.Tensor, (4,), None]
+JointValues = Annotated[torch.Tensor, ("joints",), torch.float32]
+
+
 @dataclass(kw_only=True)
 class WorldBuffers:
-    """Tensors over K worlds, the first axis of each: (K,) where nothing else is said."""
+    """Tensors over K worlds, the first axis of each: (K,) where nothing else is said; floating point as in the physics."""
 
-    active: torch.Tensor
-    """Whether the world takes part in control steps, bool."""
+    active: Flags
+    """Whether the world takes part in control steps."""
 
     # what does not change during a segment
-    spawn: torch.Tensor
+    spawn: Vectors
     """Base position after a reset [m], world frame, (K, 3)."""
-    heading: torch.Tensor
+    heading: Quaternions
     """Base orientation after a reset, wxyz, (K, 4)."""
-    terrain_index: torch.Tensor
-    """Terrain of the scene, int64."""
-    target: torch.Tensor
+    terrain_index: Counts
+    """Terrain of the scene."""
+    target: Vectors
     """Position to reach [m], world frame, (K, 3)."""
-    backward: torch.Tensor
-    """Whether the way to the target is walked backwards, bool."""
-    speed: torch.Tensor
+    backward: Flags
+    """Whether the way to the target is walked backwards."""
+    speed: Numbers
     """Forward speed on the way to the target [m/s]."""
-    limits: torch.Tensor
+    limits: Vectors
     """Command limits, forward, lateral [m/s] and yaw [rad/s], (K, 3)."""
-    friction: torch.Tensor
+    friction: Numbers
     """Sliding friction coefficient."""
-    first_row: torch.Tensor
-    """Where the sub-command begins in ``Schedule.commands``, int64."""
-    length: torch.Tensor
-    """Control steps of the sub-command, or those that the target goal may take, int64."""
-    noise_start: torch.Tensor
-    """Where the segment begins in its episode's noise [control steps], int64."""
-    aims: torch.Tensor
-    """Whether the segment aims at a target, bool."""
-    sampled: torch.Tensor
-    """Whether samples are taken, bool."""
+    first_row: Counts
+    """Where the sub-command begins in ``Schedule.commands``."""
+    length: Counts
+    """Control steps of the sub-command, or those that the target goal may take."""
+    noise_start: Counts
+    """Where the segment begins in its episode's noise [control steps]."""
+    aims: Flags
+    """Whether the segment aims at a target."""
+    sampled: Flags
+    """Whether samples are taken."""
 
     # how far it is
-    settling: torch.Tensor
-    """Whether the robot is waited for to stand, bool."""
-    commanded_steps: torch.Tensor
-    """Control steps since it stood, int64."""
-    tick: torch.Tensor
-    """Substeps on the grid of samples, int64."""
-    substeps: torch.Tensor
-    """Substeps so far, int64."""
-    control_steps: torch.Tensor
-    """Control steps so far, int64."""
-    done: torch.Tensor
-    """Whether the way to the target is over, and the robot settles once more, bool."""
-    reached: torch.Tensor
-    """Whether the target was reached, bool."""
-    falls: torch.Tensor
-    """int64."""
-    diverged: torch.Tensor
-    """bool."""
-    overflowed: torch.Tensor
-    """bool."""
-    lost_samples: torch.Tensor
-    """Samples that a fall cost, int64."""
-    action: torch.Tensor
-    """The last action, float32, (K, J)."""
-    target_command: torch.Tensor
+    settling: Flags
+    """Whether the robot is waited for to stand."""
+    commanded_steps: Counts
+    """Control steps since it stood."""
+    tick: Counts
+    """Substeps on the grid of samples."""
+    substeps: Counts
+    """Substeps so far."""
+    control_steps: Counts
+    """Control steps so far."""
+    done: Flags
+    """Whether the way to the target is over, and the robot settles once more."""
+    reached: Flags
+    """Whether the target was reached."""
+    falls: Counts
+    diverged: Flags
+    overflowed: Flags
+    lost_samples: Counts
+    """Samples that a fall cost."""
+    action: JointValues
+    """The last action, (K, J)."""
+    target_command: Vectors
     """Command that leads to the target, forward, lateral [m/s] and yaw [rad/s], (K, 3)."""
 
     # the first penetration, and how far the segment was then
-    watched: torch.Tensor
-    """Whether a penetration would matter, bool."""
-    penetrated: torch.Tensor
-    """Whether there was one, bool."""
-    penetration_control_steps: torch.Tensor
-    penetration_substeps: torch.Tensor
-    penetration_samples: torch.Tensor
-    penetration_overflowed: torch.Tensor
+    watched: Flags
+    """Whether a penetration would matter."""
+    penetrated: Flags
+    """Whether there was one."""
+    penetration_control_steps: Counts
+    penetration_substeps: Counts
+    penetration_samples: Counts
+    penetration_overflowed: Flags
 
     # since the last poll
-    ended: torch.Tensor
-    """Whether the segment has ended, bool."""
-    respawn: torch.Tensor
-    """Whether the robot goes back to its spawn, bool."""
-    not_finite: torch.Tensor
-    """Whether the policy answered a finite observation with something else, bool."""
+    ended: Flags
+    """Whether the segment has ended."""
+    respawn: Flags
+    """Whether the robot goes back to its spawn."""
+    not_finite: Flags
+    """Whether the policy answered a finite observation with something else."""
 
     @classmethod
     def allocate(cls, count: int, joints: int, device: torch.device, dtype: torch.dtype) -> WorldBuffers:
         """Buffers of ``count`` empty worlds; ``dtype`` is that of the physics."""
-
-        def zeros(*shape: int, kind: torch.dtype = dtype) -> torch.Tensor:
-            return torch.zeros(count, *shape, device=device, dtype=kind)
-
-        floats = {
-            "spawn": zeros(3),
-            "heading": zeros(4),
-            "target": zeros(3),
-            "speed": zeros(),
-            "limits": zeros(3) + 1.0,
-            "friction": zeros() + 1.0,
-            "action": zeros(joints, kind=torch.float32),
-            "target_command": zeros(3),
-        }
-        integers = (
-            "terrain_index first_row length noise_start commanded_steps tick substeps control_steps falls lost_samples "
-            "penetration_control_steps penetration_substeps penetration_samples"
-        )
-        flags = (
-            "active backward aims sampled settling done reached diverged overflowed watched penetrated "
-            "penetration_overflowed ended respawn not_finite"
-        )
-        return cls(
-            **floats,
-            **{name: zeros(kind=torch.int64) for name in integers.split()},
-            **{name: zeros(kind=torch.bool) for name in flags.split()},
-        )
+        tensors = {}
+        for name, hint in get_type_hints(cls, include_extras=True).items():
+            shape, kind = hint.__metadata__
+            sizes = [joints if size == "joints" else size for size in shape]
+            tensors[name] = torch.zeros(count, *sizes, dtype=kind or dtype, device=device)
+        made = cls(**tensors)
+        made.limits.fill_(1.0)
+        made.friction.fill_(1.0)
+        return made
 
     def mask(self, worlds: Sequence[int]) -> torch.Tensor:
         """(K,) bool, true for some worlds."""

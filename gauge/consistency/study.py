@@ -22,8 +22,7 @@ from ...robots import Robot
 from ...robots.geometry import total_mass
 from ...robots.loading import robot_digest
 from ...terrains.registry import gauge_terrain_names
-from ..evaluate import Request as EvaluateRequest
-from ..evaluate import prepare
+from ..evaluate import Request, prepare
 from ..plan import Records
 from ..sampling import GRAVITY
 from ..store import RunFolder, StoreError
@@ -44,7 +43,7 @@ SEEDS_CPU, SEEDS_GPU = 3, 10
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request:
+class StudyRequest:
     """What is to be compared. Empty tuples and None stand for a choice that suits the machine."""
 
     policies: tuple[str, ...]
@@ -75,7 +74,7 @@ class Request:
 
 
 @dataclass
-class Status:
+class StudyStatus:
     """How far a study is, for the progress display."""
 
     policy: str
@@ -89,14 +88,14 @@ class Status:
     seconds: float
 
 
-Watch = Callable[[Status], None]
+Watch = Callable[[StudyStatus], None]
 
 
 @dataclass(kw_only=True)
 class _Prepared:
     """A request that can be carried out."""
 
-    request: Request
+    request: StudyRequest
     suite: Suite
     robot: Robot
     policies: list[tuple[str, Policy]]
@@ -139,7 +138,7 @@ class _Prepared:
             )
 
 
-def prepare_study(request: Request) -> _Prepared:
+def prepare_study(request: StudyRequest) -> _Prepared:
     """Check a request and load what it names; engines that cannot run here are left out.
 
     Raises:
@@ -168,7 +167,7 @@ def prepare_study(request: Request) -> _Prepared:
     robot = None
     for name in request.policies:
         prepared_policy = prepare(
-            EvaluateRequest(
+            Request(
                 policy=name,
                 suite=request.suite,
                 pipeline="multi",
@@ -200,7 +199,7 @@ def prepare_study(request: Request) -> _Prepared:
     return prepared
 
 
-def _engines(request: Request, suite: Suite) -> tuple[Variant, list[Variant], list[dict[str, str]]]:
+def _engines(request: StudyRequest, suite: Suite) -> tuple[Variant, list[Variant], list[dict[str, str]]]:
     """The reference, the others, and those that cannot run on this machine."""
     variants = {v.label: v for v in (parse_variant(text) for text in request.backends)}
     wanted = parse_variant(request.reference).label if request.reference else next(iter(variants), None)
@@ -222,7 +221,7 @@ def _engines(request: Request, suite: Suite) -> tuple[Variant, list[Variant], li
 
 
 def study(
-    request: Request,
+    request: StudyRequest,
     folder: Path,
     *,
     resume: bool = False,
@@ -356,7 +355,9 @@ class _Policy:
         def on_progress(done: int) -> None:
             if self._watch is not None:
                 seconds = time.perf_counter() - self._began
-                self._watch(Status(self._name, variant.label, self._part, self._parts, done, len(episodes), seconds))
+                self._watch(
+                    StudyStatus(self._name, variant.label, self._part, self._parts, done, len(episodes), seconds)
+                )
 
         with RunFolder(self._folder / variant.folder, self._identity(variant), resume=self._resume) as store:
             play_variant(

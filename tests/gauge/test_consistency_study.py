@@ -16,7 +16,7 @@ from gaitgauge.gauge.consistency.closed_loop import Design, make_cells
 from gaitgauge.gauge.consistency.errors import ConsistencyError
 from gaitgauge.gauge.consistency.page import render, verdict, write_page
 from gaitgauge.gauge.consistency.statistics import Estimate
-from gaitgauge.gauge.consistency.study import Request, study
+from gaitgauge.gauge.consistency.study import StudyRequest, study
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.policy.contract import go2_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
@@ -69,7 +69,7 @@ def request_of(tmp_path):
     save_policy(policy, go2_contract(GO2), StoredNetwork(architecture="mlp", arguments=arguments, state_dict=zeros))
     suite = tmp_path / "tiny.toml"
     suite.write_text(SUITE)
-    whole = Request(
+    whole = StudyRequest(
         policies=(str(policy),),
         backends=("fake", "fake@ls_iterations=7"),
         device="cpu",
