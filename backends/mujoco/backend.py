@@ -32,9 +32,9 @@ from ..base import (
     Scene,
     Support,
 )
-from ..description import ModelFields
 from ..devices import find_device
 from ..motor_law import MotorLimits
+from .description import describe_model
 from .model import CONTACT_SLOTS, FOOT_SLOTS, build_models
 from .state import RECORDED, BatchState, Records, StateLayout
 
@@ -422,25 +422,7 @@ class MujocoBackend(PhysicsBackend):
 
     def describe(self) -> Mapping[str, list[float]]:
         """See ``PhysicsBackend.describe``."""
-        model, robot = self._models[0], self.scene.robot
-        feet, floor = [model.geom(f).id for f in robot.foot_names], model.geom("floor").id
-        limited = model.actuator_forcelimited.astype(bool)
-        dofs, joints = self._joint_v, [model.joint(j).id for j in robot.joint_names]
-        return ModelFields(
-            total_mass=float(model.body_mass.sum()),
-            body_mass=model.body_mass[self._bodies],
-            body_inertia=model.body_inertia[self._bodies],
-            joint_range=np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf]),
-            joint_armature=model.dof_armature[dofs],
-            joint_damping=model.dof_damping[dofs],
-            joint_friction_loss=model.dof_frictionloss[dofs],
-            stiffness=model.actuator_gainprm[:, 0],
-            damping=-model.actuator_biasprm[:, 2],
-            torque_limit=np.where(limited, model.actuator_forcerange[:, 1], np.inf),
-            foot_friction=model.geom_friction[feet, 0],
-            floor_friction=float(model.geom_friction[floor, 0]),
-            foot_priority=model.geom_priority[feet] - model.geom_priority[floor],
-        ).describe()
+        return describe_model(self._models[0], self.scene.robot)
 
     def close(self) -> None:
         """Drop the worlds."""

@@ -21,7 +21,8 @@ from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, S
 from ..mujoco_warp.height_fields.repair import repair_height_fields
 from ..mujoco_warp.model import SMALLEST_TOLERANCE
 from . import kernels, solver_kernels
-from .model import WorldModel, carriers, import_differences
+from .import_check import import_differences
+from .model import WorldModel, carriers
 
 repair_height_fields()
 
@@ -138,20 +139,26 @@ class MujocoAdapter(SolverAdapter):
         contacts = _contacts_per_world(scene, world)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the margins that it complains about are repaired below
-            self.solver: Any = newton.solvers.SolverMuJoCo(
-                model,
-                nconmax=contacts,
-                njmax=_constraint_rows(scene, world, contacts),
-                iterations=physics.iterations,
-                ls_iterations=physics.ls_iterations,
-                tolerance=physics.tolerance,
-                solver="newton",
-                integrator="euler",
-                cone=physics.cone,
-                impratio=physics.impratio,
-                enable_multiccd=True,  # as in MuJoCo
-                include_sites=False,
-            )
+            try:
+                self.solver: Any = newton.solvers.SolverMuJoCo(
+                    model,
+                    nconmax=contacts,
+                    njmax=_constraint_rows(scene, world, contacts),
+                    iterations=physics.iterations,
+                    ls_iterations=physics.ls_iterations,
+                    tolerance=physics.tolerance,
+                    solver="newton",
+                    integrator="euler",
+                    cone=physics.cone,
+                    impratio=physics.impratio,
+                    enable_multiccd=True,  # as in MuJoCo
+                    include_sites=False,
+                )
+            except ValueError as error:
+                raise BackendError(
+                    f"Newton's MuJoCo solver cannot build these terrains together: {error}; use fewer of them in one "
+                    "scene, PhysicsOptions(self_collision=False), or the backend 'mujoco-warp'"
+                ) from error
         self._timestep = physics.timestep
         self._data, self._model = self.solver.mjw_data, self.solver.mjw_model
         if physics.deterministic:

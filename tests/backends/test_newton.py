@@ -10,11 +10,13 @@ from gaitgauge.backends import BackendError, PhysicsOptions, Randomization, Rese
 from gaitgauge.backends.base import CAPABILITY_NAMES
 from gaitgauge.backends.mujoco.model import robot_spec
 from gaitgauge.backends.newton import NewtonBackend
-from gaitgauge.backends.newton.model import PARKED, _slot_tables, build_world_model, carriers, import_differences
+from gaitgauge.backends.newton.import_check import import_differences
+from gaitgauge.backends.newton.model import PARKED, _slot_tables, build_world_model, carriers
 from gaitgauge.backends.newton.solvers import SOLVERS, dry_friction_slope
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Box, HeightField, Terrain
+from gaitgauge.terrains.registry import make_terrain
 
 ROBOT = load_robot("go2")
 FLAT = Terrain(name="flat", family="flat")
@@ -84,6 +86,13 @@ def test_refusals_say_what_to_change(solver, physics, says):
 def test_devices_that_do_not_exist():
     with pytest.raises(BackendError, match="no device 'tpu'; give cpu, cuda or cuda:N"):
         make_backend("newton", scene(), device="tpu")
+
+
+def test_terrains_that_newton_cannot_build_together_are_refused_in_a_sentence():
+    """Its masks for who collides with whom have too few bits for many boxes, a height field and self-collision."""
+    terrains = [make_terrain(name, level) for name, level in (("flat", 0), ("stairs_fd", 5), ("wave", 4))]
+    with pytest.raises(BackendError, match=r"use fewer of them in one scene, PhysicsOptions\(self_collision=False\)"):
+        make_backend("newton", scene(*terrains, index=(0, 1)))
 
 
 def test_slots_of_a_palette():
