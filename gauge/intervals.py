@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from .episodes import QUALITY
 from .level_chance import redraw_levels, shared_luck, success_curves
@@ -71,7 +71,7 @@ class Chance:
         """Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread."""
         if not self.known:
             return None
-        reach = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, self.freedom)) * self.error
+        reach = float(special.stdtrit(self.freedom, 0.5 + 0.5 * CONFIDENCE)) * self.error
         low, high = bounds or (-math.inf, math.inf)
         return max(value - reach, low), min(value + reach, high)
 
@@ -81,7 +81,7 @@ class Chance:
             return None
         if self.error == 0.0:
             return 1.0 if value == 0.0 else 0.0
-        return 2.0 * float(stats.t.sf(abs(value) / self.error, self.freedom))
+        return 2.0 * float(special.stdtr(self.freedom, -abs(value) / self.error))
 
     def minus(self, other: Chance, *, paired: bool) -> Chance:
         """Chance in a difference.

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 Array = NDArray[np.float64]
 Trials = Mapping[int, Mapping[int, bool]]
@@ -150,7 +150,7 @@ def redraw_levels(
     needed = math.ceil(pass_rate * seeds - 1e-9)
     common = math.sqrt(luck) * generator.standard_normal((resamples, 1, seeds))
     found = np.zeros((environments, resamples), dtype=np.int64)
-    for at, thresholds in enumerate(stats.norm.ppf(curves)):
+    for at, thresholds in enumerate(special.ndtri(curves)):
         own = math.sqrt(1.0 - luck) * generator.standard_normal((resamples, levels, seeds))
         found[at] = bisect((common + own < thresholds[:, None]).sum(-1) >= needed)
     return found
