@@ -35,9 +35,14 @@ class Results:
 
     @property
     def score(self) -> float | None:
-        """The benchmark, 0 to 1: mean over terrains; None where levels alone were searched."""
+        """Mean over terrains, 0 to 1; the suite's where ``complete``; None where levels alone were searched."""
         value = self.data["score"]
         return None if value is None else float(value)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole suite was played, and nothing else: ``data["coverage"]`` says what was."""
+        return bool((self.data.get("coverage") or {}).get("kind") == "complete")
 
     @property
     def interval(self) -> tuple[float, float] | None:

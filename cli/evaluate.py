@@ -13,6 +13,7 @@ import typer
 from rich.text import Text
 
 from ..backends.registry import choose_device
+from ..gauge.coverage import COMPLETE, coverage_of, score_label, suite_label
 from ..gauge.evaluate import Request, Status, evaluate, prepare
 from ..gauge.report import write_report
 from .console import Terminal, make_table, shell_command
@@ -82,8 +83,7 @@ def shower(display: ProgressDisplay) -> Callable[[Status], None]:
 
 def print_results(console: Terminal, results: Mapping[str, Any]) -> None:
     """Tables of terrains and metrics, then the score."""
-    suite = results["suite"]
-    title = f"{suite['name']} {suite['version']}, {results['pipeline']}, on {results['backend']}"
+    title = f"{suite_label(results)}, {results['pipeline']}, on {results['backend']}"
     table = make_table(title, "terrain", "level", "mean", "mean@25", "mean@50", "95 % interval", numbers=True)
     for name, row in results["terrains"].items():
         level = "" if row["level"] is None else f"{row['level']:.2f}".rstrip("0").rstrip(".")
@@ -108,10 +108,12 @@ def print_results(console: Terminal, results: Mapping[str, Any]) -> None:
     if results["score"] is not None:
         interval = results["score_interval"]
         note = f"95 % interval {_interval(interval)}" if interval else results["chance"]["note"]
-        console.say(Text.assemble((f"score {results['score']:.4f}", "bold"), f"  ({note})"))
+        console.say(Text.assemble((f"{score_label(results)} {results['score']:.4f}", "bold"), f"  ({note})"))
     elif results["level"] is not None:
         interval = results["level_interval"]
         note = f"  (95 % interval {_interval(interval, 2)})" if interval else ""
+        covered = coverage_of(results)
+        note += "" if covered["kind"] == COMPLETE else f"  {covered['kind']}: {covered['text']}"
         console.say(Text.assemble((f"mean level {results['level']:.2f}", "bold"), note))
 
 

@@ -30,6 +30,7 @@ from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
 from ..robots.loading import robot_digest
 from ..terrains.registry import make_terrain, terrain_names
+from .coverage import coverage
 from .dispatcher import Dispatcher, Speculation, play
 from .episodes import QUALITY, Episode
 from .goals import SUB_COMMANDS, TARGET, check_terrain
@@ -265,6 +266,7 @@ def evaluate(
             "file_sha256": file_digest(request.policy),
             "provenance": dict(prepared.policy.contract.provenance),
         }
+        results["coverage"] = coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline)
         results["pipeline"] = request.pipeline
         results["backend"] = request.backend
         results["robot"] = prepared.robot.name

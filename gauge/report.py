@@ -12,6 +12,7 @@ import jinja2
 from ..files.writing import write_atomically
 from . import charts
 from .charts import FLAT, Row, number, terrain_label
+from .coverage import coverage_of, score_label, suite_label
 from .results import SCHEMA
 from .store import StoreError
 
@@ -111,6 +112,8 @@ def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
         "evaluated": evaluated,
         "searched": searched,
         "score": results["score"],
+        "score_label": score_label(results),
+        "coverage": coverage_of(results),
         "score_interval": results["score_interval"],
         "score_strip": _score_strip(results["score"], results["score_interval"]),
         "groups": _groups(results),
@@ -223,6 +226,7 @@ def sources(results: Mapping[str, Any]) -> dict[str, str]:
         "policy file, SHA-256": policy["file_sha256"],
         "policy contract, SHA-256": policy["contract_hash"],
         "suite": f"{suite['name']} {suite['version']}: {suite['title']}",
+        "of the suite": coverage_of(results)["text"],
         "pipeline": results["pipeline"],
         "robot": results["robot"],
         "engine": _engine(results),
@@ -251,9 +255,8 @@ def _rate(provenance: Mapping[str, Any]) -> str:
 
 
 def _subtitle(results: Mapping[str, Any]) -> list[str]:
-    suite = results["suite"]
     return [
-        f"{suite['name']} {suite['version']}",
+        suite_label(results),
         f"{results['pipeline']} pipeline",
         f"robot {results['robot']}",
         f"engine {_engine(results)}",

@@ -40,6 +40,19 @@ def reproducible(folder: Path) -> tuple[dict, bytes]:
     return results, (folder / "episodes.csv").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--terrain", "flat", "--friction", 0.6), "score of a part (1 of 2 terrains, 1 of 2 frictions) 0."),
+        (("--terrain", "flat", "--friction", 9, "--seed", 77), "score of a custom run (friction 9, seed 77"),
+    ],
+)
+def test_only_the_whole_suite_gives_its_score(run, tmp_path, policy, tiny, options, words):
+    done = run("evaluate", policy, "--suite", tiny, *options, "--out", tmp_path / "run", "--threads", 1)
+    assert done.exit_code == 0, done.output
+    assert words in " ".join(done.stdout.split())
+
+
 def test_results_and_their_reproducibility(run, refused, tmp_path, policy, tiny):
     command = ("evaluate", policy, "--suite", tiny, "--out")
     done = run(*command, tmp_path / "first", "--threads", 1)
@@ -48,6 +61,8 @@ def test_results_and_their_reproducibility(run, refused, tmp_path, policy, tiny)
     assert str(tmp_path / "first" / "results.json") in done.stdout.replace("\n", "")
     results = json.loads((tmp_path / "first" / "results.json").read_text())
     assert results["suite"]["name"] == "tiny"
+    assert results["coverage"]["kind"] == "complete"
+    assert "tiny 1.0.0, complete" in done.stdout
     assert set(results["terrains"]) == {"flat", "slope_fd"}
     assert len(results["environments"]) == 4
     assert 0.0 <= results["score"] <= 1.0

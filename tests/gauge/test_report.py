@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from gaitgauge.gauge import charts
+from gaitgauge.gauge.coverage import coverage
 from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.pipelines import make_environments
 from gaitgauge.gauge.plan import PlanRules, environment_result, plan
@@ -64,7 +65,9 @@ def _sample(pipeline, suite, resamples, reach=None, **choices):
         environments.append(environment_result(environment, records, rules))
     results = fold(suite, environments, (*suite.metrics.weights, "quality"))
     policy = {"path": "policies/go2_cts.pt", "contract_hash": "ab" * 32, "file_sha256": "cd" * 32}
+    covered = coverage(suite, make_environments(suite, **chosen), suite.matrix.seeds, pipeline=pipeline)
     return results | {
+        "coverage": covered,
         "policy": policy | {"provenance": {"adapter": "TorchScript", "steps": 5}},
         "pipeline": pipeline,
         "backend": "mujoco",
@@ -135,6 +138,22 @@ def test_every_pipeline_renders_well_formed_and_shows_its_environments(pipeline)
     shown = f"{results['score']:.4f}" if pipeline != "level" else f"{results['level']:.2f}"
     assert re.search(rf'class="score">{re.escape(shown)}\b', text)
     assert ("no quality episodes" in page.text) == (pipeline == "level")
+
+
+def test_a_part_and_a_custom_run_are_never_shown_as_the_suites_score():
+    def shown(**choices):
+        text = render(sample(**choices))
+        heading = re.search(r"<title>(.*?)</title>", text).group(1)
+        return heading, re.search(r'class="score-label">(.*?)</span>', text).group(1), Page(text).text
+
+    heading, score, words = shown()
+    assert (score, "robogauge-1.1 1.1.0, complete" in words, ": robogauge" in heading) == ("score", True, True)
+    heading, score, words = shown(terrains=("flat", "wave"), frictions=(0.6,))
+    assert score == "score of a part (2 of 7 terrains, 1 of 9 frictions)"
+    assert "a part of robogauge-1.1 1.1.0" in words and "part, robogauge-1.1" in heading
+    heading, score, words = shown(terrains=("flat",), frictions=(9.0,))
+    assert score == "score of a custom run (friction 9, 1 of 7 terrains)"
+    assert "custom, after robogauge-1.1 1.1.0" in words and "custom, robogauge-1.1" in heading
 
 
 def test_policy_that_passes_nothing_is_a_result():
