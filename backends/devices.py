@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from ..files.parsing import one_line
 from .base import BackendError
 
 
@@ -32,4 +33,9 @@ def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
     if (device.index or 0) >= count:
         have = f"torch finds {count}" if count else "torch finds none (see 'gaitgauge doctor')"
         raise BackendError(f"there is no GPU for device '{name}': {have}; use --device cpu")
-    return torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
+    if device.index is not None:
+        return device
+    try:
+        return torch.device("cuda", torch.cuda.current_device())
+    except (AssertionError, RuntimeError) as error:  # a torch for the CPU alone asserts
+        raise BackendError(f"the GPU of device '{name}' cannot be used: {one_line(error)}; use --device cpu") from error

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -24,6 +27,11 @@ class Terminal(Console):
         if not self.is_terminal:
             self.width = _PLAIN_WIDTH
 
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print, after the notices that were held back."""
+        _notices.tell()
+        super().print(*objects, **options)
+
     def render_str(self, text: str, **options: Any) -> Text:
         """Text as it is, control characters escaped."""
         return super().render_str(printable(text), **options)
@@ -38,6 +46,48 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+
+
+class _Notices(logging.Handler):
+    """Keeps the package's warnings back until a command says something."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self._held: list[str] = []
+        self._process = os.getpid()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep one, or print it where nobody would ask for it: in a worker."""
+        self._held.append(record.getMessage())
+        if os.getpid() != self._process:
+            self._held = self._held[-1:]
+            self.tell()
+
+    def tell(self) -> None:
+        """Print what was kept."""
+        held, self._held = self._held, []
+        for message in held:
+            print(printable(message.replace("\n", " ")), file=sys.stderr)
+
+    def forget(self) -> None:
+        """Drop what was kept."""
+        self._held = []
+
+
+_notices = _Notices()
+
+
+@contextmanager
+def held_notices() -> Iterator[None]:
+    """Around a command: its notices come before whatever else it says, and not at all where all that it says is an error."""
+    logger = logging.getLogger(__name__.partition(".")[0])
+    logger.addHandler(_notices)
+    try:
+        yield
+        _notices.tell()
+    finally:
+        _notices.forget()
+        logger.removeHandler(_notices)
 
 
 def make_table(title: str, *columns: str, numbers: bool = False) -> Table:

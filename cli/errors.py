@@ -11,7 +11,7 @@ from typing import Any
 
 import typer
 
-from .console import printable
+from .console import held_notices, printable
 
 
 class UserError(ValueError):
@@ -24,7 +24,8 @@ def report_errors(command: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(command)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
-            result = command(*args, **kwargs)
+            with held_notices():
+                result = command(*args, **kwargs)
             sys.stdout.flush()  # a full disk shows here at the latest
             return result
         except KeyboardInterrupt:

@@ -306,6 +306,9 @@ def train(
     resume: Annotated[
         str | None, typer.Option(help="Continue: latest, a run directory or a model_*.pt.", metavar="latest|PATH")
     ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Import functions that the settings of a resumed checkpoint name.")
+    ] = False,
     init_from: Annotated[
         str | None,
         typer.Option(
@@ -361,6 +364,7 @@ def train(
         iterations=iterations,
         time=time,
         resume=resume,
+        trust=trust,
         init_from=init_from,
         run_name=run_name,
         log_root=log_root,

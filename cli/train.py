@@ -46,7 +46,7 @@ def run_training(*, task: str, time: str | None, **choices: Any) -> None:
     if (run / "best.pt").is_file():
         console.say(f"best by the gauge's score: {run / 'best.pt'}")
     if outcome.reason != "finished":
-        again = shell_command(["train", task, "--resume", str(run)])
+        again = shell_command(["train", task, "--resume", str(run)], *(["--trust"] if plan.needs_trust else []))
         console.say(f"go on with:\n  {again}")
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)

@@ -180,7 +180,7 @@ class RunConfiguration:
         for name in ("gauge_interval", "video_interval"):
             if getattr(self, name) < 0:
                 raise ConfigurationError(f"{name} is {getattr(self, name)}; it must be 0 (never) or positive.")
-        if not self.experiment or PurePath(self.experiment).name != self.experiment:
+        if PurePath(self.experiment).name != self.experiment or self.experiment in ("", ".."):
             raise ConfigurationError(f"experiment is {self.experiment!r}; it must be a plain folder name.")
 
 

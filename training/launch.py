@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from ..backends.registry import choose_device
-from ..files.parsing import build
+from ..files.parsing import build, shown
 from ..gauge.suite import load_suite
 from ..policy.loading import find_policy
 from .algorithms.symmetry import build_mirror
@@ -24,6 +24,7 @@ from .environment import TrainingEnvironment
 from .environment_configuration import FLAT_TILE, EnvironmentConfiguration
 from .filming import Filmer
 from .logger import check_logger
+from .own_terms import foreign_functions
 from .processes import Processes, ProcessLostError
 from .resuming import begin_with, resume_run
 from .run_directory import (
@@ -39,7 +40,7 @@ from .runner import TrainingRunner
 from .scoring import Scorer
 from .seeding import seed_everything
 from .stopping import Progress, TrainingOutcome
-from .tasks import Task, find_task
+from .tasks import TASKS, Task, find_task
 
 DEFAULT_BACKEND = "mujoco-warp"
 QUICK_SUITE = "quick"
@@ -70,6 +71,8 @@ class TrainRequest:
     """Wall-clock limit [s] since ``began``."""
     resume: str | None = None
     """``latest``, a run directory or a checkpoint to continue."""
+    trust: bool = False
+    """Import what the settings of a resumed checkpoint name, ``module:function``, though neither task nor overrides do."""
     init_from: str | None = None
     """Checkpoint or policy whose networks a new run begins with."""
     run_name: str | None = None
@@ -102,6 +105,8 @@ class TrainPlan:
     """What is continued, None for a new run."""
     run: Path | None
     """Run directory that is continued, None to make a new one."""
+    needs_trust: bool
+    """Whether a later resume imports functions that the task does not name, and wants ``trust`` or their names again."""
     settings: Mapping[str, Any]
     """What a later resume needs to build the same run, kept in every checkpoint: backend and the resolved configuration."""
 
@@ -117,7 +122,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
             "--resume continues a run and --init-from begins a new one with its networks; give one of them"
         )
     own = _own_overrides(request)
-    task = find_task(request.task, own)
+    known, task = find_task(request.task), find_task(request.task, own)
     checkpoint, run = None, None
     if request.resume is not None:
         checkpoint = find_checkpoint(
@@ -127,7 +132,14 @@ def prepare(request: TrainRequest) -> TrainPlan:
         run = checkpoint.parent if read_run_json(checkpoint.parent).get("task") == request.task else None
         kept, kept_backend = _kept(checkpoint, request.task)
         backend = request.backend or kept_backend
-        task = kept.with_overrides(own)
+        named, task = task, kept.with_overrides(own)
+        if (foreign := foreign_functions([task.environment, task.training], [named.environment, named.training])) and (
+            not request.trust
+        ):
+            raise CheckpointError(
+                f"Cannot resume from '{checkpoint}': its settings would import {shown(foreign[0])}, code that neither this "
+                "package nor the task nor this command names; if you know whose it is, add --trust"
+            )
         if task.environment.num_envs != kept.environment.num_envs:
             raise CheckpointError(
                 f"Cannot resume from '{checkpoint}': it has {kept.environment.num_envs} environments, this run "
@@ -162,6 +174,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         device=device,
         checkpoint=checkpoint,
         run=run,
+        needs_trust=bool(foreign_functions(settings, to_plain([known.environment, known.training]))),
         settings=settings,
     )
 
@@ -173,13 +186,13 @@ def _kept(checkpoint: Path, name: str) -> tuple[Task, str]:
         CheckpointError: it is of another task, or its settings are not those of this version.
     """
     training = read_checkpoint(checkpoint)["training"]
-    if training["task"] != name:
+    if (its := training.get("task")) != name:
+        hint = f"write gaitgauge train {its}" if its in TASKS else "give that task's name"
         raise CheckpointError(
-            f"Cannot resume from '{checkpoint}': it is of task '{training['task']}', this run trains "
-            f"'{name}'; write gaitgauge train {training['task']}."
+            f"Cannot resume from '{checkpoint}': it is of task {shown(its)}, this run trains '{name}'; {hint}."
         )
-    stored, source = training.get("settings", {}), f"Cannot resume from '{checkpoint}'"
-    if "environment" not in stored:
+    stored, source = training.get("settings"), f"Cannot resume from '{checkpoint}'"
+    if not isinstance(stored, Mapping) or not {"environment", "training", "backend"} <= stored.keys():
         raise CheckpointError(
             f"{source}: an earlier version wrote it, without all of its settings; begin a new run with its networks: "
             f"--init-from {checkpoint}"
@@ -189,7 +202,7 @@ def _kept(checkpoint: Path, name: str) -> tuple[Task, str]:
         environment=build(EnvironmentConfiguration, stored["environment"], source, CheckpointError),
         training=build(TrainingConfiguration, stored["training"], source, CheckpointError),
     )
-    return task, stored["backend"]
+    return task, str(stored["backend"])
 
 
 def _going_on(task: Task, weights: Path) -> list[str]:
@@ -240,15 +253,13 @@ def _device(asked: str | None, backend: str) -> str:
     Raises:
         ConfigurationError: there is no such device here.
     """
-    asked = choose_device(backend, asked)
-    if asked != "cuda":
-        return asked
+    asked = choose_device(backend) if asked is None else asked
     place, gpus = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
-    if place >= gpus:
+    if asked == "cuda" and place >= gpus > 0:
         raise ConfigurationError(
             f"torchrun started more processes than this machine has GPUs ({gpus}); give --nproc-per-node {gpus}"
         )
-    return f"cuda:{place}"
+    return choose_device(backend, f"cuda:{place}" if asked == "cuda" and gpus > 0 else asked)
 
 
 def idle_gpus(device: str) -> str:

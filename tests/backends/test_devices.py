@@ -33,6 +33,18 @@ def test_a_gpu_without_a_number_is_the_present_one(gpus):
         find_device("cuda:2", "newton")
 
 
+@pytest.mark.parametrize("kind", [AssertionError, RuntimeError])
+def test_a_gpu_that_torch_cannot_use_is_one_sentence(kind, gpus, monkeypatch):
+    gpus(1)
+
+    def unusable():
+        raise kind("Torch not compiled with CUDA enabled")
+
+    monkeypatch.setattr(torch.cuda, "current_device", unusable)
+    with pytest.raises(BackendError, match=r"'cuda' cannot be used: Torch not compiled .*; use --device cpu"):
+        find_device("cuda", "newton")
+
+
 def test_an_engine_of_the_cpu_takes_no_gpu(gpus):
     gpus(1)
     with pytest.raises(BackendError, match="'mujoco' runs on the CPU, not on 'cuda'"):

@@ -1,11 +1,14 @@
 """What the terminal shows: names as they are, one line for each mistake, whatever the file system does."""
 
 import io
+import logging
 import subprocess
 import sys
 
 import pytest
+import typer
 from gaitgauge.cli.console import Terminal, make_table, shell_command
+from gaitgauge.cli.errors import UserError, report_errors
 from gaitgauge.cli.progress import ProgressDisplay, duration
 
 PROGRAM = "from gaitgauge.cli.main import main; main()"
@@ -91,3 +94,25 @@ def test_a_reader_that_left_is_no_error():
 def test_a_folder_s_name_that_is_too_long_is_one_sentence(refused, policy):
     assert "file name too long" in refused("evaluate", policy, "--pipeline", "base", "--out", "x" * 300).lower()
     assert "file name too long" in refused("evaluate", "x" * 300 + ".pt").lower()
+
+
+@pytest.mark.parametrize("ends", ["well", "with an error", "after a sentence"])
+def test_notices_come_first_or_not_at_all(capsys, ends):
+    """What fails says one line; a notice never comes after what it is about."""
+
+    @report_errors
+    def command() -> None:
+        logging.getLogger("gaitgauge.policy.rebuilt").warning("%s is slow", "it")
+        if ends == "after a sentence":
+            Terminal(stderr=True).say("10 s: half of it")
+        if ends != "well":
+            raise UserError("wrong")
+
+    if ends == "well":
+        command()
+    else:
+        with pytest.raises(typer.Exit):
+            command()
+    expected = {"well": ["it is slow"], "with an error": ["gaitgauge: wrong"]}
+    expected["after a sentence"] = ["it is slow", "10 s: half of it", "gaitgauge: wrong"]
+    assert capsys.readouterr().err.splitlines() == expected[ends]
