@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from ..files.parsing import shown
+from .coverage import COMPLETE, coverage_of
 from .episodes import QUALITY
 from .intervals import CONFIDENCE, Array, Chance, ChanceRules, Evidence
 from .results import ONE_SEED, SCHEMA, environment_weights
@@ -64,7 +66,7 @@ class Comparison:
 
     suite: Mapping[str, Any]
     policies: tuple[Mapping[str, Any], ...]
-    """Label, path, file digest, score, interval and level of each."""
+    """Label, path, file digest, coverage (kind and text), score, interval and level of each."""
     paired: bool
     """Whether all were given the same seeds."""
     differences: tuple[Difference, ...]
@@ -72,9 +74,23 @@ class Comparison:
 
     @property
     def sentences(self) -> list[str]:
-        """What the scores say, one sentence for each pair, and what the details add."""
+        """What the scores say, one sentence for each pair, what the details add, and of what suite this is not the score."""
         scores = [d for d in self.differences if d.kind == "score"]
-        return [_score_sentence(d, len(scores)) for d in scores] + [self._details_sentence()]
+        found = [_score_sentence(d, len(scores)) for d in scores] + [self._details_sentence()]
+        return found + ([] if self.complete else [self._coverage_sentence()])
+
+    @property
+    def complete(self) -> bool:
+        """Whether all that is compared are scores of the whole suite."""
+        return all(p["coverage"]["kind"] == COMPLETE for p in self.policies)
+
+    def _coverage_sentence(self) -> str:
+        suite = f"{self.suite['name']} {self.suite['version']}"
+        texts = {p["label"]: _words(p["coverage"]) for p in self.policies}
+        if len(set(texts.values())) == 1:
+            return f"None of these is a score of {suite}; all hold the same, {next(iter(texts.values()))}."
+        each = "; ".join(f"'{label}' {text}" for label, text in texts.items())
+        return f"Not all of these are scores of {suite}: {each}."
 
     def _details_sentence(self) -> str:
         details = [d for d in self.differences if d.kind != "score"]
@@ -155,6 +171,7 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
                 "label": label,
                 "path": found["policy"]["path"],
                 "file_sha256": found["policy"]["file_sha256"],
+                "coverage": {key: coverage_of(found)[key] for key in ("kind", "text")},
                 "score": found["score"],
                 "score_interval": found["score_interval"],
                 "level": found["level"],
@@ -236,6 +253,12 @@ def _check(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
             given, other = (label, labels[0]) if searched[0] else (labels[0], label)
             raise ComparisonError(
                 f"'{given}' was given its level and that of '{other}' was searched for; evaluate both with the same --level"
+            )
+        levels = [coverage_of(r).get("levels", []) for r in (results[0], found)]
+        if levels[0] != levels[1]:
+            raise ComparisonError(
+                f"'{labels[0]}' was given level {shown(levels[0])} and '{label}' level {shown(levels[1])}; evaluate both with "
+                "the same --level"
             )
         both = [{_key(row) for row in r["environments"]} for r in (results[0], found)]
         lone = sorted(both[0] ^ both[1])
@@ -353,3 +376,8 @@ def format_p(value: float | None) -> str:
     if value is None:
         return "–"
     return "< 0.001" if value < 0.001 else f"= {value:.3f}"
+
+
+def _words(covered: Mapping[str, Any]) -> str:
+    """A coverage in words: ``complete``, or ``part: 1 of 7 terrains``."""
+    return COMPLETE if covered["kind"] == COMPLETE else f"{covered['kind']}: {covered['text']}"

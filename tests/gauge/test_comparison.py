@@ -118,6 +118,29 @@ def test_files_of_one_name_are_told_apart_by_their_folder():
     assert [p["label"] for p in compare(same).policies] == ["x/model (1)", "x/model (2)"]
 
 
+def test_parts_of_one_shape_compare_and_say_that_they_are_no_benchmark():
+    whole = compare(both())
+    assert whole.complete
+    assert not any("score of robogauge-1.1" in s for s in whole.sentences)
+    parts = compare(both(terrains=("flat", "wave"), frictions=(0.6,)))
+    assert not parts.complete
+    assert parts.sentences[-1] == (
+        "None of these is a score of robogauge-1.1 1.1.0; all hold the same, part: 2 of 7 terrains, 1 of 9 frictions."
+    )
+    assert parts.plain()["policies"][0]["coverage"] == {"kind": "part", "text": "2 of 7 terrains, 1 of 9 frictions"}
+    first, second = both()
+    second["coverage"] = {"kind": "custom", "text": "seed 9", "levels": []}
+    assert compare([first, second]).sentences[-1] == (
+        "Not all of these are scores of robogauge-1.1 1.1.0: 'first' complete; 'second' custom: seed 9."
+    )
+
+
+def test_runs_at_different_given_levels_are_refused():
+    pair = [results(terrains=("wave",), frictions=(0.6,), level=level, path=f"{level}.pt") for level in (5, 6)]
+    with pytest.raises(ComparisonError, match=r"'5' was given level \[5\] and '6' level \[6\]; .* the same --level"):
+        compare(pair)
+
+
 # ---- what is refused ------------------------------------------------------------------------------------------------
 
 
