@@ -7,7 +7,15 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from ..policy.base import Policy
-from ..policy.export import ExportError, export_deploy, export_onnx, export_policy, export_torchscript
+from ..policy.export import (
+    ExportError,
+    export_deploy,
+    export_onnx,
+    export_policy,
+    export_torchscript,
+    export_unitree,
+    first_steps,
+)
 from ..policy.loading import load_policy
 from ..robots import Robot, load_robot
 from .console import Terminal
@@ -44,29 +52,43 @@ _ABOUT = {
 }
 
 
-def run_export(choice: str, *, out: Path | None, form: str, trust: bool = False) -> None:
+LAYOUTS = ("plain", "unitree")
+
+
+def run_export(choice: str, *, out: Path | None, form: str, layout: str = "plain", trust: bool = False) -> None:
     """Export, and print each file with its check against the policy.
 
     Raises:
-        UserError: no such format.
+        UserError: no such format or layout, or a format that the layout does not have.
         PolicyError, ContractError: no such policy, or it cannot be exported.
     """
     if form not in FORMATS:
         close = get_close_matches(form, FORMATS, 1)
         hint = f"did you mean '{close[0]}'? " if close else ""
         raise UserError(f"there is no format '{form}'; {hint}choose one of: {', '.join(FORMATS)} (--format)")
+    if layout not in LAYOUTS:
+        raise UserError(f"there is no layout '{layout}'; choose one of: {', '.join(LAYOUTS)} (--layout)")
+    if layout == "unitree" and form != "all":
+        raise UserError(f"--layout unitree always writes ONNX and deploy.yaml; leave out --format {form}")
     path = policy_file(choice)
     policy = load_policy(path, trust=trust)
     robot = load_robot(policy.contract.robot)
     # Beside the checkpoint of a run, where users of Isaac Lab look for it.
-    folder = out or (path.parent if (path.parent / "run.json").is_file() else Path()) / "exported"
+    folder = out or (path.parent if (path.parent / "run.json").is_file() else Path()) / (
+        "unitree" if layout == "unitree" else "exported"
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ExportError(f"cannot create folder '{folder}': {error.strerror}; choose another --out") from error
     console = Terminal()
     console.say(f"policy {path}, contract {policy.contract.hash[:12]}")
-    for written, largest in FORMATS[form](policy, folder, robot).items():
+    export = export_unitree if layout == "unitree" else FORMATS[form]
+    for written, largest in export(policy, folder, robot).items():
         actions = f"actions differ by at most {largest:.1e}" if largest else "actions are the same"
         check = "reads back the same" if written.suffix == ".yaml" else actions
         console.say(f"{written}  {written.stat().st_size / 1e6:.2f} MB  {_ABOUT[written.suffix]}; {check}")
+    if layout == "unitree":
+        console.say(f"point the controller's policy_dir at {folder.resolve()}")
+        if sentence := first_steps(policy):
+            console.say(sentence)

@@ -392,12 +392,18 @@ def export(
         Path | None, typer.Option(help="Output folder. Default: 'exported' in the run directory, or here.")
     ] = None,
     form: Annotated[str, typer.Option("--format", help="torchscript, onnx, deploy or all.")] = "all",
+    layout: Annotated[
+        str,
+        typer.Option(
+            help="plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'."
+        ),
+    ] = "plain",
     trust: TrustOption = False,
 ) -> None:
     """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it."""
     from .export import run_export
 
-    run_export(policy, out=out, form=form, trust=trust)
+    run_export(policy, out=out, form=form, layout=layout, trust=trust)
 
 
 @app.command()

@@ -6,7 +6,7 @@ Every adapter notes in the contract's provenance where it took the facts from an
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +32,6 @@ FOREIGN_TERMS: Mapping[str, str] = {
     "last_action": "last_action",
     "actions": "last_action",
 }
-
-# Order in which the maker's SDK numbers the motors; ``joint_ids_map`` of a deploy.yaml refers to it.
-SDK_LEGS: Mapping[str, Sequence[str]] = {"go2": ("FR", "FL", "RR", "RL")}
-SDK_JOINTS = ("hip", "thigh", "calf")
 
 LONGEST_HISTORY = 20
 
@@ -161,12 +157,12 @@ def _deploy_contract(data: Mapping[str, Any], path: Path, robot: Robot) -> Polic
 def _deploy_joints(data: Any, path: Path, robot: Robot) -> tuple[str, ...]:
     if not isinstance(data, Mapping):
         raise PolicyError(f"'{path}' holds no table of settings")
-    legs = SDK_LEGS.get(robot.name)
-    if legs is None:
+    numbered = robot.sdk_joint_names
+    if numbered is None:
         raise PolicyError(
-            f"'{path}' numbers joints as the robot's SDK does, which is not known for robot '{robot.name}'"
+            f"'{path}' numbers joints as the maker's SDK does, which the description of robot '{robot.name}' does not say; "
+            "add sdk_joint_names to its robot.toml"
         )
-    numbered = [matching_joint(f"{leg}_{joint}", robot) for leg in legs for joint in SDK_JOINTS]
     order = list(data["joint_ids_map"])
     if sorted(order) != list(range(len(numbered))):
         raise PolicyError(

@@ -7,7 +7,6 @@ never left behind.
 from __future__ import annotations
 
 import io
-import logging
 import math
 import warnings
 from collections.abc import Callable
@@ -23,7 +22,7 @@ from torch.nn import functional
 
 from ..files.writing import replacing
 from ..robots import Robot
-from .adapters import FOREIGN_TERMS, SDK_JOINTS, SDK_LEGS, deploy_contract, matching_joint
+from .adapters import FOREIGN_TERMS, deploy_contract
 from .base import Policy, PolicyError
 from .contract import TERM_WIDTH, HistoryOrder, PolicyContract, difference
 from .loading import load_policy
@@ -34,7 +33,12 @@ from .torchscript import CONTRACT_FILE
 TOLERANCE = 1e-5
 """Largest difference of an action between an export and its policy."""
 CHECK_STEPS = 16
-ONNX_OPSET = 18
+WIDE = 100.0
+"""Clip of the published controller's files where nothing is to be clipped [SI units, radians]: far beyond what a robot
+measures, is commanded or may be sent.
+"""
+ONNX_OPSET, ONNX_IR_VERSION = 17, 8
+"""What onnxruntime 1.16 reads, which the published C++ controller prescribes on the robot."""
 
 # This project's observation terms as Isaac Lab, whose names the C++ runtime knows, calls them.
 DEPLOY_TERMS = {
@@ -203,52 +207,80 @@ def export_onnx(policy: Policy, path: str | Path) -> float:
     frames = int(network.history_length)  # type: ignore[arg-type]
     module = _TermMajor(network, term_major_order(policy.contract, frames)).eval()
     contract = stacked_contract(policy.contract, frames)
-    example = torch.zeros(1, contract.observation_width)
-    # The exporter tells its steps on standard output and in its log; failures arrive as exceptions.
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    buffer = io.BytesIO()
     with warnings.catch_warnings():
+        # torch announces the retirement of this exporter; its successor writes no opset below 18.
         warnings.simplefilter("ignore")
-        program = torch.onnx.export(
+        torch.onnx.export(
             module,
-            (example,),
+            (torch.zeros(1, contract.observation_width),),
+            buffer,  # type: ignore[arg-type]
             input_names=["obs"],
             output_names=["actions"],
             opset_version=ONNX_OPSET,
-            dynamo=True,
-            verbose=False,
+            dynamo=False,
         )
-    assert program is not None
-    model = program.model_proto
+    model = onnx.load_model_from_string(buffer.getvalue())
+    model.ir_version = ONNX_IR_VERSION
     del model.metadata_props[:]
     onnx.helper.set_model_props(model, {"contract": contract.to_json(), **mjlab_metadata(contract)})
     return _write_checked(Path(path), model.SerializeToString(), lambda written: _largest_difference(policy, written))
 
 
-def export_deploy(policy: Policy, path: str | Path, robot: Robot) -> None:
+def export_deploy(policy: Policy, path: str | Path, robot: Robot, *, finite_clips: bool = False) -> None:
     """Write the ``deploy.yaml`` with which the robot's C++ runtime runs the ONNX file; it is read back and compared.
 
-    The runtime fills the history with the first observation. A policy whose contract begins it with zeros acts a little
-    differently for as many steps as the history has frames.
+    The runtime fills the history with the first observation; ``first_steps`` says what that changes.
 
     Args:
         policy: one of the project's own.
         path: file to write; an existing one is replaced.
         robot: the robot the policy is for.
+        finite_clips: write clips of ``WIDE`` where the contract clips nothing.
 
     Raises:
         ExportError: the robot's own joint numbers are not known, or the file cannot say what the contract says.
     """
     network = _network(policy)
     contract = stacked_contract(policy.contract, int(network.history_length))  # type: ignore[arg-type]
-    text = yaml.safe_dump(deploy_settings(contract, robot), sort_keys=False, default_flow_style=None, width=120)
+    settings = deploy_settings(contract, robot, finite_clips=finite_clips)
+    text = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
+    expected = _with_wide_clips(contract) if finite_clips else contract
 
     def check(written: Path) -> float:
-        wanted = replace(_spelled_out(contract), history=replace(contract.history, start="repeat"))
+        wanted = replace(_spelled_out(expected), history=replace(contract.history, start="repeat"))
         if lines := difference(wanted, _spelled_out(deploy_contract(written, robot))):
             raise ExportError(f"a deploy.yaml cannot express this policy's contract: {lines.splitlines()[0]}")
         return 0.0
 
     _write_checked(Path(path), text.encode(), check)
+
+
+def export_unitree(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path, float]:
+    """Write the folder that the published C++ controller is pointed at: ``exported/policy.onnx`` and ``params/deploy.yaml``.
+
+    Returns:
+        The written files, with the largest difference of an action to the policy's.
+
+    Raises:
+        ExportError: see ``export_onnx`` and ``export_deploy``.
+    """
+    graph, deploy = Path(folder) / "exported" / "policy.onnx", Path(folder) / "params" / "deploy.yaml"
+    _make_folders(graph.parent, deploy.parent)
+    difference_of_graph = export_onnx(policy, graph)
+    export_deploy(policy, deploy, robot, finite_clips=True)
+    return {graph: difference_of_graph, deploy: 0.0}
+
+
+def first_steps(policy: Policy) -> str | None:
+    """What the robot's C++ runtime does otherwise at the start, in one sentence; None where it does the same."""
+    frames = int(_network(policy).history_length)  # type: ignore[arg-type]
+    if frames == 1 or policy.contract.history.start == "repeat":
+        return None
+    return (
+        f"the policy was trained on a history that begins with zeros, the controller fills it with the first observation: "
+        f"its first {frames - 1} actions differ from the gauge's, later ones are the same for the same observations"
+    )
 
 
 def export_policy(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path, float]:
@@ -261,10 +293,7 @@ def export_policy(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path
         ExportError: see the three exports.
     """
     target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ExportError(f"Cannot create '{target}': {error.strerror}") from error
+    _make_folders(target)
     script, graph, deploy = target / "policy.pt", target / "policy.onnx", target / "deploy.yaml"
     differences = {script: export_torchscript(policy, script), graph: export_onnx(policy, graph)}
     export_deploy(policy, deploy, robot)
@@ -303,22 +332,29 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
     }
 
 
-def deploy_settings(contract: PolicyContract, robot: Robot) -> dict[str, Any]:
+def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: bool = False) -> dict[str, Any]:
     """The table of a ``deploy.yaml``; gains in the order of the robot's SDK, all else in the policy's.
+
+    With ``finite_clips``, what the contract does not clip is clipped to ``WIDE``.
 
     Raises:
         ExportError: the SDK's joint order is not known for this robot.
     """
-    legs = SDK_LEGS.get(robot.name)
-    if legs is None:
+    numbered = robot.sdk_joint_names
+    if numbered is None:
         raise ExportError(
-            f"a deploy.yaml numbers joints as the robot's SDK does, which is not known for robot '{robot.name}'"
+            f"a deploy.yaml numbers joints as the maker's SDK does, which the description of robot '{robot.name}' does not "
+            "say; add sdk_joint_names to its robot.toml"
         )
-    numbered = [matching_joint(f"{leg}_{joint}", robot) for leg in legs for joint in SDK_JOINTS]
     sdk = [numbered.index(name) for name in contract.joint_names]
     policy = [contract.joint_names.index(name) for name in numbered]
     clipped = any(term.clip is not None for term in contract.observation)
+    unclipped = WIDE if finite_clips else None
     observations: dict[str, Any] = {"scale_first": True} if clipped else {}
+
+    def clips(limit: float | None) -> list[float] | None:
+        return None if limit is None else [-limit, limit]
+
     for term in contract.observation:
         width = TERM_WIDTH[term.name] or contract.num_joints
         if isinstance(term.clip, tuple):
@@ -327,10 +363,11 @@ def deploy_settings(contract: PolicyContract, robot: Robot) -> dict[str, Any]:
             )
         observations[DEPLOY_TERMS[term.name]] = {
             "params": {"command_name": "base_velocity"} if term.name == "command" else {},
-            "clip": None if term.clip is None else [-term.clip, term.clip],
+            "clip": clips(term.clip or unclipped),
             "scale": list(term.scale) if len(term.scale) == width else list(term.scale) * width,
             "history_length": contract.history.length,
         }
+    targets = [list(r) for r in contract.target_range or ()] or [clips(unclipped) for _ in range(contract.num_joints)]
     limits = zip(("lin_vel_x", "lin_vel_y", "ang_vel_z"), contract.command_limits, strict=True)
     return {
         "joint_ids_map": sdk,
@@ -343,7 +380,7 @@ def deploy_settings(contract: PolicyContract, robot: Robot) -> dict[str, Any]:
         },
         "actions": {
             "JointPositionAction": {
-                "clip": None if contract.target_range is None else [list(r) for r in contract.target_range],
+                "clip": targets if contract.target_range or finite_clips else None,
                 "joint_names": [".*"],
                 "scale": list(contract.action_scale),
                 "offset": list(contract.default_joint_position),
@@ -367,6 +404,26 @@ def _spelled_out(contract: PolicyContract) -> PolicyContract:
         clip = None if term.clip is None else every(term.clip, width)
         terms.append(replace(term, scale=every(term.scale, width), clip=clip))
     return replace(contract, observation=tuple(terms))
+
+
+def _with_wide_clips(contract: PolicyContract) -> PolicyContract:
+    """The contract with the clips that ``deploy_settings`` writes where there are none."""
+    clipped = any(term.clip is not None for term in contract.observation)
+    terms = tuple(
+        t if t.clip is not None else replace(t, clip=WIDE if clipped else tuple(WIDE * abs(s) for s in t.scale))
+        for t in contract.observation
+    )
+    return replace(
+        contract, observation=terms, target_range=contract.target_range or ((-WIDE, WIDE),) * contract.num_joints
+    )
+
+
+def _make_folders(*folders: Path) -> None:
+    for folder in folders:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ExportError(f"cannot create folder '{folder}': {error.strerror}; choose another --out") from error
 
 
 def _network(policy: Policy) -> nn.Module:

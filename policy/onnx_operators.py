@@ -122,6 +122,10 @@ def _divide(node: Node, inputs: Inputs) -> torch.Tensor:
     return torch.div(*inputs, rounding_mode=None if inputs[0].is_floating_point() else "trunc")
 
 
+def _mod(node: Node, inputs: Inputs) -> torch.Tensor:
+    return (torch.fmod if node.get("fmod", 0) else torch.remainder)(*inputs)
+
+
 def _slice(node: Node, inputs: Inputs) -> torch.Tensor:
     starts, ends = node.listed(1, "starts"), node.listed(2, "ends")
     if starts is None or ends is None:
@@ -309,6 +313,7 @@ OPERATORS: Mapping[str, Callable[[Node, Inputs], Any]] = {
     "Max": _all_of(torch.maximum),
     "Min": _all_of(torch.minimum),
     "Mish": _plain(functional.mish),
+    "Mod": _mod,
     "Mul": _plain(torch.mul),
     "Neg": _plain(torch.neg),
     "NonZero": lambda node, inputs: inputs[0].nonzero().t(),

@@ -75,6 +75,9 @@ class Robot:
     """Named parameter sets (``gauge``, ``training`` …)."""
     command_limits: tuple[_Speed, _Speed, _Speed]
     """Largest commanded forward, lateral [m/s] and yaw [rad/s] speed that the robot is meant for."""
+    sdk_joint_names: _Names | None = None
+    """The joints in the order in which the maker's SDK numbers the motors, which a ``deploy.yaml`` refers to; None where it
+    is not known."""
 
     @property
     def num_joints(self) -> int:

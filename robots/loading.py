@@ -163,6 +163,12 @@ def _check(robot: Robot, source: str) -> None:
             raise RobotError(f"{source}: {key} has {len(values)} values but there are {robot.num_joints} joints")
     for name, constants in robot.parameters.items():
         _check_motors(constants, robot.joint_names, f"{source}: parameters.{name}.")
+    if robot.sdk_joint_names and sorted(robot.sdk_joint_names) != sorted(robot.joint_names):
+        odd = next((n for n in robot.sdk_joint_names if n not in robot.joint_names), None)
+        problem = f"names {shown(odd)}, which is none of joint_names" if odd else "does not name each joint once"
+        raise RobotError(
+            f"{source}: sdk_joint_names {problem}; give every joint once, in the order of the SDK's motors"
+        )
     if robot.default_parameters not in robot.parameters:
         known = ", ".join(robot.parameters)
         raise RobotError(

@@ -225,8 +225,8 @@ def test_deploy_refuses_what_it_cannot_say(tmp_path):
     with pytest.raises(ExportError, match="one clip for all entries"):
         export_deploy(policy, tmp_path / "deploy.yaml", robot)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(ExportError, match="not known for robot 'other'"):
-        export_deploy(make_policy("moe"), tmp_path / "deploy.yaml", replace(robot, name="other"))
+    with pytest.raises(ExportError, match="add sdk_joint_names"):
+        export_deploy(make_policy("moe"), tmp_path / "deploy.yaml", replace(robot, sdk_joint_names=None))
 
 
 @pytest.mark.slow

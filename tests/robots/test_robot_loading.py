@@ -159,6 +159,16 @@ def test_longest_key_wins(write_hopper):
         ('title = "One leg"\n', "", "it lacks title"),
         ('title = "One leg"\n', 'titel = "One leg"\n', "unknown field 'titel'; did you mean 'title'?"),
         ('trunk_shapes = ["chest"]\n', "", "it lacks trunk_shapes"),
+        (
+            "stand_height = 0.5",
+            'stand_height = 0.5\nsdk_joint_names = ["hip", "knee"]',
+            "sdk_joint_names names 'knee', which is none of joint_names; give every joint once",
+        ),
+        (
+            "stand_height = 0.5",
+            'stand_height = 0.5\nsdk_joint_names = ["hip"]',
+            "sdk_joint_names does not name each joint once",
+        ),
         ("armature = 0.01\n", "", "parameters.soft lacks armature"),
         ("armature = 0.01", "amature = 0.01", "unknown field 'parameters.soft.amature'; did you mean 'armature'?"),
         ("armature = 0.01", "armature = true", "parameters.soft.armature[0] is True; it must be a number"),
