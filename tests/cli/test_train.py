@@ -387,6 +387,7 @@ def test_idle_gpus_are_named(monkeypatch):
 def test_more_processes_than_gpus(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setenv("LOCAL_RANK", "2")
     with pytest.raises(ConfigurationError, match="give --nproc-per-node 2"):
         prepare(TrainRequest(task="go2-flat", backend="fake", device="cuda"))
