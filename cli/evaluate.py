@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import sys
@@ -16,8 +17,14 @@ from ..backends.registry import choose_device
 from ..gauge.coverage import COMPLETE, coverage_of, score_label, suite_label
 from ..gauge.evaluate import Request, Status, evaluate, prepare
 from ..gauge.report import write_report
+from ..gauge.suite import Suite
+from ..policy.adapters import assumptions
+from ..policy.contract import PolicyContract
 from .console import Terminal, make_table, shell_command
 from .progress import ProgressDisplay, duration
+
+_AT_ONCE = 1.0
+"""Time after settling within which a fall says that the policy is run wrongly [s]."""
 
 
 def run_evaluation(
@@ -61,7 +68,23 @@ def run_evaluation(
         return
     console = Terminal()
     print_results(console, results)
+    if sentence := doubtful_assumptions(prepared.policy.contract, prepared.suite, folder):
+        console.say(sentence)
     console.say(f"results  {folder / 'results.json'}\nepisodes {folder / 'episodes.csv'}\nreport   {report}")
+
+
+def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -> str | None:
+    """What was taken for granted of the policy, where in most episodes the robot fell within a second of standing."""
+    taken = assumptions(contract)
+    if taken is None:
+        return None
+    at_once = _AT_ONCE + suite.settling.longest
+    with (folder / "episodes.csv").open(encoding="utf-8", newline="") as file:
+        counts = [(int(row["falls"]), int(row["control_steps"])) for row in csv.DictReader(file)]
+    fell = [falls > 0 and steps * contract.control_period <= falls * at_once for falls, steps in counts]
+    if 2 * sum(fell) <= len(fell):
+        return None
+    return f"the robot fell at once in {sum(fell)} of {len(fell)} episodes. The policy does not say how it is to be run; {taken}"
 
 
 def shower(display: ProgressDisplay) -> Callable[[Status], None]:

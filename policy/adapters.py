@@ -71,6 +71,29 @@ def contract_for_width(
     return go2_contract(robot, history=history, provenance={**provenance, "assumed": assumed})
 
 
+def assumptions(contract: PolicyContract) -> str | None:
+    """What had to be taken for granted of a policy that does not say it, as one sentence; None where nothing was."""
+    if "assumed" not in contract.provenance:
+        return None
+    scales = ", ".join(f"{t.name} × {', '.join(f'{s:g}' for s in t.scale)}" for t in contract.observation)
+    joints = ", ".join(name.removesuffix("_joint") for name in contract.joint_names)
+    gains = " and ".join(
+        f"{letter} {min(v):g}" + (f" to {max(v):g}" if min(v) != max(v) else "")
+        for letter, v in (("kp", contract.stiffness), ("kd", contract.damping))
+    )
+    history = contract.history
+    frames = (
+        "the current frame alone"
+        if history.length == 1
+        else f"{history.length} frames, {history.order}, starting with {history.start}"
+    )
+    return (
+        f"taken for granted ({contract.provenance['assumed']}): history {frames}; joints {joints}; observation {scales}; "
+        f"action scale {min(contract.action_scale):g} rad, gains {gains}; where this is wrong the robot falls: put a "
+        "contract.json or deploy.yaml beside the file that says it"
+    )
+
+
 def find_deploy_file(path: Path) -> Path | None:
     """The ``deploy.yaml`` that belongs to an ONNX file: beside it, or in ``params/`` next to the folder of exports."""
     candidates = (

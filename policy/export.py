@@ -367,7 +367,8 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
             "scale": list(term.scale) if len(term.scale) == width else list(term.scale) * width,
             "history_length": contract.history.length,
         }
-    targets = [list(r) for r in contract.target_range or ()] or [clips(unclipped) for _ in range(contract.num_joints)]
+    targets: list[Any] = [list(r) for r in contract.target_range or ()]
+    targets = targets or [clips(unclipped) for _ in contract.joint_names]
     limits = zip(("lin_vel_x", "lin_vel_y", "ang_vel_z"), contract.command_limits, strict=True)
     return {
         "joint_ids_map": sdk,

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..robots import Robot, load_robot
 from .adapters import (
     LONGEST_HISTORY,
+    assumptions,
     checkpoint_network,
     contract_for_width,
     deploy_contract,
@@ -57,9 +60,16 @@ def load_policy(
     data = _read(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
     policy = rebuilt(_load(data, path, str(path_or_name), stand_in, trust=trust))
+    if sentence := assumptions(policy.contract):
+        _say(policy.path, sentence)
     if robot is not None:
         check_robot(policy.contract, robot)
     return policy
+
+
+@cache  # once, and not again in each process that is forked from this one
+def _say(path: str, sentence: str) -> None:
+    logging.getLogger(__name__).warning("'%s' does not say how it is to be run; %s", path, sentence)
 
 
 def find_policy(path_or_name: str | Path, *, log_root: Path = LOG_ROOT) -> Path:

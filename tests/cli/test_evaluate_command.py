@@ -1,9 +1,12 @@
 """The whole command on a suite of a few seconds."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from gaitgauge.cli.evaluate import doubtful_assumptions
+from gaitgauge.gauge.suite import load_suite
 
 SUITE = """
 extends = "gaitgauge-1"
@@ -94,3 +97,22 @@ def test_results_and_their_reproducibility(run, refused, tmp_path, policy, tiny)
     other = refused(*command, tmp_path / "first", "--seed", 5, "--resume")
     assert "another run" in other
     assert json.loads((tmp_path / "first" / "results.json").read_text()) == results
+
+
+def test_assumptions_are_repeated_where_the_robot_falls_at_once(tmp_path, contract):
+    suite = load_suite("gaitgauge-1")
+    guessed = replace(contract, provenance={"assumed": "5 frames of the standard observation"})
+    period, longest = contract.control_period, suite.settling.longest
+    at_once = round((longest + 0.5) / period)
+
+    def said(contract, *rows):
+        lines = [f"{falls},{steps}" for falls, steps in rows]
+        (tmp_path / "episodes.csv").write_text("\n".join(["falls,control_steps", *lines]))
+        return doubtful_assumptions(contract, suite, tmp_path)
+
+    falling, walking = (1, at_once), (0, 4000)
+    assert "fell at once in 2 of 3 episodes" in said(guessed, falling, (3, 3 * at_once), walking)
+    assert "taken for granted (5 frames" in said(guessed, falling)
+    assert said(guessed, falling, walking) is None
+    assert said(guessed, (1, 4000)) is None  # it fell late
+    assert said(contract, falling) is None  # nothing was guessed

@@ -190,6 +190,25 @@ def test_onnx_metadata(moe_onnx):
     assert load_policy(path).contract == stored
 
 
+def test_a_file_that_does_not_describe_itself_says_what_was_taken_for_granted(moe_onnx, tmp_path, caplog):
+    bare = onnx.load(moe_onnx[1])
+    del bare.metadata_props[:]
+    onnx.save(bare, tmp_path / "bare.onnx")
+    load_policy(moe_onnx[1])
+    assert "taken for granted" not in caplog.text
+    load_policy(tmp_path / "bare.onnx")
+    said = [r.getMessage() for r in caplog.records if "taken for granted" in r.getMessage()]
+    assert len(said) == 1
+    for fact in (
+        "5 frames, term-major",
+        "joints FL_hip, FL_thigh",
+        "joint_velocity × 0.05",
+        "kp 20 and kd 0.5",
+        "bare.onnx",
+    ):
+        assert fact in said[0]
+
+
 def test_term_major_order():
     contract = go2_contract(load_robot("go2"))
     order = term_major_order(contract, 5)
