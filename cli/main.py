@@ -178,6 +178,41 @@ def compare(
 
 @app.command()
 @report_errors
+def verify(
+    card: Annotated[
+        Path, typer.Argument(help="A score card: results.json, a copy of it, or its folder.", metavar="CARD")
+    ],
+    policy: Annotated[str | None, typer.Option(help="The policy's file, where it is not at the card's path.")] = None,
+    suite: Annotated[str | None, typer.Option(help="The card's suite file, where its suite does not ship.")] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cpu or cuda. Default: what the card's engine is made for.")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads. Default: all cores.")] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One environment of each terrain, at nominal friction and payload.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder of the replay. Default: results/verify-<card>.")] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
+    trust: TrustOption = False,
+) -> None:
+    """Play a score card again and say whether it holds on this machine; exit code 1 where it does not."""
+    from .verify import run_verification
+
+    run_verification(
+        card=card,
+        policy=policy,
+        suite=suite,
+        device=device,
+        threads=threads,
+        quick=quick,
+        out=out,
+        json_output=json_output,
+        trust=trust,
+    )
+
+
+@app.command()
+@report_errors
 def validate(
     tables: Annotated[
         list[Path] | None,

@@ -1,0 +1,70 @@
+"""``gaitgauge verify``: plays a score card again and says whether it holds on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import typer
+
+from ..backends.registry import choose_device
+from ..gauge.verify import load_card, prepare_replay, verify
+from .console import Terminal, shell_command
+from .evaluate import shower
+from .progress import ProgressDisplay
+
+
+def run_verification(
+    *,
+    card: Path,
+    policy: str | None,
+    suite: str | None,
+    device: str | None,
+    threads: int | None,
+    quick: bool,
+    out: Path | None,
+    json_output: bool,
+    trust: bool,
+) -> None:
+    """Replay, show progress, print whether the card holds; exit code 1 where it does not."""
+    content = load_card(card)
+    prepared = prepare_replay(
+        content,
+        policy=policy,
+        suite=suite,
+        device=choose_device(content["backend"], device),
+        threads=threads or os.cpu_count() or 1,
+        quick=quick,
+        trust=trust,
+    )
+    stem = card.resolve().parent.name if card.name == "results.json" else card.stem
+    folder = out or Path("results") / f"verify-{stem}{'-quick' if quick else ''}"
+    console = Terminal(stderr=True)
+    try:
+        with ProgressDisplay(console, "gauging") as display:
+            found = verify(content, prepared, folder, command=["gaitgauge", *sys.argv[1:]], watch=shower(display))
+    except KeyboardInterrupt:
+        console.say(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {shell_command()}")
+        raise typer.Exit(130) from None
+    if json_output:
+        print(json.dumps(found, indent=1))
+    else:
+        console = Terminal()
+        for item in found["levels"]:
+            where = f"{item['terrain']}, friction {item['friction']:g}, payload {item['payload']:g} kg"
+            console.say(f"{where}: level {item['card']} on the card, {item['here']} here")
+        played, whole = found["environments"]
+        console.say(f"played {played} of the card's {whole} environments" + (", one of each terrain" if quick else ""))
+        if found["score"] is not None:
+            low_high = "no interval" if found["interval"] is None else "{:.4f} to {:.4f}".format(*found["interval"])
+            console.say(f"score on the card {found['score']:.4f} ({low_high}), here {found['replayed']:.4f}")
+        if found["equal"]:
+            console.say("the card holds: every outcome is the same to the last digit")
+        elif found["holds"]:
+            console.say("the card holds: the score lies within its interval, single outcomes differ")
+        else:
+            console.say("the card does NOT hold on this machine")
+    if not found["holds"]:
+        raise typer.Exit(1)

@@ -1,0 +1,178 @@
+"""Does a score card hold here? Its environments are played again, by the same policy under the same rules, and compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..robots.loading import robot_digest
+from .comparison import chance_rules_of, load_result
+from .evaluate import Prepared, Request, Status, evaluate, file_digest, prepare
+from .intervals import Evidence
+from .pipelines import Environment
+from .results import environment_weights
+from .suite import Suite, load_suite
+
+Row = Mapping[str, Any]
+_OUTCOME = ("level", "score", "quality", "metrics", "trials", "runs", "falls", "diverged", "overflowed", "restarted")
+"""What of an environment's row must be the same to the last digit for a replay to be called equal."""
+
+
+class CardError(ValueError):
+    """A score card that cannot be replayed; the message says why and what to do."""
+
+
+def prepare_replay(
+    card: Mapping[str, Any],
+    *,
+    policy: str | None = None,
+    suite: str | None = None,
+    device: str = "cpu",
+    threads: int = 1,
+    quick: bool = False,
+    trust: bool = False,
+) -> Prepared:
+    """What must be played to check a card.
+
+    Args:
+        card: content of a ``results.json``.
+        policy: the policy's file, where it is not at the card's path.
+        suite: name or ``.toml`` file, where the suite is one of the user's own.
+        device: torch device.
+        threads: CPU threads.
+        quick: one environment of each terrain, at nominal friction and payload where the card has it, else the card's first.
+        trust: as for ``evaluate``.
+
+    Raises:
+        CardError: policy, suite or robot is not the card's.
+        SuiteError, PolicyError, …: as ``evaluate.prepare``.
+    """
+    path, wanted = policy or card["policy"]["path"], card["suite"]
+    if policy is None and not Path(path).is_file():
+        raise CardError(f"the card's policy is not at '{path}' on this machine; say where it is with --policy")
+    found = file_digest(path)
+    if found != card["policy"]["file_sha256"]:
+        raise CardError(
+            f"'{path}' is another policy than the card's: SHA-256 {found[:12]}…, not {card['policy']['file_sha256'][:12]}…; "
+            "give the right file with --policy"
+        )
+    rules = load_suite(suite or wanted["name"])
+    if rules.digest != wanted["digest"]:
+        raise CardError(
+            f"the card was made on {wanted['name']} {wanted['version']} with digest {wanted['digest'][:12]}…, here it is "
+            f"{rules.name} {rules.version} with {rules.digest[:12]}…; give the card's suite file with --suite"
+        )
+    rows = _sample(card["environments"], rules) if quick else card["environments"]
+    prepared = prepare(
+        Request(
+            policy=path,
+            suite=suite or wanted["name"],
+            pipeline="level" if card["pipeline"] == "level" else "stress",
+            backend=card["backend"],
+            robot=card["robot"],
+            device=device,
+            seeds=tuple(card["chance"]["seeds"]),
+            threads=threads,
+            trust=trust,
+        )
+    )
+    expected = card["provenance"].get("digests", {}).get("robot")
+    if expected is not None and expected != robot_digest(prepared.robot):
+        raise CardError(
+            f"the files of robot '{card['robot']}' are not the card's; check out the commit that made the card"
+        )
+    return replace(prepared, environments=tuple(_environment(row) for row in rows))
+
+
+def verify(
+    card: Mapping[str, Any],
+    prepared: Prepared,
+    folder: Path,
+    *,
+    command: Sequence[str] = (),
+    watch: Callable[[Status], None] | None = None,
+    play: Callable[..., dict[str, Any]] = evaluate,
+) -> dict[str, Any]:
+    """Play what ``prepare_replay`` chose, into a folder that keeps finished episodes, and compare.
+
+    Returns:
+        Plain data of ``judge``.
+    """
+    return judge(card, play(prepared, folder, resume=True, command=command, watch=watch))
+
+
+def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
+    """Whether a card holds, given the results of a replay of all or some of its environments.
+
+    It holds where the replay's score lies within the card's interval: the printed one, or for a sample that of the card's
+    own rows over the sampled environments. Where the card has no interval (one seed, or levels alone) only the same outcome holds.
+
+    Returns:
+        ``holds``, ``equal`` (every outcome the same to the last digit), ``quick``, ``environments`` (played, of the card),
+        ``score`` and ``interval`` of the card and the ``replayed`` score over what was played, and ``levels``: for each
+        environment whose level differs its terrain, friction, payload, ``card`` and ``here``.
+    """
+    by_key = {_key(row): row for row in card["environments"]}
+    pairs = [(by_key[_key(row)], row) for row in replay["environments"]]
+    equal = all(old.get(key) == new.get(key) for old, new in pairs for key in _OUTCOME)
+    quick = len(pairs) < len(by_key)
+    score, interval, here = card["score"], card["score_interval"], replay["score"]
+    if quick and score is not None:
+        olds = [old for old, _ in pairs]
+        weights = environment_weights([row["terrain"] for row in olds])
+        score = round(float(weights @ np.array([row["score"] for row in olds])), 6)
+        interval = Evidence(olds, chance_rules_of(card)).chance(weights).interval(score)
+    within = interval is not None and here is not None and interval[0] <= here <= interval[1]
+    return {
+        "holds": equal or within,
+        "equal": equal,
+        "quick": quick,
+        "environments": [len(pairs), len(by_key)],
+        "score": score,
+        "interval": None if interval is None else [round(float(end), 6) for end in interval],
+        "replayed": here,
+        "levels": [
+            {**{k: old[k] for k in ("terrain", "friction", "payload")}, "card": old["level"], "here": new["level"]}
+            for old, new in pairs
+            if old["level"] != new["level"]
+        ],
+    }
+
+
+def load_card(path: Path) -> dict[str, Any]:
+    """Read a score card: a ``results.json`` or a copy of it, or its folder.
+
+    Raises:
+        ComparisonError: there is none, or it is damaged or too old.
+        CardError: a field is missing.
+    """
+    card = load_result(path)
+    missing = [
+        k for k in ("suite", "score", "chance", "policy", "pipeline", "backend", "robot", "provenance") if k not in card
+    ]
+    if missing:
+        raise CardError(f"'{path}' is no score card: it has no '{missing[0]}'; give the results.json of an evaluation")
+    return card
+
+
+def _sample(rows: Sequence[Row], suite: Suite) -> list[Row]:
+    """One row of each terrain, at nominal friction and payload where there is one."""
+    nominal = (suite.matrix.nominal_friction, suite.matrix.nominal_payload)
+    chosen: dict[str, Row] = {}
+    for row in rows:
+        if row["terrain"] not in chosen or (row["friction"], row["payload"]) == nominal:
+            chosen[row["terrain"]] = row
+    return list(chosen.values())
+
+
+def _environment(row: Row) -> Environment:
+    given = 0 if row["terrain"] == "flat" else None if "search" in row else row["level"]
+    return Environment(terrain=row["terrain"], friction=row["friction"], payload=row["payload"], level=given)
+
+
+def _key(row: Row) -> tuple[str, float, float]:
+    return row["terrain"], row["friction"], row["payload"]

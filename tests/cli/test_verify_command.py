@@ -1,0 +1,67 @@
+"""Score cards are replayed: one that holds, one that does not, and what is refused."""
+
+import json
+
+import pytest
+
+SUITE = """
+extends = "gaitgauge-1"
+name = "tiny"
+goals = [{ name = "max_velocity", phases = [0.3, 0.1] }, { name = "target_pos_velocity", phases = [] }]
+
+[matrix]
+terrains = ["flat", "slope_fd"]
+frictions = [0.6, 0.9]
+payloads = [0.0]
+seeds = [0, 1]
+search_seeds = [100, 101]
+
+[commands]
+target_time = { slope = 0.3, wave = 0.3, stairs = 0.3, obstacle = 0.3 }
+
+[settling]
+longest = 0.3
+"""
+
+
+@pytest.fixture
+def card(run, tmp_path, policy):
+    """A card, its content and the options that replay it."""
+    suite = tmp_path / "tiny.toml"
+    suite.write_text(SUITE)
+    done = run("evaluate", policy, "--suite", suite, "--out", tmp_path / "run", "--threads", 1)
+    assert done.exit_code == 0, done.output
+    path = tmp_path / "card.json"
+    path.write_text((tmp_path / "run" / "results.json").read_text())
+    return path, json.loads(path.read_text()), ("--suite", suite, "--threads", 1)
+
+
+def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused, tmp_path, policy, card):
+    path, content, options = card
+    done = run("verify", path, *options, "--quick", "--out", tmp_path / "again")
+    assert done.exit_code == 0, done.output
+    words = " ".join(done.stdout.split())
+    assert "played 2 of the card's 4 environments, one of each terrain" in words
+    assert "every outcome is the same to the last digit" in words
+
+    for row in content["environments"]:
+        row["score"] = row["score"] + 0.3
+        for played in row.get("runs", {}).values():
+            played["quality"] += 0.3
+        if row["terrain"] == "slope_fd":
+            row["level"] = 9
+    path.write_text(json.dumps(content))
+    done = run("verify", path, *options, "--quick", "--out", tmp_path / "again", "--json")
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)
+    assert (found["holds"], found["equal"]) == (False, False)
+    (level,) = found["levels"]
+    assert (level["terrain"], level["friction"], level["card"]) == ("slope_fd", 0.6, 9)
+
+    assert "digest" in refused("verify", path, "--suite", "demo")
+    content["policy"]["file_sha256"] = "ab" * 32
+    path.write_text(json.dumps(content))
+    assert "another policy than the card's" in refused("verify", path, *options)
+    content["policy"]["path"] = "elsewhere/policy.pt"
+    path.write_text(json.dumps(content))
+    assert "--policy" in refused("verify", path, *options)
