@@ -213,6 +213,18 @@ def verify(
 
 @app.command()
 @report_errors
+def board(
+    folder: Annotated[Path, typer.Argument(help="Folder of score cards (*.json) or of evaluations.", metavar="FOLDER")],
+    out: Annotated[Path | None, typer.Option(help="The page. Default: board.html in the folder.")] = None,
+) -> None:
+    """Make a leaderboard page of a folder of score cards."""
+    from .board import run_board
+
+    run_board(folder=folder, out=out)
+
+
+@app.command()
+@report_errors
 def validate(
     tables: Annotated[
         list[Path] | None,

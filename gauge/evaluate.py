@@ -264,6 +264,7 @@ def evaluate(
             "path": prepared.policy.path,
             "contract_hash": prepared.policy.contract.hash,
             "file_sha256": file_digest(request.policy),
+            "observations": [term.name for term in prepared.policy.contract.observation],
             "provenance": dict(prepared.policy.contract.provenance),
         }
         results["coverage"] = coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline)

@@ -1,0 +1,102 @@
+"""A leaderboard: one static page made of a folder of score cards. It loads nothing from anywhere."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any
+
+import jinja2
+
+from ..files.writing import write_atomically
+from .coverage import COMPLETE, coverage_of
+from .report import TEMPLATES
+from .verify import CardError, load_card
+
+PRIVILEGED = ("base_linear_velocity_b",)
+"""Observation terms that no sensor of a robot measures."""
+
+
+def write_board(folder: Path, page: Path) -> Path:
+    """Write the board of a folder's cards, all or nothing.
+
+    Args:
+        folder: holds cards as ``*.json``, or folders of evaluations.
+        page: where the page goes.
+
+    Raises:
+        CardError: there is no card.
+        ComparisonError: a file that is none, or a damaged one; nothing is left out in silence.
+    """
+    files = sorted([*folder.glob("*.json"), *folder.glob("*/results.json")])
+    if not files:
+        raise CardError(f"'{folder}' holds no score cards; put results.json files or folders of evaluations there")
+    cards = {str(file.relative_to(folder)): load_card(file) for file in files}
+    write_atomically(page, render_board(board_data(cards, folder)), CardError)
+    return page
+
+
+def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) -> list[dict[str, Any]]:
+    """Tables of a board, one for each digest of a suite, engine and robot, those with most cards first.
+
+    Args:
+        cards: contents by file name.
+        folder: what the command that checks a card finds the files in.
+
+    Returns:
+        For each table ``suite``, ``backend``, ``robot``, ``ranked`` (complete cards, best first, with their ``rank``) and
+        ``others`` (parts, custom runs and levels alone, which have no rank).
+    """
+    tables: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    suites: dict[tuple[str, ...], Mapping[str, Any]] = {}
+    for name, card in cards.items():
+        key = (card["suite"]["digest"], card["backend"], card["robot"])
+        suites[key] = card["suite"]
+        tables.setdefault(key, []).append(_entry(name, card, folder))
+    found = []
+    for key, entries in sorted(tables.items(), key=lambda item: -len(item[1])):
+        entries.sort(key=lambda e: -1.0 if e["score"] is None else e["score"], reverse=True)
+        ranked = [e for e in entries if e["ranked"]]
+        for entry in ranked:  # equal scores share a rank
+            entry["rank"] = 1 + sum(other["score"] > entry["score"] for other in ranked)
+        others = [e for e in entries if not e["ranked"]]
+        found.append({"suite": suites[key], "backend": key[1], "robot": key[2], "ranked": ranked, "others": others})
+    return found
+
+
+def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
+    """The page, as HTML text. Whatever cards contain is shown as text and never becomes markup."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("board.html.j2").render(tables=tables)
+
+
+def _entry(name: str, card: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A line of the board."""
+    terms: Sequence[str] | None = card["policy"].get("observations")
+    covered = coverage_of(card)
+    return {
+        "card": name,
+        "policy": PurePath(card["policy"]["path"].replace("\\", "/")).name,
+        "hash": card["policy"]["file_sha256"],
+        "score": card["score"],
+        "interval": card["score_interval"],
+        "note": card["chance"]["note"],
+        "level": card["level"],
+        "observations": "not stated"
+        if terms is None
+        else "privileged"
+        if set(terms) & set(PRIVILEGED)
+        else "measurable",
+        "terms": list(terms or ()),
+        "coverage": f"{covered['kind']}" if covered["kind"] == COMPLETE else f"{covered['kind']}: {covered['text']}",
+        "ranked": covered["kind"] == COMPLETE and card["score"] is not None,
+        "rank": None,
+        "command": f"gaitgauge verify {shlex.quote(str(folder / name))} --policy FILE",
+    }

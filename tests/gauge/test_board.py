@@ -1,0 +1,83 @@
+"""The leaderboard: what is ranked, what is only listed, and that hostile text stays text."""
+
+import json
+
+import pytest
+from gaitgauge.gauge.board import board_data, render_board, write_board
+from gaitgauge.gauge.comparison import ComparisonError
+from gaitgauge.gauge.verify import CardError
+from test_report import HOSTILE, Page
+
+
+def card(
+    score, *, kind="complete", text="complete", path="a/walk.pt", digest="ab" * 32, observations=("command",), **other
+):
+    return {
+        "schema": 2,
+        "suite": {"name": "robogauge-1.1", "version": "1.1.0", "title": "", "digest": digest},
+        "coverage": {"kind": kind, "text": text},
+        "score": score,
+        "score_interval": None if score is None else [score - 0.01, score + 0.01],
+        "level": 7.5,
+        "chance": {"note": None},
+        "policy": {"path": path, "file_sha256": "cd" * 32, "observations": list(observations)},
+        "pipeline": "stress",
+        "backend": "mujoco",
+        "robot": "go2",
+        "provenance": {},
+        "environments": [],
+    } | other
+
+
+def test_complete_cards_are_ranked_by_score_and_others_only_listed():
+    part = card(0.9, kind="part", text="1 of 7 terrains")
+    (table,) = board_data({"low.json": card(0.5), "part.json": part, "high.json": card(0.6), "same.json": card(0.5)})
+    assert [(e["rank"], e["card"]) for e in table["ranked"]] == [(1, "high.json"), (2, "low.json"), (2, "same.json")]
+    assert [(e["rank"], e["coverage"]) for e in table["others"]] == [(None, "part: 1 of 7 terrains")]
+    assert table["ranked"][0]["command"] == "gaitgauge verify high.json --policy FILE"
+
+
+def test_results_that_do_not_state_their_coverage_or_have_no_score_are_not_ranked():
+    old, levels = card(0.7), card(None)
+    del old["coverage"]
+    (table,) = board_data({"old.json": old, "levels.json": levels})
+    assert not table["ranked"]
+    assert [e["card"] for e in table["others"]] == ["old.json", "levels.json"]
+
+
+def test_other_rules_engines_and_robots_have_tables_of_their_own():
+    cards = {"a": card(0.5), "b": card(0.5, digest="00"), "c": card(0.5, backend="newton"), "d": card(0.5, robot="a1")}
+    assert len(board_data(cards)) == 4
+
+
+def test_privileged_observations_are_marked():
+    cards = {
+        "1": card(0.9, observations=("command", "base_linear_velocity_b")),
+        "2": card(0.8, observations=("command", "joint_position")),
+        "3": card(0.7),
+    }
+    del cards["3"]["policy"]["observations"]
+    (table,) = board_data(cards)
+    assert [e["observations"] for e in table["ranked"]] == ["privileged", "measurable", "not stated"]
+
+
+def test_the_page_is_well_formed_and_hostile_text_stays_text():
+    page = Page(render_board(board_data({"x.json": card(0.5, path=HOSTILE), "y.json": card(0.4)})))
+    assert not page.open
+    assert page.count("img") == page.count("script") == 0
+    assert "0.5000" in page.text and "0.4900 – 0.5100" in page.text
+    assert "gaitgauge verify y.json --policy FILE" in page.text
+
+
+def test_a_folder_becomes_a_page_and_what_is_no_card_is_named(tmp_path):
+    with pytest.raises(CardError, match="holds no score cards"):
+        write_board(tmp_path, tmp_path / "board.html")
+    (tmp_path / "one.json").write_text(json.dumps(card(0.5)))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "results.json").write_text(json.dumps(card(0.6)))
+    text = write_board(tmp_path, tmp_path / "board.html").read_text()
+    assert f"gaitgauge verify {tmp_path / 'run' / 'results.json'}" in text
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(ComparisonError, match=r"other.json"):
+        write_board(tmp_path, tmp_path / "second.html")
+    assert not (tmp_path / "second.html").exists()
