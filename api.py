@@ -6,7 +6,6 @@ errors. Heavy packages are imported inside the functions.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -79,17 +78,20 @@ def load_results(path: str | Path) -> Results:
     """
     file = Path(path)
     file = file / "results.json" if file.is_dir() else file
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ResultsError(
-            f"there are no results at '{path}'; give a folder that 'gaitgauge evaluate' wrote"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise ResultsError(f"'{file}' cannot be read as results: {error}") from error
-    if not isinstance(data, dict) or not {"suite", "score", "terrains", "metrics"} <= data.keys():
+    from .files.parsing import edited, read_results
+
+    if not file.exists():
+        raise ResultsError(f"there are no results at '{path}'; give a folder that 'gaitgauge evaluate' wrote")
+    data = read_results(file, "results", ResultsError)
+    if not {"suite", "score", "terrains", "metrics"} <= data.keys():
         raise ResultsError(f"'{file}' holds no results of an evaluation; give the results.json that it wrote")
-    return Results(path=file, data=data)
+    found = Results(path=file, data=data)
+    with edited(f"'{file}'", ResultsError):
+        for table in (found.terrains, found.metrics):
+            if not all(isinstance(row, Mapping) for row in table.values()):
+                raise ResultsError(f"'{file}' was edited or is damaged: a terrain or metric is no table")
+        _ = found.score, found.interval, found.suite  # what is asked for later is there
+    return found
 
 
 def load_policy(policy: str | Path, *, robot: str = "go2", trust: bool = False) -> Policy:

@@ -10,7 +10,8 @@ import json
 import re
 import reprlib
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import is_dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -25,6 +26,8 @@ Kind = TypeVar("Kind")
 
 LARGEST = 1_000_000
 """Size of a file that describes something [bytes]."""
+LARGEST_RESULTS = 100_000_000
+"""Size of a file of results [bytes]."""
 _DEEPEST, _MOST = 32, 100_000
 """Of nested tables and lists, and of entries in all."""
 _SHOWN = 80
@@ -121,8 +124,8 @@ def parse_toml(text: str, source: str, error: type[Exception]) -> dict[str, Any]
     return plain(data, source, error)
 
 
-def parse_json(text: str | bytes, source: str, error: type[Exception]) -> Any:
-    """Plain data of JSON text.
+def parse_json(text: str | bytes, source: str, error: type[Exception], *, most: int = _MOST) -> Any:
+    """Plain data of JSON text, with no more entries than ``most``.
 
     Raises:
         error: no valid JSON, or nested too deep.
@@ -131,7 +134,39 @@ def parse_json(text: str | bytes, source: str, error: type[Exception]) -> Any:
         data = json.loads(text)
     except (ValueError, RecursionError) as problem:
         raise error(f"{source} is not valid JSON: {_reason(problem)}") from problem
-    return plain(data, source, error)
+    return plain(data, source, error, most=most)
+
+
+def read_results(path: Path, what: str, error: type[Exception]) -> dict[str, Any]:
+    """The table of a JSON file that this package wrote, which may be large, and which anybody may have changed since.
+
+    Raises:
+        error: no such file, too large, not readable, no valid JSON, or no table.
+    """
+    text = read_text(path, what, error, largest=LARGEST_RESULTS)
+    found = parse_json(text, f"{what} '{one_line(path)}'", error, most=LARGEST_RESULTS // 10)
+    if not isinstance(found, dict):
+        raise error(f"{what} '{one_line(path)}' is {shown(found)}; it must be a table")
+    return found
+
+
+@contextmanager
+def edited(source: str, error: type[Exception], *others: type[Exception]) -> Iterator[None]:
+    """Around code that takes for granted what a file holds: where something else stands in it, that is one sentence.
+
+    Args:
+        source: the file, the beginning of the sentence.
+        error: class of the error.
+        others: errors, beside those of Python's own lookups and arithmetic, that mean the same.
+    """
+    caught: tuple[type[Exception], ...] = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, *others)
+    try:
+        yield
+    except caught as problem:
+        if any(kind.__module__.partition(".")[0] == __name__.partition(".")[0] for kind in type(problem).__mro__):
+            raise
+        lacks = f"it lacks {shown(problem.args[0])}" if isinstance(problem, KeyError) else one_line(problem)
+        raise error(f"{source} was edited or is damaged: {lacks}") from problem
 
 
 def parse_yaml(text: str, source: str, error: type[Exception]) -> Any:
@@ -160,7 +195,7 @@ def _reason(problem: BaseException) -> str:
     return "it is nested too deep" if isinstance(problem, RecursionError) else one_line(problem)
 
 
-def plain(data: Any, source: str, error: type[Exception]) -> Any:
+def plain(data: Any, source: str, error: type[Exception], *, most: int = _MOST) -> Any:
     """A copy of plain data (tables, lists, texts, numbers, true, false, null) of bounded depth and size.
 
     Halves of surrogate pairs, which no text file can hold, become their escape sequence.
@@ -168,7 +203,7 @@ def plain(data: Any, source: str, error: type[Exception]) -> Any:
     Raises:
         error: anything else is in it, a key that is no text, or too much.
     """
-    left = _MOST
+    left = most
 
     def copy(value: Any, path: str, depth: int) -> Any:
         nonlocal left

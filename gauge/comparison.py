@@ -6,7 +6,6 @@ compared seed by seed.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..files.parsing import shown
+from ..files.parsing import edited, one_line, read_results, shown
 from .coverage import COMPLETE, coverage_of
 from .episodes import QUALITY
 from .intervals import CONFIDENCE, Array, Chance, ChanceRules, Evidence
@@ -128,6 +127,11 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
     Raises:
         ComparisonError: results of different suites, engines, robots or environments, or without scores.
     """
+    with edited("one of the results", ComparisonError):
+        return _compare(results, labels)
+
+
+def _compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None) -> Comparison:
     if len(results) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results, not {len(results)}")
     labels = list(labels) if labels else _labels(results)
@@ -202,16 +206,12 @@ def load_result(path: Path) -> dict[str, Any]:
         ComparisonError: there is none, or it is damaged, or too old to compare.
     """
     file = path / "results.json" if path.is_dir() else path
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ComparisonError(f"there are no results at '{path}'; give a folder of 'gaitgauge evaluate'") from error
-    except (OSError, ValueError) as error:
-        raise ComparisonError(f"'{file}' cannot be read as results: {error}") from error
-    if not isinstance(found, dict) or found.get("schema") != SCHEMA or "environments" not in found:
-        schema = found.get("schema") if isinstance(found, dict) else None
+    if not file.exists():
+        raise ComparisonError(f"there are no results at '{one_line(path)}'; give a folder of 'gaitgauge evaluate'")
+    found = read_results(file, "results", ComparisonError)
+    if (schema := found.get("schema")) != SCHEMA or "environments" not in found:
         raise ComparisonError(
-            f"'{file}' has schema {schema!r}, a comparison needs {SCHEMA}, which holds trials and runs; "
+            f"'{file}' has schema {shown(schema)}, a comparison needs {SCHEMA}, which holds trials and runs; "
             "run its evaluation again with --resume"
         )
     return found

@@ -9,6 +9,7 @@ from typing import Any
 
 import jinja2
 
+from ..files.parsing import edited, read_results
 from ..files.writing import write_atomically
 from . import charts
 from .charts import FLAT, Row, number, terrain_label
@@ -52,14 +53,16 @@ def write_report(folder: Path) -> Path:
         StoreError: the folder holds no results, or damaged ones, or some of another version.
     """
     source = folder / "results.json"
+    if not source.exists():
+        raise StoreError(f"{folder} holds no results.json; run gaitgauge evaluate with --out {folder} first")
     try:
-        results = json.loads(source.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise StoreError(f"{folder} holds no results.json; run gaitgauge evaluate with --out {folder} first") from error
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{source} cannot be read ({error}); run gaitgauge evaluate again with --resume") from error
+        results = read_results(source, "results", StoreError)
+        with edited(str(source), StoreError, jinja2.TemplateError):
+            text = render(results)
+    except StoreError as error:
+        raise StoreError(f"{error}; run gaitgauge evaluate again with --resume") from error
     page = folder / "report.html"
-    write_atomically(page, render(results), StoreError)
+    write_atomically(page, text, StoreError)
     return page
 
 

@@ -15,6 +15,7 @@ import torch
 
 from ..backends.registry import choose_device
 from ..files.parsing import build, shown
+from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
 from ..policy.loading import find_policy
 from .algorithms.symmetry import build_mirror
@@ -310,6 +311,8 @@ def train(
     seed_everything(run_settings.seed + rank)
     environment = replace(task.environment, seed=task.environment.seed + rank)
     with ExitStack() as closing:
+        if run is not None:
+            closing.callback(lock_folder(run, CheckpointError).release)
         try:
             env = TrainingEnvironment(
                 environment,

@@ -117,7 +117,7 @@ def resume_run(runner: TrainingRunner, path: Path) -> None:
     # A score may have come back, and best.pt been replaced, after the checkpoint was written.
     noted = read_run_json(runner.log_dir) if runner.log_dir else {}
     if (score := noted.get("best_score")) is not None and (runner.best_score is None or score > runner.best_score):
-        runner.best_score, runner.best_iteration = score, noted["best_iteration"]
+        runner.best_score, runner.best_iteration = score, noted.get("best_iteration")
     local: Mapping[str, Any] | None = training
     if training["world_size"] != runner.processes.count:
         local = None

@@ -6,7 +6,6 @@ the gauge's score), ``params/env.yaml`` and ``params/agent.yaml``, ``run.json`` 
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping
 from datetime import datetime
@@ -15,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from ..files.parsing import read_results
 from ..files.provenance import provenance
 from ..files.writing import json_text, write_atomically
 from ..policy.contract import PolicyContract
@@ -122,10 +122,11 @@ def read_run_json(run: Path) -> dict[str, Any]:
     path = run / "run.json"
     if not path.exists():
         return {}
-    try:
-        return dict(json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError) as error:
-        raise CheckpointError(f"Cannot read '{path}': {error}.") from error
+    found = read_results(path, "run description", CheckpointError)
+    score = (found.get("best_score"), found.get("best_iteration"))
+    if not isinstance(found.get("resumed", []), list) or not all(s is None or type(s) in (int, float) for s in score):
+        raise CheckpointError(f"'{path}' was edited or is damaged: resumed, best_score or best_iteration")
+    return found
 
 
 def update_run_json(run: Path, changes: Mapping[str, Any]) -> None:

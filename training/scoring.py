@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sys
@@ -11,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..files.parsing import edited, read_results
 from ..gauge.suite import load_suite
 from .side_process import Finished, Job, SideProcess
 
@@ -93,8 +93,9 @@ def _report(finished: Finished) -> ScoreReport:
         failure = "skipped: gauging is slower than training; raise gauge_interval"
     elif not failure:
         try:
-            scores = scores_of(json.loads(job.output.read_text()))
-        except (json.JSONDecodeError, KeyError, TypeError, ValueError, OSError) as error:
+            with edited("it", ValueError):
+                scores = scores_of(read_results(job.output, "results", ValueError))
+        except ValueError as error:
             failure = f"the gauge's output {job.output} cannot be read: {error}"
     return ScoreReport(path=job.checkpoint, iteration=job.iteration, scores=scores, failure=failure)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
 import jinja2
 
+from ...files.parsing import edited, read_results
 from ...files.writing import write_atomically
 from ..charts import number, terrain_label
 from ..report import TEMPLATES, metric_label
@@ -50,16 +50,16 @@ def write_page(folder: Path) -> Path:
         StoreError: the folder holds no study, or a damaged one, or one of another version.
     """
     source = folder / "consistency.json"
+    if not source.exists():
+        raise StoreError(f"{folder} holds no consistency.json; run gaitgauge consistency with --out {folder} first")
     try:
-        results = json.loads(source.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise StoreError(
-            f"{folder} holds no consistency.json; run gaitgauge consistency with --out {folder} first"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{source} cannot be read ({error}); run gaitgauge consistency again with --resume") from error
+        results = read_results(source, "study", StoreError)
+        with edited(str(source), StoreError, jinja2.TemplateError):
+            text = render(results)
+    except StoreError as error:
+        raise StoreError(f"{error}; run gaitgauge consistency again with --resume") from error
     page = folder / "consistency.html"
-    write_atomically(page, render(results), StoreError)
+    write_atomically(page, text, StoreError)
     return page
 
 

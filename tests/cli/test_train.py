@@ -14,6 +14,7 @@ import torch
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.train import parse_duration
 from gaitgauge.files import writing
+from gaitgauge.files.writing import lock_folder
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.launch import TrainRequest, idle_gpus, prepare
 from gaitgauge.training.overrides import override_keys
@@ -347,6 +348,24 @@ def test_what_the_command_line_names_needs_no_trust(trained, tmp_path, monkeypat
 def test_the_package_vouches_for_its_own_functions_alone(name, foreign):
     assert foreign_functions({"a": [{"b": name}]}, {}) == ([name] if foreign else [])
     assert foreign_functions({"a": [{"b": name}]}, {"known": name}) == []
+
+
+def test_two_processes_do_not_share_a_run(run, trained):
+    lock = lock_folder(trained, RuntimeError)
+    before = sorted(f.name for f in trained.iterdir())
+    resume = ("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--iterations", 3)
+    result = run(*resume)
+    assert result.exit_code == 2
+    assert "another process is writing to" in result.stderr
+    assert sorted(f.name for f in trained.iterdir()) == before
+    lock.release()
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"resumed": 3}', '{"best_score": "high"}', "[" * 9999])
+def test_damaged_descriptions_of_a_run(refused, trained, tmp_path, text):
+    (tmp_path / "model_2.pt").write_bytes((trained / "model_2.pt").read_bytes())
+    (tmp_path / "run.json").write_text(text)
+    assert "run.json" in refused("train", "go2-flat", "--resume", tmp_path, "--device", "cpu", "--no-score")
 
 
 def test_a_task_that_a_checkpoint_names_is_no_command_to_paste(refused, trained, tmp_path):

@@ -4,6 +4,7 @@ import json
 import math
 import re
 import zlib
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -11,7 +12,9 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from gaitgauge.api import ResultsError, load_results
 from gaitgauge.gauge import charts
+from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
 from gaitgauge.gauge.coverage import coverage
 from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.pipelines import make_environments
@@ -222,8 +225,23 @@ def test_report_is_written_beside_the_results(tmp_path, stress):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html", "results.json"]
 
 
+@pytest.mark.parametrize("key", ["environments", "terrains", "provenance", "policy", "health", "score", "metrics"])
+@pytest.mark.parametrize("value", [None, [1], {"a": 1}, "text", -1])
+def test_edited_results_are_one_clear_sentence_or_a_page(tmp_path, stress, key, value):
+    for changed in ({**stress, key: value}, {k: v for k, v in stress.items() if k != key}):
+        (tmp_path / "results.json").write_text(json.dumps(changed))
+        try:
+            write_report(tmp_path)
+        except StoreError as error:
+            assert "results.json was edited or is damaged" in str(error) and str(error).isprintable()
+        for read in (lambda: compare([load_result(tmp_path)] * 2, ["a", "b"]), lambda: load_results(tmp_path)):
+            with suppress(ComparisonError, ResultsError):
+                read()
+
+
 @pytest.mark.parametrize(
-    ("content", "words"), [(None, "holds no results.json"), ("{", "cannot be read"), ("[]", "schema")]
+    ("content", "words"),
+    [(None, "holds no results.json"), ("{", "not valid JSON"), ("[]", "must be a table"), ("[" * 9999, "too deep")],
 )
 def test_missing_or_damaged_results_are_one_clear_sentence(tmp_path, content, words):
     (tmp_path / "report.html").write_text("earlier")
