@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: install demo test test-slow test-gpu fuzz check docs format clean
+.PHONY: install demo test test-slow test-gpu fuzz torture check docs format clean
 
 install: $(READY)
 
@@ -28,10 +28,15 @@ test-slow: install
 test-gpu: install
 	$(BIN)/python -m pytest -m gpu
 
-# What somebody else may have written, against every parser: CASES of each.
-CASES ?= 10000
+# What somebody else may have written, against every parser: CASES of all of them together. Prints a table.
+CASES ?= 100000
 fuzz: install
 	GAITGAUGE_FUZZ_CASES=$(CASES) $(BIN)/python -m pytest -n auto tests/fuzz
+
+# Kills an evaluation KILLS times and resumes it; nothing may be lost.
+KILLS ?= 100
+torture: install
+	$(BIN)/python benchmarks/torture.py --kills $(KILLS)
 
 check: install
 	$(BIN)/ruff check .

@@ -12,6 +12,7 @@ import resource
 import signal
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,6 +41,22 @@ class Parser:
     """What is put in between."""
 
 
+@dataclass(kw_only=True)
+class Tally:
+    """What the cases of a parser came to."""
+
+    cases: int = 0
+    tracebacks: int = 0
+    """Errors that are not the project's own, of time and memory included."""
+    slowest: float = 0.0
+    """[s]"""
+    memory: int = 0
+    """Largest that a case took beyond what the process had [bytes]; 0 where the system does not tell."""
+    outside: int = 0
+    """Files touched outside a case's folder."""
+
+
+TALLIES: dict[str, Tally] = {}
 PARSERS: dict[str, Parser] = {}
 
 _BYTES = (b"\x00", b"\xff", b"\x80", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8, b"\x7f" + b"\xff" * 8)
@@ -101,17 +118,39 @@ def check(parser: Parser, content: bytes) -> None:
     Raises:
         AssertionError: it did what it must not.
     """
+    tally = TALLIES.setdefault(parser.name, Tally())
+    tally.cases += 1
     with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
         folder = Path(name)
-        with _watched(folder) as written, _limits():
-            try:
-                parser.feed(content, folder)
-            except (ValueError, RuntimeError, OSError) as error:
-                if not _is_ours(error):
-                    raise
-                assert str(error).isprintable(), f"not one printable line: {error!r}"
-                assert len(str(error)) < 2000, "a sentence of over 2000 characters"
+        before, began = _memory(reset=True), time.perf_counter()
+        try:
+            with _watched(folder) as written, _limits():
+                try:
+                    parser.feed(content, folder)
+                except (ValueError, RuntimeError, OSError) as error:
+                    if not _is_ours(error):
+                        raise
+                    assert str(error).isprintable(), f"not one printable line: {error!r}"
+                    assert len(str(error)) < 2000, "a sentence of over 2000 characters"
+        except BaseException:
+            tally.tracebacks += 1
+            raise
+        finally:
+            tally.slowest = max(tally.slowest, time.perf_counter() - began)
+            tally.memory = max(tally.memory, _memory() - before)
+            tally.outside += len(written)
         assert not written, f"written outside its folder: {written}"
+
+
+def _memory(*, reset: bool = False) -> int:
+    """Most memory that the process had at once, since its last reset [bytes]."""
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:")), 0)
 
 
 def _is_ours(error: BaseException) -> bool:

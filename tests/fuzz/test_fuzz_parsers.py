@@ -5,15 +5,15 @@ import os
 from pathlib import Path
 
 import pytest
-from fuzzing import PARSERS, Parser, check, contents
+from fuzzing import PARSERS, TALLIES, Parser, check, contents
 from gaitgauge.policy.base import PolicyError
 from hypothesis import HealthCheck, given, settings
 
 for module in sorted(Path(__file__).parent.glob("fuzz_*.py")):
     importlib.import_module(module.stem)
 
-CASES = int(os.environ.get("GAITGAUGE_FUZZ_CASES", "20"))
-"""Of each parser."""
+CASES = -(-int(os.environ.get("GAITGAUGE_FUZZ_CASES", len(PARSERS) * 20)) // len(PARSERS))
+"""Of each parser; the variable says how many of all."""
 
 
 @pytest.mark.parametrize("name", PARSERS)
@@ -23,8 +23,9 @@ def test_seeds_are_taken(name):
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_whatever_is_read_ends_well(name):
+def test_whatever_is_read_ends_well(name, record_property):
     parser = PARSERS[name]
+    TALLIES.pop(name, None)
 
     @settings(
         max_examples=CASES,
@@ -37,7 +38,10 @@ def test_whatever_is_read_ends_well(name):
     def case(content: bytes) -> None:
         check(parser, content)
 
-    case()
+    try:
+        case()
+    finally:
+        record_property("fuzzed", {"parser": name, **vars(TALLIES[name])})
 
 
 def parser(feed) -> Parser:
@@ -49,6 +53,7 @@ def test_the_harness_catches_what_it_is_for(tmp_path):
         (folder / "own").write_text("")
         raise PolicyError("one sentence")
 
+    TALLIES.clear()
     check(parser(sentence), b"")
     with pytest.raises(KeyError):
         check(parser(lambda content, folder: {}["x"]), b"")
@@ -58,3 +63,7 @@ def test_the_harness_catches_what_it_is_for(tmp_path):
         check(parser(lambda content, folder: (tmp_path / "x").write_text("")), b"")
     with pytest.raises(AssertionError, match="outside"):
         check(parser(lambda content, folder: os.mkdir(tmp_path / "y")), b"")
+    tally = TALLIES["test"]
+    assert (tally.cases, tally.tracebacks, tally.outside) == (5, 2, 2)
+    check(parser(lambda content, folder: bytearray(3 * 10**8)), b"")
+    assert 2 * 10**8 < tally.memory < 4 * 10**8 or not Path("/proc/self/clear_refs").exists()
