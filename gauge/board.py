@@ -48,8 +48,8 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
         For each table ``suite``, ``backend``, ``robot``, ``ranked`` (complete cards, best first, with their ``rank``) and
         ``others`` (parts, custom runs and levels alone, which have no rank).
     """
-    tables: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    suites: dict[tuple[str, ...], Mapping[str, Any]] = {}
+    tables: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    suites: dict[tuple[str, str, str], Mapping[str, Any]] = {}
     for name, card in cards.items():
         key = (card["suite"]["digest"], card["backend"], card["robot"])
         suites[key] = card["suite"]

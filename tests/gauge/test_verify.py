@@ -1,0 +1,66 @@
+"""When a score card holds: pure judgements on hand-made replays."""
+
+from copy import deepcopy
+
+import pytest
+from gaitgauge.gauge.verify import CardError, judge, load_card
+from test_report import sample
+
+
+@pytest.fixture
+def card():
+    return sample(terrains=("flat", "wave"), frictions=(0.4, 0.6))
+
+
+def test_the_same_outcomes_hold_and_are_equal(card):
+    found = judge(card, deepcopy(card))
+    assert (found["holds"], found["equal"], found["quick"], found["levels"]) == (True, True, False, [])
+    assert found["interval"] == card["score_interval"]
+
+
+def test_a_score_within_the_interval_holds_and_one_outside_does_not(card):
+    low, high = card["score_interval"]
+    for value, holds in ((low + 1e-4, True), (high + 1e-4, False), (low - 1e-4, False)):
+        replay = deepcopy(card) | {"score": value}
+        replay["environments"][0]["score"] += 0.001
+        found = judge(card, replay)
+        assert (found["holds"], found["equal"], found["replayed"]) == (holds, False, value)
+
+
+def test_levels_that_differ_are_listed(card):
+    replay = deepcopy(card)
+    row = replay["environments"][3]
+    row["level"] -= 1
+    (found,) = judge(card, replay)["levels"]
+    place = {"terrain": "wave", "friction": 0.6, "payload": 0.0}
+    assert found == place | {"card": row["level"] + 1, "here": row["level"]}
+
+
+def test_a_sample_is_held_against_the_same_environments(card):
+    """Scores of the two sampled rows by hand; the card's own score, over four rows, does not matter."""
+    replay = deepcopy(card)
+    replay["environments"] = [replay["environments"][1], replay["environments"][3]]
+    expected = sum(row["score"] for row in replay["environments"]) / 2
+    replay["score"] = expected
+    found = judge(card, replay)
+    assert (found["quick"], found["environments"], found["equal"]) == (True, [2, 4], True)
+    assert found["score"] == pytest.approx(expected, abs=1e-6)
+    low, high = found["interval"]
+    assert low < expected < high
+    replay["environments"][0]["score"] += 0.2
+    assert not judge(card, replay | {"score": high + 0.01})["holds"]
+
+
+def test_without_an_interval_only_the_same_outcome_holds(card):
+    card["score_interval"] = None
+    replay = deepcopy(card)
+    assert judge(card, replay)["holds"]
+    replay["environments"][0]["score"] += 1e-6
+    assert not judge(card, replay)["holds"]
+
+
+def test_results_of_something_else_are_no_card(tmp_path):
+    path = tmp_path / "half.json"
+    path.write_text('{"schema": 2, "environments": [], "suite": {}}')
+    with pytest.raises(CardError, match="it has no 'score'"):
+        load_card(path)
