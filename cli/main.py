@@ -1,4 +1,4 @@
-"""The command line: parses, calls one function of a lower room, prints. Heavy packages are imported inside the commands."""
+"""The command line: parses, calls one function of a lower package, prints. Heavy packages are imported inside the commands."""
 
 from __future__ import annotations
 

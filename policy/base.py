@@ -1,4 +1,4 @@
-"""What a policy is to the rooms that run it."""
+"""What a policy is to the packages that run it."""
 
 from __future__ import annotations
 

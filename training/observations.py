@@ -1,6 +1,6 @@
 """What the networks see: the noisy frame, its history, and the privileged state of teacher and critic.
 
-The frame itself comes from the policy room's builder, the one that the gauge uses too. The privileged state is a table,
+The frame itself comes from the policy package's builder, the one that the gauge uses too. The privileged state is a table,
 ``PRIVILEGED_TERMS``, of functions of ``ObservationInputs``.
 """
 
