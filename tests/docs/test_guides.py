@@ -110,3 +110,13 @@ def test_marked_blocks_run(page, tmp_path):
                     ]
                 )
             run([sys.executable, "-c", block.text] if block.kind == "python" else ["bash", "-c", shell + block.text])
+
+
+@pytest.mark.parametrize(
+    "page",
+    sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/**/*.md")]),
+    ids=lambda p: str(p.relative_to(ROOT)),
+)
+def test_lines_are_at_most_100_columns(page):
+    too_long = [f"{i}: {len(line)}" for i, line in enumerate(page.read_text().splitlines(), 1) if len(line) > 100]
+    assert not too_long, f"{page.name}, line: columns {too_long[:10]}"
