@@ -24,7 +24,14 @@ _HASH = 12
 
 
 def import_file(
-    source: str, destination: Path, *, force: bool, trainable: bool = False, raw: bool = False, trust: bool = False
+    source: str,
+    destination: Path,
+    *,
+    force: bool,
+    trainable: bool = False,
+    raw: bool = False,
+    trust: bool = False,
+    contract: Path | None = None,
 ) -> None:
     """Write a foreign policy as the project's own file, and print the contract that it got.
 
@@ -35,6 +42,7 @@ def import_file(
         trainable: keep the teacher and the critic of a training checkpoint.
         raw: with ``trainable``, the weights after the last update instead of their average.
         trust: run the program that a file of the project's own format carries inside.
+        contract: a ``contract.toml`` that says how a TorchScript or ONNX file is to be run.
 
     Raises:
         CheckpointError: ``trainable``, and the source is no training checkpoint.
@@ -47,21 +55,23 @@ def import_file(
         )
     if destination.exists() and not force:
         raise UserError(f"'{destination}' already exists; give another name, or replace it with --force")
+    if trainable and contract is not None:
+        raise UserError("a training checkpoint has its contract inside; leave out --contract")
     if trainable:
         from ..policy.loading import find_policy, load_policy
         from ..training.checkpoint import trim_checkpoint
 
         trim_checkpoint(find_policy(source), destination, raw=raw)
-        contract = load_policy(str(destination)).contract
+        stored = load_policy(str(destination)).contract
     else:
         from ..policy.importing import carries_program, import_policy
 
-        contract = import_policy(source, destination, trust=trust)
+        stored = import_policy(source, destination, trust=trust, contract_file=contract)
     console = Terminal()
     console.say(f"wrote {destination}")
     if not trainable and carries_program(destination):
         console.say("it carries the program of its source, not weights alone: commands that run it need --trust")
-    console.print(contract_table(contract))
+    console.print(contract_table(stored))
 
 
 def contract_table(contract: PolicyContract) -> Table:

@@ -523,11 +523,14 @@ def import_command(
         bool, typer.Option("--raw", help="The same with the weights after the last update, not their average.")
     ] = False,
     trust: TrustOption = False,
+    contract: Annotated[
+        Path | None, typer.Option(help="A contract.toml that says how a TorchScript or ONNX file is to be run.")
+    ] = None,
 ) -> None:
     """Turn a foreign policy into the project's own file, with its contract."""
     from .inspect import import_file
 
-    import_file(source, destination, force=force, trainable=trainable or raw, raw=raw, trust=trust)
+    import_file(source, destination, force=force, trainable=trainable or raw, raw=raw, trust=trust, contract=contract)
 
 
 @app.command("list")

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from ..files.parsing import parse_yaml, read_text
+from ..files.parsing import parse_toml, parse_yaml, read_text
 from ..robots.base import Robot
 from .base import PolicyError
 from .contract import ContractError, History, HistoryOrder, ObservationTerm, PolicyContract, go2_contract
@@ -49,6 +49,22 @@ def sidecar_contract(path: Path) -> PolicyContract | None:
             except ContractError as error:
                 raise PolicyError(f"'{sidecar}' is not a policy contract: {error}") from error
     return None
+
+
+def described_contract(path: Path, robot: Robot) -> PolicyContract:
+    """Read a ``contract.toml``: fields of ``PolicyContract``, of which those left out are the robot's standard ones.
+
+    Raises:
+        PolicyError: no such file, or a field is unknown or malformed.
+    """
+    source = f"contract file '{path}'"
+    data = parse_toml(read_text(path, "contract file", PolicyError), source, PolicyError)
+    provenance = {"adapter": "contract.toml", "file": path.name}
+    standard = go2_contract(robot, provenance=provenance).to_dict()
+    try:
+        return PolicyContract.from_dict({**standard, **data})
+    except ContractError as error:
+        raise PolicyError(f"{source} is wrong: {error}") from error
 
 
 def contract_for_width(

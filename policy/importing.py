@@ -19,6 +19,7 @@ def import_policy(
     *,
     trust: bool = False,
     log_root: Path = LOG_ROOT,
+    contract_file: Path | None = None,
 ) -> PolicyContract:
     """Write a policy and its contract into one file of the project's own format; its actions stay the same.
 
@@ -31,6 +32,7 @@ def import_policy(
         robot: as in ``load_policy``.
         trust: as in ``load_policy``; the imported file, if it carries a program, needs it in turn.
         log_root: as in ``load_policy``.
+        contract_file: as in ``load_policy``.
 
     Returns:
         The contract that was stored.
@@ -39,7 +41,7 @@ def import_policy(
         PolicyError: the source cannot be loaded, or the destination cannot be written.
         ContractError: the policy is for another robot.
     """
-    policy = load_policy(source, robot, trust=trust, log_root=log_root)
+    policy = load_policy(source, robot, trust=trust, log_root=log_root, contract_file=contract_file)
     contract = replace(
         policy.contract, provenance={**policy.contract.provenance, "imported_from": Path(policy.path).name}
     )

@@ -16,6 +16,7 @@ from .adapters import (
     checkpoint_network,
     contract_for_width,
     deploy_contract,
+    described_contract,
     find_deploy_file,
     mjlab_contract,
     sidecar_contract,
@@ -36,7 +37,12 @@ DEFAULT_ROBOT = "go2"
 
 
 def load_policy(
-    path_or_name: str | Path, robot: Robot | None = None, *, trust: bool = False, log_root: Path = LOG_ROOT
+    path_or_name: str | Path,
+    robot: Robot | None = None,
+    *,
+    trust: bool = False,
+    log_root: Path = LOG_ROOT,
+    contract_file: Path | None = None,
 ) -> FilePolicy:
     """Load a policy and try it on zeros.
 
@@ -51,6 +57,7 @@ def load_policy(
             accepted, and the Go2 stands in.
         trust: run a program that a file of the project's own format carries inside; it is fenced in either way.
         log_root: where ``latest`` and ``best`` look: ``<log_root>/<experiment>/<run>/``.
+        contract_file: a ``contract.toml`` that says how a TorchScript or ONNX file is to be run; it goes before all else.
 
     Raises:
         PolicyError: no such file or name, a damaged or foreign file, or a network that does not fit its contract.
@@ -59,7 +66,8 @@ def load_policy(
     path = find_policy(path_or_name, log_root=log_root)
     data = _read(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
-    policy = rebuilt(_load(data, path, str(path_or_name), stand_in, trust=trust))
+    contract = None if contract_file is None else described_contract(contract_file, stand_in)
+    policy = rebuilt(_load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract))
     if sentence := assumptions(policy.contract):
         _say(policy.path, sentence)
     if robot is not None:
@@ -133,11 +141,17 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _load(data: bytes, path: Path, source: str, robot: Robot, *, trust: bool) -> FilePolicy:
+def _load(
+    data: bytes, path: Path, source: str, robot: Robot, *, trust: bool, contract: PolicyContract | None
+) -> FilePolicy:
     """Load a file's content; ``path`` is where its sidecars are, ``source`` what the user called it."""
     kind = file_kind(data, source)
     if kind in ("torchscript", "onnx"):
-        return _foreign(ForeignFile(kind=kind, data=data), path, source, robot)
+        return _foreign(ForeignFile(kind=kind, data=data), path, source, robot, contract=contract)
+    if contract is not None:
+        raise PolicyError(
+            f"'{source}' is neither TorchScript nor ONNX, and has its contract inside; leave out --contract"
+        )
     entries = load_entries(data, source=source)
     if entries.get("format") == FORMAT:
         stored = read_policy(entries, source=source)

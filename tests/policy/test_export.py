@@ -10,6 +10,7 @@ import torch
 import yaml
 from gaitgauge.policy import export
 from gaitgauge.policy.adapters import deploy_contract
+from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import History, PolicyContract, go2_contract
 from gaitgauge.policy.export import (
     ExportError,
@@ -20,6 +21,7 @@ from gaitgauge.policy.export import (
     mjlab_metadata,
     term_major_order,
 )
+from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork
 from gaitgauge.policy.networks import ARCHITECTURES
@@ -207,6 +209,26 @@ def test_a_file_that_does_not_describe_itself_says_what_was_taken_for_granted(mo
         "bare.onnx",
     ):
         assert fact in said[0]
+
+
+def test_a_contract_file_says_how_a_file_is_run(moe_onnx, tmp_path):
+    (tmp_path / "contract.toml").write_text(
+        "action_scale = [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]\n"
+        '[history]\nlength = 5\norder = "frame-major-newest-first"\nstart = "repeat"\n'
+        '[[observation]]\nname = "command"\nscale = [2.0, 2.0, 0.25]\n'
+        '[[observation]]\nname = "base_angular_velocity_b"\nscale = [0.25]\n'
+        '[[observation]]\nname = "projected_gravity_b"\nscale = [1.0]\n'
+        '[[observation]]\nname = "joint_position"\nscale = [1.0]\n'
+        '[[observation]]\nname = "joint_velocity"\nscale = [0.05]\n'
+        '[[observation]]\nname = "last_action"\nscale = [1.0]\n'
+    )
+    policy = import_policy(moe_onnx[1], tmp_path / "mine.gauge.pt", contract_file=tmp_path / "contract.toml")
+    assert policy.history == History(length=5, order="frame-major-newest-first", start="repeat")
+    assert policy.observation[0].name == "command" and policy.action_scale == (0.5,) * 12
+    assert policy.stiffness == go2_contract(load_robot("go2")).stiffness and "assumed" not in policy.provenance
+    (tmp_path / "contract.toml").write_text("actionscale = 1")
+    with pytest.raises(PolicyError, match="actionscale"):
+        import_policy(moe_onnx[1], tmp_path / "mine.gauge.pt", contract_file=tmp_path / "contract.toml")
 
 
 def test_term_major_order():
