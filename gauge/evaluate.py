@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -21,7 +22,7 @@ import torch
 from ..backends.base import PhysicsBackend
 from ..backends.registry import find_backend, make_backend
 from ..files.parsing import shown
-from ..files.provenance import digest, plugins, provenance, versions
+from ..files.provenance import plugins, provenance, versions
 from ..files.writing import json_text, write_atomically
 from ..policy.contract import check_robot
 from ..policy.digest import policy_digest
@@ -217,8 +218,9 @@ def identity(prepared: Prepared) -> dict[str, Any]:
 
 
 def file_digest(name: str) -> str:
-    """SHA-256 of a policy's file, hexadecimal."""
-    return digest([find_policy(name)])
+    """SHA-256 of a policy's file, hexadecimal, as ``sha256sum`` prints it."""
+    with find_policy(name).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def evaluate(

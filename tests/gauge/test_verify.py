@@ -3,6 +3,7 @@
 from copy import deepcopy
 
 import pytest
+from gaitgauge.gauge.evaluate import file_digest
 from gaitgauge.gauge.verify import CardError, judge, load_card
 from test_report import sample
 
@@ -57,6 +58,12 @@ def test_without_an_interval_only_the_same_outcome_holds(card):
     assert judge(card, replay)["holds"]
     replay["environments"][0]["score"] += 1e-6
     assert not judge(card, replay)["holds"]
+
+
+def test_the_hash_of_a_policys_file_is_what_other_programs_print(tmp_path):
+    path = tmp_path / "policy.pt"
+    path.write_bytes(b"abc")  # FIPS 180-2, appendix B.1
+    assert file_digest(str(path)) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
 def test_results_of_something_else_are_no_card(tmp_path):
