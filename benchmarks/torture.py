@@ -39,6 +39,7 @@ GONE_WITHIN = 60.0
 """Seconds after a kill in which every process of the run must have ended."""
 ENDS_WITHIN = 1800.0
 """Seconds that an undisturbed run may take."""
+STARTED: list[subprocess.Popen[bytes]] = []
 Records = dict[str, tuple[int, int, bytes]]
 """Inode, time of writing and content of every record."""
 
@@ -52,7 +53,7 @@ def start(policy: str, folder: Path, threads: int, *, resume: bool) -> subproces
     command = [sys.executable, "-c", "from gaitgauge.cli.main import main; main()", "evaluate", policy]
     command += ["--suite", "torture.toml", "--threads", str(threads), "--out", folder.name]
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
-        return subprocess.Popen(
+        run = subprocess.Popen(
             command + (["--resume"] if resume else []),
             cwd=folder.parent,
             start_new_session=True,
@@ -60,6 +61,8 @@ def start(policy: str, folder: Path, threads: int, *, resume: bool) -> subproces
             stdout=log,
             stderr=log,
         )
+    STARTED.append(run)
+    return run
 
 
 def members(session: int) -> list[int]:
@@ -215,12 +218,17 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("torture: ended by a signal"))
     policy = options.policy if not Path(options.policy).exists() else str(Path(options.policy).resolve())
     with tempfile.TemporaryDirectory(prefix="torture-") as folder:
         try:
             torture(policy, options.kills, options.threads, options.seed, Path(folder))
         except DamageError as damage:
             sys.exit(f"torture: {damage}")
+        finally:
+            for run in STARTED:
+                for process in members(run.pid):  # nothing outlives this program
+                    os.kill(process, signal.SIGKILL)
 
 
 if __name__ == "__main__":
