@@ -306,6 +306,17 @@ def judge(recorded: Sequence[Results]) -> dict[str, Figures]:
     return found
 
 
+def fixed_levels(recorded: Sequence[Results]) -> int:
+    """How many intervals of the score would hold the mean score if the levels found were taken for certain."""
+    mean, held = np.mean([r["score"] for r in recorded]), 0
+    for results in recorded:
+        rows = [{k: v for k, v in row.items() if k != "trials"} for row in results["environments"]]
+        chance = Evidence(rows, chance_rules_of(results)).chance(environment_weights([r["terrain"] for r in rows]))
+        low, high = chance.interval(results["score"]) or (0.0, 1.0)
+        held += low <= mean <= high
+    return held
+
+
 def quality_by_level(recorded: Sequence[Results]) -> dict[str, float]:
     """Mean quality of all runs on a terrain at a level."""
     found: dict[str, list[float]] = {}
@@ -335,6 +346,7 @@ def main() -> None:
     for name, (mean, reach, printed, held) in judge(recorded).items():
         print(f"{name:24}{mean:9.4f}{reach:9.4f}{printed:9.4f}{held:9.3f}")
     print("\nmean quality by level: " + ", ".join(f"{k} {v:.3f}" for k, v in quality_by_level(recorded).items()))
+    print(f"levels held fixed: {fixed_levels(recorded)} of {len(recorded)} intervals of the score hold its mean")
     pairs = list(zip(recorded[::2], recorded[1::2], strict=False))
     alarms = np.sum([alarm(pair) for pair in pairs], axis=0)
     print(f"\ntold apart from itself: {alarms[0]:.0f} of {len(pairs)} by the score, {alarms[1]:.0f} by a detail")
