@@ -300,7 +300,7 @@ class NewtonBackend(WarpBackend):
     # ---- the contract -------------------------------------------------------------------------------------------
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
-        """See ``PhysicsBackend.randomize``."""
+        """See ``PhysicsBackend.randomize``. Fields may also have a row for every world; then the masked rows count."""
         masses, rows = self._masses, self._changes(randomization, worlds)
         self._write_motors(rows)
         if "friction" in rows:

@@ -210,8 +210,10 @@ def test_randomizing_some_worlds_takes_a_row_for_each():
     engine.randomize(Randomization(motor_offset=torch.ones(2, 12), friction=torch.tensor([0.3, 0.7])), mask)
     assert engine._motors.offset[:, 0].tolist() == [1.0, 0.0, 1.0]
     np.testing.assert_allclose(engine._masses.friction[:, 5], [0.3, 0.4, 0.7])
-    with pytest.raises(BackendError, match="friction has 3 rows for 2 worlds"):
-        engine.randomize(Randomization(friction=torch.ones(3)), mask)
+    engine.randomize(Randomization(friction=torch.tensor([0.5, 0.6, 0.8])), mask)  # a row for every world does as well
+    np.testing.assert_allclose(engine._masses.friction[:, 5], [0.5, 0.4, 0.8])
+    with pytest.raises(BackendError, match="friction has 4 rows for 2 worlds"):
+        engine.randomize(Randomization(friction=torch.ones(4)), mask)
 
 
 def test_the_solver_settings_told_are_those_that_act():
