@@ -1,0 +1,274 @@
+"""Commands that judge: evaluate, compare, verify, board, validate, consistency."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import report_errors
+from ..options import (
+    BackendOption,
+    DeviceOption,
+    FrictionsOption,
+    LevelOption,
+    PolicyArgument,
+    RobotOption,
+    SeedsOption,
+    SuiteOption,
+    TerrainsOption,
+    ThreadsOption,
+    TrustOption,
+)
+
+app = typer.Typer()
+
+
+@app.command()
+@report_errors
+def evaluate(
+    policy: PolicyArgument,
+    pipeline: Annotated[
+        str,
+        typer.Option(
+            help="base: one environment and seed; multi: one level, all frictions and seeds; level: find the highest level; stress: all."
+        ),
+    ] = "stress",
+    suite: SuiteOption = "gaitgauge-1",
+    backend: BackendOption = "mujoco",
+    device: DeviceOption = None,
+    robot: RobotOption = "go2",
+    terrain: TerrainsOption = None,
+    level: LevelOption = None,
+    friction: FrictionsOption = None,
+    payload: Annotated[
+        list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")
+    ] = None,
+    seed: SeedsOption = None,
+    threads: ThreadsOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-<pipeline>.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the output folder.")] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Print results.json instead of tables.")] = False,
+    trust: TrustOption = False,
+) -> None:
+    """Gauge a policy: terrains, levels, frictions, payloads, noise and latency, down to one score with its interval."""
+    from ..evaluate import run_evaluation
+
+    run_evaluation(
+        policy=policy,
+        pipeline=pipeline,
+        suite=suite,
+        backend=backend,
+        device=device,
+        robot=robot,
+        terrains=tuple(terrain or ()),
+        level=level,
+        frictions=tuple(friction or ()),
+        payloads=tuple(payload or ()),
+        seeds=tuple(seed or ()),
+        threads=threads,
+        out=out,
+        resume=resume,
+        json_output=json_output,
+        trust=trust,
+    )
+
+
+@app.command()
+@report_errors
+def compare(
+    contestants: Annotated[
+        list[str],
+        typer.Argument(
+            help="Two or more of: policies, as for evaluate; results folders; results.json files and score cards.",
+            metavar="A B...",
+        ),
+    ],
+    pipeline: Annotated[
+        str, typer.Option(help="How policies are evaluated: stress, or multi at one --level.")
+    ] = "stress",
+    suite: SuiteOption = "gaitgauge-1",
+    backend: BackendOption = "mujoco",
+    device: DeviceOption = None,
+    robot: RobotOption = "go2",
+    terrain: TerrainsOption = None,
+    level: LevelOption = None,
+    friction: FrictionsOption = None,
+    payload: Annotated[
+        list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")
+    ] = None,
+    seed: SeedsOption = None,
+    threads: ThreadsOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
+        ),
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print comparison.json instead of tables.")] = False,
+) -> None:
+    """Say which differences between policies are real. Policies are evaluated first; what has been played is not played again."""
+    from ..compare import run_comparison
+
+    run_comparison(
+        contestants=contestants,
+        pipeline=pipeline,
+        suite=suite,
+        backend=backend,
+        device=device,
+        robot=robot,
+        terrains=tuple(terrain or ()),
+        level=level,
+        frictions=tuple(friction or ()),
+        payloads=tuple(payload or ()),
+        seeds=tuple(seed or ()),
+        threads=threads,
+        out=out,
+        json_output=json_output,
+    )
+
+
+@app.command()
+@report_errors
+def verify(
+    card: Annotated[
+        Path, typer.Argument(help="A score card: results.json, a copy of it, or its folder.", metavar="CARD")
+    ],
+    policy: Annotated[str | None, typer.Option(help="The policy's file, where it is not at the card's path.")] = None,
+    suite: Annotated[str | None, typer.Option(help="The card's suite file, where its suite does not ship.")] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cpu or cuda. Default: what the card's engine is made for.")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads. Default: all cores.")] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One environment of each terrain, at nominal friction and payload.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder of the replay. Default: results/verify-<card>.")] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
+    trust: TrustOption = False,
+) -> None:
+    """Play a score card again and say whether it holds on this machine; exit code 1 where it does not."""
+    from ..verify import run_verification
+
+    run_verification(
+        card=card,
+        policy=policy,
+        suite=suite,
+        device=device,
+        threads=threads,
+        quick=quick,
+        out=out,
+        json_output=json_output,
+        trust=trust,
+    )
+
+
+@app.command()
+@report_errors
+def board(
+    folder: Annotated[Path, typer.Argument(help="Folder of score cards (*.json) or of evaluations.", metavar="FOLDER")],
+    out: Annotated[Path | None, typer.Option(help="The page. Default: board.html in the folder.")] = None,
+) -> None:
+    """Make a leaderboard page of a folder of score cards."""
+    from ..board import run_board
+
+    run_board(folder=folder, out=out)
+
+
+@app.command()
+@report_errors
+def validate(
+    tables: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="The measured table, then one for each simulator (CSV; docs/validate.md).", metavar="REAL SIM..."
+        ),
+    ] = None,
+    example: Annotated[str | None, typer.Option(help="Tables that ship with the project: paper.")] = None,
+    ranks_only: Annotated[
+        bool, typer.Option("--ranks-only", help="Values are on different scales: compare the order of policies alone.")
+    ] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Hold predictions of simulators against measurements of a robot: errors by motion and metric, and ranks of policies."""
+    from ..validate import run_validation
+
+    run_validation(tables=tables or [], example_name=example, ranks_only=ranks_only, json_output=json_output)
+
+
+@app.command()
+@report_errors
+def consistency(
+    policies: Annotated[
+        list[str],
+        typer.Argument(
+            help="One or more policy files (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
+            metavar="POLICY...",
+        ),
+    ],
+    backends: Annotated[
+        str,
+        typer.Option(
+            help="Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005)."
+        ),
+    ] = "mujoco,mujoco-warp,newton",
+    reference: Annotated[
+        str | None, typer.Option(help="Engine that the others are compared with. Default: the first.")
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cpu or cuda, for the engines that can use a GPU. Default: a GPU.")
+    ] = None,
+    suite: SuiteOption = "robogauge-1.1",
+    robot: RobotOption = "go2",
+    terrain: TerrainsOption = None,
+    friction: Annotated[
+        list[float] | None,
+        typer.Option(help="Friction coefficient; repeatable. Default: the nominal one; on a GPU the suite's."),
+    ] = None,
+    level: Annotated[
+        list[int] | None, typer.Option(help="Level (1-10) of the terrains that have levels; repeatable. Default: 3.")
+    ] = None,
+    seeds: Annotated[int | None, typer.Option(help="Number of seeds, at least 2. Default: 3; on a GPU 10.")] = None,
+    factor: Annotated[
+        list[str] | None,
+        typer.Option(help="Factor that the attribution switches; repeatable. Default: all (docs/consistency.md)."),
+    ] = None,
+    margin: Annotated[
+        float,
+        typer.Option(min=0.0, help="Difference of quality that does not matter: below it engines are equivalent."),
+    ] = 0.02,
+    attribution: Annotated[bool, typer.Option(help="Switch one factor at a time and see what it does.")] = True,
+    threads: ThreadsOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-consistency.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the output folder.")] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Print consistency.json instead of tables.")] = False,
+    trust: TrustOption = False,
+) -> None:
+    """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why."""
+    from ..consistency import run_consistency
+
+    run_consistency(
+        policies=policies,
+        backends=backends,
+        reference=reference,
+        device=device,
+        suite=suite,
+        robot=robot,
+        terrains=tuple(terrain or ()),
+        frictions=tuple(friction or ()),
+        levels=tuple(level or ()),
+        seeds=seeds,
+        margin=margin,
+        factors=tuple(factor or ()),
+        attribution=attribution,
+        threads=threads,
+        out=out,
+        resume=resume,
+        json_output=json_output,
+        trust=trust,
+    )

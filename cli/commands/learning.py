@@ -1,0 +1,115 @@
+"""The command that learns: train."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import report_errors
+
+app = typer.Typer()
+
+
+@app.command()
+@report_errors
+def train(
+    task: Annotated[str, typer.Argument(help="What to learn, see 'gaitgauge list tasks'.", metavar="TASK")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Settings of the task, such as environment.push.linear=0.6 or training.network.expert_count=4.",
+            metavar="key=value",
+        ),
+    ] = None,
+    backend: Annotated[
+        str | None, typer.Option(help="Physics engine, see 'gaitgauge list backends'. Default: mujoco-warp.")
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cpu, cuda or cuda:N; the default is what the engine is made for.")
+    ] = None,
+    num_envs: Annotated[
+        int | None, typer.Option(min=1, help="Parallel worlds, for each GPU. Default: the task's.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random. Default: the task's.")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="Updates of the whole run, resumed ones included. Default: the task's.")
+    ] = None,
+    time: Annotated[
+        str | None, typer.Option(help="Stop after this wall-clock time, building included: seconds, 9m, 2h or 1h30m.")
+    ] = None,
+    resume: Annotated[
+        str | None, typer.Option(help="Continue: latest, a run directory or a model_*.pt.", metavar="latest|PATH")
+    ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Import functions that the settings of a resumed checkpoint name.")
+    ] = False,
+    init_from: Annotated[
+        str | None,
+        typer.Option(
+            help="Begin a new run with these networks: a checkpoint or a policy file.", metavar="PATH|pretrained"
+        ),
+    ] = None,
+    run_name: Annotated[str | None, typer.Option(help="Appended to the date in the run directory's name.")] = None,
+    log_root: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("logs/rsl_rl"),
+    capture: Annotated[
+        bool | None, typer.Option("--capture/--no-capture", help="CUDA graphs in the environment. Default: on a GPU.")
+    ] = None,
+    fuse: Annotated[
+        bool, typer.Option("--fuse/--no-fuse", help="Compile the environment's torch parts; faster, starts slower.")
+    ] = False,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads of an engine that runs on the CPU.")] = 1,
+    logger: Annotated[
+        str | None,
+        typer.Option(help="tensorboard, or wandb or neptune beside it. Default: the task's.", metavar="NAME"),
+    ] = None,
+    video_every: Annotated[
+        int | None, typer.Option(min=1, help="Iterations between two videos, made in a side process. Default: none.")
+    ] = None,
+    list_settings: Annotated[
+        bool, typer.Option("--list-settings", help="Print every setting of the task with its default, and end.")
+    ] = False,
+    score: Annotated[
+        bool,
+        typer.Option("--score/--no-score", help="Gauge checkpoints in a side process; best.pt is the best of them."),
+    ] = True,
+    score_every: Annotated[
+        int | None, typer.Option(min=1, help="Iterations between two scores. Default: the task's.")
+    ] = None,
+    score_suite: Annotated[str, typer.Option(help="Suite of the scores, or a suite's .toml file.")] = "quick",
+    score_threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads of the side process. Default: half of the machine.")
+    ] = None,
+) -> None:
+    """Train a policy; Ctrl-C or SIGTERM writes a checkpoint and says how to go on."""
+    if list_settings:
+        from ..settings import print_settings
+
+        print_settings(task, tuple(overrides or ()))
+        return
+    from ..train import run_training
+
+    run_training(
+        task=task,
+        overrides=tuple(overrides or ()),
+        backend=backend,
+        device=device,
+        num_envs=num_envs,
+        seed=seed,
+        iterations=iterations,
+        time=time,
+        resume=resume,
+        trust=trust,
+        init_from=init_from,
+        run_name=run_name,
+        log_root=log_root,
+        capture=capture,
+        fuse=fuse,
+        threads=threads,
+        logger=logger,
+        video_every=video_every,
+        score_suite=score_suite if score else None,
+        score_every=score_every,
+        score_threads=score_threads,
+    )

@@ -1,0 +1,120 @@
+"""Commands for one policy: export, play, import."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import report_errors
+from ..options import BackendOption, DeviceOption, TrustOption
+
+app = typer.Typer()
+
+
+@app.command()
+@report_errors
+def export(
+    policy: Annotated[
+        str,
+        typer.Argument(
+            help="A checkpoint of the project's own, a run directory, or latest, best, pretrained.", metavar="POLICY"
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder. Default: 'exported' in the run directory, or here.")
+    ] = None,
+    form: Annotated[str, typer.Option("--format", help="torchscript, onnx, deploy or all.")] = "all",
+    layout: Annotated[
+        str,
+        typer.Option(
+            help="plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'."
+        ),
+    ] = "plain",
+    trust: TrustOption = False,
+) -> None:
+    """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it."""
+    from ..export import run_export
+
+    run_export(policy, out=out, form=form, layout=layout, trust=trust)
+
+
+@app.command()
+@report_errors
+def play(
+    policy: Annotated[
+        str, typer.Argument(help="A policy file, a run directory, or latest, best, pretrained.", metavar="POLICY")
+    ],
+    terrain: Annotated[str, typer.Option(help="Terrain, see 'gaitgauge list terrains'.")] = "flat",
+    level: Annotated[int | None, typer.Option(help="Level of the terrain, 1 to 10. Default: 5.")] = None,
+    viewer: Annotated[
+        str | None,
+        typer.Option(help="native: a window; viser: in a browser; video. Default: a window where there is a display."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write a video (.mp4); needs no display.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="How long [s]. Default: 10 for a video, else no end.")] = None,
+    command: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="Forward, sideways [m/s] and turning [rad/s] speed. Default: to the target, or a tour.",
+            metavar="VX VY YAW",
+        ),
+    ] = None,
+    friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.6,
+    seed: Annotated[int, typer.Option(help="Of the heading at each start.")] = 0,
+    backend: BackendOption = "mujoco",
+    device: DeviceOption = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,
+    host: Annotated[
+        str, typer.Option(help="Interface of the browser's viewer; 0.0.0.0 lets other machines in.")
+    ] = "127.0.0.1",
+    gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
+    trust: TrustOption = False,
+) -> None:
+    """Watch a policy walk: in MuJoCo's viewer, in a browser, or in a video file without a display."""
+    from ..play import run_play
+
+    run_play(
+        policy,
+        terrain=terrain,
+        level=level,
+        backend=backend,
+        device=device,
+        viewer=viewer,
+        out=out,
+        seconds=seconds,
+        command=command,
+        friction=friction,
+        seed=seed,
+        port=port,
+        host=host,
+        gamepad=gamepad,
+        trust=trust,
+    )
+
+
+@app.command("import")
+@report_errors
+def import_command(
+    source: Annotated[
+        str, typer.Argument(help="TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint.")
+    ],
+    destination: Annotated[Path, typer.Argument(help="File to write, by custom NAME.gauge.pt.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace the destination if it exists.")] = False,
+    trainable: Annotated[
+        bool,
+        typer.Option("--trainable", help="Keep teacher and critic of a training checkpoint, for train --init-from."),
+    ] = False,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="The same with the weights after the last update, not their average.")
+    ] = False,
+    trust: TrustOption = False,
+    contract: Annotated[
+        Path | None, typer.Option(help="A contract.toml that says how a TorchScript or ONNX file is to be run.")
+    ] = None,
+) -> None:
+    """Turn a foreign policy into the project's own file, with its contract."""
+    from ..inspect import import_file
+
+    import_file(source, destination, force=force, trainable=trainable or raw, raw=raw, trust=trust, contract=contract)

@@ -1,0 +1,38 @@
+"""Arguments and options that several commands share. What differs from command to command stands in the command."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+PolicyArgument = Annotated[
+    str,
+    typer.Argument(
+        help="A policy file (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.", metavar="POLICY"
+    ),
+]
+TrustOption = Annotated[
+    bool,
+    typer.Option("--trust", help="Run the program that a policy file of the project's own format carries inside."),
+]
+SuiteOption = Annotated[str, typer.Option(help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.")]
+BackendOption = Annotated[str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.")]
+DeviceOption = Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")]
+RobotOption = Annotated[str, typer.Option(help="Robot name, or a robot.toml.")]
+TerrainsOption = Annotated[list[str] | None, typer.Option(help="Terrain; repeatable. Default: the suite's.")]
+LevelOption = Annotated[
+    int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")
+]
+FrictionsOption = Annotated[
+    list[float] | None, typer.Option(help="Friction coefficient; repeatable. Default: the suite's.")
+]
+PayloadsOption = Annotated[
+    list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")
+]
+SeedsOption = Annotated[
+    list[int] | None, typer.Option(help="Seed of the quality episodes; repeatable. Default: the suite's.")
+]
+ThreadsOption = Annotated[
+    int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")
+]
