@@ -9,6 +9,10 @@ interfaces:
 - with a memory of its own, in addition ``initial_state(n) -> (n, S)`` and ``forward(history, state) -> (action,
   state)``. The session keeps the state, and resets rows of it.
 
+A network with an encoder or with experts also has ``encode(history) -> (latent, weights)``, which ``forward`` goes
+through: what its actor is given of the history (N, L), None for no encoder, and the gate's weights (N, K), which add up
+to one, None for no experts. ``gaitgauge latent`` looks at both.
+
 Row i of the output may depend on row i of the input alone. ``ARCHITECTURES`` maps an architecture's name to the
 function that builds it from the keyword arguments stored in the file, which are plain JSON data. State-dict keys are
 part of the file format.
@@ -137,8 +141,11 @@ class CtsNetwork(nn.Module):
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for ``history`` (N, H, F)."""
-        latent = unit(self.encoder(history.flatten(1)))
-        return self.actor(torch.cat((latent, history[:, -1]), dim=-1))
+        return self.actor(torch.cat((self.encode(history)[0], history[:, -1]), dim=-1))
+
+    def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Unit latent (N, L) for ``history`` (N, H, F); there are no experts."""
+        return unit(self.encoder(history.flatten(1))), None
 
 
 class ExpertMixture(nn.Module):
@@ -241,8 +248,12 @@ class MoeCtsNetwork(nn.Module):
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for ``history`` (N, H, F)."""
-        latent = unit(self.encoder(history)[0])
-        return self.actor(torch.cat((latent, history[:, -1]), dim=-1))
+        return self.actor(torch.cat((self.encode(history)[0], history[:, -1]), dim=-1))
+
+    def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Unit latent (N, L) and weights of the experts (N, K) for ``history`` (N, H, F)."""
+        mixture, weights = self.encoder(history)
+        return unit(mixture), weights
 
 
 ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {

@@ -1,0 +1,50 @@
+"""Watches the inside of a policy at work: what its encoder makes of the history, and how its experts are weighed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from .base import Policy, PolicyError
+from .native import NativePolicy, NativeSession, StoredNetwork
+
+
+class WatchedNetwork:
+    """A network of ``networks.py`` that acts as ever and keeps what its ``encode`` gave last."""
+
+    latent: torch.Tensor | None = None
+    """What the actor was given of the history, (N, L); None where there is no encoder."""
+    weights: torch.Tensor | None = None
+    """The gate's weights, (N, K); None where there are no experts."""
+
+    def __init__(self, network: Any) -> None:
+        """Watch a network that has ``encode`` and no memory of its own."""
+        self.history_length, self.frame_width = network.history_length, network.frame_width
+        self._network = network
+
+    def __call__(self, history: torch.Tensor) -> torch.Tensor:
+        """Actions (N, J) for ``history`` (N, H, F)."""
+        self.latent, self.weights = self._network.encode(history)
+        action: torch.Tensor = self._network(history)
+        return action
+
+
+def watched_session(policy: Policy, num_episodes: int) -> tuple[NativeSession, WatchedNetwork]:
+    """A session of ``num_episodes`` episodes on the CPU, and the network at work in it, to be looked at after each step.
+
+    Raises:
+        PolicyError: the policy is a foreign program that cannot be looked into, or has neither encoder nor experts.
+    """
+    if not isinstance(policy, NativePolicy) or not isinstance(policy.stored, StoredNetwork):
+        raise PolicyError(
+            f"'{policy.path}' is a program of another format, whose inside cannot be watched; give the policy as a file of "
+            "the project's own or as an rsl_rl checkpoint"
+        )
+    if not hasattr(policy.network, "encode"):
+        raise PolicyError(
+            f"'{policy.path}' has neither an encoder nor experts (network '{policy.stored.architecture}'), so there is no "
+            "latent to look at; give a policy of another network, such as cts or moe_cts"
+        )
+    watched = WatchedNetwork(policy.network)
+    return NativeSession(watched, num_episodes, policy.contract, torch.device("cpu"), policy.path), watched
