@@ -18,13 +18,14 @@ import onnx
 import torch
 import yaml
 from torch import nn
-from torch.nn import functional
 
 from ..files.writing import replacing
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, deploy_contract
 from .base import Policy, PolicyError
+from .composed import AcMoeNetwork, McpNetwork
 from .contract import TERM_WIDTH, HistoryOrder, PolicyContract, difference
+from .estimators import DreamwaqNetwork, HimNetwork
 from .loading import load_policy
 from .native import NativePolicy
 from .networks import CtsNetwork, MlpNetwork, MoeCtsNetwork
@@ -56,22 +57,15 @@ class ExportError(PolicyError):
     """A policy cannot be exported; the message says why."""
 
 
-class _LatentOutput(nn.Module):
-    """A CTS student as a function of its history: actions, latent, and gate weights where there are experts."""
+class _Explained(nn.Module):
+    """A network as a function of its history: actions, latent, and the weights of its experts where it has any."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network: Any = network
 
     def forward(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        extras: tuple[torch.Tensor, ...] = ()
-        if isinstance(self.network, MoeCtsNetwork):
-            mixture, weights = self.network.encoder(history)
-            extras = (weights,)
-        else:
-            mixture = self.network.encoder(history.flatten(1))
-        latent = functional.normalize(mixture, dim=-1)
-        return self.network.actor(torch.cat((latent, history[:, -1]), dim=-1)), latent, *extras
+        return self.network.explained(history)
 
 
 class _WithMemory(nn.Module):
@@ -103,7 +97,7 @@ class _MlpScript(_WithMemory):
         return self.network(self.remember(observation))
 
 
-class _CtsScript(_WithMemory):
+class _LatentScript(_WithMemory):
     """Observation (1, F) to actions (1, J) and (nothing, latent (1, L))."""
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor | None, torch.Tensor]]:
@@ -112,7 +106,7 @@ class _CtsScript(_WithMemory):
         return actions, (weights, latent)
 
 
-class _MoeScript(_WithMemory):
+class _ExpertsScript(_WithMemory):
     """Observation (1, F) to actions (1, J) and (gate weights (1, K), latent (1, L))."""
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
@@ -122,8 +116,12 @@ class _MoeScript(_WithMemory):
 
 _SCRIPTS: dict[type[nn.Module], type[_WithMemory]] = {
     MlpNetwork: _MlpScript,
-    CtsNetwork: _CtsScript,
-    MoeCtsNetwork: _MoeScript,
+    CtsNetwork: _LatentScript,
+    HimNetwork: _LatentScript,
+    DreamwaqNetwork: _LatentScript,
+    MoeCtsNetwork: _ExpertsScript,
+    AcMoeNetwork: _ExpertsScript,
+    McpNetwork: _ExpertsScript,
 }
 
 
@@ -158,8 +156,8 @@ def export_torchscript(policy: Policy, path: str | Path) -> float:
     """Write a TorchScript file for one robot: one observation (1, F) in, the history inside, ``reset()`` to clear it.
 
     The output is that of the published training code, so that the file runs unchanged in the published evaluation:
-    the actions alone for a perceptron, ``(actions, (None, latent))`` for CTS, ``(actions, (gate weights, latent))``
-    for a Mixture of Experts. The contract lies in the archive as ``contract.json``.
+    the actions alone for a perceptron, ``(actions, (None, latent))`` for a network with a latent, ``(actions, (gate weights,
+    latent))`` for one with experts. The contract lies in the archive as ``contract.json``.
 
     Args:
         policy: one of the project's own.
@@ -175,7 +173,7 @@ def export_torchscript(policy: Policy, path: str | Path) -> float:
     contract = policy.contract
     history = torch.zeros(1, int(network.history_length), int(network.frame_width))  # type: ignore[arg-type]
     start = torch.full_like(history, math.nan) if contract.history.start == "repeat" else history
-    core = network if isinstance(network, MlpNetwork) else _LatentOutput(network)
+    core = network if isinstance(network, MlpNetwork) else _Explained(network)
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # torch announces TorchScript's retirement; the published evaluation and many deployments read nothing else.

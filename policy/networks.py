@@ -10,8 +10,10 @@ interfaces:
   state)``. The session keeps the state, and resets rows of it.
 
 A network with an encoder or with experts also has ``encode(history) -> (latent, weights)``, which ``forward`` goes
-through: what its actor is given of the history (N, L), None for no encoder, and the gate's weights (N, K), which add up
-to one, None for no experts. ``gaitgauge latent`` looks at both.
+through: what its actor is given of the history (N, L), None for no encoder, and the gate's weights (N, K), None for no
+experts; they add up to one but for MCP, whose primitives are weighed each for itself. ``gaitgauge latent`` looks at both.
+With a latent it also has ``explained(history)``: the actions, the latent, and the weights where it has experts, which is
+what its TorchScript export gives out.
 
 Row i of the output may depend on row i of the input alone. ``ARCHITECTURES`` maps an architecture's name to the
 function that builds it from the keyword arguments stored in the file, which are plain JSON data. State-dict keys are
@@ -21,57 +23,14 @@ part of the file format.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 
 import torch
 from torch import nn
-from torch.nn import functional
 
+from .composed import AcMoeNetwork, McpNetwork
+from .estimators import DreamwaqNetwork, HimNetwork
+from .layers import ACTIVATIONS, Experts, Perceptron, mixed, multilayer_perceptron, unit
 from .trot import TrotController
-
-ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
-    "elu": nn.ELU,
-    "relu": nn.ReLU,
-    "selu": nn.SELU,
-    "gelu": nn.GELU,
-    "silu": nn.SiLU,
-    "leaky_relu": nn.LeakyReLU,
-    "tanh": nn.Tanh,
-    "sigmoid": nn.Sigmoid,
-}
-
-
-class Perceptron(nn.Sequential):
-    """Layers one after another, called without hooks and detours: on the CPU these cost as much as a small layer."""
-
-    def forward(self, input: torch.Tensor) -> torch.Tensor:
-        """Outputs (N, last width) for inputs (N, first width)."""
-        for layer in self:
-            if isinstance(layer, nn.Linear):
-                input = functional.linear(input, layer.weight, layer.bias)
-            else:
-                input = layer.forward(input)
-        return input
-
-
-def multilayer_perceptron(
-    widths: Sequence[int], *, activation: str = "elu", activate_output: bool = False
-) -> Perceptron:
-    """Linear layers of the given widths (input first, output last) with an activation between them.
-
-    The linear layers are numbered 0, 2, 4 … in the state dict, as rsl_rl numbers them.
-    """
-    if activation not in ACTIVATIONS:
-        raise ValueError(f"unknown activation '{activation}'; choose from: {', '.join(ACTIVATIONS)}")
-    layers: list[nn.Module] = []
-    for width_in, width_out in pairwise(widths):
-        layers += [nn.Linear(width_in, width_out), ACTIVATIONS[activation]()]
-    return Perceptron(*layers) if activate_output else Perceptron(*layers[:-1])
-
-
-def unit(latent: torch.Tensor) -> torch.Tensor:
-    """Vectors of unit length, those that are zero left zero, (…, L). To the last bit what ``functional.normalize`` gives."""
-    return latent / torch.linalg.vector_norm(latent, dim=-1, keepdim=True).clamp_min(1e-12)
 
 
 class MlpNetwork(nn.Module):
@@ -141,20 +100,24 @@ class CtsNetwork(nn.Module):
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for ``history`` (N, H, F)."""
-        return self.actor(torch.cat((self.encode(history)[0], history[:, -1]), dim=-1))
+        return self.explained(history)[0]
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Unit latent (N, L) for ``history`` (N, H, F); there are no experts."""
         return unit(self.encoder(history.flatten(1))), None
 
+    def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Actions (N, J) and latent (N, L)."""
+        latent = self.encode(history)[0]
+        return self.actor(torch.cat((latent, history[:, -1]), dim=-1)), latent
 
-class ExpertMixture(nn.Module):
+
+class ExpertMixture(Experts):
     """Encoder of the history as a dense mixture of experts (paper, mixture of experts): one shared trunk, a head per
     expert, a gate.
 
     The trunk's last layer is ``num_experts`` blocks of ``expert_width``; head k maps block k to the latent. The gate's
-    softmax weighs the heads. State dict: ``trunk.<layer>.*``, ``gate.<layer>.*``, ``head_weight`` (K, latent, expert),
-    ``head_bias`` (K, latent), with K = 1 if the experts share one head.
+    softmax weighs the heads. State dict: that of ``Experts``, and ``gate.<layer>.*``.
     """
 
     seen: torch.Tensor
@@ -173,21 +136,18 @@ class ExpertMixture(nn.Module):
         expert_blind_to: Sequence[int],
         activation: str,
     ) -> None:
-        super().__init__()
-        self.num_experts = num_experts
-        self.expert_width = expert_width
         seen = [i for i in range(frame_width) if i not in set(expert_blind_to)]
+        super().__init__(
+            inputs=len(seen) * history_length,
+            trunk_hidden=trunk_hidden,
+            num_experts=num_experts,
+            expert_width=expert_width,
+            outputs=latent_width,
+            shared_head=shared_head,
+            activation=activation,
+        )
         self.register_buffer("seen", torch.tensor(seen, dtype=torch.int64), persistent=False)
         self.sees_all = len(seen) == frame_width
-        self.trunk = multilayer_perceptron(
-            (len(seen) * history_length, *trunk_hidden, num_experts * expert_width),
-            activation=activation,
-            activate_output=True,
-        )
-        heads = 1 if shared_head else num_experts
-        bound = expert_width**-0.5
-        self.head_weight = nn.Parameter(torch.empty(heads, latent_width, expert_width).uniform_(-bound, bound))
-        self.head_bias = nn.Parameter(torch.empty(heads, latent_width).uniform_(-bound, bound))
         self.gate = multilayer_perceptron(
             (frame_width * history_length, *gate_hidden, num_experts), activation=activation
         )
@@ -196,11 +156,7 @@ class ExpertMixture(nn.Module):
         """Mixture of the experts' latents (N, L), not normalised, and gate weights (N, K) for ``history`` (N, H, F)."""
         weights = torch.softmax(self.gate(history.flatten(1)), dim=-1)
         seen = history if self.sees_all else history[:, :, self.seen]
-        features = self.trunk(seen.flatten(1)).unflatten(1, (self.num_experts, self.expert_width))
-        head_weight = self.head_weight.expand(self.num_experts, -1, -1)
-        head_bias = self.head_bias.expand(self.num_experts, -1)
-        experts = torch.bmm(features.transpose(0, 1), head_weight.transpose(1, 2)) + head_bias[:, None]
-        return (weights.t()[..., None] * experts).sum(dim=0), weights
+        return mixed(weights, self.opinions(seen.flatten(1))), weights
 
 
 class MoeCtsNetwork(nn.Module):
@@ -248,17 +204,38 @@ class MoeCtsNetwork(nn.Module):
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for ``history`` (N, H, F)."""
-        return self.actor(torch.cat((self.encode(history)[0], history[:, -1]), dim=-1))
+        return self.explained(history)[0]
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Unit latent (N, L) and weights of the experts (N, K) for ``history`` (N, H, F)."""
         mixture, weights = self.encoder(history)
         return unit(mixture), weights
 
+    def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Actions (N, J), latent (N, L) and weights of the experts (N, K)."""
+        latent, weights = self.encode(history)
+        return self.actor(torch.cat((latent, history[:, -1]), dim=-1)), latent, weights
+
 
 ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     "mlp": MlpNetwork,
     "cts": CtsNetwork,
     "moe_cts": MoeCtsNetwork,
+    "ac_moe": AcMoeNetwork,
+    "mcp": McpNetwork,
+    "him": HimNetwork,
+    "dreamwaq": DreamwaqNetwork,
     "trot": TrotController,
 }
+
+__all__ = [
+    "ACTIVATIONS",
+    "ARCHITECTURES",
+    "CtsNetwork",
+    "ExpertMixture",
+    "MlpNetwork",
+    "MoeCtsNetwork",
+    "Perceptron",
+    "multilayer_perceptron",
+    "unit",
+]

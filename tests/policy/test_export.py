@@ -30,6 +30,8 @@ from gaitgauge.robots import load_robot
 torch.set_num_threads(1)
 
 SMALL = {"actor_hidden": [32], "latent_width": 8}
+COMPOSED = {"latent_width": 8, "encoder_hidden": [32], "num_experts": 4, "expert_width": 8}
+COMPOSED |= {"trunk_hidden": [32], "gate_hidden": [16]}
 NETWORKS = {
     "mlp": ("mlp", {"frame_width": 45, "num_actions": 12, "hidden": [32]}),
     "normalized mlp with history": (
@@ -44,6 +46,10 @@ NETWORKS = {
         | {"num_experts": 4, "expert_width": 8, "trunk_hidden": [32], "gate_hidden": [16]}
         | {"expert_blind_to": [6, 7, 8], "shared_head": True},
     ),
+    "ac moe": ("ac_moe", COMPOSED),
+    "mcp": ("mcp", COMPOSED | {"primitives_blind_to": [6, 7, 8]}),
+    "him": ("him", SMALL | {"encoder_hidden": [32]}),
+    "dreamwaq": ("dreamwaq", SMALL | {"encoder_hidden": [32]}),
 }
 
 
@@ -138,6 +144,14 @@ def test_torchscript_output_is_the_published_one(tmp_path):
     actions, (weights, latent) = outputs["moe"]
     assert actions.shape == (1, 12) and weights.shape == (1, 4) and float(weights.sum()) == pytest.approx(1.0)
     assert float(latent.norm()) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("kind", "experts", "width"), [("ac moe", 4, 8), ("mcp", 4, 8), ("him", 0, 11)])
+def test_torchscript_gives_latent_and_weights_of_experts(kind, experts, width, tmp_path):
+    export_torchscript(make_policy(kind), tmp_path / "policy.pt")
+    actions, (weights, latent) = torch.jit.load(tmp_path / "policy.pt")(torch.zeros(1, 45))
+    assert actions.shape == (1, 12) and latent.shape == (1, width)
+    assert weights is None if experts == 0 else weights.shape == (1, experts)
 
 
 @pytest.fixture(scope="module")
@@ -281,13 +295,13 @@ def test_a_wrong_export_is_not_left_behind(tmp_path, monkeypatch):
     policy = make_policy("cts")
     path = tmp_path / "policy.pt"
     path.write_bytes(b"previous")
-    monkeypatch.setattr(export, "_LatentOutput", WrongOutput)
+    monkeypatch.setattr(export, "_Explained", WrongOutput)
     with pytest.raises(ExportError, match="differs from it by"):
         export_torchscript(policy, path)
     assert path.read_bytes() == b"previous" and [p.name for p in tmp_path.iterdir()] == ["policy.pt"]
 
 
-class WrongOutput(export._LatentOutput):
+class WrongOutput(export._Explained):
     def forward(self, history):
         actions, *rest = super().forward(history)
         return actions + 1e-3, *rest

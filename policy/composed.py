@@ -1,0 +1,211 @@
+"""Policies whose actor is composed of experts: the paper's ablations AC-MoE and MCP, with a plain encoder of the history."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+from .layers import Experts, mixed, multilayer_perceptron, unit
+
+_LEAST_LOG_STD, _LARGEST_LOG_STD = -5.0, 2.0
+_LEAST_VARIANCE = 1e-9
+
+
+class GatedActor(Experts):
+    """Actions as a mixture of the experts' actions: a softmax gate on the same input as the experts.
+
+    State dict: that of ``Experts``, and ``gate.<layer>.*``.
+    """
+
+    def __init__(
+        self,
+        *,
+        inputs: int,
+        num_actions: int,
+        num_experts: int,
+        expert_width: int,
+        trunk_hidden: Sequence[int],
+        gate_hidden: Sequence[int],
+        activation: str,
+    ) -> None:
+        super().__init__(
+            inputs=inputs,
+            trunk_hidden=trunk_hidden,
+            num_experts=num_experts,
+            expert_width=expert_width,
+            outputs=num_actions,
+            activation=activation,
+        )
+        self.gate = multilayer_perceptron((inputs, *gate_hidden, num_experts), activation=activation)
+
+    def weigh(self, values: torch.Tensor) -> torch.Tensor:
+        """Weights of the experts (N, K), which add up to one, for inputs (N, D)."""
+        return torch.softmax(self.gate(values), dim=-1)
+
+    def forward(self, values: torch.Tensor, weights: torch.Tensor) -> tuple[torch.Tensor]:
+        """Actions (N, J) for inputs (N, D) and what ``weigh`` gave for them."""
+        return (mixed(weights, self.opinions(values)),)
+
+
+class CompositeActor(Experts):
+    """Actions as the product of Gaussian primitives, each to the power of its weight (Peng et al., "MCP: Learning Composable
+    Hierarchical Control with Multiplicative Compositional Policies", 2019, eq. 5 and 6). The gate sees everything, the primitives
+    do not see the command: they are skills, the gate has the goal.
+
+    State dict: that of ``Experts``, and ``gate.<layer>.*``.
+    """
+
+    seen: torch.Tensor
+
+    def __init__(
+        self,
+        *,
+        inputs: int,
+        num_actions: int,
+        num_experts: int,
+        expert_width: int,
+        trunk_hidden: Sequence[int],
+        gate_hidden: Sequence[int],
+        blind_to: Sequence[int],
+        activation: str,
+    ) -> None:
+        seen = [i for i in range(inputs) if i not in set(blind_to)]
+        super().__init__(
+            inputs=len(seen),
+            trunk_hidden=trunk_hidden,
+            num_experts=num_experts,
+            expert_width=expert_width,
+            outputs=2 * num_actions,
+            activation=activation,
+        )
+        self.register_buffer("seen", torch.tensor(seen, dtype=torch.int64), persistent=False)
+        self.gate = multilayer_perceptron((inputs, *gate_hidden, num_experts), activation=activation)
+
+    def weigh(self, values: torch.Tensor) -> torch.Tensor:
+        """Weights of the primitives (N, K), each in (0, 1), for inputs (N, D)."""
+        return torch.sigmoid(self.gate(values))
+
+    def forward(self, values: torch.Tensor, weights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and standard deviation of the actions, (N, J) each, for inputs (N, D) and what ``weigh`` gave for them."""
+        mean, log_std = self.opinions(values[:, self.seen]).chunk(2, dim=-1)
+        log_std = log_std.clamp(_LEAST_LOG_STD, _LARGEST_LOG_STD)
+        precision = weights.t()[..., None] / (torch.exp(2.0 * log_std) + _LEAST_VARIANCE)
+        variance = 1.0 / (precision.sum(dim=0) + _LEAST_VARIANCE)
+        return variance * (precision * mean).sum(dim=0), variance.sqrt()
+
+
+class _ComposedNetwork(nn.Module):
+    """An encoder of the history to a unit latent, and an actor of experts on the latent and the current frame."""
+
+    actor: GatedActor | CompositeActor
+
+    def __init__(
+        self,
+        *,
+        frame_width: int,
+        history_length: int,
+        latent_width: int,
+        encoder_hidden: Sequence[int],
+        activation: str,
+    ) -> None:
+        super().__init__()
+        self.history_length = history_length
+        self.frame_width = frame_width
+        self.encoder = multilayer_perceptron(
+            (frame_width * history_length, *encoder_hidden, latent_width), activation=activation
+        )
+
+    def forward(self, history: torch.Tensor) -> torch.Tensor:
+        """Actions (N, J) for ``history`` (N, H, F)."""
+        return self.explained(history)[0]
+
+    def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Unit latent (N, L) and weights of the actor's experts (N, K) for ``history`` (N, H, F)."""
+        latent = unit(self.encoder(history.flatten(1)))
+        return latent, self.actor.weigh(torch.cat((latent, history[:, -1]), dim=-1))
+
+    def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Actions (N, J), latent (N, L) and weights of the actor's experts (N, K)."""
+        latent, weights = self.encode(history)
+        return self.actor(torch.cat((latent, history[:, -1]), dim=-1), weights)[0], latent, weights
+
+
+class AcMoeNetwork(_ComposedNetwork):
+    """CTS whose actor is a mixture of experts (paper, ablation AC-MoE).
+
+    State dict: ``encoder.<layer>.*``, ``actor.*`` as in ``GatedActor``.
+    """
+
+    def __init__(
+        self,
+        *,
+        frame_width: int = 45,
+        num_actions: int = 12,
+        history_length: int = 5,
+        latent_width: int = 32,
+        encoder_hidden: Sequence[int] = (512, 256),
+        num_experts: int = 8,
+        expert_width: int = 128,
+        trunk_hidden: Sequence[int] = (512, 256),
+        gate_hidden: Sequence[int] = (512, 256),
+        activation: str = "elu",
+    ) -> None:
+        super().__init__(
+            frame_width=frame_width,
+            history_length=history_length,
+            latent_width=latent_width,
+            encoder_hidden=encoder_hidden,
+            activation=activation,
+        )
+        self.actor = GatedActor(
+            inputs=latent_width + frame_width,
+            num_actions=num_actions,
+            num_experts=num_experts,
+            expert_width=expert_width,
+            trunk_hidden=trunk_hidden,
+            gate_hidden=gate_hidden,
+            activation=activation,
+        )
+
+
+class McpNetwork(_ComposedNetwork):
+    """CTS whose actor multiplies Gaussian primitives (paper, ablation MCP).
+
+    State dict: ``encoder.<layer>.*``, ``actor.*`` as in ``CompositeActor``.
+    """
+
+    def __init__(
+        self,
+        *,
+        frame_width: int = 45,
+        num_actions: int = 12,
+        history_length: int = 5,
+        latent_width: int = 32,
+        encoder_hidden: Sequence[int] = (512, 256),
+        num_experts: int = 8,
+        expert_width: int = 256,
+        trunk_hidden: Sequence[int] = (512, 256, 128),
+        gate_hidden: Sequence[int] = (512, 256, 128),
+        primitives_blind_to: Sequence[int] = (),
+        activation: str = "elu",
+    ) -> None:
+        """``primitives_blind_to``: entries of the current frame, as a rule the command's."""
+        super().__init__(
+            frame_width=frame_width,
+            history_length=history_length,
+            latent_width=latent_width,
+            encoder_hidden=encoder_hidden,
+            activation=activation,
+        )
+        self.actor = CompositeActor(
+            inputs=latent_width + frame_width,
+            num_actions=num_actions,
+            num_experts=num_experts,
+            expert_width=expert_width,
+            trunk_hidden=trunk_hidden,
+            gate_hidden=gate_hidden,
+            blind_to=[latent_width + i for i in primitives_blind_to],
+            activation=activation,
+        )

@@ -1,0 +1,119 @@
+"""Policies that estimate the base's velocity and a latent from the history, and act on both: DreamWaQ and HIM."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+from .layers import multilayer_perceptron, unit
+
+VELOCITY = 3
+"""Entries of an estimate that are the base's velocity, its first, in the scale of the training's privileged observation."""
+
+
+class _EstimatorNetwork(nn.Module):
+    """An encoder of the history, and an actor on the estimate and the current frame.
+
+    State dict: ``encoder.<layer>.*`` and ``actor.<layer>.*``; the actor's input is velocity, latent, then the current frame.
+    """
+
+    def __init__(
+        self,
+        *,
+        encoded: int,
+        frame_width: int,
+        num_actions: int,
+        history_length: int,
+        latent_width: int,
+        encoder_hidden: Sequence[int],
+        actor_hidden: Sequence[int],
+        activation: str,
+    ) -> None:
+        super().__init__()
+        self.history_length = history_length
+        self.frame_width = frame_width
+        self.latent_width = latent_width
+        self.encoder = multilayer_perceptron(
+            (frame_width * history_length, *encoder_hidden, encoded), activation=activation
+        )
+        self.actor = multilayer_perceptron(
+            (VELOCITY + latent_width + frame_width, *actor_hidden, num_actions), activation=activation
+        )
+
+    def forward(self, history: torch.Tensor) -> torch.Tensor:
+        """Actions (N, J) for ``history`` (N, H, F)."""
+        return self.explained(history)[0]
+
+    def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Actions (N, J) and the estimate behind them (N, 3 + L)."""
+        estimate = self.encode(history)[0]
+        return self.actor(torch.cat((estimate, history[:, -1]), dim=-1)), estimate
+
+    def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Velocity and latent, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
+        raise NotImplementedError
+
+
+class DreamwaqNetwork(_EstimatorNetwork):
+    """A variational estimator (Nahrendra et al., "DreamWaQ", 2023): the latent is the mean of its distribution. The encoder's
+    outputs are velocity, means, and logarithms of variances, which only training uses.
+    """
+
+    def __init__(
+        self,
+        *,
+        frame_width: int = 45,
+        num_actions: int = 12,
+        history_length: int = 5,
+        latent_width: int = 16,
+        encoder_hidden: Sequence[int] = (128, 64),
+        actor_hidden: Sequence[int] = (512, 256, 128),
+        activation: str = "elu",
+    ) -> None:
+        super().__init__(
+            encoded=VELOCITY + 2 * latent_width,
+            frame_width=frame_width,
+            num_actions=num_actions,
+            history_length=history_length,
+            latent_width=latent_width,
+            encoder_hidden=encoder_hidden,
+            actor_hidden=actor_hidden,
+            activation=activation,
+        )
+
+    def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Velocity and mean of the latent, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
+        return self.encoder(history.flatten(1))[:, : VELOCITY + self.latent_width], None
+
+
+class HimNetwork(_EstimatorNetwork):
+    """A hybrid internal model (Long et al., "Hybrid Internal Model", 2024): velocity and an embedding on the unit sphere."""
+
+    def __init__(
+        self,
+        *,
+        frame_width: int = 45,
+        num_actions: int = 12,
+        history_length: int = 5,
+        latent_width: int = 16,
+        encoder_hidden: Sequence[int] = (128, 64),
+        actor_hidden: Sequence[int] = (512, 256, 128),
+        activation: str = "elu",
+    ) -> None:
+        super().__init__(
+            encoded=VELOCITY + latent_width,
+            frame_width=frame_width,
+            num_actions=num_actions,
+            history_length=history_length,
+            latent_width=latent_width,
+            encoder_hidden=encoder_hidden,
+            actor_hidden=actor_hidden,
+            activation=activation,
+        )
+
+    def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Velocity and embedding, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
+        encoded = self.encoder(history.flatten(1))
+        return torch.cat((encoded[:, :VELOCITY], unit(encoded[:, VELOCITY:])), dim=-1), None

@@ -1,0 +1,96 @@
+"""Layers that the networks of policy files are made of. Their names in a state dict are part of the file format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
+    "elu": nn.ELU,
+    "relu": nn.ReLU,
+    "selu": nn.SELU,
+    "gelu": nn.GELU,
+    "silu": nn.SiLU,
+    "leaky_relu": nn.LeakyReLU,
+    "tanh": nn.Tanh,
+    "sigmoid": nn.Sigmoid,
+}
+
+
+class Perceptron(nn.Sequential):
+    """Layers one after another, called without hooks and detours: on the CPU these cost as much as a small layer."""
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        """Outputs (N, last width) for inputs (N, first width)."""
+        for layer in self:
+            if isinstance(layer, nn.Linear):
+                input = functional.linear(input, layer.weight, layer.bias)
+            else:
+                input = layer.forward(input)
+        return input
+
+
+def multilayer_perceptron(
+    widths: Sequence[int], *, activation: str = "elu", activate_output: bool = False
+) -> Perceptron:
+    """Linear layers of the given widths (input first, output last) with an activation between them.
+
+    The linear layers are numbered 0, 2, 4 … in the state dict, as rsl_rl numbers them.
+    """
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"unknown activation '{activation}'; choose from: {', '.join(ACTIVATIONS)}")
+    layers: list[nn.Module] = []
+    for width_in, width_out in pairwise(widths):
+        layers += [nn.Linear(width_in, width_out), ACTIVATIONS[activation]()]
+    return Perceptron(*layers) if activate_output else Perceptron(*layers[:-1])
+
+
+def unit(latent: torch.Tensor) -> torch.Tensor:
+    """Vectors of unit length, those that are zero left zero, (…, L). To the last bit what ``functional.normalize`` gives."""
+    return latent / torch.linalg.vector_norm(latent, dim=-1, keepdim=True).clamp_min(1e-12)
+
+
+class Experts(nn.Module):
+    """Several experts as one shared trunk, whose last layer is a block of private features for each, and a linear head for each.
+
+    State dict: ``trunk.<layer>.*``, ``head_weight`` (K, output, expert), ``head_bias`` (K, output), with K = 1 if the experts
+    share one head.
+    """
+
+    def __init__(
+        self,
+        *,
+        inputs: int,
+        trunk_hidden: Sequence[int],
+        num_experts: int,
+        expert_width: int,
+        outputs: int,
+        shared_head: bool = False,
+        activation: str = "elu",
+    ) -> None:
+        super().__init__()
+        self.num_experts = num_experts
+        self.expert_width = expert_width
+        self.trunk = multilayer_perceptron(
+            (inputs, *trunk_hidden, num_experts * expert_width), activation=activation, activate_output=True
+        )
+        heads = 1 if shared_head else num_experts
+        bound = expert_width**-0.5
+        self.head_weight = nn.Parameter(torch.empty(heads, outputs, expert_width).uniform_(-bound, bound))
+        self.head_bias = nn.Parameter(torch.empty(heads, outputs).uniform_(-bound, bound))
+
+    def opinions(self, values: torch.Tensor) -> torch.Tensor:
+        """What each expert makes of inputs (N, D), (K, N, outputs)."""
+        features = self.trunk(values).unflatten(1, (self.num_experts, self.expert_width))
+        head_weight = self.head_weight.expand(self.num_experts, -1, -1)
+        head_bias = self.head_bias.expand(self.num_experts, -1)
+        return torch.bmm(features.transpose(0, 1), head_weight.transpose(1, 2)) + head_bias[:, None]
+
+
+def mixed(weights: torch.Tensor, opinions: torch.Tensor) -> torch.Tensor:
+    """Sum of the experts' opinions (K, N, D) with weights (N, K), (N, D)."""
+    return (weights.t()[..., None] * opinions).sum(dim=0)
