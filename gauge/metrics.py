@@ -8,9 +8,11 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
+import numpy as np
 import torch
 
 from ..robots.base import Robot
+from ..robots.body_plan import LEG_PARTS, body_plan
 from ..robots.geometry import joint_ranges, stance_span
 from ..robots.rotation import projected_gravity, rotate_inverse
 from .suite import Metrics, SuiteError
@@ -170,6 +172,16 @@ class MotionState(Protocol):
     def foot_tangential_force(self) -> torch.Tensor: ...  # noqa: D102
 
 
+def _joints_of(robot: Robot, parts: tuple[str, ...]) -> list[int]:
+    """Joints that a suite names by parts of legs (``LEG_PARTS``), or by parts of their names."""
+    plan = body_plan(robot)
+    return [
+        j
+        for j, name in enumerate(robot.joint_names)
+        if any(plan.part(j) == part if part in LEG_PARTS else part in name for part in parts)
+    ]
+
+
 class MetricEvaluator:
     """All metrics of a suite for N instants at once."""
 
@@ -188,8 +200,14 @@ class MetricEvaluator:
         self._metrics = metrics
         self._weight = weight
         self._weights = torch.tensor([metrics.weights[n] for n in self.names], device=device, dtype=dtype)
-        watched = [j for j, n in enumerate(robot.joint_names) if any(p in n for p in metrics.soft_limit_joints)]
-        ranges = torch.tensor(joint_ranges(robot)[watched], device=device, dtype=dtype)
+        bounds = joint_ranges(robot)
+        watched = [j for j in _joints_of(robot, metrics.soft_limit_joints) if np.isfinite(bounds[j]).all()]
+        if not watched and "dof_limits" in self.names:
+            raise SuiteError(
+                f"the metric 'dof_limits' watches {', '.join(metrics.soft_limit_joints)}, of which robot '{robot.name}' has no "
+                "joint with limits; give its joints a range in the model"
+            )
+        ranges = torch.tensor(bounds[watched].reshape(-1, 2), device=device, dtype=dtype)
         middle, self._full = ranges.mean(1), ranges[:, 1] - ranges[:, 0]
         self._low, self._high = (
             middle - 0.5 * metrics.soft_limit * self._full,

@@ -161,7 +161,7 @@ class Metrics:
     soft_limit: Annotated[float, Field(gt=0.0, le=1.0)]
     """Share of each joint range, around its middle, inside which no limit is exceeded."""
     soft_limit_joints: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
-    """Name parts of the joints that the limit metric watches."""
+    """The joints that the limit metric watches: ``hip``, ``thigh`` and ``calf`` by their place in the leg, else parts of names."""
     zmp_span: Positive | None = None
     """Diagonal stance span that normalizes the ZMP distance [m]; None: that of the robot's default pose."""
     contact_share: Share = 0.05

@@ -241,7 +241,7 @@ def go2_contract(
     """The interface that the CTS family of policies for the Unitree Go2 shares (paper, section on observations).
 
     Angular velocity, gravity, command, joint positions, joint velocities and the last action make 45 entries; an action
-    moves the target by 0.25 rad per unit around the standing pose, every 0.02 s.
+    moves the target around the standing pose by the robot's action scale, 0.25 rad per unit for the Go2, every 0.02 s.
 
     Args:
         robot: gives the joints, the standing pose, the gains and the command limits.
@@ -253,7 +253,7 @@ def go2_contract(
         robot=robot.name,
         joint_names=robot.joint_names,
         default_joint_position=robot.default_joint_position,
-        action_scale=(0.25,) * robot.num_joints,
+        action_scale=robot.action_scale or (0.25,) * robot.num_joints,
         stiffness=motors.stiffness,
         damping=motors.damping,
         control_period=0.02,

@@ -1,4 +1,4 @@
-"""What a robot is: a MuJoCo model file and the data that the other rooms need to know about it."""
+"""What a robot is: a MuJoCo model file and the data that the other packages need to know about it."""
 
 from __future__ import annotations
 
@@ -61,12 +61,14 @@ class Robot:
     base_body: Text
     """Body that carries the free joint; its origin is the base position."""
     foot_names: _Names
-    """Name of each foot; both the collision geom and the site at its centre bear it."""
+    """Name of each foot; its collision geom, whose centre is the foot's position, bears it where ``foot_shapes`` does not say
+    otherwise."""
     collision_bodies: _Names
-    """Bodies whose contacts with the ground are reported one by one; their foot geoms are reported apart."""
+    """Bodies whose contacts with the ground are reported one by one; foot geoms are reported apart."""
     trunk_shapes: _Names
     """Collision geoms of the base body that are its trunk, without head or sensors: what must not touch the ground."""
-    imu_site: Text
+    imu_site: Text | None = None
+    """Site on the base where the gyroscope sits; None where the model has none."""
     stand_height: Annotated[float, Field(gt=0.0, le=10.0)]
     """Height of the base above the ground at which an episode starts [m]."""
     default_parameters: Text
@@ -78,8 +80,17 @@ class Robot:
     sdk_joint_names: _Names | None = None
     """The joints in the order in which the maker's SDK numbers the motors, which a ``deploy.yaml`` refers to; None where it
     is not known."""
+    action_scale: _PerJoint | None = None
+    """How far an output of 1 of a standard policy moves a joint's target [rad]; None for 0.25."""
+    foot_shapes: _Names | None = None
+    """Collision geom of each foot; None where they bear the feet's names."""
 
     @property
     def num_joints(self) -> int:
         """Number of actuated joints."""
         return len(self.joint_names)
+
+    @property
+    def foot_geoms(self) -> tuple[str, ...]:
+        """Name of each foot's collision geom."""
+        return self.foot_shapes or self.foot_names

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -13,8 +12,6 @@ from .loading import RobotError, robot_digest
 if TYPE_CHECKING:
     import mujoco
 
-_SITE_TOLERANCE = 1e-4
-"""Largest distance between a foot's site and its geom's centre [m]."""
 _DEPTH_TOLERANCE = 1e-3
 """Depth to which a robot that is put on the ground may reach into it [m]."""
 _GRAVITY = (0.0, 0.0, -9.81)
@@ -27,7 +24,7 @@ def check_robot(robot: Robot) -> None:
     carry the robot.
 
     That is: the free base and nothing outside it; no welds, forces or options that spare it its weight; the joints with
-    one motor each; the feet (a geom and a site at its centre); the collision bodies and the trunk's shapes, which must meet
+    one motor each, if it has any; the feet's geoms; the collision bodies and the trunk's shapes, which must meet
     the ground; the imu site; that the default pose is within the joint ranges; that nothing is in the ground at
     ``stand_height``. A robot whose files have not changed is checked once in a process.
 
@@ -158,6 +155,8 @@ class _Check:
 
     def motors(self) -> None:
         model, robot = self.model, self.robot
+        if not model.nu:
+            return  # engines bring their own
         ids = self.require(robot.joint_names, "joint_names", "joint")
         driven = [
             int(model.actuator_trnid[a, 0])
@@ -174,13 +173,9 @@ class _Check:
 
     def feet(self) -> None:
         model, robot = self.model, self.robot
-        geoms = self.require(robot.foot_names, "foot_names", "geom")
-        sites = self.require(robot.foot_names, "foot_names", "site")
-        for name, geom, site in zip(robot.foot_names, geoms, sites, strict=True):
-            apart = math.dist(model.geom_pos[geom], model.site_pos[site])
-            if model.geom_bodyid[geom] != model.site_bodyid[site] or apart > _SITE_TOLERANCE:
-                raise self.error(f"the site '{name}' must be at the centre of the foot geom '{name}', on the same body")
+        for geom in self.require(robot.foot_geoms, "foot_shapes" if robot.foot_shapes else "foot_names", "geom"):
             if not self.solid(geom):
+                name = model.geom(geom).name
                 raise self.error(f"the foot geom '{name}' does not meet the ground; give it contype or conaffinity 1")
 
     def solid(self, geom: int) -> bool:
@@ -191,6 +186,8 @@ class _Check:
         (base,) = self.require([self.robot.base_body], "base_body", "body")
         model = self.model
         bodies = self.require(self.robot.collision_bodies, "collision_bodies", "body")
+        if base not in bodies:
+            raise self.error(f"collision_bodies lacks the base_body '{self.robot.base_body}'; add it")
         for name, body in zip(self.robot.collision_bodies, bodies, strict=True):
             first = model.body_geomadr[body]
             if not any(self.solid(g) for g in range(first, first + model.body_geomnum[body])):
@@ -203,6 +200,8 @@ class _Check:
                 raise self.error(f"trunk_shapes names '{name}', which is not on the base_body '{self.robot.base_body}'")
             if not self.solid(geom):
                 raise self.error(f"the trunk shape '{name}' does not meet the ground; give it contype or conaffinity 1")
+        if self.robot.imu_site is None:
+            return
         (imu,) = self.require([self.robot.imu_site], "imu_site", "site")
         if self.model.site_bodyid[imu] != base:
             raise self.error(f"imu_site '{self.robot.imu_site}' must be on the base_body '{self.robot.base_body}'")

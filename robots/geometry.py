@@ -8,26 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Robot
+from .body_plan import default_pose
 
 
 def joint_ranges(robot: Robot) -> NDArray[np.float64]:
-    """Lower and upper limit of every joint in the robot's order [rad], (J, 2)."""
+    """Lower and upper limit of every joint in the robot's order [rad], (J, 2); infinite where a joint has none."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
-    return np.array([model.joint(name).range for name in robot.joint_names])
+    ids = [model.joint(name).id for name in robot.joint_names]
+    return np.where(model.jnt_limited[ids, None], model.jnt_range[ids], [-np.inf, np.inf])
 
 
 def stance_span(robot: Robot) -> float:
     """Largest horizontal distance between two feet in the default pose [m]: the diagonal stance span."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
-    data = mujoco.MjData(model)
-    for name, angle in zip(robot.joint_names, robot.default_joint_position, strict=True):
-        data.joint(name).qpos[0] = angle
-    mujoco.mj_kinematics(model, data)
-    feet = [data.site(name).xpos[:2] for name in robot.foot_names]
+    _, data = default_pose(robot)
+    feet = [data.geom(name).xpos[:2] for name in robot.foot_geoms]
     return float(max(np.linalg.norm(a - b) for a, b in combinations(feet, 2)))
 
 

@@ -22,6 +22,8 @@ from .base import JointParameters, Robot
 
 ROBOT_FILE = "robot.toml"
 _JOINT_ENDING = "_joint"
+_ADDED_LATER = ("foot_shapes", "action_scale", "imu_site")
+"""Fields that count for a robot's digest only where they are set, so that those of older descriptions stay."""
 
 
 class RobotError(ValueError):
@@ -49,7 +51,7 @@ def load_robot_file(path: str | Path) -> Robot:
     data = parse_toml(read_text(file, "robot file", RobotError), source, RobotError)
     names = data.get("joint_names")
     if isinstance(names, list) and all(isinstance(n, str) for n in names) and len(set(names)) == len(names):
-        _spread(data, ("default_joint_position",), names, source)
+        _spread(data, ("default_joint_position", "action_scale"), names, source)
         sets = data.get("parameters")
         for name, table in sets.items() if isinstance(sets, dict) else ():
             if isinstance(table, dict):
@@ -80,7 +82,7 @@ def robot_digest(robot: Robot) -> str:
     Raises:
         RobotError: a file cannot be read.
     """
-    description = {k: v for k, v in asdict(robot).items() if k != "mjcf"}
+    description = {k: v for k, v in asdict(robot).items() if k != "mjcf" and not (v is None and k in _ADDED_LATER)}
     try:
         return digest(model_files(robot.mjcf), json_text(description))
     except OSError as error:
@@ -150,12 +152,19 @@ def _check(robot: Robot, source: str) -> None:
         raise RobotError(
             f"{source}: mjcf names '{one_line(robot.mjcf)}', which does not exist; the path is relative to the robot file"
         )
-    for key in ("joint_names", "foot_names", "collision_bodies", "trunk_shapes"):
-        names = getattr(robot, key)
+    for key in ("joint_names", "foot_names", "collision_bodies", "trunk_shapes", "foot_shapes"):
+        names = getattr(robot, key) or ()
         twice = [n for n in names if names.count(n) > 1]
         if twice:
             raise RobotError(f"{source}: {key} names {shown(twice[0])} twice")
-    per_joint = {"default_joint_position": robot.default_joint_position}
+    if robot.foot_shapes and len(robot.foot_shapes) != len(robot.foot_names):
+        raise RobotError(
+            f"{source}: foot_shapes has {len(robot.foot_shapes)} names but foot_names has {len(robot.foot_names)}; give one "
+            "for each foot"
+        )
+    per_joint: dict[str, tuple[float, ...]] = {"default_joint_position": robot.default_joint_position}
+    if robot.action_scale is not None:
+        per_joint["action_scale"] = robot.action_scale
     for name, constants in robot.parameters.items():
         per_joint |= {f"parameters.{name}.{k}": v for k, v in vars(constants).items() if v is not None}
     for key, values in per_joint.items():

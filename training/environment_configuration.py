@@ -135,6 +135,10 @@ class ObservationConfiguration:
     """Extent of the height scan across the heading [m]."""
     scan_spacing: _Metres = 0.1
     """Distance between scan points [m]."""
+    foot_force_scale: Positive = 1e-3
+    """Factor on the feet's contact forces, which teacher and critic see [1/N]."""
+    height_offset: float = 0.5
+    """Height of the base over the ground that a scan entry of 0 stands for [m]."""
     scan_cell: _Metres = 0.05
     """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
     own: tuple[OwnObservation, ...] = ()
@@ -174,7 +178,7 @@ class RewardConfiguration:
     action_smoothness: float = -0.01
     """Squared second difference of the actions."""
     collision: float = -1.0
-    """Number of thighs and calves that touch something."""
+    """Number of thighs, calves and what hangs on them that touch something."""
     base_collision: float = 0.0
     """The base touches something; head and chin too."""
     joint_limits: float = -2.0
@@ -204,6 +208,9 @@ class RewardConfiguration:
     """Commanded yaw rate between which sigma grows to the terrain's largest [rad/s]."""
     base_height_target: float = 0.38
     """[m]."""
+    trunk_area: tuple[float, float] = (0.4, 0.3)
+    """Length and width of the area below the base whose mean ground the base's height is measured from [m]; points of the
+    height scan count."""
     foot_height_scale: float = 0.025
     """Foot regulation fades with foot height over this share of ``base_height_target``."""
     foot_height_over: str = "foot"
@@ -350,6 +357,8 @@ class ResetConfiguration:
     """Largest component of the base's linear [m/s] and angular [rad/s] velocity."""
     clearance: float | None = None
     """Height of the base over the highest ground below the robot [m]; None for the robot's ``stand_height``."""
+    footprint: tuple[float, float] = (0.5, 0.4)
+    """Length and width of what counts as below the robot there [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import mujoco
 import torch
 
 from ..backends.base import PhysicsOptions, PhysicsState
 from ..robots.base import Robot
+from ..robots.geometry import joint_ranges
 from ..robots.rotation import from_yaw
 from .environment_configuration import (
     PushConfiguration,
@@ -56,12 +56,6 @@ class Push:
     """Body frame [rad/s], (N, 3)."""
 
 
-def joint_ranges(robot: Robot) -> torch.Tensor:
-    """Lower and upper limit of every joint of the robot's model [rad], (J, 2)."""
-    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
-    return torch.tensor([list(model.joint(name).range) for name in robot.joint_names], dtype=torch.float32)
-
-
 class EpisodeStarts:
     """Draws where and how episodes begin."""
 
@@ -76,10 +70,10 @@ class EpisodeStarts:
     ) -> None:
         """Put constants on the device."""
         self._reset, self._terrain, self._rasters = reset, terrain, rasters
-        self._footprint = scan_pattern(0.5, 0.4, 0.1, device)
+        self._footprint = scan_pattern(*reset.footprint, 0.1, device)
         self._clearance = robot.stand_height if reset.clearance is None else reset.clearance
         self._default_pose = torch.tensor(robot.default_joint_position, device=device)
-        self._lower, self._upper = joint_ranges(robot).to(device).unbind(1)
+        self._lower, self._upper = torch.from_numpy(joint_ranges(robot)).float().to(device).unbind(1)
         self._spread, self._jitter = (
             torch.tensor(distance, device=device) for distance in (terrain.spread_distance, terrain.spawn_jitter)
         )

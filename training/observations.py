@@ -22,11 +22,8 @@ from .own_terms import resolve_own
 from .randomness import UniformColumns
 
 LINEAR_VELOCITY_SCALE = 2.0
-FOOT_FORCE_SCALE = 1e-3
 JOINT_ACCELERATION_SCALE = 1e-4
 HEIGHT_SCALE = 2.5
-HEIGHT_OFFSET = 0.5
-"""Height of the base over the ground that a scan entry of 0 stands for [m]."""
 
 
 def noise_amplitude(contract: PolicyContract, noise: NoiseConfiguration, device: torch.device | str) -> torch.Tensor:
@@ -83,6 +80,7 @@ class ObservationInputs:
     """Height of the ground at each point of the scan, world frame [m], (N, P)."""
     torque_limit: torch.Tensor
     """Largest torque of each joint [N·m], (J,)."""
+    settings: ObservationConfiguration
 
 
 def base_linear_velocity(inputs: ObservationInputs) -> torch.Tensor:
@@ -98,7 +96,7 @@ def frame(inputs: ObservationInputs) -> torch.Tensor:
 
 def foot_force(inputs: ObservationInputs) -> torch.Tensor:
     """Norm of each foot's contact force, (N, F)."""
-    return inputs.memory.foot_force * FOOT_FORCE_SCALE
+    return inputs.memory.foot_force * inputs.settings.foot_force_scale
 
 
 def torque_ratio(inputs: ObservationInputs) -> torch.Tensor:
@@ -112,8 +110,8 @@ def joint_acceleration(inputs: ObservationInputs) -> torch.Tensor:
 
 
 def height_scan(inputs: ObservationInputs) -> torch.Tensor:
-    """Height of the base over each point of the scan less ``HEIGHT_OFFSET``, clipped to 1 m, (N, P)."""
-    height = inputs.state.base_position_w[:, 2:3] - HEIGHT_OFFSET - inputs.ground
+    """Height of the base over each point of the scan less ``height_offset``, clipped to 1 m, (N, P)."""
+    height = inputs.state.base_position_w[:, 2:3] - inputs.settings.height_offset - inputs.ground
     return height.clamp(-1.0, 1.0) * HEIGHT_SCALE
 
 
@@ -161,7 +159,7 @@ class Observer:
         """
         own = resolve_own(configuration.own, "observations.own", taken=PRIVILEGED_TERMS)
         self._terms: list[PrivilegedTerm] = [*PRIVILEGED_TERMS.values(), *own.values()]
-        self._builder, self._scan, self._rasters = builder, scan, rasters
+        self._settings, self._builder, self._scan, self._rasters = configuration, builder, scan, rasters
         self._torque_limit = torque_limit
         self._noise = noise_amplitude(contract, configuration.noise, scan.device)
         self._start = contract.history.start
@@ -178,6 +176,7 @@ class Observer:
             frame=clean,
             ground=self._rasters.height(memory.terrain_index, points),
             torque_limit=self._torque_limit,
+            settings=self._settings,
         )
         privileged = torch.cat([term(inputs) for term in self._terms], dim=1)
         return Observations(policy=noisy, history=memory.history.flatten(1), privileged=privileged)

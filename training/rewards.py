@@ -94,7 +94,7 @@ def action_smoothness(inputs: StepInputs) -> torch.Tensor:
 
 
 def collision(inputs: StepInputs) -> torch.Tensor:
-    """Number of thighs and calves in contact."""
+    """Number of thighs, calves and what hangs on them in contact."""
     return inputs.touching_bodies
 
 
@@ -126,9 +126,11 @@ def hip_regulation(inputs: StepInputs) -> torch.Tensor:
 
 
 def hip_symmetry(inputs: StepInputs) -> torch.Tensor:
-    """|vx*| / ‖command‖ · (|FL + FR| + |RL + RR|) of the hip angles [rad]; 0 for the zero command."""
-    hips = inputs.joint_position[:, inputs.hip_joints]
-    asymmetry = (hips[:, 0::2] + hips[:, 1::2]).abs().sum(dim=1)
+    """|vx*| / ‖command‖ · Σ |left hip − mirror image of the right one|, angles from the standing pose [rad]; 0 for the zero
+    command.
+    """
+    deviation = (inputs.joint_position - inputs.default_joint_position)[:, inputs.hip_pairs]
+    asymmetry = (deviation[..., 0] - inputs.hip_signs * deviation[..., 1]).abs().sum(dim=1)
     share = inputs.command[:, 0].abs() / inputs.command.norm(dim=1).clamp_min(1e-6)
     return share * asymmetry
 

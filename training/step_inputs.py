@@ -74,7 +74,11 @@ class StepInputs:
     soft_upper: torch.Tensor
     """Upper soft joint limit [rad], (J,)."""
     hip_joints: torch.Tensor
-    """Indices of the hip joints FL, FR, RL, RR, (4,) int64."""
+    """Indices of the hip joints, which swing legs sideways, (H,) int64."""
+    hip_pairs: torch.Tensor
+    """Hip joints and their mirror images, (P, 2) int64; empty where the reward ``hip_symmetry`` has no weight."""
+    hip_signs: torch.Tensor
+    """−1 for pairs that turn opposite ways when they mirror each other, else 1, (P,)."""
     action: torch.Tensor
     """Raw action of this step, (N, J)."""
     previous_action: torch.Tensor
@@ -86,7 +90,7 @@ class StepInputs:
     foot_velocity_w: torch.Tensor
     """[m/s], (N, F, 3)."""
     touching_bodies: torch.Tensor
-    """Number of thighs and calves in contact, (N,)."""
+    """Number of thighs, calves and what hangs on them in contact, (N,)."""
     base_touching: torch.Tensor
     """1 where the base touches something, (N,)."""
     upright: torch.Tensor

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
+from ..robots.body_plan import body_plan, mirror_image
+from ..robots.geometry import joint_ranges
 from ..robots.rotation import rotate_inverse
+from .configuration import ConfigurationError
 from .curriculum import TrainingPalette
 from .environment_configuration import EnvironmentConfiguration
 from .environment_memory import EnvironmentMemory
-from .events import joint_ranges
 from .height_scan import HeightRasters, heading_and_upright, place_pattern
 from .step_inputs import StepInputs
 
@@ -45,17 +48,30 @@ class StepReader:
         self._period = configuration.physics.control_period
         self._longest = round(configuration.episode_length / self._period)
         self._device = device = kind.device
-        near = (scan[:, 0].abs() <= 0.2 + 1e-4) & (scan[:, 1].abs() <= 0.15 + 1e-4)
-        self._trunk_points = scan[near]
+        area = 0.5 * torch.tensor(self._settings.trunk_area, device=device) + 1e-4
+        self._trunk_points = scan[(scan.abs() <= area).all(dim=1)]
+        if not len(self._trunk_points):
+            length, width = self._settings.trunk_area
+            raise ConfigurationError(
+                f"rewards.trunk_area is {length:g} x {width:g} m, which holds no point of the height scan; make it larger"
+            )
         self._default_pose = torch.tensor(robot.default_joint_position, device=device)
-        ranges = joint_ranges(robot).to(device)
+        ranges = torch.from_numpy(joint_ranges(robot)).float().to(device)
         lower, upper = ranges.unbind(1)
         middle, half = ranges.mean(dim=1), 0.5 * (upper - lower) * self._settings.soft_limit
-        self._soft_lower, self._soft_upper = middle - half, middle + half
-        self._hips = self._indices(robot.joint_names, "hip")
-        bodies = robot.collision_bodies
-        self._base = bodies.index(robot.base_body)
-        self._legs = torch.cat((self._indices(bodies, "thigh"), self._indices(bodies, "calf")))
+        limited = ranges.isfinite().all(dim=1)
+        self._soft_lower = torch.where(limited, middle - half, lower)
+        self._soft_upper = torch.where(limited, middle + half, upper)
+        plan = body_plan(robot)
+        self._hips = self._indices(plan.abduction)
+        pairs: list[tuple[int, int, float]] = []
+        if self._settings.hip_symmetry:
+            mirror = mirror_image(robot)
+            pairs = [(i, mirror.joint[i], mirror.sign[i]) for i in plan.abduction if i < mirror.joint[i]]
+        self._hip_pairs = self._indices([pair[:2] for pair in pairs]).view(-1, 2)
+        self._hip_signs = torch.tensor([sign for *_, sign in pairs], device=device)
+        self._base = robot.collision_bodies.index(robot.base_body)
+        self._limbs = self._indices(plan.limb_bodies)
         r, tiles = self._settings, palette.tiles
         sigma = torch.tensor([tile.sigma for tile in tiles], device=device)[kind]
         self._sigma_growth = sigma - r.tracking_sigma
@@ -68,8 +84,7 @@ class StepReader:
         distance = [leave if leave is not None and tile.ends else math.inf for tile in tiles]
         self._leave = torch.tensor(distance, device=device)[kind]
 
-    def _indices(self, names: tuple[str, ...], part: str) -> torch.Tensor:
-        found = [i for i, name in enumerate(names) if part in name]
+    def _indices(self, found: Sequence[int] | Sequence[tuple[int, int]]) -> torch.Tensor:
         return torch.tensor(found, dtype=torch.int64, device=self._device)
 
     def sigma(self, memory: EnvironmentMemory) -> torch.Tensor:
@@ -124,12 +139,14 @@ class StepReader:
             soft_lower=self._soft_lower,
             soft_upper=self._soft_upper,
             hip_joints=self._hips,
+            hip_pairs=self._hip_pairs,
+            hip_signs=self._hip_signs,
             action=action,
             previous_action=memory.action,
             second_previous_action=memory.previous_action,
             foot_height=state.foot_position_w[..., 2] - below_feet,
             foot_velocity_w=state.foot_velocity_w,
-            touching_bodies=(touching[:, self._legs] > settings.collision_force).sum(dim=1).float(),
+            touching_bodies=(touching[:, self._limbs] > settings.collision_force).sum(dim=1).float(),
             base_touching=(touching[:, self._base] > settings.collision_force).float(),
             upright=upright,
             trunk_contact_force_w=state.trunk_contact_force_w,

@@ -51,7 +51,7 @@ class Reference:
         self.model.dof_frictionloss[self.at_velocity] = parameters.friction_loss
         self.base = self.model.body(robot.base_body).id
         self.bodies = np.array([self.model.body(name).id for name in robot.collision_bodies])
-        self.feet = np.array([self.model.geom(name).id for name in robot.foot_names])
+        self.feet = np.array([self.model.geom(name).id for name in robot.foot_geoms])
         self.foot_radius = float(self.model.geom_size[self.feet[0], 0])
         self.torque = np.zeros(robot.num_joints)
         self.force_w = np.zeros(3)
@@ -166,7 +166,7 @@ class Reference:
 def _add_ground(spec: mujoco.MjSpec, robot: Robot, physics: PhysicsOptions) -> None:
     """Add a plane and a solver that iterates until it has converged."""
     for geom in spec.geoms:
-        if geom.name in robot.foot_names and physics.foot_condim is not None:
+        if geom.name in robot.foot_geoms and physics.foot_condim is not None:
             geom.condim = physics.foot_condim
         if not physics.self_collision and (geom.contype or geom.conaffinity):
             geom.contype, geom.conaffinity = 0, 1

@@ -11,7 +11,7 @@ from ..description import ModelFields
 
 def describe_model(model: mujoco.MjModel, robot: Robot) -> dict[str, list[float]]:
     """A world's model as ``PhysicsBackend.describe`` says."""
-    feet, floor = [model.geom(f).id for f in robot.foot_names], model.geom("floor").id
+    feet, floor = [model.geom(f).id for f in robot.foot_geoms], model.geom("floor").id
     bodies = [model.body(name).id for name in robot.collision_bodies]
     joints = [model.joint(name).id for name in robot.joint_names]
     dofs = model.jnt_dofadr[joints]

@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from ...robots.base import Robot
 from ...terrains.base import Terrain
 from ..base import BackendError, Scene
 
@@ -18,6 +19,8 @@ CONTACT_SLOTS = 12
 """Ground contacts reported one by one, the strongest first; a robot that lies flat has about this many."""
 FOOT_SLOTS = 3
 """Contacts reported one by one for each foot."""
+FOOT_SITE = "centre of {}"
+"""Name of the site that the engine puts into a foot."""
 NOTHING: dict[str, Any] = {"contype": 2, "conaffinity": 0}
 """Meets nothing, yet counts as a collision geom, so that all models of a layout have bounding-volume trees of one size."""
 PARKED: dict[str, Any] = {"size": [0.01, 0.01, 0.01], "pos": [0.0, 0.0, -1.0], **NOTHING}
@@ -52,15 +55,24 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
         joint.damping = np.array([constants.joint_damping[j], 0.0, 0.0])
         joint.frictionloss = constants.friction_loss[j]
     _set_motors(spec, scene)
+    weighed = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     for geom in list(spec.geoms):
         if not (geom.contype or geom.conaffinity):
-            spec.delete(geom)  # visual only: costs time in every step
+            if geom.parent.explicitinertial and not weighed:  # otherwise it may be what the body weighs
+                spec.delete(geom)  # visual only: costs time in every step
             continue
-        if geom.name in robot.foot_names and physics.foot_condim is not None:
+        if geom.name in robot.foot_geoms and physics.foot_condim is not None:
             geom.condim = physics.foot_condim
         if not physics.self_collision and (geom.contype or geom.conaffinity):
             geom.contype, geom.conaffinity = 0, 1  # the ground's contype 1 still meets it, other robot geoms do not
     return spec
+
+
+def _mark_feet(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Put a site at the centre of each foot's geom, whose motion sensors can report."""
+    compiled = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    for name, shape in zip(robot.foot_names, robot.foot_geoms, strict=True):
+        spec.geom(shape).parent.add_site(name=FOOT_SITE.format(name), pos=compiled.geom(shape).pos)
 
 
 def _set_motors(spec: mujoco.MjSpec, scene: Scene) -> None:
@@ -123,6 +135,7 @@ def add_terrain(
 def add_report_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
     """Add the sensors from which the engine reads foot velocities and ground contacts."""
     robot = scene.robot
+    _mark_feet(spec, robot)
 
     def contact(name: str, reduce: str, data: tuple[str, ...], slots: int, **objects: tuple[int, str]) -> None:
         sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)
@@ -134,15 +147,15 @@ def add_report_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
 
     body, geom, tree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_XBODY
     everything = (tree, "environment")
-    for foot in robot.foot_names:
+    for foot, shape in zip(robot.foot_names, robot.foot_geoms, strict=True):
         spec.add_sensor(
             name=f"velocity_{foot}",
             type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
             objtype=mujoco.mjtObj.mjOBJ_SITE,
-            objname=foot,
+            objname=FOOT_SITE.format(foot),
         )
-        contact(f"net_{foot}", "netforce", ("force",), 1, robot=(geom, foot), other=everything)
-        contact(f"each_{foot}", "maxforce", ("force",), FOOT_SLOTS, robot=(geom, foot), other=everything)
+        contact(f"net_{foot}", "netforce", ("force",), 1, robot=(geom, shape), other=everything)
+        contact(f"each_{foot}", "maxforce", ("force",), FOOT_SLOTS, robot=(geom, shape), other=everything)
     for name in robot.collision_bodies:
         contact(f"body_{name}", "netforce", ("force",), 1, robot=(body, name), other=everything)
     for name in robot.trunk_shapes:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..base import PhysicsState, Scene
-from .model import CONTACT_SLOTS, FOOT_SLOTS
+from .model import CONTACT_SLOTS, FOOT_SITE, FOOT_SLOTS
 
 RECORDED = ("qpos", "qvel", "sensordata", "actuator_force", "site_xpos")
 """What the engine records after each substep. Positions and velocities are the new ones in qpos and qvel alone; elsewhere they
@@ -31,7 +31,7 @@ class StateLayout:
         self.timestep = scene.physics.timestep
         self.joint_q = _as_slice(np.array([model.joint(j).qposadr[0] for j in robot.joint_names]))
         self.joint_v = _as_slice(np.array([model.joint(j).dofadr[0] for j in robot.joint_names]))
-        self.foot_sites = np.array([model.site(f).id for f in robot.foot_names])
+        self.foot_sites = np.array([model.site(FOOT_SITE.format(f)).id for f in robot.foot_names])
 
         def columns(name: str) -> NDArray[np.int64]:
             sensor = model.sensor(name)
@@ -47,8 +47,9 @@ class StateLayout:
         watched = scene.physics.watch_penetration is not None
         self.penetration = int(columns("penetration")[1]) if watched else None
         # the body that a foot geom belongs to reports its force too: it is subtracted there
-        bodies = [model.body(b).id for b in robot.collision_bodies]
-        self.foot_owner = [bodies.index(model.geom(f).bodyid[0]) for f in robot.foot_names]
+        bodies = {model.body(b).id: i for i, b in enumerate(robot.collision_bodies)}
+        owners = [(foot, bodies.get(model.geom(g).bodyid[0])) for foot, g in enumerate(robot.foot_geoms)]
+        self.foot_owner = [(foot, owner) for foot, owner in owners if owner is not None]
 
 
 class BatchState(PhysicsState):
@@ -151,7 +152,7 @@ class BatchState(PhysicsState):
         feet = -sensors[:, layout.foot_net]
         each = sensors[:, layout.foot_each].reshape(n, -1, FOOT_SLOTS, 3)
         bodies = -sensors[:, layout.body_net]
-        for foot, owner in enumerate(layout.foot_owner):
+        for foot, owner in layout.foot_owner:
             bodies[:, owner] -= feet[:, foot]
         ground = sensors[:, layout.ground]
         force = -ground[:, 0:3]

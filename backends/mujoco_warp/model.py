@@ -151,7 +151,7 @@ def build_shared_model(scene: Scene) -> SharedModel:
     index = {int(b): i for i, b in enumerate(bodies)}
     trunk = [_geom(model, scene, name) for name in scene.robot.trunk_shapes]
     geom_foot = np.full(model.ngeom, -1, dtype=np.int32)
-    for i, name in enumerate(robot.foot_names):
+    for i, name in enumerate(robot.foot_geoms):
         geom_foot[_geom(model, scene, name)] = i
     return SharedModel(
         model=model,
@@ -285,7 +285,7 @@ def _foot_chains(model: mujoco.MjModel, scene: Scene, base: int) -> FootChains:
     rows: list[tuple[Floats, Floats, int]] = []
     feet: list[Floats] = []
     unit = np.array([1.0, 0.0, 0.0, 0.0])
-    for name in scene.robot.foot_names:
+    for name in scene.robot.foot_geoms:
         geom = _geom(model, scene, name)
         feet.append(model.geom_pos[geom].copy())
         chain: list[int] = []

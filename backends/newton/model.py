@@ -319,7 +319,7 @@ def _layout(
     shapes = {_leaf(label): i for i, label in enumerate(world.shape_label[:robot_shapes])}
     for what, names, known in (
         ("body", (robot.base_body, *robot.collision_bodies), bodies),
-        ("foot", robot.foot_names, shapes),
+        ("foot", robot.foot_geoms, shapes),
         ("trunk shape", robot.trunk_shapes, shapes),
     ):
         missing = [name for name in names if name not in known]
@@ -335,14 +335,14 @@ def _layout(
     foot, body = np.full(count, -1, dtype=np.int32), np.full(count, -1, dtype=np.int32)
     trunk, ground = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.int32)
     slot = np.full(count, -1, dtype=np.int32)
-    for i, name in enumerate(robot.foot_names):
+    for i, name in enumerate(robot.foot_geoms):
         foot[shapes[name]] = i
     trunk[[shapes[name] for name in robot.trunk_shapes]] = 1
     for shape in range(robot_shapes):
         body[shape] = body_index.get(world.shape_body[shape], -1)
     ground[robot_shapes:] = 1
     slot[slot_shapes] = np.arange(len(slot_shapes))
-    feet = [shapes[name] for name in robot.foot_names]
+    feet = [shapes[name] for name in robot.foot_geoms]
     return WorldLayout(
         coordinates=len(world.joint_q),
         dofs=len(world.joint_qd),
@@ -353,7 +353,7 @@ def _layout(
         joint_v=np.array([world.joint_qd_start[j] for j in joints], dtype=np.int32),
         collision_bodies=np.array([bodies[name] for name in robot.collision_bodies], dtype=np.int32),
         foot_body=np.array([world.shape_body[s] for s in feet], dtype=np.int32),
-        foot_center=np.array([reference.geom(name).pos for name in robot.foot_names]),
+        foot_center=np.array([reference.geom(name).pos for name in robot.foot_geoms]),
         shape_foot=foot,
         shape_body=body,
         shape_trunk=trunk,

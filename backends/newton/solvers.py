@@ -233,7 +233,7 @@ def _constraint_rows(scene: Scene, world: WorldModel, contacts: int) -> int:
     """Constraint rows of one world: joint friction, joint limits and contacts, feet with their own dimension."""
     reference, elliptic = world.reference, scene.physics.cone == "elliptic"
     rows = int(np.count_nonzero(reference.dof_frictionloss > 0)) + int(reference.jnt_limited.sum())
-    for name in scene.robot.foot_names:
+    for name in scene.robot.foot_geoms:
         dimension = max(int(reference.geom(name).condim[0]), 3)
         # a foot has two contacts at most times: the ground and another box
         rows += 2 * ((dimension - 3) if elliptic else 2 * (dimension - 3))
@@ -371,7 +371,7 @@ class SteelAdapter(SolverAdapter):
         contacts = _contacts_per_world(scene, world)
         self._timestep = physics.timestep
         # one coefficient acts, and the mean of two equal ones is it: the feet's, until it is randomized
-        feet = float(np.mean([world.reference.geom(name).friction[0] for name in scene.robot.foot_names]))
+        feet = float(np.mean([world.reference.geom(name).friction[0] for name in scene.robot.foot_geoms]))
         model.shape_material_mu.fill_(feet)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

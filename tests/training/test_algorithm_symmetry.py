@@ -4,7 +4,6 @@ from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.symmetry import (
     MirrorMap,
     SymmetryError,
-    mirror_by_name,
     mirror_points,
 )
 from gaitgauge.training.height_scan import scan_pattern
@@ -71,8 +70,3 @@ def test_a_scan_keeps_its_middle_line():
 def test_points_without_an_image_are_refused():
     with pytest.raises(SymmetryError, match=r"point \[0\.0, 0\.5\d*\] has no mirror image"):
         mirror_points(torch.tensor([[0.0, 0.5], [0.0, 0.0]]))
-
-
-def test_unpaired_names_are_refused():
-    with pytest.raises(SymmetryError, match="No mirror image of 'FL_hip_joint'"):
-        mirror_by_name(["FL_hip_joint", "RR_hip_joint"])

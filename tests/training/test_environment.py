@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from gaitgauge.backends.fake import FakeBackend, FakeScript
+from gaitgauge.robots.geometry import joint_ranges
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
     CommandConfiguration,
@@ -17,7 +18,6 @@ from gaitgauge.training.environment_configuration import (
     ResetConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge.training.events import joint_ranges
 from small_environment import FLAT, STAIRS, gliding, idle, make
 
 NEVER = math.inf
@@ -207,7 +207,7 @@ def test_episodes_start_above_the_highest_ground_below_the_robot():
 def test_joints_start_within_their_limits():
     environment = make(300, reset=ResetConfiguration())
     position = environment.backend.state.joint_position.float()
-    lower, upper = joint_ranges(environment.robot).unbind(1)
+    lower, upper = torch.from_numpy(joint_ranges(environment.robot)).float().unbind(1)
     assert (position >= lower - 1e-6).all() and (position <= upper + 1e-6).all()
     assert (position.std(dim=0) > 0.02).all()
 

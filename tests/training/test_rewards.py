@@ -30,6 +30,8 @@ def quiet():
         soft_lower=torch.full((12,), -1.0),
         soft_upper=torch.full((12,), 1.0),
         hip_joints=torch.tensor([0, 3, 6, 9]),
+        hip_pairs=torch.tensor([[0, 3], [6, 9]]),
+        hip_signs=torch.tensor([-1.0, -1.0]),
         action=joints,
         previous_action=joints,
         second_previous_action=joints,
@@ -178,7 +180,7 @@ def test_weights_follow_progress(quiet):
 
 def test_every_weight_names_a_term():
     settings = {"tracking_sigma", "dynamic_sigma", "sigma_linear_range", "sigma_yaw_range", "base_height_target"}
-    settings |= {"foot_height_scale", "foot_height_over", "collision_force", "soft_limit", "own"}
+    settings |= {"foot_height_scale", "foot_height_over", "collision_force", "soft_limit", "own", "trunk_area"}
     assert {f.name for f in fields(RewardConfiguration)} - settings == set(REWARD_TERMS)
 
 

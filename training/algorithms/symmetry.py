@@ -1,30 +1,26 @@
 """Left-right mirror images of observations and actions of a legged robot.
 
 Mirroring at the robot's sagittal plane (y to -y) keeps the x and z entries of a vector and flips its y entry; of an
-axial vector such as an angular velocity it flips x and z and keeps y. Left legs change places with right legs, and
-joints that turn about the x axis (hip abduction) change sign.
+axial vector such as an angular velocity it flips x and z and keeps y. Left legs change places with right legs; which
+joint is whose image, and which change sign, is read off the robot's model (``robots.body_plan``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from ...policy.contract import PolicyContract
 from ...robots.base import Robot
+from ...robots.body_plan import mirror_image
 from ..environment_configuration import ObservationConfiguration
 from ..height_scan import scan_pattern
 
-# Name prefixes of the left legs and of their mirror images.
-LEG_PAIRS: tuple[tuple[str, str], ...] = (("FL", "FR"), ("RL", "RR"), ("LF", "RF"), ("LH", "RH"), ("left_", "right_"))
-# What the name of a joint about the x axis contains.
-ABDUCTION_MARKS: tuple[str, ...] = ("hip", "HAA", "abduction", "hx")
-
 
 class SymmetryError(ValueError):
-    """The robot's names or poses do not tell what its mirror image is."""
+    """What the networks see has no mirror image."""
 
 
 @dataclass(frozen=True)
@@ -70,35 +66,6 @@ PLANAR_COMMAND = MirrorMap.signs(1.0, -1.0, -1.0)
 """Forward, lateral and yaw speed."""
 
 
-def _mirrored_name(name: str) -> str:
-    for left, right in LEG_PAIRS:
-        for here, there in ((left, right), (right, left)):
-            if name.startswith(here):
-                return there + name[len(here) :]
-    return name
-
-
-def mirror_by_name(names: Sequence[str], flipped_marks: Sequence[str] = ()) -> MirrorMap:
-    """Map that exchanges entries named for left and right legs.
-
-    Args:
-        names: name of each entry, legs as prefix (``FL_hip_joint``).
-        flipped_marks: an entry whose name contains one of these changes sign.
-
-    Raises:
-        SymmetryError: an entry has no mirror image among the names.
-    """
-    position = {name: i for i, name in enumerate(names)}
-    missing = [name for name in names if _mirrored_name(name) not in position]
-    if missing:
-        raise SymmetryError(
-            f"No mirror image of {missing[0]!r} ({_mirrored_name(missing[0])!r}) among {', '.join(names)}."
-        )
-    index = torch.tensor([position[_mirrored_name(name)] for name in names])
-    sign = torch.tensor([-1.0 if any(mark in name for mark in flipped_marks) else 1.0 for name in names])
-    return MirrorMap(index, sign)
-
-
 def mirror_points(points: torch.Tensor) -> MirrorMap:
     """Map of values at points (P, 2), the x and y positions of a height scan: each takes the value at its mirror image.
 
@@ -140,24 +107,22 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
     Args:
         observations: gives the frames of the history and the points of the height scan.
         contract: gives the terms of the policy frame and the joint order.
-        robot: gives the foot names.
+        robot: gives the mirror images of joints and feet.
 
     Raises:
-        SymmetryError: names do not pair up, the default pose is not its own mirror image, or there are observations of
-            one's own.
+        RobotError: a joint or a foot has no mirror image in the contract's default pose.
+        SymmetryError: there are observations of one's own.
     """
     if observations.own:
         raise SymmetryError(
             f"The mirror image of the observation '{observations.own[0].name}' is not known; set "
             "training.algorithm.symmetry=none."
         )
-    joints = mirror_by_name(contract.joint_names, ABDUCTION_MARKS)
-    pose = torch.tensor(contract.default_joint_position)
-    if not torch.allclose(joints(pose), pose, atol=1e-6):
-        raise SymmetryError(
-            "The default pose is not its own mirror image, so joint positions relative to it cannot be mirrored: "
-            f"{contract.default_joint_position}."
-        )
+    # angles are relative to the contract's pose, in its order
+    image = mirror_image(
+        replace(robot, joint_names=contract.joint_names, default_joint_position=contract.default_joint_position)
+    )
+    joints = MirrorMap(torch.tensor(image.joint), torch.tensor(image.sign))
     terms = {
         "base_linear_velocity_b": VECTOR,
         "base_angular_velocity_b": AXIAL_VECTOR,
@@ -168,7 +133,7 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
         "last_action": joints,
     }
     frame = MirrorMap.joined([terms[term.name] for term in contract.observation])
-    feet = mirror_by_name(robot.foot_names)
+    feet = MirrorMap(torch.tensor(image.foot), torch.ones(len(image.foot)))
     scan = scan_pattern(observations.scan_length, observations.scan_width, observations.scan_spacing, "cpu")
     return Mirror(
         policy=frame,

@@ -1,0 +1,191 @@
+"""How a legged robot is built, read off its MuJoCo model in the default pose: legs, mirror images, sizes.
+
+Nothing here goes by names. Frames are the base's: x forward, y left, z up, origin at the base.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import Robot
+from .loading import RobotError
+
+if TYPE_CHECKING:
+    import mujoco
+
+LEG_PARTS = ("hip", "thigh", "calf")
+_MIRROR = np.array([1.0, -1.0, 1.0])
+_APART = 0.01
+"""Largest distance of a joint or foot from the mirror image of its counterpart [m]."""
+_ALIGNED = 0.999
+"""Smallest cosine between a joint's axis and the mirror image of its counterpart's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MirrorImage:
+    """What becomes of joints and feet when the robot is mirrored at its sagittal plane (y to −y)."""
+
+    joint: tuple[int, ...]
+    """Counterpart of each joint, an index in the robot's joint order."""
+    sign: tuple[float, ...]
+    """Factor of each joint's angle from the default pose: −1 where the counterpart turns the other way."""
+    foot: tuple[int, ...]
+    """Counterpart of each foot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyPlan:
+    """A robot's legs and sizes."""
+
+    legs: tuple[tuple[int, ...], ...]
+    """Joints of each foot's leg from the base outwards, indices in the robot's joint order."""
+    abduction: tuple[int, ...]
+    """Joint of each leg that swings it sideways, the first about the x axis; legs without one are left out."""
+    limb_bodies: tuple[int, ...]
+    """Which of ``collision_bodies`` are thighs, calves and what hangs on them: moved by more than an abduction joint."""
+    foot_position: NDArray[np.float64]
+    """Centres of the feet in the default pose [m], (F, 3)."""
+    standing_height: float
+    """Height of the base above level ground that the lowest foot touches in the default pose [m]."""
+    leg_length: float
+    """Length of a stretched leg [m]: the links from its first joint beside abduction to the foot, the mean of all legs."""
+    mass: float
+    """Of the whole robot [kg]."""
+
+    def part(self, joint: int) -> str:
+        """What a joint moves, in the words of ``LEG_PARTS``: the last of a leg its calf, abduction its hip, any other its
+        thigh; empty for a joint of no leg.
+        """
+        for leg in self.legs:
+            if joint in leg:
+                return "hip" if joint in self.abduction else "calf" if joint == leg[-1] else "thigh"
+        return ""
+
+
+def body_plan(robot: Robot) -> BodyPlan:
+    """Read legs and sizes off a robot's model.
+
+    Raises:
+        RobotError: a foot does not hang on the base by joints of ``joint_names``.
+    """
+    model, data = default_pose(robot)
+    order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
+    base = model.body(robot.base_body).id
+    feet = [model.geom(name).id for name in robot.foot_geoms]
+    legs, abduction, lengths = [], [], []
+    for name, foot in zip(robot.foot_names, feet, strict=True):
+        chain = _chain(model, int(model.geom_bodyid[foot]), base)
+        if not chain or any(j not in order for j in chain):
+            raise RobotError(f"robot '{robot.name}': the foot '{name}' is not moved by joints of joint_names")
+        legs.append(tuple(order[j] for j in chain))
+        sideways = next((j for j in chain if _sideways(data, j)), None)
+        if sideways is not None:
+            abduction.append(order[sideways])
+        swinging = [j for j in chain if j != sideways] or chain
+        ends = [*(data.xanchor[j] for j in swinging), data.geom_xpos[foot]]
+        # what lies along a hinge is width, not length
+        lengths.append(
+            sum(
+                float(np.linalg.norm(link - axis * (link @ axis)))
+                for link, axis in zip(np.diff(ends, axis=0), data.xaxis[swinging], strict=True)
+            )
+        )
+    sideways_ids = {model.joint(robot.joint_names[i]).id for i in abduction}
+    bodies = [_chain(model, model.body(name).id, base) for name in robot.collision_bodies]
+    return BodyPlan(
+        legs=tuple(legs),
+        abduction=tuple(abduction),
+        limb_bodies=tuple(i for i, chain in enumerate(bodies) if set(chain) - sideways_ids),
+        foot_position=data.geom_xpos[feet].copy(),
+        standing_height=max(-_lowest_point(model, data, foot) for foot in feet),
+        leg_length=float(np.mean(lengths)),
+        mass=float(model.body_mass.sum()),
+    )
+
+
+def mirror_image(robot: Robot) -> MirrorImage:
+    """Find the counterparts of joints and feet, by where they are and how they turn in the default pose.
+
+    Raises:
+        RobotError: a joint or foot has no mirror image.
+    """
+    model, data = default_pose(robot)
+    joints = [model.joint(name).id for name in robot.joint_names]
+    anchors, axes = data.xanchor[joints], data.xaxis[joints]
+    # a rotation about an axis, seen in a mirror, is one about minus the axis's image
+    images, turned = anchors * _MIRROR, -axes * _MIRROR
+    counterpart, sign = [], []
+    for i, name in enumerate(robot.joint_names):
+        along = axes @ turned[i]
+        distance = np.linalg.norm(anchors - images[i], axis=1) + np.where(np.abs(along) >= _ALIGNED, 0.0, np.inf)
+        found = int(distance.argmin())
+        if distance[found] > _APART:
+            raise _no_image(robot, "joint", name, images[i])
+        counterpart.append(found)
+        sign.append(float(np.sign(along[found])))
+    feet = data.geom_xpos[[model.geom(name).id for name in robot.foot_geoms]]
+    pairs = []
+    for name, image in zip(robot.foot_names, feet * _MIRROR, strict=True):
+        distance = np.linalg.norm(feet - image, axis=1)
+        if distance.min() > _APART:
+            raise _no_image(robot, "foot", name, image)
+        pairs.append(int(distance.argmin()))
+    for what, found_pairs in (("joints", counterpart), ("feet", pairs)):
+        if [found_pairs[i] for i in found_pairs] != list(range(len(found_pairs))):
+            raise RobotError(
+                f"robot '{robot.name}': its {what} do not pair up left and right; train with "
+                "training.algorithm.symmetry=none"
+            )
+    return MirrorImage(joint=tuple(counterpart), sign=tuple(sign), foot=tuple(pairs))
+
+
+def _no_image(robot: Robot, kind: str, name: str, image: NDArray[np.float64]) -> RobotError:
+    x, y, z = (f"{v:.3f}" for v in image)
+    return RobotError(
+        f"robot '{robot.name}': in the default pose the {kind} '{name}' has no counterpart at its mirror image "
+        f"({x}, {y}, {z}) m; mend default_joint_position or the model, or train with training.algorithm.symmetry=none"
+    )
+
+
+def default_pose(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The robot's model, and its kinematics in the default pose with the base at the origin, level and unturned."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    data = mujoco.MjData(model)
+    start = model.jnt_qposadr[model.body(robot.base_body).jntadr[0]]
+    data.qpos[start : start + 7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    for name, angle in zip(robot.joint_names, robot.default_joint_position, strict=True):
+        data.joint(name).qpos[0] = angle
+    mujoco.mj_kinematics(model, data)
+    return model, data
+
+
+def _chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
+    """Joints that move a body against the base, from the base outwards."""
+    joints: list[int] = []
+    while body not in (base, 0):
+        first = int(model.body_jntadr[body])
+        joints = [first + i for i in range(model.body_jntnum[body])] + joints
+        body = int(model.body_parentid[body])
+    return joints
+
+
+def _sideways(data: mujoco.MjData, joint: int) -> bool:
+    """Whether a joint turns more about the x axis than about any other."""
+    return int(np.abs(data.xaxis[joint]).argmax()) == 0
+
+
+def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Height of the lowest point of a geom, of its box for what is no sphere [m]."""
+    import mujoco
+
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return float(data.geom_xpos[geom, 2] - model.geom_size[geom, 0])
+    center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    up = data.geom_xmat[geom].reshape(3, 3)[2]
+    return float(data.geom_xpos[geom, 2] + up @ center - np.abs(up) @ half)
