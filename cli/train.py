@@ -11,7 +11,8 @@ from typing import Any
 
 import typer
 
-from ..training.launch import TrainRequest, prepare, train
+from ..training.configuration import RunConfiguration
+from ..training.launch import TrainPlan, TrainRequest, prepare, train
 from ..training.stopping import Progress
 from .console import Terminal, shell_command
 from .errors import UserError
@@ -46,10 +47,20 @@ def run_training(*, task: str, time: str | None, **choices: Any) -> None:
     if (run / "best.pt").is_file():
         console.say(f"best by the gauge's score: {run / 'best.pt'}")
     if outcome.reason != "finished":
-        again = shell_command(["train", task, "--resume", str(run)], *(["--trust"] if plan.needs_trust else []))
+        again = shell_command(["train", task, "--resume", str(run)], *_again(plan))
         console.say(f"go on with:\n  {again}")
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
+
+
+def _again(plan: TrainPlan) -> list[str]:
+    """What a resume must be told anew, since checkpoints do not decide it: trust, and where data go."""
+    run, usual = plan.task.training.run, RunConfiguration()
+    found = ["--trust"] if plan.needs_trust else []
+    found += ["--logger", run.logger] if run.logger != usual.logger else []
+    return found + (
+        [f"training.run.logger_project={run.logger_project}"] if run.logger_project != usual.logger_project else []
+    )
 
 
 def parse_duration(text: str) -> float:

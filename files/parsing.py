@@ -63,7 +63,7 @@ def shown(value: object) -> str:
     """A value as it stands in a sentence: shortened, control characters escaped."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = _SHOWN
-    text = short.repr(value)
+    text = " ".join(short.repr(value).splitlines())
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
 
 

@@ -23,8 +23,8 @@ from .adapters import (
 )
 from .base import PolicyError
 from .contract import ContractError, PolicyContract, check_robot, go2_contract
-from .fence.archive import LARGEST_FILE, archive_names
-from .native import FORMAT, FilePolicy, ForeignFile, NativePolicy, StoredNetwork, load_entries, read_policy
+from .fence.archive import archive_names, read_limited
+from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 from .rebuilt import rebuilt
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def load_policy(
         ContractError: the policy is for another robot or other joints.
     """
     path = find_policy(path_or_name, log_root=log_root)
-    data = _read(path)
+    data = read_limited(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
     contract = None if contract_file is None else described_contract(contract_file, stand_in)
     policy = rebuilt(_load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract))
@@ -128,19 +128,6 @@ def _named(name: str, log_root: Path) -> Path:
     )
 
 
-def _read(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            data = file.read(LARGEST_FILE + 1)
-    except OSError as error:
-        raise PolicyError(f"'{path}' cannot be read: {error.strerror}") from error
-    if not data:
-        raise PolicyError(f"'{path}' is empty")
-    if len(data) > LARGEST_FILE:
-        raise PolicyError(f"'{path}' is larger than {LARGEST_FILE // 2**20} MiB, the most that is read of a policy")
-    return data
-
-
 def _load(
     data: bytes, path: Path, source: str, robot: Robot, *, trust: bool, contract: PolicyContract | None
 ) -> FilePolicy:
@@ -153,7 +140,7 @@ def _load(
             f"'{source}' is neither TorchScript nor ONNX, and has its contract inside; leave out --contract"
         )
     entries = load_entries(data, source=source)
-    if entries.get("format") == FORMAT:
+    if is_policy(entries):
         stored = read_policy(entries, source=source)
         if isinstance(stored.network, StoredNetwork):
             return NativePolicy(stored.contract, stored.network, path=source)

@@ -36,6 +36,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..files.parsing import shown
 from ..files.writing import replacing
 from .base import Policy, PolicyError, PolicySession, check_observation, checked_action
 from .contract import ContractError, PolicyContract
@@ -173,6 +174,12 @@ def checksum(entries: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
+def is_policy(entries: Mapping[str, Any]) -> bool:
+    """Whether a loaded file's dictionary is of the project's own format."""
+    name = entries.get("format")
+    return isinstance(name, str) and name == FORMAT
+
+
 def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
     """Take the parts out of a loaded file's dictionary.
 
@@ -183,9 +190,10 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
     Raises:
         PolicyError: the file is of another version, incomplete or malformed.
     """
-    if entries.get("version") != VERSION:
+    version = entries.get("version")
+    if type(version) is not int or version != VERSION:
         raise PolicyError(
-            f"'{source}' has version {entries.get('version')!r} of the policy format; this gaitgauge reads {VERSION}"
+            f"'{source}' has version {shown(version)} of the policy format; this gaitgauge reads {VERSION}"
         )
     text, spec = entries.get("contract"), entries.get("network")
     if "checksum" in entries and not _intact(entries):
@@ -199,13 +207,13 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
     except ContractError as error:
         raise PolicyError(f"'{source}' has a malformed contract: {error}") from error
     kind = spec.get("kind")
-    if kind in FOREIGN_KINDS:
+    if isinstance(kind, str) and kind in FOREIGN_KINDS:
         data = spec.get("bytes")
         if not isinstance(data, torch.Tensor) or data.dtype != torch.uint8:
             raise PolicyError(f"'{source}' says that it carries a {kind} file, but has none")
         return PolicyFile(contract=contract, network=ForeignFile(kind=kind, data=data.numpy().tobytes()))
-    if kind != "native":
-        raise PolicyError(f"'{source}' has a network of unknown kind {kind!r}")
+    if not isinstance(kind, str) or kind != "native":
+        raise PolicyError(f"'{source}' has a network of unknown kind {shown(kind)}")
     state_dict = entries.get("state_dict")
     if not isinstance(state_dict, Mapping) or not all(isinstance(v, torch.Tensor) for v in state_dict.values()):
         raise PolicyError(f"'{source}' has no state_dict of tensors")

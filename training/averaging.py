@@ -53,10 +53,18 @@ class WeightAverage:
         return {"iterations": self._count, **self._states}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:
-        """Continue from what ``state_dict`` returned; None begins with the present weights."""
-        self._count = 0 if state is None else state["iterations"]
+        """Continue from what ``state_dict`` returned; None begins with the present weights.
+
+        Raises:
+            ValueError: weights of another shape.
+            LookupError, TypeError, AttributeError: it is no such state.
+        """
+        self._count = 0 if state is None else int(state["iterations"])
         now = iter(self._now)
         for name, mean in self._states.items():
             for key, value in mean.items():
                 present = next(now)
-                value.copy_(present if state is None else state[name][key])
+                kept = present if state is None else state[name][key]
+                if kept.shape != value.shape:
+                    raise ValueError(f"the average of {key} has shape {tuple(kept.shape)}, not {tuple(value.shape)}")
+                value.copy_(kept)

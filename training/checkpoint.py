@@ -13,16 +13,19 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 
+from ..files.parsing import Count, Text, build, edited, shown
 from ..files.writing import replacing
 from ..policy.base import PolicyError
 from ..policy.contract import PolicyContract
-from ..policy.native import FORMAT, StoredNetwork, checksum, load_entries
+from ..policy.fence.archive import read_limited
+from ..policy.native import FORMAT, ForeignFile, StoredNetwork, checksum, is_policy, load_entries, read_policy
 from ..policy.native import VERSION as POLICY_VERSION
 
 TRAINING_VERSION = 1
@@ -123,19 +126,14 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True) -> dict[st
     Raises:
         CheckpointError: no such file, damaged, no policy of this project, or a policy without what training needs.
     """
-    file = Path(path)
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise CheckpointError(f"Cannot read checkpoint '{path}': {error.strerror}.") from error
-    try:
-        entries = dict(load_entries(data, source=str(path)))
-    except PolicyError as error:
-        raise CheckpointError(f"Cannot resume: {error}.") from error
+    entries = _load(Path(path))
     training = entries.get("training")
-    if not training_state and training is None and entries.get("format") == FORMAT and "state_dict" in entries:
+    policy = is_policy(entries)
+    if policy:
+        _check_policy(entries, str(path))
+    if not training_state and training is None and policy:
         return entries
-    if entries.get("format") != FORMAT or not isinstance(training, Mapping):
+    if not policy or not isinstance(training, Mapping):
         raise CheckpointError(
             f"Cannot resume from '{path}': it holds no training state; give a model_<iteration>.pt of a training run."
         )
@@ -143,13 +141,73 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True) -> dict[st
         raise CheckpointError(
             f"Cannot resume from '{path}': it holds networks only; begin a new run with them: --init-from {path}."
         )
-    if training.get("version") != TRAINING_VERSION:
+    version = training.get("version")
+    if type(version) is not int or version != TRAINING_VERSION:
         raise CheckpointError(
-            f"Cannot resume from '{path}': its training state has version {training.get('version')!r}, this "
-            "gaitgauge reads "
+            f"Cannot resume from '{path}': its training state has version {shown(version)}, this gaitgauge reads "
             f"{TRAINING_VERSION}."
         )
+    progress = training.get("progress", 1.0)
+    if not isinstance(progress, int | float) or not progress >= 0.0:
+        raise CheckpointError(f"Cannot resume from '{path}': its progress is {shown(progress)}, no share of a run.")
     return entries
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunNumbers:
+    """What a checkpoint says of its run in numbers and names."""
+
+    task: Text
+    iteration: Annotated[int, Field(ge=0, lt=2**53)]
+    """Updates done."""
+    num_envs: Count
+    """Environments of the process that wrote it."""
+    world_size: Annotated[int, Field(ge=0, le=1_000_000)]
+    """Processes of the run; 0 where some were lost."""
+    best_score: float | None
+    best_iteration: Annotated[int, Field(ge=0, lt=2**53)] | None
+
+
+def run_numbers(entries: Mapping[str, Any], path: Path) -> RunNumbers:
+    """The numbers of a checkpoint that ``read_checkpoint`` read with its training state.
+
+    Raises:
+        CheckpointError: one is missing, of the wrong type or out of range.
+    """
+    training = entries["training"]
+    found = {f.name: training[f.name] for f in fields(RunNumbers) if f.name in training}
+    if "iter" in entries:
+        found["iteration"] = entries["iter"]
+    return build(RunNumbers, found, f"Cannot resume from '{path}': its training state", CheckpointError)
+
+
+def read_rank(path: Path, rank: int) -> dict[str, Any]:
+    """What process ``rank`` of a run kept beside a checkpoint.
+
+    Raises:
+        CheckpointError: the file is missing, damaged or holds more than tensors and plain data.
+    """
+    return _load(rank_file(path, rank))
+
+
+def _load(file: Path) -> dict[str, Any]:
+    try:
+        return dict(load_entries(read_limited(file), source=str(file)))
+    except PolicyError as error:
+        raise CheckpointError(f"Cannot resume: {error}.") from error
+
+
+def _check_policy(entries: Mapping[str, Any], source: str) -> None:
+    """Refuse a checkpoint whose policy is damaged, or a program: training goes on with weights."""
+    try:
+        network = read_policy(entries, source=source).network
+    except PolicyError as error:
+        raise CheckpointError(f"Cannot resume: {error}.") from error
+    if isinstance(network, ForeignFile):
+        raise CheckpointError(
+            f"Cannot start from '{source}': it carries a program ({network.kind}), not weights, which is all that training "
+            "takes; --trust changes nothing in that."
+        )
 
 
 def reached(entries: Mapping[str, Any]) -> float:
@@ -182,6 +240,11 @@ def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False)
         CheckpointError: ``source`` is no training checkpoint, or the destination cannot be written.
     """
     entries = read_checkpoint(source)
+    with edited(f"Cannot use '{source}': it", CheckpointError, RuntimeError):
+        _trim(entries, Path(destination), raw=raw)
+
+
+def _trim(entries: Mapping[str, Any], destination: Path, *, raw: bool) -> None:
     networks = learned_networks(entries, raw=raw)
     actor, critic = networks["actor_state_dict"], networks["critic_state_dict"]
     kept = {name: entries[name] for name in ("format", "version", "contract", "network")}

@@ -10,7 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from pathlib import PurePath
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from ..files.parsing import Seed
 from .environment_configuration import Ramp
@@ -20,6 +22,9 @@ SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "alternate")
 PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
 LOGGERS: tuple[str, ...] = ("tensorboard", "wandb", "neptune")
 COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default")
+
+
+Width = Annotated[int, Field(ge=1, le=65_536)]
 
 
 class ConfigurationError(ValueError):
@@ -42,23 +47,23 @@ def _positive(owner: object, *names: str) -> None:
 class NetworkConfiguration:
     """Sizes of the networks. ELU everywhere, PyTorch's own initial weights."""
 
-    latent_width: int = 32
+    latent_width: Width = 32
     """Width of the latent that teacher and student encoders produce on the unit sphere."""
-    teacher_hidden: tuple[int, ...] = (512, 256)
+    teacher_hidden: tuple[Width, ...] = (512, 256)
     """Hidden layers of the teacher encoder."""
     student_encoder: str = "moe"
     """``mlp`` (CTS), ``moe`` (MoE-CTS, the paper's) or ``moe_ng`` (experts that do not see the command)."""
-    student_hidden: tuple[int, ...] = (512, 256)
+    student_hidden: tuple[Width, ...] = (512, 256)
     """Hidden layers of the student encoder, or of the experts' shared trunk."""
-    expert_count: int = 8
+    expert_count: Width = 8
     """Number of experts."""
-    expert_width: int = 256
+    expert_width: Width = 256
     """Private features of each expert."""
-    gate_hidden: tuple[int, ...] = (512, 256)
+    gate_hidden: tuple[Width, ...] = (512, 256)
     """Hidden layers of the gating network."""
-    actor_hidden: tuple[int, ...] = (512, 256, 128)
+    actor_hidden: tuple[Width, ...] = (512, 256, 128)
     """Hidden layers of the actor, shared by teacher and student."""
-    critic_hidden: tuple[int, ...] = (512, 256, 128)
+    critic_hidden: tuple[Width, ...] = (512, 256, 128)
     """Hidden layers of the critic, shared by teacher and student."""
     initial_std: float = 1.0
     """Initial standard deviation of the exploration noise, in network output units."""
@@ -182,6 +187,8 @@ class RunConfiguration:
                 raise ConfigurationError(f"{name} is {getattr(self, name)}; it must be 0 (never) or positive.")
         if PurePath(self.experiment).name != self.experiment or self.experiment in ("", ".."):
             raise ConfigurationError(f"experiment is {self.experiment!r}; it must be a plain folder name.")
+        if self.run_name and PurePath(self.run_name).name != self.run_name:
+            raise ConfigurationError(f"run_name is {self.run_name!r}; it must be a part of a folder's name.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ import torch
 
 from ..backends.base import PhysicsBackend, Randomization
 from .environment_configuration import RandomizationConfiguration, Range
+from .environment_memory import fitting
 
 MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_offset")
 """Names of the uniform numbers that a reset takes, one column per joint each."""
@@ -27,9 +28,13 @@ class BodyParameters:
     base_com_offset: torch.Tensor
     """[m], (N, 3)."""
 
+    def by_name(self) -> dict[str, torch.Tensor]:
+        """The values by their names."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
     def apply(self, backend: PhysicsBackend) -> None:
         """Write the values into the physics of all worlds."""
-        backend.randomize(Randomization(**{f.name: getattr(self, f.name) for f in fields(self)}))
+        backend.randomize(Randomization(**self.by_name()))
 
 
 def draw_bodies(
@@ -76,9 +81,14 @@ class MotorParameters:
         return {name: values.clone() for name, values in self._by_name().items()}
 
     def restore(self, snapshot: Mapping[str, torch.Tensor]) -> None:
-        """Copy a snapshot back."""
-        for name, values in self._by_name().items():
-            values.copy_(snapshot[name])
+        """Copy a snapshot back.
+
+        Raises:
+            ValueError: values are missing or have another shape.
+        """
+        present = self._by_name()
+        for name, values in fitting(snapshot, present).items():
+            present[name].copy_(values)
 
     def apply(self, backend: PhysicsBackend) -> None:
         """Write all worlds' values into the physics.

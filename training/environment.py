@@ -27,6 +27,7 @@ from .configuration import ConfigurationError
 from .curriculum import TrainingPalette, assign_kinds, build_palette
 from .domain_randomization import BodyParameters, draw_bodies
 from .environment_configuration import EnvironmentConfiguration
+from .environment_memory import fitting
 from .events import EpisodeStart
 from .observations import Observations
 from .own_terms import resolve_own
@@ -272,7 +273,7 @@ class TrainingEnvironment(VecEnv):
             "version": STATE_VERSION,
             "step": self.parts.memory.step.clone(),
             "level": self.parts.memory.level.to(torch.int16),
-            "bodies": {f.name: getattr(self._bodies, f.name).clone() for f in fields(self._bodies)},
+            "bodies": {name: value.clone() for name, value in self._bodies.by_name().items()},
             "common_step_counter": self.common_step_counter,
         }
 
@@ -289,7 +290,7 @@ class TrainingEnvironment(VecEnv):
             "version": STATE_VERSION,
             "memory": self.parts.memory.snapshot(),
             "motors": self.parts.motors.snapshot(),
-            "bodies": {f.name: getattr(self._bodies, f.name).clone() for f in fields(self._bodies)},
+            "bodies": {name: value.clone() for name, value in self._bodies.by_name().items()},
             "observations": {f.name: getattr(self._observations, f.name).clone() for f in fields(self._observations)},
             "generator": self._generator.get_state(),
             "common_step_counter": self.common_step_counter,
@@ -310,16 +311,20 @@ class TrainingEnvironment(VecEnv):
         if "memory" not in state:
             self._begin_from(state)
             return
-        parts = self.parts
-        parts.memory.restore({name: value.to(self.device) for name, value in state["memory"].items()})
+        parts, now = self.parts, self.backend.state
+        parts.memory.restore(state["memory"])
+        self._require_below(parts.memory.level, self.palette.num_levels, "level")
+        self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")
         parts.motors.restore(state["motors"])
-        self._bodies = BodyParameters(**{name: value.to(self.device) for name, value in state["bodies"].items()})
+        self._bodies = BodyParameters(**fitting(state["bodies"], self._bodies.by_name()))
         self._bodies.apply(self.backend)
         parts.motors.apply(self.backend)
-        self._observations = Observations(**{n: v.to(self.device).clone() for n, v in state["observations"].items()})
+        observed = {f.name: getattr(self._observations, f.name) for f in fields(self._observations)}
+        kept = fitting(state["observations"], observed)
+        self._observations = Observations(**{name: value.clone() for name, value in kept.items()})
         self._generator.set_state(state["generator"].cpu())
-        self.common_step_counter = state["common_step_counter"]
-        physics = {name: value.to(self.device) for name, value in state["physics"].items()}
+        self.common_step_counter = int(state["common_step_counter"])
+        physics = fitting(state["physics"], {name: getattr(now, name) for name in AFTER_RESET})
         parts.action.copy_(parts.memory.action)
         self.backend.reset(
             ResetState(
@@ -337,16 +342,29 @@ class TrainingEnvironment(VecEnv):
 
     def _begin_from(self, progress: dict[str, Any]) -> None:
         """Begin new episodes where ``progress_dict`` says that the run is."""
-        level = progress["level"]
-        if level.shape != (self.num_envs,):
+        if len(progress["level"]) != self.num_envs:
             raise ValueError(
-                f"the saved environment does not fit: it has {len(level)} worlds, this environment {self.num_envs}"
+                f"the saved environment does not fit: it has {len(progress['level'])} worlds, this environment "
+                f"{self.num_envs}"
             )
-        self.parts.memory.step.copy_(progress["step"])
-        self.common_step_counter = progress["common_step_counter"]
-        self._bodies = BodyParameters(**{name: value.to(self.device) for name, value in progress["bodies"].items()})
+        memory = self.parts.memory
+        found = fitting(progress, {"level": memory.level, "step": memory.step})
+        self._require_below(found["level"], self.palette.num_levels, "level")
+        memory.step.copy_(found["step"])
+        self.common_step_counter = int(progress["common_step_counter"])
+        self._bodies = BodyParameters(**fitting(progress["bodies"], self._bodies.by_name()))
         self._bodies.apply(self.backend)
-        self._begin(level.to(self.device, torch.int64))
+        self._begin(found["level"])
+
+    @staticmethod
+    def _require_below(numbers: torch.Tensor, count: int, name: str) -> None:
+        """Refuse saved numbers of things that are not there: engines read memory by them, unchecked.
+
+        Raises:
+            ValueError: one is negative or not below ``count``.
+        """
+        if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < count:
+            raise ValueError(f"the saved environment does not fit: '{name}' is not between 0 and {count - 1}")
 
 
 def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:

@@ -4,8 +4,9 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 
@@ -184,18 +185,30 @@ class EnvironmentMemory:
         """Copies of all tensors by name."""
         return {name: getattr(self, name).clone() for name in self._names()}
 
-    def restore(self, snapshot: dict[str, torch.Tensor]) -> None:
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Copy a snapshot back.
 
         Raises:
             ValueError: a tensor is missing or has another shape.
         """
-        for name in self._names():
-            present, saved = getattr(self, name), snapshot.get(name)
-            if saved is None or saved.shape != present.shape:
-                found = "is missing" if saved is None else f"has shape {tuple(saved.shape)}"
-                raise ValueError(
-                    f"the saved environment does not fit: '{name}' {found}, this environment needs "
-                    f"{tuple(present.shape)}; resume with the run's own configuration"
-                )
-            present.copy_(saved)
+        for name, saved in fitting(snapshot, {name: getattr(self, name) for name in self._names()}).items():
+            getattr(self, name).copy_(saved)
+
+
+def fitting(saved: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Saved tensors by the names of present ones, each with the type and on the device of that one.
+
+    Raises:
+        ValueError: one is missing, is no tensor or has another shape.
+    """
+    found = {}
+    for name, own in present.items():
+        value = saved.get(name)
+        if not isinstance(value, torch.Tensor) or value.shape != own.shape:
+            what = f"has shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else "is missing"
+            raise ValueError(
+                f"the saved environment does not fit: '{name}' {what}, this environment needs {tuple(own.shape)}; "
+                "resume with the run's own configuration"
+            )
+        found[name] = value.to(own.device, own.dtype)
+    return found

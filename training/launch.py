@@ -19,7 +19,7 @@ from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
 from ..policy.loading import find_policy
 from .algorithms.symmetry import build_mirror
-from .checkpoint import CheckpointError, reached, read_checkpoint
+from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .configuration import ConfigurationError, TrainingConfiguration, to_plain
 from .environment import TrainingEnvironment
 from .environment_configuration import FLAT_TILE, EnvironmentConfiguration
@@ -110,6 +110,8 @@ class TrainPlan:
     """Whether a later resume imports functions that the task does not name, and wants ``trust`` or their names again."""
     settings: Mapping[str, Any]
     """What a later resume needs to build the same run, kept in every checkpoint: backend and the resolved configuration."""
+    notice: str = ""
+    """A sentence to say before the run begins, empty for none."""
 
 
 def prepare(request: TrainRequest) -> TrainPlan:
@@ -124,7 +126,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         )
     own = _own_overrides(request)
     known, task = find_task(request.task), find_task(request.task, own)
-    checkpoint, run = None, None
+    checkpoint, run, notice = None, None, ""
     if request.resume is not None:
         checkpoint = find_checkpoint(
             request.resume, experiment=task.training.run.experiment, root=request.log_root
@@ -134,6 +136,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         kept, kept_backend = _kept(checkpoint, request.task)
         backend = request.backend or kept_backend
         named, task = task, kept.with_overrides(own)
+        task, notice = _own_logger(task, named, checkpoint)
         if (foreign := foreign_functions([task.environment, task.training], [named.environment, named.training])) and (
             not request.trust
         ):
@@ -177,7 +180,23 @@ def prepare(request: TrainRequest) -> TrainPlan:
         run=run,
         needs_trust=bool(foreign_functions(settings, to_plain([known.environment, known.training]))),
         settings=settings,
+        notice=notice,
     )
+
+
+def _own_logger(task: Task, named: Task, checkpoint: Path) -> tuple[Task, str]:
+    """A resumed task with the logger that the task of today and the command line name, and a sentence if its own was another:
+    a file, perhaps a stranger's, never decides where data are sent.
+    """
+    chosen, kept = named.training.run, task.training.run
+    run = replace(kept, logger=chosen.logger, logger_project=chosen.logger_project)
+    notice = ""
+    if kept.logger != chosen.logger:
+        notice = (
+            f"the run of '{checkpoint}' logged with {kept.logger}; only a command says where data go: add --logger "
+            f"{kept.logger} to go on with that"
+        )
+    return replace(task, training=replace(task.training, run=run)), notice
 
 
 def _kept(checkpoint: Path, name: str) -> tuple[Task, str]:
@@ -186,8 +205,9 @@ def _kept(checkpoint: Path, name: str) -> tuple[Task, str]:
     Raises:
         CheckpointError: it is of another task, or its settings are not those of this version.
     """
-    training = read_checkpoint(checkpoint)["training"]
-    if (its := training.get("task")) != name:
+    entries = read_checkpoint(checkpoint)
+    training = entries["training"]
+    if (its := run_numbers(entries, checkpoint).task) != name:
         hint = f"write gaitgauge train {its}" if its in TASKS else "give that task's name"
         raise CheckpointError(
             f"Cannot resume from '{checkpoint}': it is of task {shown(its)}, this run trains '{name}'; {hint}."
@@ -306,8 +326,8 @@ def train(
     if rank == 0:
         run = plan.run or new_run_directory(request.log_root, run_settings.experiment, run_settings.run_name)
         started(run)
-        if idle := idle_gpus(device):
-            message(idle)
+        for sentence in filter(None, (plan.notice, idle_gpus(device))):
+            message(sentence)
     seed_everything(run_settings.seed + rank)
     environment = replace(task.environment, seed=task.environment.seed + rank)
     with ExitStack() as closing:
@@ -352,22 +372,31 @@ def train(
                 message=message if rank == 0 else None,
             )
             closing.callback(runner.close)
-        except torch.OutOfMemoryError as error:
+        except (RuntimeError, MemoryError) as error:
+            if not _out_of_memory(error):
+                raise
             raise ConfigurationError(
                 f"{environment.num_envs} environments do not fit into the memory of {device}; use a smaller --num-envs"
             ) from error
         try:
             outcome = _learn(plan, runner, began)
-        except torch.OutOfMemoryError as error:
+        except ProcessLostError:
+            closing.pop_all()  # closing would wait for the lost process
+            raise
+        except (RuntimeError, MemoryError) as error:
+            if not _out_of_memory(error):
+                raise
             raise ConfigurationError(
                 f"learning with {environment.num_envs} environments does not fit into the memory of {device}; use a "
                 "smaller --num-envs, or more training.algorithm.minibatches"
             ) from error
-        except ProcessLostError:
-            closing.pop_all()  # closing would wait for the lost process
-            raise
         processes.leave()
     return outcome, run
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Whether the memory of the device, or on a CPU of the machine, did not suffice."""
+    return isinstance(error, torch.OutOfMemoryError | MemoryError) or "can't allocate memory" in str(error)
 
 
 def _learn(plan: TrainPlan, runner: TrainingRunner, began: float) -> TrainingOutcome:

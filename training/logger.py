@@ -7,7 +7,7 @@ import importlib.util
 import os
 import statistics
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
@@ -229,12 +229,21 @@ class RunLogger:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over what ``state_dict`` returned; running episodes only if the number of environments is the same."""
-        self.total_steps = state["total_steps"]
-        self.total_time = state["total_time"]
-        self.returns = deque(state["returns"], maxlen=WINDOW)
-        self.lengths = deque(state["lengths"], maxlen=WINDOW)
-        self.group_returns = {name: deque(values, maxlen=WINDOW) for name, values in state["group_returns"].items()}
+        """Take over what ``state_dict`` returned; running episodes only if the number of environments is the same.
+
+        Raises:
+            LookupError, TypeError, ValueError, AttributeError: it is no such state.
+        """
+        self.total_steps = int(state["total_steps"])
+        self.total_time = float(state["total_time"])
+        self.returns = _window(state["returns"])
+        self.lengths = _window(state["lengths"])
+        self.group_returns = {name: _window(state["group_returns"][name]) for name in self.group_returns}
         if state["reward_sum"].shape == self.reward_sum.shape:
             self.reward_sum.copy_(state["reward_sum"])
             self.episode_length.copy_(state["episode_length"])
+
+
+def _window(values: Iterable[Any]) -> deque[float]:
+    """The last of some numbers."""
+    return deque(map(float, values), maxlen=WINDOW)

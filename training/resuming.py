@@ -9,15 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from ..files.parsing import edited, one_line, shown
 from ..policy.contract import PolicyContract, difference
 from ..policy.native import StoredNetwork
 from .checkpoint import (
     TRAINING_VERSION,
     CheckpointError,
+    RunNumbers,
     checkpoint_entries,
     learned_networks,
     rank_file,
     read_checkpoint,
+    read_rank,
+    run_numbers,
     student_state,
     write_checkpoint,
 )
@@ -103,8 +107,14 @@ def resume_run(runner: TrainingRunner, path: Path) -> None:
         CheckpointError: damaged, of another task, contract, network or number of environments.
     """
     entries = read_checkpoint(path)
+    numbers = run_numbers(entries, path)
+    _check_fits(runner, path, entries, numbers)
+    with edited(f"Cannot resume from '{path}': its training state", CheckpointError, RuntimeError):
+        _take_over(runner, path, entries, numbers)
+
+
+def _take_over(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> None:
     training = entries["training"]
-    _check_fits(runner, path, entries)
     try:
         runner.alg.load(entries)
     except (RuntimeError, KeyError, ValueError) as error:
@@ -112,26 +122,32 @@ def resume_run(runner: TrainingRunner, path: Path) -> None:
     runner.average.load_state_dict(entries.get("average"))
     if "average" not in entries:
         runner.message(f"'{path}' holds no average of weights: it begins here.")
-    runner.iteration = entries["iter"]
-    runner.best_score, runner.best_iteration = training["best_score"], training["best_iteration"]
+    runner.iteration = numbers.iteration
+    runner.best_score, runner.best_iteration = numbers.best_score, numbers.best_iteration
     # A score may have come back, and best.pt been replaced, after the checkpoint was written.
     noted = read_run_json(runner.log_dir) if runner.log_dir else {}
     if (score := noted.get("best_score")) is not None and (runner.best_score is None or score > runner.best_score):
         runner.best_score, runner.best_iteration = score, noted.get("best_iteration")
     local: Mapping[str, Any] | None = training
-    if training["world_size"] != runner.processes.count:
+    if numbers.world_size != runner.processes.count:
         local = None
         runner.message(
-            f"'{path}' was written by {training['world_size'] or 'what was left of several'} processes, not "
+            f"'{path}' was written by {numbers.world_size or 'what was left of several'} processes, not "
             f"{runner.processes.count}: episodes start anew."
         )
     elif runner.processes.rank != 0:
-        local = torch.load(rank_file(path, runner.processes.rank), map_location="cpu", weights_only=True)
-    runner.logger.load_state_dict((local or training)["log"])
+        local = read_rank(path, runner.processes.rank)
+    runner.logger.load_state_dict(_table((local or training)["log"]))
     if local is not None:
         loaded = _load_environment(runner, path, local["environment"])
         runner.fresh = not loaded or not runner.configuration.run.keep_episodes
-        restore_random_state(local["random"], runner.device)
+        restore_random_state(_table(local["random"]), runner.device)
+
+
+def _table(value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{shown(value)} stands in the place of a table")
+    return value
 
 
 def begin_with(runner: TrainingRunner, path: Path) -> None:
@@ -144,12 +160,17 @@ def begin_with(runner: TrainingRunner, path: Path) -> None:
         CheckpointError: damaged, of other joints or another observation, or of other networks.
     """
     entries = read_checkpoint(path, training_state=False)
+    with edited(f"Cannot start from '{path}': it", CheckpointError, RuntimeError):
+        _begin(runner, path, entries)
+
+
+def _begin(runner: TrainingRunner, path: Path, entries: Mapping[str, Any]) -> None:
     theirs = PolicyContract.from_json(entries["contract"])
     for name in ("joint_names", "observation", "action_scale", "default_joint_position"):
         if getattr(theirs, name) != getattr(runner.contract, name):
             raise CheckpointError(
-                f"Cannot start from '{path}': its {name} is {getattr(theirs, name)}, this run's is "
-                f"{getattr(runner.contract, name)}."
+                f"Cannot start from '{path}': its {name} is {one_line(getattr(theirs, name))}, this run's is "
+                f"{one_line(getattr(runner.contract, name))}."
             )
     _check_network(runner, path, entries, "start")
     try:
@@ -164,8 +185,9 @@ def begin_with(runner: TrainingRunner, path: Path) -> None:
 
 
 def _misfit(verb: str, path: Path, error: Exception) -> CheckpointError:
-    reason = " ".join(str(error).split())
-    return CheckpointError(f"Cannot {verb} from '{path}': its weights do not fit the networks of this run: {reason}")
+    return CheckpointError(
+        f"Cannot {verb} from '{path}': its weights do not fit the networks of this run: {one_line(error, 600)}"
+    )
 
 
 def _load_environment(runner: TrainingRunner, path: Path, state: Any) -> bool:
@@ -173,37 +195,36 @@ def _load_environment(runner: TrainingRunner, path: Path, state: Any) -> bool:
         runner.message(f"'{path}' holds no state of the environment: episodes start anew.")
         return False
     try:
-        runner.env.load_state_dict(state)
+        runner.env.load_state_dict(_table(state))
     except (ValueError, KeyError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
         raise CheckpointError(
-            f"Cannot resume from '{path}': its environment does not fit this run's settings: {reason}"
+            f"Cannot resume from '{path}': its environment does not fit this run's settings: {one_line(error)}"
         ) from error
     return True
 
 
-def _check_fits(runner: TrainingRunner, path: Path, entries: Mapping[str, Any]) -> None:
-    training = entries["training"]
-    if training["task"] != runner.task:
+def _check_fits(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> None:
+    if numbers.task != runner.task:
         raise CheckpointError(
-            f"Cannot resume from '{path}': it is of task '{training['task']}', this run trains '{runner.task}'."
+            f"Cannot resume from '{path}': it is of task '{numbers.task}', this run trains '{runner.task}'."
         )
     if lines := difference(PolicyContract.from_json(entries["contract"]), runner.contract):
         first = lines.splitlines()[0]
         raise CheckpointError(f"Cannot resume from '{path}': its policy contract differs from this task's: {first}")
     _check_network(runner, path, entries, "resume")
-    if training["num_envs"] != runner.env.num_envs:
+    if numbers.num_envs != runner.env.num_envs:
         raise CheckpointError(
-            f"Cannot resume from '{path}': it has {training['num_envs']} environments, this run "
-            f"{runner.env.num_envs}; give --num-envs {training['num_envs']}."
+            f"Cannot resume from '{path}': it has {numbers.num_envs} environments, this run "
+            f"{runner.env.num_envs}; give --num-envs {numbers.num_envs}."
         )
 
 
 def _check_network(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], verb: str) -> None:
     mine = checkpoint_entries(runner.contract, stored_network(runner), {})["network"]
-    if entries["network"] != mine:
+    theirs = {name: str(entries["network"].get(name)) for name in mine}
+    if theirs != mine:
         raise CheckpointError(
-            f"Cannot {verb} from '{path}': its network is {entries['network']['architecture']} "
-            f"{entries['network']['arguments']}, this run's is {mine['architecture']} {mine['arguments']}; give the same "
+            f"Cannot {verb} from '{path}': its network is {one_line(theirs['architecture'])} "
+            f"{one_line(theirs['arguments'])}, this run's is {mine['architecture']} {mine['arguments']}; give the same "
             "training.network.* settings."
         )

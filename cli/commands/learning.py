@@ -43,7 +43,11 @@ def train(
         str | None, typer.Option(help="Continue: latest, a run directory or a model_*.pt.", metavar="latest|PATH")
     ] = None,
     trust: Annotated[
-        bool, typer.Option("--trust", help="Import functions that the settings of a resumed checkpoint name.")
+        bool,
+        typer.Option(
+            "--trust",
+            help="Import functions that the settings of a resumed checkpoint name; --init-from runs nothing either way.",
+        ),
     ] = False,
     init_from: Annotated[
         str | None,

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import os
 import zipfile
 import zlib
 from collections.abc import Mapping
+from pathlib import Path
 
 from ..base import PolicyError
 
@@ -15,6 +17,25 @@ MOST_RECORDS = 20_000
 """Most entries of an archive."""
 
 _ERRORS = (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError)
+
+
+def read_limited(path: Path) -> bytes:
+    """The content of a policy file or checkpoint.
+
+    Raises:
+        PolicyError: it cannot be read, is empty or larger than ``LARGEST_FILE``.
+    """
+    try:
+        with path.open("rb") as file:
+            large = os.fstat(file.fileno()).st_size > LARGEST_FILE
+            data = b"" if large else file.read(LARGEST_FILE + 1)
+    except OSError as error:
+        raise PolicyError(f"'{path}' cannot be read: {error.strerror}") from error
+    if large or len(data) > LARGEST_FILE:
+        raise PolicyError(f"'{path}' is larger than {LARGEST_FILE // 2**20} MiB, the most that is read of a policy")
+    if not data:
+        raise PolicyError(f"'{path}' is empty")
+    return data
 
 
 def archive_names(data: bytes, *, source: str) -> frozenset[str]:

@@ -1,3 +1,4 @@
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import load_robot
 from typer.testing import CliRunner, Result
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture
@@ -59,3 +62,17 @@ def policy(tmp_path: Path, contract: PolicyContract, stored: StoredNetwork) -> P
     path = tmp_path / "standing.gauge.pt"
     save_policy(path, contract, stored)
     return path
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run directory of two iterations of go2-flat."""
+    from small_run import FAKE, SMALL
+
+    root = tmp_path_factory.mktemp("logs")
+    arguments = ["train", "go2-flat", *FAKE, "--iterations", 2, "--seed", 5, "--log-root", root, *SMALL]
+    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    (run,) = (root / "go2_flat").iterdir()
+    assert str(run) in result.output.replace("\n", "")
+    return run

@@ -5,7 +5,6 @@ import importlib.util
 import json
 import os
 import signal
-import sys
 import threading
 from pathlib import Path
 
@@ -18,36 +17,9 @@ from gaitgauge.files.writing import lock_folder
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.launch import TrainRequest, idle_gpus, prepare
 from gaitgauge.training.overrides import override_keys
-from gaitgauge.training.own_terms import foreign_functions
 from gaitgauge.training.scoring import Scorer, scores_of
 from gaitgauge.training.tasks import TASKS
-
-SMALL = (
-    "training.algorithm.minibatches=1",
-    "training.algorithm.epochs=1",
-    "training.run.steps_per_iteration=4",
-    "training.network.actor_hidden=8",
-    "training.network.critic_hidden=8",
-    "training.network.teacher_hidden=8",
-    "training.network.student_hidden=8",
-)
-FAKE = ("--backend", "fake", "--device", "cpu", "--num-envs", 8, "--no-score")
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run directory of two iterations of go2-flat."""
-    from gaitgauge.cli.main import app
-    from typer.testing import CliRunner
-
-    root = tmp_path_factory.mktemp("logs")
-    arguments = ["train", "go2-flat", *FAKE, "--iterations", 2, "--seed", 5, "--log-root", root, *SMALL]
-    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    (run,) = (root / "go2_flat").iterdir()
-    assert str(run) in result.output.replace("\n", "")
-    return run
-
+from small_run import FAKE, SMALL
 
 # ---- runs -----------------------------------------------------------------------------------------------------------
 
@@ -293,64 +265,8 @@ def test_a_resumed_run_has_the_settings_of_its_checkpoint_whatever_the_task_says
     path.unlink()
 
 
-def stranger(trained: Path, folder: Path, **environment: object) -> Path:
-    """A checkpoint whose settings name code that lies in the current folder."""
-    sys.modules.pop("evil_code", None)
-    (folder / "evil_code.py").write_text("open('executed', 'w').close()\nOwn = TASK = None\n")
-    entries = torch.load(trained / "model_2.pt", weights_only=True)
-    entries["training"]["settings"]["environment"] |= environment
-    torch.save(entries, folder / "model_2.pt")
-    return folder / "model_2.pt"
-
-
-@pytest.mark.parametrize("place", ["generator", "level rule", "reward", "event"])
-def test_functions_that_a_checkpoint_names_are_not_imported(refused, run, trained, tmp_path, monkeypatch, place):
-    monkeypatch.syspath_prepend(str(tmp_path))
-    stored = torch.load(trained / "model_2.pt", weights_only=True)["training"]["settings"]["environment"]
-    term = {"name": "mine", "function": "evil_code:Own", "weight": 1.0}
-    changed = {
-        "generator": {"commands": stored["commands"] | {"generator": "evil_code:Own"}},
-        "level rule": {"terrain": stored["terrain"] | {"level_rule": "evil_code:Own"}},
-        "reward": {"rewards": stored["rewards"] | {"own": [term]}},
-        "event": {"events": [{k: term[k] for k in ("name", "function")}]},
-    }[place]
-    path = stranger(trained, tmp_path, **changed)
-    resume = ("train", "go2-flat", "--resume", path, "--device", "cpu", "--no-score", "--iterations", 3)
-    message = refused(*resume)
-    assert "'evil_code:Own'" in message and "--trust" in message
-    run("import", path, tmp_path / "x.gauge.pt")
-    run("list", "policies")
-    assert not (tmp_path / "executed").exists()
-    assert "evil_code" in refused(*resume, "--trust")
-    assert (tmp_path / "executed").exists(), "it would not have been imported anyway"
-
-
-def test_what_the_command_line_names_needs_no_trust(trained, tmp_path, monkeypatch):
-    stored = torch.load(trained / "model_2.pt", weights_only=True)["training"]["settings"]["environment"]
-    named = "environment.commands.generator=mine:Own"
-    path = stranger(trained, tmp_path, commands=stored["commands"] | {"generator": "mine:Own"})
-    request = TrainRequest(task="go2-flat", device="cpu", resume=str(path), overrides=(named,))
-    plan = prepare(request)
-    assert plan.task.environment.commands.generator == "mine:Own" and plan.needs_trust
-    assert not prepare(TrainRequest(task="go2-flat", device="cpu", resume=str(trained))).needs_trust
-
-
-@pytest.mark.parametrize(
-    ("name", "foreign"),
-    [
-        ("gaitgauge.training.commands:CommandGenerator", False),
-        ("gaitgauge.training.own_terms:import_module", True),
-        ("gaitgauge.cli.main:train", True),
-        ("gaitgauge.training.nothing:here", True),
-        ("os:system", True),
-    ],
-)
-def test_the_package_vouches_for_its_own_functions_alone(name, foreign):
-    assert foreign_functions({"a": [{"b": name}]}, {}) == ([name] if foreign else [])
-    assert foreign_functions({"a": [{"b": name}]}, {"known": name}) == []
-
-
-def test_two_processes_do_not_share_a_run(run, trained):
+def test_two_processes_do_not_share_a_run(run, trained, monkeypatch):
+    monkeypatch.setattr(writing, "_PATIENCE", 0.1)
     lock = lock_folder(trained, RuntimeError)
     before = sorted(f.name for f in trained.iterdir())
     resume = ("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--iterations", 3)
@@ -359,21 +275,6 @@ def test_two_processes_do_not_share_a_run(run, trained):
     assert "another process is writing to" in result.stderr
     assert sorted(f.name for f in trained.iterdir()) == before
     lock.release()
-
-
-@pytest.mark.parametrize("text", ["[]", "{", '{"resumed": 3}', '{"best_score": "high"}', "[" * 9999])
-def test_damaged_descriptions_of_a_run(refused, trained, tmp_path, text):
-    (tmp_path / "model_2.pt").write_bytes((trained / "model_2.pt").read_bytes())
-    (tmp_path / "run.json").write_text(text)
-    assert "run.json" in refused("train", "go2-flat", "--resume", tmp_path, "--device", "cpu", "--no-score")
-
-
-def test_a_task_that_a_checkpoint_names_is_no_command_to_paste(refused, trained, tmp_path):
-    entries = torch.load(trained / "model_2.pt", weights_only=True)
-    entries["training"]["task"] = "evil_code:TASK; rm -rf /"
-    torch.save(entries, tmp_path / "model_2.pt")
-    message = refused("train", "go2-flat", "--resume", tmp_path / "model_2.pt", "--device", "cpu")
-    assert "gaitgauge train evil_code" not in message
 
 
 def test_a_checkpoint_without_its_settings_begins_a_new_run(refused, trained):

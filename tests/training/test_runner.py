@@ -245,7 +245,7 @@ def test_resume_refuses_what_does_not_fit(tmp_path):
     damaged.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(CheckpointError, match="damaged"):
         resume_run(make(), damaged)
-    with pytest.raises(CheckpointError, match="Cannot read"):
+    with pytest.raises(CheckpointError, match="cannot be read"):
         resume_run(make(), tmp_path / "none.pt")
 
 

@@ -20,6 +20,7 @@ import torch
 from tensordict import TensorDict
 
 from ...backends.warp.graphs import RecordedFunction
+from ...policy.fence.archive import LARGEST_FILE
 from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
 from ..networks import CtsActor, CtsCritic, student_architecture
 from ..processes import Processes
@@ -27,11 +28,14 @@ from ..schedules import RampTable
 from .bootstrap import Bootstrap
 from .cts_losses import POLICY_LOSSES, STUDENT_LOSSES, CtsLosses
 from .gradients import FlatGradients, clip_gradients
+from .moments import load_moments
 from .storage import EnvironmentSplit, RolloutStorage
 from .symmetry import Mirror, passes
 
 POLICY_METRICS = (*POLICY_LOSSES, "gradient_norm", "skipped")
 STUDENT_METRICS = (*STUDENT_LOSSES, "skipped")
+MOST_WEIGHTS = LARGEST_FILE // 24
+"""A checkpoint has each weight as it is and averaged, with two moments, and a part of them once more as the policy, at 4 bytes."""
 GROUPS = ("policy", "history", "privileged")
 Step = Callable[..., None]
 
@@ -139,8 +143,19 @@ class CTS:
             history_length=history // frame,
             command_entries=command_entries,
         )
-        actor = CtsActor(network, privileged_width=privileged, architecture=architecture, arguments=arguments)
-        critic = CtsCritic(network, privileged_width=privileged)
+
+        def networks() -> tuple[CtsActor, CtsCritic]:
+            actor = CtsActor(network, privileged_width=privileged, architecture=architecture, arguments=arguments)
+            return actor, CtsCritic(network, privileged_width=privileged)
+
+        with torch.device("meta"):  # counted before they take memory
+            weights = sum(p.numel() for module in networks() for p in module.parameters())
+        if weights > MOST_WEIGHTS:
+            raise ConfigurationError(
+                f"The networks have {weights:,} weights; at most {MOST_WEIGHTS:,} fit into a checkpoint that can be read again. "
+                "Make training.network.* smaller."
+            )
+        actor, critic = networks()
         storage = RolloutStorage(
             EnvironmentSplit.build(observations.batch_size[0], settings.student_period, device),
             configuration.run.steps_per_iteration,
@@ -365,15 +380,14 @@ class CTS:
         """Take over what ``save`` returned.
 
         Raises:
-            RuntimeError, KeyError, ValueError: it does not fit.
+            RuntimeError, LookupError, ValueError, TypeError, AttributeError: it does not fit.
         """
         self.actor.load_state_dict(state["actor_state_dict"])
         self.critic.load_state_dict(state["critic_state_dict"])
         if optimizers:
-            self.optimizer.load_state_dict(state["optimizer_state_dict"])
-            self.student_optimizer.load_state_dict(state["student_optimizer_state_dict"])
+            self.learning_rate = load_moments(self.optimizer, state["optimizer_state_dict"])
+            load_moments(self.student_optimizer, state["student_optimizer_state_dict"])
             # Loading replaced the rate's tensor by a copy.
-            self.learning_rate = self.optimizer.param_groups[0]["lr"]
             for group in self.optimizer.param_groups:
                 group["lr"] = self._rate
         # Captured graphs refer to the replaced optimizer state.
