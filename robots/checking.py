@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from ..files.parsing import did_you_mean, one_line
+from .apart import run_apart
 from .base import Robot
 from .loading import RobotError, robot_digest
 
@@ -14,12 +16,14 @@ if TYPE_CHECKING:
 
 _DEPTH_TOLERANCE = 1e-3
 """Depth to which a robot that is put on the ground may reach into it [m]."""
+_MOST_PARTS = 2_000
+"""Of each kind; robots have some hundred."""
 _GRAVITY = (0.0, 0.0, -9.81)
 _checked: set[str] = set()
 """Digests of the robots that this process has found sound."""
 
 
-def check_robot(robot: Robot) -> None:
+def check_robot(robot: Robot, *, foreign: bool = False) -> None:
     """Compile the robot's MuJoCo model and check that it has everything that the description names, and nothing that would
     carry the robot.
 
@@ -28,12 +32,25 @@ def check_robot(robot: Robot) -> None:
     the ground; the imu site; that the default pose is within the joint ranges; that nothing is in the ground at
     ``stand_height``. A robot whose files have not changed is checked once in a process.
 
+    Args:
+        robot: description and model.
+        foreign: somebody else wrote it: it is compiled and checked in a process of its own, with limits of time and memory.
+
     Raises:
         RobotError: the first disagreement found.
     """
     digest = robot_digest(robot)
     if digest in _checked:
         return
+    if foreign:
+        run_apart(partial(_inspect, robot), robot.mjcf)
+    else:
+        _inspect(robot)
+    _checked.add(digest)
+
+
+def _inspect(robot: Robot) -> None:
+    """Compile and check, here."""
     import mujoco
 
     try:
@@ -44,6 +61,7 @@ def check_robot(robot: Robot) -> None:
             f"'{one_line(robot.mjcf)}' is not a model that MuJoCo can compile: {one_line(error)}"
         ) from error
     check = _Check(robot, model)
+    check.size()
     check.base()
     check.weight()
     check.joints()
@@ -51,7 +69,6 @@ def check_robot(robot: Robot) -> None:
     check.feet()
     check.bodies_and_sites()
     check.standing_pose(spec)
-    _checked.add(digest)
 
 
 class _Check:
@@ -86,6 +103,14 @@ class _Check:
         }[object_type]
         found = (self.mujoco.mj_id2name(self.model, object_type, i) for i in range(count))
         return [name for name in found if name is not None]
+
+    def size(self) -> None:
+        """A few lines of XML can stand for a million parts, each of which every world would simulate."""
+        model = self.model
+        counts = {"bodies": model.nbody, "geoms": model.ngeom, "sites": model.nsite, "degrees of freedom": model.nv}
+        for kind, count in counts.items():
+            if count > _MOST_PARTS:
+                raise self.error(f"{self.robot.mjcf.name} has {count:,} {kind}; at most {_MOST_PARTS:,} are simulated")
 
     def base(self) -> None:
         model, robot = self.model, self.robot

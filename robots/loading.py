@@ -9,11 +9,11 @@ and ``FL_calf_joint``); the longest fitting key wins.
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
 from ..files.parsing import build, did_you_mean, one_line, parse_toml, read_text, shown
 from ..files.provenance import digest
@@ -21,6 +21,10 @@ from ..files.writing import json_text
 from .base import JointParameters, Robot
 
 ROBOT_FILE = "robot.toml"
+LARGEST_XML = 4_000_000
+"""Size of one file of a model [bytes]."""
+LARGEST_MODEL, MOST_FILES = 512 * 2**20, 2_000
+"""Size of a model with all that it names, meshes and textures [bytes], and number of these files."""
 _JOINT_ENDING = "_joint"
 _ADDED_LATER = ("foot_shapes", "action_scale", "imu_site")
 """Fields that count for a robot's digest only where they are set, so that those of older descriptions stay."""
@@ -93,25 +97,65 @@ def model_files(mjcf: Path) -> list[Path]:
     """A MuJoCo model's file and those that it names: included models, meshes, textures, height fields, skins.
 
     A name that leads nowhere is left out; MuJoCo refuses such a model.
+
+    Raises:
+        RobotError: a file of the model is not XML or defines entities, or all of them are too many or too large.
+        OSError: a file cannot be read.
     """
-    found = [mjcf]
-    for file in found:
-        try:
-            root = ElementTree.fromstring(file.read_bytes()) if file.suffix.lower() in (".xml", ".mjcf") else ()
-        except (OSError, ElementTree.ParseError):
+    found, described, size = {mjcf: None}, {mjcf}, 0
+    pending = [mjcf]
+    while pending:
+        file = pending.pop(0)
+        size += file.stat().st_size
+        if size > LARGEST_MODEL or len(found) > MOST_FILES:
+            raise RobotError(
+                f"'{one_line(mjcf)}' and the files that it names are over {LARGEST_MODEL // 2**20} MiB or {MOST_FILES:,} files, "
+                "the most that is read of a robot"
+            )
+        if file not in described and file.suffix.lower() not in (".xml", ".mjcf", ".urdf"):
             continue
-        elements = list(root.iter()) if root != () else []  # type: ignore[union-attr]
+        elements = _elements(file)
         folders = [mjcf.parent, file.parent]
         folders += [
             mjcf.parent / value
-            for element in elements
-            if element.tag == "compiler"
-            for key, value in element.attrib.items()
+            for tag, attributes in elements
+            if tag == "compiler"
+            for key, value in attributes.items()
             if key in ("meshdir", "texturedir", "assetdir")
         ]
-        names = [v for e in elements for k, v in e.attrib.items() if k.startswith("file")]
-        paths = [folder / name for name in names for folder in folders]
-        found += [path for path in dict.fromkeys(paths) if path not in found and os.path.isfile(path)]
+        for tag, attributes in elements:
+            names = [value for key, value in attributes.items() if key.startswith("file")]
+            for path in (folder / name for name in names for folder in folders):
+                if path not in found and os.path.isfile(path):
+                    found[path] = None
+                    pending.append(path)
+                    if tag in ("include", "model"):  # MuJoCo reads these as XML, whatever their ending
+                        described.add(path)
+    return list(found)
+
+
+def _elements(file: Path) -> list[tuple[str, dict[str, str]]]:
+    """Tags and attributes of an XML file, in their order."""
+    with file.open("rb") as opened:
+        data = opened.read(LARGEST_XML + 1)
+    if len(data) > LARGEST_XML:
+        raise RobotError(
+            f"'{one_line(file)}' is larger than {LARGEST_XML // 10**6} MB, the most that is read of a model"
+        )
+    found: list[tuple[str, dict[str, str]]] = []
+
+    def entity(*_: object) -> None:  # a few lines of them can stand for gigabytes
+        raise RobotError(f"'{one_line(file)}' defines XML entities, which no robot needs; take them out")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = lambda tag, attributes: found.append((tag, attributes))
+    parser.EntityDeclHandler = entity
+    try:
+        parser.Parse(data, True)
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        if isinstance(error, RobotError):
+            raise
+        raise RobotError(f"'{one_line(file)}' is not XML: {one_line(error)}") from error
     return found
 
 

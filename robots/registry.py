@@ -31,22 +31,22 @@ def load_robot(name_or_path: str | Path, *, check: bool = True) -> Robot:
     Args:
         name_or_path: a name out of ``robot_names()``, the path of a ``robot.toml``, or a folder that holds one. A text
             is a path if it contains a path separator or ends in ``.toml``, else a name.
-        check: compare it with its MuJoCo model (``check_robot``), which takes MuJoCo.
+        check: compare it with its MuJoCo model (``check_robot``), which takes MuJoCo. A robot that is given by its path is
+            compiled in a process of its own.
 
     Raises:
         RobotError: there is no such robot, its description is wrong or does not fit its model, or a plug-in's entry point
             does not give a robot.
     """
-    robot = _load(name_or_path)
+    text = os.fspath(name_or_path)
+    given = isinstance(name_or_path, Path) or "/" in text or os.sep in text or text.endswith(".toml")
+    robot = load_robot_file(text) if given else _named(text)
     if check:
-        check_robot(robot)
+        check_robot(robot, foreign=given)
     return robot
 
 
-def _load(name_or_path: str | Path) -> Robot:
-    text = os.fspath(name_or_path)
-    if isinstance(name_or_path, Path) or "/" in text or os.sep in text or text.endswith(".toml"):
-        return load_robot_file(text)
+def _named(text: str) -> Robot:
     own = _own()
     if text in own:
         return load_robot_file(own[text])

@@ -7,12 +7,10 @@ ends when its owner does, when it takes too long, and when nothing refers to it 
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import select
 import signal
 import struct
-import sys
 import threading
 import time
 import weakref
@@ -24,8 +22,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from ...files.cell import CONTEXT, MEMORY, allow_seconds, enclose
 from ..base import PolicyError, PolicySession
-from .cell import MEMORY, allow_seconds, lock
 
 STEP_SECONDS = 10
 """Longest that a foreign program may compute for one control step, or for being loaded."""
@@ -35,8 +33,6 @@ _LONGEST_REPLY = 2**28
 
 _FINE, _FAILED = b"\0\0\0\0", b"\1\0\0\0"
 _ACT = struct.Struct("=IIII")  # zero, session, rows, whether a mask of those to forget follows
-# A forked process has all modules at once; elsewhere system libraries do not bear being forked.
-_CONTEXT: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
 
 
 class Program(Protocol):
@@ -70,9 +66,9 @@ class Child:
         self._source = source
         self._busy = threading.Lock()
         self._dropped: list[int] = []
-        self._connection, theirs = _CONTEXT.Pipe()
+        self._connection, theirs = CONTEXT.Pipe()
         with theirs:
-            self._process = _CONTEXT.Process(
+            self._process = CONTEXT.Process(
                 target=_run, args=(make, theirs, self._connection, source, os.getpid()), daemon=True, name="fence"
             )
             self._process.start()
@@ -162,15 +158,11 @@ def _end(process: Any, connection: Connection, owner: int) -> None:
 
 def _run(make: Any, connection: Connection, parents: Connection, source: str, owner: int) -> None:
     """The process's whole life."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the owner ends this one
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if parents.fileno() != connection.fileno():
         parents.close()
-    _close_all_but(connection.fileno())
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
-    lock([Path(__file__).parent.parent])
-    threading.Thread(target=_watch, args=(owner,), daemon=True).start()
+    enclose(connection.fileno(), owner, [Path(__file__).parent.parent])
     try:
         allow_seconds(STEP_SECONDS)
         program = _answered(connection, source, lambda: make(connection.recv_bytes(), source))
@@ -231,22 +223,3 @@ def _act(connection: Connection, source: str, sessions: dict[int, PolicySession]
         return sessions[number].act(observation.view(rows, -1))
 
     _answered(connection, source, work, lambda action: action.numpy().tobytes())
-
-
-def _watch(owner: int) -> None:
-    """End with the owner, whoever else holds its connection."""
-    while os.getppid() == owner:
-        time.sleep(1.0)
-    os._exit(0)
-
-
-def _close_all_but(kept: int) -> None:
-    """Files, sockets and devices that the owner has open are none of a foreign program's business."""
-    if sys.platform == "win32":
-        return
-    os.closerange(3, kept)
-    os.closerange(kept + 1, min(os.sysconf("SC_OPEN_MAX"), 65_536))
-    nothing = os.open(os.devnull, os.O_RDWR)
-    for standard in (0, 1, 2):
-        os.dup2(nothing, standard)
-    os.close(nothing)

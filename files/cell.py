@@ -1,4 +1,5 @@
-"""Locks a process up for good: no file to write, no other program, no network, little memory.
+"""Locks a process up for good, so that it can work on a stranger's file: no file to write, no other program, no network, little
+memory.
 
 Landlock and seccomp do this on Linux, each as far as the kernel has it; limits on resources hold on every Unix.
 """
@@ -6,12 +7,17 @@ Landlock and seccomp do this on Linux, each as far as the kernel has it; limits 
 from __future__ import annotations
 
 import ctypes
+import multiprocessing
 import os
 import platform
+import signal
 import struct
 import sys
+import threading
+import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 try:
     import resource
@@ -19,7 +25,10 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 MEMORY = 2**30
-"""Memory that a foreign program may take beyond what its process has when it starts [bytes]."""
+"""Memory that a process may take beyond what it has when it is locked [bytes]."""
+# A forked process has all modules at once; elsewhere system libraries do not bear being forked.
+CONTEXT: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+"""Starts processes that are to be locked."""
 
 _PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _SECCOMP_FILTER = 38, 22, 2
 _LANDLOCK_CREATE, _LANDLOCK_ADD, _LANDLOCK_RESTRICT = 444, 445, 446
@@ -53,6 +62,46 @@ _CALLS: dict[str, tuple[dict[int, tuple[int, int]], tuple[int, ...], int]] = {
 _CLONE3 = 435
 _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 _FIRST_FOREIGN_CALL = 0x40000000  # numbers of x86's other set of calls
+
+
+def enclose(kept: int, owner: int, readable: Iterable[Path] = ()) -> tuple[str, ...]:
+    """Lock a process that has just been started by its owner, and whose life it is to work for that one.
+
+    It ends when its owner does, hears no Ctrl-C (the owner ends it), and has nothing open of what its owner has.
+
+    Args:
+        kept: descriptor of the connection with its owner.
+        owner: process id.
+        readable: as for ``lock``.
+
+    Returns:
+        As ``lock``.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it reaches all processes of a terminal
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    _close_all_but(kept)
+    held = lock(readable)
+    threading.Thread(target=_watch, args=(owner,), daemon=True).start()
+    return held
+
+
+def _watch(owner: int) -> None:
+    """End with the owner, whoever else holds its connection."""
+    while os.getppid() == owner:
+        time.sleep(1.0)
+    os._exit(0)
+
+
+def _close_all_but(kept: int) -> None:
+    """Files, sockets and devices that the owner has open are none of a stranger's business."""
+    if sys.platform == "win32":
+        return
+    os.closerange(3, kept)
+    os.closerange(kept + 1, min(os.sysconf("SC_OPEN_MAX"), 65_536))
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for standard in (0, 1, 2):
+        os.dup2(nothing, standard)
+    os.close(nothing)
 
 
 def lock(readable: Iterable[Path] = ()) -> tuple[str, ...]:

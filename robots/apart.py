@@ -1,0 +1,84 @@
+"""A stranger's robot is tried in a process of its own first: MuJoCo compiles what its files say, and that may take all memory, all
+time, or MuJoCo itself down.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from ..files.cell import CONTEXT, MEMORY, allow_seconds, enclose
+from ..files.parsing import one_line
+from .loading import RobotError, model_files
+
+COMPUTING_SECONDS = 10
+"""Longest that compiling and checking a robot may compute."""
+_WAITING_SECONDS = 6 * COMPUTING_SECONDS
+"""Longest that is waited for that, on a machine that has other things to do."""
+_LONGEST_SENTENCE = 10_000
+_SOUND = b"sound"
+
+
+def run_apart(work: Callable[[], None], mjcf: Path) -> None:
+    """Do something with a robot's model where it can do no harm.
+
+    Args:
+        work: raises ``RobotError`` for what is wrong; else its outcome is lost.
+        mjcf: the model; folders of the files that it names can be read.
+
+    Raises:
+        RobotError: as ``work``, or it takes too much time or memory, or MuJoCo crashes.
+    """
+    import mujoco  # noqa: F401  (once, and not again in each process that is forked from this one)
+
+    ours, theirs = CONTEXT.Pipe(duplex=False)
+    folders = sorted({file.resolve().parent for file in model_files(mjcf)} | {mjcf.parent})
+    process = CONTEXT.Process(target=_run, args=(work, theirs, folders, os.getpid()), daemon=True, name="robot")
+    with ours:
+        with theirs:
+            process.start()
+        verdict = b""
+        try:
+            if ours.poll(_WAITING_SECONDS):
+                verdict = ours.recv_bytes(_LONGEST_SENTENCE)
+        except (OSError, EOFError):
+            process.join(2.0)  # it has ended, or is about to
+        finally:
+            process.kill()
+            process.join(5.0)
+    if verdict == _SOUND:
+        return
+    raise RobotError(verdict.decode("utf-8", "replace") or f"'{one_line(mjcf)}' {_how_it_ended(process.exitcode)}")
+
+
+def _how_it_ended(code: int | None) -> str:
+    if code is not None and -code == getattr(signal, "SIGXCPU", 0):
+        return f"takes over {COMPUTING_SECONDS} s of computing to be compiled; make its model smaller"
+    if code is not None and code < 0 and -code != signal.SIGKILL:
+        return (
+            f"brought MuJoCo down ({signal.Signals(-code).name}); it may need over {MEMORY // 2**20} MiB of memory: make its model "
+            "smaller"
+        )
+    return f"was not compiled and checked within {_WAITING_SECONDS} s; make its model smaller"
+
+
+def _run(work: Callable[[], None], connection: Connection, folders: list[Path], owner: int) -> None:
+    """The process's whole life."""
+    enclose(connection.fileno(), owner, folders)
+    allow_seconds(COMPUTING_SECONDS)
+    try:
+        work()
+        verdict = _SOUND
+    except RobotError as error:
+        verdict = str(error).encode("utf-8", "backslashreplace")
+    except MemoryError:
+        verdict = (
+            f"the robot needs over {MEMORY // 2**20} MiB of memory to be compiled; make its model smaller".encode()
+        )
+    except Exception as error:  # noqa: BLE001  (whatever it is, the owner has to hear of it)
+        verdict = f"the robot cannot be checked: {type(error).__name__}: {one_line(error)}".encode(errors="replace")
+    connection.send_bytes(verdict[:_LONGEST_SENTENCE])
+    os._exit(0)  # nothing of what the owner would do at its end

@@ -1,0 +1,124 @@
+"""Models of robots that would take all memory or time, or MuJoCo down: each ends in one sentence, outside of this process."""
+
+import ctypes
+import os
+import resource
+import shutil
+import time
+from pathlib import Path
+
+import mujoco
+import pytest
+from gaitgauge.robots import RobotError, apart, checking, load_robot
+from gaitgauge.robots.loading import model_files
+
+GO2 = load_robot("go2").mjcf.parent
+TEXT = (GO2 / "go2.xml").read_text()
+GEOM = '<geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>'
+
+
+def above(text: str) -> str:
+    """The Go2 with elements before its bodies."""
+    return TEXT.replace("<worldbody>", f"{text}<worldbody>", 1)
+
+
+def on_base(text: str) -> str:
+    """The Go2 with elements on its trunk."""
+    return TEXT.replace('<body name="base_link">', f'<body name="base_link">{text}', 1)
+
+
+@pytest.fixture
+def stranger(tmp_path):
+    """Writes a robot of somebody else and gives its folder."""
+
+    def write(text: str) -> Path:
+        (tmp_path / "go2.xml").write_text(text)
+        shutil.copy(GO2 / "robot.toml", tmp_path)
+        return tmp_path
+
+    return write
+
+
+def refused(folder: Path, named: str | None = None) -> str:
+    with pytest.raises(RobotError, match=named) as caught:
+        load_robot(folder)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 700
+    return str(caught.value)
+
+
+LAUGHS = '<!ENTITY a0 "ha">' + "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 30))
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        (f"<!DOCTYPE m [{LAUGHS}]>" + TEXT.replace('model="', 'model="&a29;', 1), "defines XML entities"),
+        (above('<size memory="900G"/>'), "Could not allocate memory"),
+        (above('<asset><hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/></asset>'), "go2.xml"),
+        (above('<asset><texture type="2d" name="t" builtin="flat" width="60000" height="60000"/></asset>'), "allocate"),
+        (above('<asset><mesh name="m" builtin="plate" params="20000 20000"/></asset>'), "go2.xml"),
+        (above('<asset><mesh name="m" file="/dev/zero"/></asset>'), "go2.xml"),
+        (on_base(f'<replicate count="2500">{GEOM}</replicate>'), "geoms; at most 2,000 are simulated"),
+        ("<mujoco>" + "<body>" * 100_000 + "</body>" * 100_000 + "</mujoco>", "go2.xml"),
+        (TEXT + f"<!--{'x' * 4_000_000}-->", "larger than 4 MB"),
+    ],
+    ids=["entities", "arena", "height field", "texture", "mesh", "device", "copies", "nested", "long"],
+)
+def test_a_model_that_would_take_all_memory(stranger, text, named):
+    folder = stranger(text)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refused(folder, named)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 200_000  # kB, or on macOS bytes
+
+
+def test_a_model_that_is_never_compiled(stranger, monkeypatch):
+    monkeypatch.setattr(apart, "COMPUTING_SECONDS", 1)
+    folder = stranger(on_base(f'<replicate count="100000000">{GEOM}</replicate>'))
+    refused(folder, "takes over 1 s of computing to be compiled")
+
+
+def test_a_model_that_waits_for_ever(stranger, monkeypatch):
+    monkeypatch.setattr(apart, "_WAITING_SECONDS", 0.2)
+    monkeypatch.setattr(checking, "_inspect", lambda robot: time.sleep(60))
+    refused(stranger(above("<!-- sleeping -->")), "within 0.2 s")
+
+
+@pytest.mark.parametrize("end", ["crash", "exit", "bug"])
+def test_a_model_that_brings_mujoco_down(stranger, monkeypatch, end):
+    def inspect(robot: object) -> None:
+        if end == "crash":
+            ctypes.string_at(0)
+        os._exit(3) if end == "exit" else {}["x"]
+
+    monkeypatch.setattr(checking, "_inspect", inspect)
+    named = {"crash": "SIGSEGV", "exit": "was not compiled", "bug": "cannot be checked: KeyError"}
+    refused(stranger(above("<!-- falling -->")), named[end])
+
+
+def test_a_file_of_any_size_is_not_read(stranger):
+    folder = stranger(above('<asset><mesh name="m" file="shell.stl"/></asset>'))
+    with (folder / "shell.stl").open("wb") as file:
+        file.truncate(2**40)
+    refused(folder, "over 512 MiB")
+
+
+def test_included_files_are_known_by_what_includes_them(stranger):
+    """MuJoCo reads them as XML whatever their ending; the digest has to cover what they name."""
+    folder = stranger(above('<include file="parts.txt"/>'))
+    (folder / "parts.txt").write_text('<mujoco><asset><mesh file="shell.stl"/></asset></mujoco>')
+    (folder / "shell.stl").write_bytes(b"solid")
+    assert [f.name for f in model_files(folder / "go2.xml")] == ["go2.xml", "parts.txt", "shell.stl"]
+
+
+def test_only_a_robot_given_by_its_path_is_compiled_apart(stranger, monkeypatch):
+    def here(robot: object) -> None:
+        compiled.append(os.getpid())
+
+    compiled: list[int] = []
+    monkeypatch.setattr(checking, "_inspect", here)
+    monkeypatch.setattr(checking, "_checked", set())
+    load_robot("go2")
+    assert compiled == [os.getpid()]
+    load_robot(stranger(above("<!-- mine -->")))
+    assert compiled == [os.getpid()], "it was compiled in this process"
+    assert mujoco.MjModel.from_xml_path(str(GO2 / "go2.xml")).nu == 12
