@@ -247,9 +247,14 @@ def _share_interval(same: Array, cluster: NDArray[np.intp]) -> tuple[float, floa
         seen = clusters / (clusters - 1) * float((np.bincount(cluster, weights=same - share) ** 2).sum()) / count**2
         student = stats.t.ppf(0.5 + 0.5 * CONFIDENCE, [count - 1, clusters - 1])
         effective /= max(seen / independent if independent > 0.0 else 1.0, 1.0) * (student[1] / student[0]) ** 2
+    return wilson_interval(share, effective)
+
+
+def wilson_interval(share: float, trials: float) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share of successes among so many independent trials (Wilson 1927)."""
     z = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
-    centre = (share + z**2 / (2 * effective)) / (1 + z**2 / effective)
-    reach = z / (1 + z**2 / effective) * math.sqrt(share * (1 - share) / effective + z**2 / (4 * effective**2))
+    centre = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    reach = z / (1 + z**2 / trials) * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
     return max(centre - reach, 0.0), min(centre + reach, 1.0)
 
 

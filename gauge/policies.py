@@ -1,0 +1,67 @@
+"""Several policies at once: each by a label, and a sentence on each that cannot be had, so that the others go on."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..policy.base import PolicyError
+from ..policy.contract import ContractError, check_robot
+from ..policy.loading import find_policy, load_policy
+from ..policy.native import FilePolicy
+from ..robots import Robot
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refused:
+    """Something that was asked for and cannot be done; the rest was."""
+
+    what: str
+    """A policy, a scenario …, as the user named it."""
+    reason: str
+    """One sentence."""
+
+
+def load_policies(
+    names: Sequence[str], robot: Robot, *, trust: bool = False
+) -> tuple[dict[str, FilePolicy], list[Refused]]:
+    """Load policies.
+
+    Args:
+        names: what ``gaitgauge evaluate`` takes; one that is named twice is loaded once.
+        robot: the robot that they have to fit.
+        trust: run programs that files of the project's own format carry inside.
+
+    Returns:
+        Policies by label, the shortest that tells them apart, and those that could not be loaded.
+    """
+    found: dict[str, FilePolicy] = {}
+    refused: list[Refused] = []
+    names = list(dict.fromkeys(names))
+    short = [Path(name).name.partition(".")[0] for name in names]
+    for name, stem in zip(names, short, strict=True):
+        try:
+            policy = load_policy(name, robot, trust=trust)
+            check_robot(policy.contract, robot)
+        except (PolicyError, ContractError) as error:
+            refused.append(Refused(what=name, reason=str(error)))
+        else:
+            found[stem if short.count(stem) == 1 else name] = policy
+    return found, refused
+
+
+def describe(label: str, policy: FilePolicy) -> dict[str, Any]:
+    """What a result says of a policy, as plain data."""
+    with find_policy(policy.path).open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {
+        "label": label,
+        "path": policy.path,
+        "file_sha256": digest,
+        "contract_hash": policy.contract.hash,
+        "command_limits": list(policy.contract.command_limits),
+        "provenance": dict(policy.contract.provenance),
+    }

@@ -1,0 +1,295 @@
+"""A field trial as data: the ground, commands over time, pulls, and what counts as success. One TOML file for each scenario."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ...files.parsing import Name, Text, build, did_you_mean, one_line, parse_toml, read_text
+from ...terrains.base import Box, Terrain
+from ...terrains.course import Stretch, course_boxes
+from ...terrains.registry import TerrainError, make_terrain
+from ..suite import Friction, load_suite
+
+SCENARIO_FOLDER = Path(__file__).parents[1] / "scenarios"
+
+_Place = Annotated[float, Field(ge=-200.0, le=200.0)]
+_Size = Annotated[float, Field(gt=0.0, le=200.0)]
+_Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
+_Seconds = Annotated[float, Field(gt=0.0, le=600.0)]
+_Moment = Annotated[float, Field(ge=0.0, le=600.0)]
+_Newtons = Annotated[float, Field(ge=0.0, le=10_000.0)]
+_Angle = Annotated[float, Field(ge=-math.pi, le=math.pi)]
+_Spread = Annotated[float, Field(ge=0.0, le=10.0)]
+_Number = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
+class ScenarioError(ValueError):
+    """A scenario that does not exist, is malformed, or could never be decided."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """A solid box that stands or lies somewhere."""
+
+    center: tuple[_Place, _Place, _Place]
+    """[m]."""
+    size: tuple[_Size, _Size, _Size]
+    """Whole lengths along the box's own axes [m]."""
+    yaw: _Angle = 0.0
+    """Turned about the vertical [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground:
+    """What is walked on: a terrain by its name, or a course of stretches, or boxes, or both of these; with none of them a floor."""
+
+    terrain: Text | None = None
+    """Name of a terrain (``gaitgauge list terrains``)."""
+    level: Annotated[int, Field(ge=1, le=1000)] | None = None
+    """Its level."""
+    begin: _Place = -2.0
+    """x at which the course begins [m]."""
+    height: Annotated[float, Field(ge=0.0, le=50.0)] = 0.0
+    """Of the ground there [m]."""
+    width: _Size = 6.0
+    """Of the course [m]; it has no walls."""
+    stretches: Annotated[tuple[Stretch, ...], Field(max_length=200)] = ()
+    """The course, from its beginning on; behind it comes the floor."""
+    boxes: Annotated[tuple[Block, ...], Field(max_length=1000)] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """Where robots start, on the ground, in their standing pose."""
+
+    x: _Place = 0.0
+    """[m]."""
+    y: _Place = 0.0
+    """[m]."""
+    yaw: _Angle = 0.0
+    """Heading [rad]."""
+    spread: tuple[_Spread, _Spread, _Spread] = (0.05, 0.05, 0.05)
+    """Half widths of what each seed adds to x, y [m] and heading [rad], uniformly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """What is commanded for a time."""
+
+    seconds: _Seconds
+    velocity: tuple[_Speed, _Speed, _Speed]
+    """Forward, lateral [m/s] and yaw [rad/s] speed."""
+    until_x: _Place | None = None
+    """The phase ends early once the base is beyond this x [m]."""
+    steer: bool = False
+    """Whether the yaw speed is an operator's who keeps the robot on the line through its start, in place of ``velocity``'s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Force:
+    """A pull at the base's centre of mass, horizontal, in a direction that turns with the robot's heading."""
+
+    direction: Literal["left", "right", "side", "forward", "backward"]
+    """``side``: left or right, as each pull's draw says."""
+    newtons: tuple[_Newtons, _Newtons]
+    """Least and largest [N]; each pull draws its own, uniformly."""
+    begin: tuple[_Moment, _Moment]
+    """When it begins [s] after the start, least and latest; drawn."""
+    seconds: tuple[_Seconds, _Seconds]
+    """How long it lasts [s], least and longest; drawn."""
+    every: _Seconds | None = None
+    """Time from the beginning of one pull to that of the next [s]; None for a single pull."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Success:
+    """What must hold by the time the commands are over. A robot that fell has failed, whatever else it did."""
+
+    survive: bool = False
+    """Nothing but not to fall."""
+    beyond: _Place | None = None
+    """The base came beyond this x [m]."""
+    speed: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
+    """The forward speed, a mean over 0.1 s, came to this [m/s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """What counts as a fall. Physics that becomes invalid always does."""
+
+    tilt: Annotated[float, Field(gt=0.0, le=3.1416)] = 1.309
+    """Tilt of the base [rad]."""
+    lying: Annotated[float, Field(gt=0.0, le=60.0)] | Literal[False] = 1.0
+    """Time without a break with the trunk on the ground [s]; false: that is allowed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reported:
+    """What somebody reports of the same trial on a real robot."""
+
+    who: Text
+    successes: _Number | None = None
+    trials: _Number | None = None
+    text: Text | None = None
+    """What was measured, in words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """A field trial."""
+
+    name: Name
+    title: Text
+    about: Annotated[str, Field(max_length=4000)] = ""
+    """What it stands for, and what had to be assumed."""
+    friction: Friction
+    """Sliding friction coefficient of every contact."""
+    repeats: Annotated[int, Field(ge=1, le=10_000)] = 20
+    """Robots, where no other number is asked for."""
+    suite: Text = "gaitgauge-1"
+    """Suite whose physics, sensor noise and latency act."""
+    torque_speed_limit: bool = True
+    """Whether the motors' torque falls with their speed, as a real one's does."""
+    ground: Ground = field(default_factory=Ground)
+    start: Start = field(default_factory=Start)
+    commands: Annotated[tuple[Phase, ...], Field(min_length=1, max_length=1000)]
+    """One after another, from the start on."""
+    forces: Annotated[tuple[Force, ...], Field(max_length=100)] = ()
+    success: Success = field(default_factory=Success)
+    failure: Failure = field(default_factory=Failure)
+    reported: Annotated[tuple[Reported, ...], Field(max_length=100)] = ()
+
+    @property
+    def seconds(self) -> float:
+        """The longest that a trial can take [s]."""
+        return sum(phase.seconds for phase in self.commands)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over all that decides about outcomes, hexadecimal."""
+        words = ("title", "about", "repeats", "reported")
+        rules = {k: v for k, v in asdict(self).items() if k not in words} | {"suite": load_suite(self.suite).digest}
+        return hashlib.sha256(json.dumps(rules, sort_keys=True).encode()).hexdigest()
+
+    def terrain(self) -> Terrain:
+        """The ground.
+
+        Raises:
+            TerrainError: no such terrain or level, or a course that leads below the floor.
+        """
+        ground = self.ground
+        if ground.terrain is not None:
+            return make_terrain(ground.terrain, ground.level)
+        course = course_boxes(
+            ground.stretches,
+            begin=ground.begin,
+            height=ground.height,
+            width=ground.width,
+            source=f"scenario '{self.name}'",
+        )
+        blocks = tuple(
+            Box(
+                center=block.center,
+                half_size=(0.5 * block.size[0], 0.5 * block.size[1], 0.5 * block.size[2]),
+                quaternion=(math.cos(0.5 * block.yaw), 0.0, 0.0, math.sin(0.5 * block.yaw)),
+            )
+            for block in ground.boxes
+        )
+        return Terrain(name=self.name, family="course", boxes=course + blocks)
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that ship with the project."""
+    return sorted(path.stem for path in SCENARIO_FOLDER.glob("*.toml"))
+
+
+def load_scenario(name: str) -> Scenario:
+    """Load a scenario by name, or from a TOML file of the user's own (a path that ends in ``.toml``).
+
+    Raises:
+        ScenarioError: no such scenario, a malformed file, or a scenario that could never be decided.
+        SuiteError: its suite does not exist.
+    """
+    own = name.endswith(".toml")
+    if not own and name not in scenario_names():
+        known = ", ".join(scenario_names())
+        raise ScenarioError(
+            f"there is no scenario '{one_line(name, 80)}'{did_you_mean(name, scenario_names())}; choose one of {known}, or "
+            "give a .toml file"
+        )
+    path = Path(name) if own else SCENARIO_FOLDER / f"{name}.toml"
+    source = f"scenario file {one_line(path)}"
+    data = parse_toml(read_text(path, "scenario file", ScenarioError), source, ScenarioError)
+    scenario = build(Scenario, data, source, ScenarioError)
+    _check(scenario, source)
+    return scenario
+
+
+def _check(scenario: Scenario, source: str) -> None:
+    """Refuse what each field alone allows and all of them together do not.
+
+    Raises:
+        ScenarioError: one sentence.
+        SuiteError: the suite does not exist.
+    """
+    load_suite(scenario.suite)
+    ground, start, success = scenario.ground, scenario.start, scenario.success
+    seconds = scenario.seconds
+    if ground.terrain is None and ground.level is not None:
+        raise ScenarioError(
+            f"{source}: ground.level is {ground.level} of no terrain; give ground.terrain, or leave it out"
+        )
+    if ground.terrain is not None and (ground.stretches or ground.boxes):
+        raise ScenarioError(
+            f"{source}: ground has the terrain '{one_line(ground.terrain, 80)}' and stretches or boxes too; choose one of them"
+        )
+    try:
+        scenario.terrain()
+    except TerrainError as error:
+        raise ScenarioError(f"{source}: {error}") from error
+    for number, force in enumerate(scenario.forces):
+        for name, (least, largest) in (("newtons", force.newtons), ("begin", force.begin), ("seconds", force.seconds)):
+            if least > largest:
+                raise ScenarioError(
+                    f"{source}: forces[{number}].{name} is {least:g} to {largest:g}; the least must come first"
+                )
+        if force.begin[1] >= seconds:
+            raise ScenarioError(
+                f"{source}: forces[{number}] may begin after {force.begin[1]:g} s, when the commands, of {seconds:g} s, are "
+                "over; let it begin sooner"
+            )
+    if not success.survive and success.beyond is None and success.speed is None:
+        raise ScenarioError(
+            f"{source}: nothing says what success is, so it can never be decided; give beyond, speed or survive = true "
+            "under [success]"
+        )
+    fastest = max(phase.velocity[0] for phase in scenario.commands)
+    if success.speed is not None and success.speed > fastest:
+        raise ScenarioError(
+            f"{source}: success.speed is {success.speed:g} m/s and no more than {fastest:g} m/s is ever commanded, so success "
+            "can never be decided; command more, or ask for less"
+        )
+    way = sum(math.hypot(*phase.velocity[:2]) * phase.seconds for phase in scenario.commands)
+    if success.beyond is not None and not start.x + start.spread[0] < success.beyond <= start.x + way:
+        raise ScenarioError(
+            f"{source}: success.beyond is x = {success.beyond:g} m, but robots start at {start.x:g} m and the commands lead no "
+            f"further than to {start.x + way:g} m, so success can never be decided; choose a place between"
+        )
+    limits = [phase.until_x for phase in scenario.commands if phase.until_x is not None]
+    if success.beyond is not None and limits and max(limits) < success.beyond and _ends_early(scenario):
+        raise ScenarioError(
+            f"{source}: success.beyond is x = {success.beyond:g} m, but the commands that lead on end at until_x = "
+            f"{max(limits):g} m, so success can never be decided; let until_x be as far"
+        )
+
+
+def _ends_early(scenario: Scenario) -> bool:
+    """Whether every command that leads on ends at a place."""
+    return all(phase.until_x is not None for phase in scenario.commands if phase.velocity[0] > 0.0)

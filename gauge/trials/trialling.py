@@ -1,0 +1,220 @@
+"""Policies through scenarios: ``trials.json``, ``trials.csv`` and ``trial.html``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from ...backends.base import BackendError, PhysicsBackend
+from ...backends.registry import find_backend, make_backend
+from ...files.provenance import provenance
+from ...files.writing import json_text, write_atomically
+from ...policy.base import PolicyError
+from ...policy.contract import ContractError
+from ...policy.native import FilePolicy
+from ...robots import Robot, RobotError, load_robot
+from ..consistency.statistics import wilson_interval
+from ..policies import Refused, describe, load_policies
+from ..suite import SuiteError
+from .page import render_page
+from .running import Trial, run_scenario
+from .scenario import Scenario, ScenarioError, load_scenario, scenario_names
+
+ALL = "all"
+"""Stands for every scenario that ships with the project."""
+MEASURES = ("reached", "progress", "mean_speed", "peak_speed", "speed_time", "tracking_error")
+"""Numbers of a trial whose median is shown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialRequest:
+    """Who goes through what."""
+
+    policies: tuple[str, ...]
+    scenarios: tuple[str, ...] = (ALL,)
+    """Names, ``.toml`` files, or ``all``."""
+    repeats: int | None = None
+    """Robots of each policy in each scenario; None for the scenario's own number."""
+    seed: int = 0
+    """The first robot's seed; the others' follow it."""
+    backend: str = "mujoco"
+    device: str = "cpu"
+    robot: str = "go2"
+    threads: int = 1
+    """CPU threads; they change the time, never the results."""
+    trust: bool = False
+    """Run the program that a policy file of the project's own format carries inside."""
+
+
+def run_trials(
+    request: TrialRequest,
+    folder: Path,
+    *,
+    command: Sequence[str] = (),
+    watch: Callable[[int, int, str], None] | None = None,
+    make: Callable[..., PhysicsBackend] = make_backend,
+) -> dict[str, Any]:
+    """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
+
+    Args:
+        request: who and what.
+        folder: where the files go.
+        command: the command line, for the provenance.
+        watch: called before each policy's turn in each scenario with the turn's number, their count, and its name.
+        make: builds engines by name.
+
+    Returns:
+        The content of ``trials.json`` (docs/trials.md).
+
+    Raises:
+        BackendError, RobotError, ScenarioError: nothing of it can be done; or no such engine, device or robot.
+    """
+    began = time.perf_counter()
+    find_backend(request.backend, request.device)
+    robot = load_robot(request.robot)
+    policies, refused = load_policies(request.policies, robot, trust=request.trust)
+    scenarios: dict[str, Scenario] = {}
+    names = [n for name in request.scenarios for n in (scenario_names() if name == ALL else [name])]
+    for name in dict.fromkeys(names):
+        try:
+            scenario = load_scenario(name)
+            if scenario.name in scenarios:
+                raise ScenarioError(
+                    f"'{name}' is called '{scenario.name}' as another one of these scenarios; rename it"
+                )
+            scenarios[scenario.name] = scenario
+        except (ScenarioError, SuiteError) as error:
+            refused.append(Refused(what=name, reason=str(error)))
+    entries = [_about(scenario, robot) for scenario in scenarios.values()]
+    turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]
+    for number, (scenario, entry, label) in enumerate(turns, 1):
+        if watch is not None:
+            watch(number, len(turns), f"{label} in {scenario.name}")
+        seeds = range(request.seed, request.seed + (request.repeats or scenario.repeats))
+        try:
+            trials = run_scenario(
+                policies[label],
+                robot,
+                scenario,
+                seeds,
+                backend=request.backend,
+                device=request.device,
+                threads=request.threads,
+                make=make,
+            )
+        except (BackendError, ContractError, PolicyError, RobotError, ScenarioError) as error:
+            refused.append(Refused(what=f"{label} in {scenario.name}", reason=str(error)))
+        else:
+            entry["results"].append(summary(label, policies[label], scenario, trials))
+    if not any(entry["results"] for entry in entries):
+        raise ScenarioError("; ".join(r.reason for r in refused) or "there is nothing to try; name a scenario")
+    results = {
+        "schema": 1,
+        "policies": [describe(label, policy) for label, policy in policies.items()],
+        "scenarios": entries,
+        "refused": [asdict(r) for r in refused],
+        "backend": request.backend,
+        "robot": robot.name,
+        "provenance": provenance(
+            command=command,
+            device=request.device,
+            threads=request.threads,
+            seconds=round(time.perf_counter() - began, 2),
+        ),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / "trials.csv", as_csv(results), ScenarioError)
+    write_atomically(folder / "trial.html", render_page(results), ScenarioError)
+    write_atomically(folder / "trials.json", json_text(results), ScenarioError)
+    return results
+
+
+def _about(scenario: Scenario, robot: Robot) -> dict[str, Any]:
+    """What a result says of a scenario."""
+    terrain, start = scenario.terrain(), scenario.start
+    return {
+        "name": scenario.name,
+        "title": scenario.title,
+        "about": " ".join(scenario.about.split()),
+        "digest": scenario.digest,
+        "suite": scenario.suite,
+        "friction": scenario.friction,
+        "seconds": scenario.seconds,
+        "success": asdict(scenario.success),
+        "reported": [asdict(r) for r in scenario.reported],
+        "start": [start.x, start.y],
+        "stand_height": robot.stand_height,
+        "profile": profile(terrain, start.x, start.y, scenario.success.beyond),
+        "results": [],
+    }
+
+
+def profile(terrain: Any, x: float, y: float, beyond: float | None) -> list[tuple[float, float]]:
+    """Height of the ground along x through the start, as corners of a line [m]; empty where all of it is level."""
+    step = 0.02
+    count = round((max(beyond or 0.0, x + 2.0) - x + 4.0) / step)
+    places = [x - 2.0 + step * i for i in range(count)]
+    heights = [float(z) for z in terrain.height(places, [y] * count)]
+    if max(heights) - min(heights) < 1e-6:
+        return []
+    line = [(round(a, 3), round(b, 3)) for a, b in zip(places, heights, strict=True)]
+    inner = [p for before, p, after in zip(line, line[1:], line[2:], strict=False) if not _straight(before, p, after)]
+    return [line[0], *inner, line[-1]]
+
+
+def _straight(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+    return abs((b[1] - a[1]) - (c[1] - b[1])) < 2e-3
+
+
+def summary(label: str, policy: FilePolicy, scenario: Scenario, trials: Sequence[Trial]) -> dict[str, Any]:
+    """Counts, Wilson's interval and medians of a policy's trials, and each of these."""
+    outcomes = [t.outcome for t in trials]
+    successes, count = outcomes.count("success"), len(trials)
+    asked = [max(abs(p.velocity[i]) for p in scenario.commands) for i in range(3)]
+    limits = policy.contract.command_limits
+    above = [
+        f"{a:g} {unit}"
+        for a, limit, unit in zip(asked, limits, ("m/s", "m/s sideways", "rad/s"), strict=True)
+        if a > limit
+    ]
+    note = f"told up to {', '.join(above)}; made for up to {limits[0]:g}, {limits[1]:g} m/s and {limits[2]:g} rad/s"
+    medians: dict[str, float | None] = {}
+    for name in MEASURES:
+        values = [v for t in trials if (v := getattr(t, name)) is not None]
+        medians[name] = median(values) if values else None
+    return {
+        "policy": label,
+        "trials": count,
+        "successes": successes,
+        "fell": outcomes.count("fell"),
+        "missed": outcomes.count("missed"),
+        "diverged": sum(t.diverged for t in trials),
+        "share": successes / count,
+        "interval": list(wilson_interval(successes / count, count)),
+        "medians": medians,
+        "note": note if above else "",
+        "rows": [asdict(t) for t in trials],
+    }
+
+
+def as_csv(results: Mapping[str, Any]) -> str:
+    """One row for each trial."""
+    text = io.StringIO()
+    names = ("seed", "outcome", "diverged", "seconds", *MEASURES)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["scenario", "policy", *names, "pulls"])
+    for entry in results["scenarios"]:
+        for result in entry["results"]:
+            for row in result["rows"]:
+                pulls = "; ".join(
+                    f"{p['newtons']:.1f} N at {p['begin']:.2f} s for {p['seconds']:.2f} s" for p in row["pulls"]
+                )
+                values = ["" if row[n] is None else row[n] for n in names]
+                writer.writerow([entry["name"], result["policy"], *values, pulls])
+    return text.getvalue()
