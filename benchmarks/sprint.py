@@ -2,140 +2,79 @@
 
     python benchmarks/sprint.py logs/rsl_rl/go2_sprint/RUN/model_2000.pt --speed 4.2 --reach 4.0
 
-Robots stand for a second, are told to run straight ahead, and to stop after the runway (the paper's has 8 m, a robot
-gets there 4.01 m/s within 2.16 s with an error of 0.20 m/s). Physics and noise are those of a suite, in MuJoCo, with the
-motors' torque-speed limits. Prints the time until the forward speed, a mean over 0.1 s, first comes to ``--reach``, its
-peak, the mean error from then to the runway's end, falls, and joint speeds.
+The scenario ``sprint`` of ``gaitgauge trial`` with settings of its own: robots stand for a second, are told to run straight
+ahead, and to stop after the runway (the paper's has 8 m, a robot gets there 4.01 m/s within 2.16 s with an error of 0.20 m/s).
+Prints the time until the forward speed, a mean over 0.1 s, first comes to ``--reach``, its peak, the mean error from then to
+the runway's end, falls, and joint speeds.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
-from gaitgauge.backends.base import PhysicsState, Randomization, ResetState, Scene
-from gaitgauge.backends.registry import make_backend
-from gaitgauge.gauge.suite import load_suite
+from gaitgauge.backends.base import PhysicsState
+from gaitgauge.gauge.trials.running import Trial, run_scenario
+from gaitgauge.gauge.trials.scenario import Scenario, load_scenario
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.rotation import rotate_inverse
-from gaitgauge.terrains.registry import make_terrain
-
-STAND, BRAKE = 1.0, 2.0
-"""Time before the run and after it [s]."""
-SMOOTHING = 0.1
-"""Time over which speeds are averaged [s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """What happened; R robots, T control steps."""
-
-    period: float
-    """Control period [s]."""
-    speed: torch.Tensor
-    """Forward speed of the base, smoothed [m/s], (T, R)."""
-    running: torch.Tensor
-    """Whether the command was to run, (T, R) bool."""
-    joint_speed: torch.Tensor
-    """Absolute joint speeds while running, NaN elsewhere [rad/s], (T, R, J)."""
-    fallen: torch.Tensor
-    """(R,) bool."""
-
-
-def run(policy_path: str, *, speed: float, runway: float, friction: float, robots: int, seed: int, suite: str) -> Run:
-    """Let robots run.
+def scenario(*, speed: float, reach: float, runway: float, friction: float, suite: str) -> Scenario:
+    """The sprint.
 
     Args:
-        policy_path: what ``gaitgauge evaluate`` takes.
         speed: commanded forward speed [m/s].
+        reach: speed whose time is taken [m/s].
         runway: way after which the command is to stand [m].
         friction: sliding friction.
-        robots: how many run side by side, each with noise of its own.
-        seed: of the noise.
         suite: whose physics and noise act.
     """
-    rules, policy = load_suite(suite), load_policy(policy_path)
-    robot = load_robot(policy.contract.robot)
-    scene = Scene(
-        robot=robot,
-        parameters=robot.parameters[rules.parameters],
-        terrains=(make_terrain("flat"),),
-        terrain_index=(0,) * robots,
-        physics=replace(rules.physics, torque_limits=True, torque_speed_limit=True),
+    whole = load_scenario("sprint")
+    stand, run, brake = whole.commands
+    run = replace(run, velocity=(speed, 0.0, 0.0), until_x=runway, seconds=2.0 * runway / speed + 3.0)
+    success = replace(whole.success, speed=reach)
+    return replace(whole, commands=(stand, run, brake), success=success, friction=friction, suite=suite)
+
+
+def run(policy_path: str, sprint: Scenario, *, robots: int, seed: int) -> tuple[list[Trial], torch.Tensor]:
+    """Let robots run, each with noise of its own.
+
+    Returns:
+        What came of each, and absolute joint speeds of those that were told to run, (T, J) [rad/s].
+    """
+    policy = load_policy(policy_path)
+    joint_speeds: list[torch.Tensor] = []
+
+    def watch(state: PhysicsState, moving: torch.Tensor) -> None:
+        joint_speeds.append(state.joint_velocity[moving].float().abs())
+
+    trials = run_scenario(
+        policy, load_robot(policy.contract.robot), sprint, range(seed, seed + robots), backend="mujoco", watch=watch
     )
-    physics = make_backend("mujoco", scene)
-    session, builder = policy.session(robots), ObservationBuilder(policy.contract, robot, robots)
-    random = torch.Generator().manual_seed(seed)
-
-    def noise(state: PhysicsState, name: str) -> torch.Tensor:
-        width = getattr(rules.noise, name.removesuffix("_b"))
-        return width * (2.0 * torch.rand(getattr(state, name).shape, generator=random) - 1.0)
-
-    try:
-        physics.randomize(Randomization(friction=torch.full((robots,), friction)))
-        position = torch.tensor([0.0, 0.0, robot.stand_height]).expand(robots, 3)
-        upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(robots, 4)
-        default = torch.tensor(robot.default_joint_position).expand(robots, -1)
-        physics.reset(ResetState(base_position=position, base_quaternion=upright, held_target=default))
-        period = scene.physics.control_period
-        longest = STAND + 2.0 * runway / speed + 3.0 + BRAKE
-        speeds, commands, joints = [], [], []
-        command, action = torch.zeros(robots, 3), torch.zeros(robots, policy.contract.num_joints)
-        fallen, stopped = torch.zeros(robots, dtype=torch.bool), torch.zeros(robots, dtype=torch.bool)
-        for step in range(round(longest / period)):
-            state = physics.state
-            stopped |= state.base_position_w[:, 0].float() >= runway
-            runs = ~stopped & (step * period >= STAND)
-            command[:, 0] = speed * runs
-            noisy = {
-                name: noise(state, name) for name in ("base_angular_velocity_b", "joint_position", "joint_velocity")
-            }
-            action = session.act(builder.build(state, command, action, noisy))
-            delay = torch.randint(rules.noise.latency + 1, (robots,), generator=random)
-            physics.step(builder.targets(action), delay=delay)
-            state = physics.state
-            forward = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)[:, 0].float()
-            up = 1.0 - 2.0 * state.base_quaternion_w[:, 1:3].square().sum(dim=1)
-            fallen |= (up < math.cos(1.2)) | state.diverged | (state.trunk_contact_force_w.norm(dim=1) > 1.0)
-            speeds.append(forward.clone())
-            commands.append(runs)
-            joints.append(torch.where(runs[:, None], state.joint_velocity.float().abs(), math.nan))
-        window = round(SMOOTHING / period)
-        raw = torch.stack(speeds)
-        padded = torch.cat((torch.zeros(window - 1, robots), raw))
-        smooth = padded.unfold(0, window, 1).mean(dim=-1)
-        return Run(
-            period=period, speed=smooth, running=torch.stack(commands), joint_speed=torch.stack(joints), fallen=fallen
-        )
-    finally:
-        physics.close()
+    return trials, torch.cat(joint_speeds)
 
 
-def lines(done: Run, *, speed: float, reach: float) -> list[str]:
+def lines(trials: Sequence[Trial], joint_speeds: torch.Tensor, *, reach: float) -> list[str]:
     """What is printed, a line each."""
-    start = done.running.int().argmax(dim=0)
-    there = done.running & (done.speed >= reach)
-    reached = there.any(dim=0)
-    time = (there.int().argmax(dim=0) - start + 1) * done.period
-    after = done.running & (torch.arange(len(done.speed))[:, None] >= there.int().argmax(dim=0)) & reached
-    error = (done.speed - speed).abs()[after]
+    times = [t.speed_time for t in trials if t.speed_time is not None]
+    errors = [t.tracking_error for t in trials if t.speed_time is not None and t.tracking_error is not None]
     rows = [
-        f"robots                       {len(reached)}, of which fell {int(done.fallen.sum())}",
-        f"came to {reach:g} m/s             {int(reached.sum())}",
-        f"peak forward speed           {done.speed.amax(dim=0).mean():.2f} m/s",
+        f"robots                       {len(trials)}, of which fell {sum(t.outcome == 'fell' for t in trials)}",
+        f"came to {reach:g} m/s             {len(times)}",
+        f"peak forward speed           {math.fsum(t.peak_speed for t in trials) / len(trials):.2f} m/s",
     ]
-    if reached.any():
+    if times:
+        mean, least, largest = math.fsum(times) / len(times), min(times), max(times)
         rows += [
-            f"time to {reach:g} m/s             {time[reached].mean():.2f} s ({time[reached].min():.2f} to {time[reached].max():.2f})",
-            f"error from there on          {error.mean():.2f} m/s",
+            f"time to {reach:g} m/s             {mean:.2f} s ({least:.2f} to {largest:.2f})",
+            f"error from there on          {math.fsum(errors) / len(errors):.2f} m/s",
         ]
     for joint, name in enumerate(("hips", "thighs", "calves")):
-        seen = done.joint_speed[..., joint::3]
-        seen = seen[seen.isfinite()]
+        seen = joint_speeds[:, joint::3].flatten()
         rows.append(f"{name + ' turn at up to':<28} {seen.max():.1f} rad/s, 99 % below {seen.quantile(0.99):.1f} rad/s")
     return rows
 
@@ -152,16 +91,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--suite", default="robogauge-1.1", help="suite whose physics and noise act")
     given = parser.parse_args()
-    done = run(
-        given.policy,
-        speed=given.speed,
-        runway=given.runway,
-        friction=given.friction,
-        robots=given.robots,
-        seed=given.seed,
-        suite=given.suite,
+    sprint = scenario(
+        speed=given.speed, reach=given.reach, runway=given.runway, friction=given.friction, suite=given.suite
     )
-    print("\n".join(lines(done, speed=given.speed, reach=given.reach)))
+    trials, joint_speeds = run(given.policy, sprint, robots=given.robots, seed=given.seed)
+    print("\n".join(lines(trials, joint_speeds, reach=given.reach)))
 
 
 if __name__ == "__main__":

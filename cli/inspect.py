@@ -198,6 +198,15 @@ def _suites() -> Table:
     return table
 
 
+def _scenarios() -> Table:
+    from ..gauge.trials.scenario import load_scenario, scenario_names
+
+    table = make_table("field trials (--scenario NAME, or a scenario's .toml)", "name", "title", "at most")
+    for scenario in map(load_scenario, scenario_names()):
+        table.add_row(scenario.name, scenario.title, f"{scenario.seconds:g} s")
+    return table
+
+
 def _tasks() -> Table:
     from ..training.tasks import TASKS
 
@@ -252,6 +261,7 @@ LISTS: dict[str, Callable[[], Table]] = {
     "terrains": _terrains,
     "backends": _backends,
     "suites": _suites,
+    "scenarios": _scenarios,
     "policies": _policies,
     "tasks": _tasks,
 }

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .commands import judging, learning, looking, policies
+from .commands import experiments, judging, learning, looking, policies
 from .errors import output_failures
 
 app = typer.Typer(
@@ -16,7 +16,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (judging, learning, policies, looking):
+for group in (judging, experiments, learning, policies, looking):
     app.add_typer(group.app)
 
 

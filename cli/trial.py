@@ -13,7 +13,6 @@ import typer
 
 from ..backends.registry import choose_device
 from ..gauge.trials.page import measures, percent, reported
-from ..gauge.trials.scenario import load_scenario, scenario_names
 from ..gauge.trials.trialling import ALL, TrialRequest, run_trials
 from .console import Terminal, make_table
 from .errors import UserError
@@ -87,9 +86,3 @@ def print_trials(console: Terminal, results: Mapping[str, Any]) -> None:
     console.print(table)
     for note in notes:
         console.say(note)
-
-
-def list_scenarios() -> list[tuple[str, str, str]]:
-    """Name, title and longest time of every scenario that ships."""
-    found = [load_scenario(name) for name in scenario_names()]
-    return [(s.name, s.title, f"{s.seconds:g} s") for s in found]

@@ -14,7 +14,7 @@ app = typer.Typer()
 @app.command("list")
 @report_errors
 def list_command(
-    what: Annotated[str, typer.Argument(help="robots, terrains, backends, suites, policies or tasks.")],
+    what: Annotated[str, typer.Argument(help="robots, terrains, backends, suites, scenarios, policies or tasks.")],
 ) -> None:
     """List what can be named on the command line."""
     from ..inspect import list_things

@@ -275,14 +275,14 @@ class _Run:
             seed=self._seeds[i],
             outcome="fell" if fell.any() else "success" if came else "missed",
             diverged=bool(diverged),
-            seconds=last * period,
-            reached=None if at is None else (at - began + 1) * period,
+            seconds=round(last * period, 6),
+            reached=None if at is None else round((at - began + 1) * period, 6),
             progress=None
             if success.beyond is None
             else min(max((float(x.max()) - begin) / (success.beyond - begin), 0.0), 1.0),
             mean_speed=None if at is None else (float(x[at]) - begin) / ((at - began + 1) * period),
             peak_speed=float(speed.max()),
-            speed_time=None if fast is None else (fast - began + 1) * period,
+            speed_time=None if fast is None else round((fast - began + 1) * period, 6),
             tracking_error=float(np.abs(speed - told)[counted].mean()) if counted.any() else None,
             pulls=self._pulls[i],
             path=tuple(_place(position[j], tilts[j]) for j in range(0, last, stride)),

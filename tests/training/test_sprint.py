@@ -1,37 +1,31 @@
-"""What the sprint benchmark makes of a run whose speeds are known."""
+"""The sprint benchmark: the scenario with settings of its own, and what it prints."""
 
 import pytest
 import sprint
 import torch
+from gaitgauge.gauge.trials.running import Trial
 
 
-def test_time_peak_and_error_of_a_robot_that_accelerates_evenly():
-    """2 m/s² from rest after 50 steps of standing, up to 4 m/s, which it keeps until it is told to stop."""
-    time = torch.arange(400) * 0.02
-    first = (2.0 * (time - 1.0)).clamp(0.0, 4.0)
-    never = first.clamp(max=3.0)
-    running = (time >= 1.0) & (time < 5.0)
-    done = sprint.Run(
-        period=0.02,
-        speed=torch.stack((first, never), dim=1),
-        running=running[:, None].expand(-1, 2),
-        joint_speed=torch.full((400, 2, 12), 3.0),
-        fallen=torch.tensor([False, True]),
-    )
-    text = "\n".join(sprint.lines(done, speed=4.2, reach=3.9))
+def trial(**known: object) -> Trial:
+    unknown = {"reached": None, "progress": None, "mean_speed": None, "diverged": False, "pulls": (), "path": ()}
+    return Trial(**(unknown | {"seed": 0, "seconds": 5.0, "speed_time": None, "tracking_error": 1.0} | known))
+
+
+def test_what_is_printed_of_two_robots_of_which_one_fell():
+    fast = trial(outcome="success", peak_speed=4.0, speed_time=1.98, tracking_error=0.2)
+    slow = trial(outcome="fell", peak_speed=3.0)
+    text = "\n".join(sprint.lines([fast, slow], torch.full((400, 12), 3.0), reach=3.9))
     assert "robots                       2, of which fell 1" in text
     assert "came to 3.9 m/s             1" in text
     assert "peak forward speed           3.50 m/s" in text
-    # The first step at 3.92 m/s ends 1.98 s after the command.
     assert "time to 3.9 m/s             1.98 s" in text
     assert "error from there on          0.20 m/s" in text
     assert "calves turn at up to         3.0 rad/s" in text
 
 
 def test_a_robot_runs_stands_and_is_told_to_stop():
-    done = sprint.run("pretrained", speed=1.0, runway=0.3, friction=0.6, robots=1, seed=0, suite="robogauge-1.1")
-    start, stop = int(done.running[:, 0].int().argmax()), int(done.running[:, 0].sum())
-    assert start == 50 and 15 < stop < 100
-    assert float(done.speed[:start].abs().max()) < 0.3 < float(done.speed.max()) and not done.fallen.any()
-    assert done.joint_speed[start].isfinite().all() and done.joint_speed[0].isnan().all()
-    assert done.period == pytest.approx(0.02)
+    settings = {"speed": 1.0, "reach": 0.5, "runway": 0.3, "friction": 0.6, "suite": "robogauge-1.1"}
+    [done], joint_speeds = sprint.run("pretrained", sprint.scenario(**settings), robots=1, seed=0)
+    assert done.outcome == "success" and 0.5 < done.peak_speed < 1.3
+    assert 0.1 < done.speed_time < 1.0 and done.path[-1][0] == pytest.approx(0.45, abs=0.2)
+    assert joint_speeds.shape[1] == 12 and 15 < len(joint_speeds) < 100

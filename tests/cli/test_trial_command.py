@@ -1,0 +1,93 @@
+"""``gaitgauge trial`` with a policy that stands, where it takes a moment."""
+
+import csv
+import json
+
+import pytest
+
+STANDS = """
+name = "stands"
+title = "Standing <b>still</b>"
+friction = 0.6
+repeats = 2
+
+[[commands]]
+seconds = 0.2
+velocity = [0.0, 0.0, 0.0]
+
+[success]
+survive = true
+
+[[reported]]
+who = "Theirs"
+successes = 5
+trials = 20
+"""
+RUNS = """
+name = "runs"
+title = "Running"
+friction = 0.6
+repeats = 2
+
+[[commands]]
+seconds = 0.2
+velocity = [3.0, 0.0, 0.0]
+
+[success]
+beyond = 0.5
+"""
+
+
+@pytest.fixture
+def scenarios(tmp_path):
+    (tmp_path / "stands.toml").write_text(STANDS)
+    (tmp_path / "runs.toml").write_text(RUNS)
+    (tmp_path / "never.toml").write_text(STANDS.replace("survive = true", "beyond = 0.1"))
+
+
+def test_what_comes_of_it_is_printed_and_written(run, policy, scenarios, tmp_path):
+    result = run(
+        "trial", policy, "--scenario", "stands.toml", "--scenario", "runs.toml", "--threads", 1, "--out", "here"
+    )
+    assert result.exit_code == 0, result.output
+    assert "2/2" in result.stdout and "0/2" in result.stdout and "Theirs: 5/20" in result.stdout
+    assert "standing in runs: told up to 3 m/s; made for up to 2, 1 m/s and 2 rad/s" in result.stdout
+    found = json.loads((tmp_path / "here" / "trials.json").read_text())
+    stands, runs = [entry["results"][0] for entry in found["scenarios"]]
+    assert (stands["successes"], stands["trials"]) == (2, 2)
+    # Wilson, all of two: (1 + z²/4 ± z²/4) / (1 + z²/2), z = 1.96
+    assert stands["interval"] == pytest.approx([0.3424, 1.0], abs=1e-3)
+    assert (runs["missed"], runs["fell"], runs["medians"]["reached"]) == (2, 0, None)
+    rows = list(csv.DictReader((tmp_path / "here" / "trials.csv").open()))
+    assert [(r["scenario"], r["seed"], r["outcome"]) for r in rows] == [
+        ("stands", "0", "success"),
+        ("stands", "1", "success"),
+        ("runs", "0", "missed"),
+        ("runs", "1", "missed"),
+    ]
+    page = (tmp_path / "here" / "trial.html").read_text()
+    assert "Standing &lt;b&gt;still&lt;/b&gt;" in page and "<b>still" not in page and "Theirs: 5/20" in page
+
+
+def test_what_cannot_be_tried_is_said_and_the_others_go_on(run, policy, scenarios):
+    words = ("--scenario", "stands.toml", "--scenario", "never.toml", "--repeats", 1, "--out", "here", "--json")
+    result = run("trial", policy, "nobody.pt", *words)
+    assert result.exit_code == 1
+    found = json.loads(result.stdout)
+    assert [r["what"] for r in found["refused"]] == ["nobody.pt", "never.toml"]
+    assert "success can never be decided" in result.stderr and "no policy file 'nobody.pt'" in result.stderr
+    assert found["scenarios"][0]["results"][0]["successes"] == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--scenario", "never.toml"), "so success can never be decided"),
+        (("--scenario", "tile-stair"), "did you mean 'tile-stairs'"),
+        (("--scenario", "stands.toml", "--backend", "bullet"), "unknown backend 'bullet'"),
+        (("--scenario", "stands.toml", "--robot", "spot"), "spot"),
+        (("--scenario", "stands.toml", "--out", "stands.toml"), "'stands.toml' is a file"),
+    ],
+)
+def test_one_sentence_where_nothing_can_be_tried(refused, policy, scenarios, words, sentence):
+    assert sentence in refused("trial", policy, *words)

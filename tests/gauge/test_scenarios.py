@@ -1,0 +1,111 @@
+"""Scenario files: those that ship, and those that could not be played or decided."""
+
+import pytest
+from gaitgauge.gauge.trials.scenario import ScenarioError, load_scenario, scenario_names
+
+OWN = """
+name = "own"
+title = "One's own"
+friction = 0.6
+
+[[commands]]
+seconds = 2.0
+velocity = [1.0, 0.0, 0.0]
+
+[success]
+survive = true
+"""
+
+
+def load(tmp_path, text: str):
+    path = tmp_path / "own.toml"
+    path.write_text(text)
+    return load_scenario(str(path))
+
+
+def test_every_scenario_that_ships_can_be_loaded_and_has_ground():
+    for name in scenario_names():
+        scenario = load_scenario(name)
+        assert scenario.name == name and scenario.about and scenario.seconds < 100.0
+        assert scenario.terrain().height([scenario.start.x], [0.0]).shape == (1,)
+
+
+@pytest.mark.parametrize(("name", "ours"), [("lateral-impulse", (18, 20)), ("obstacle-30cm", (17, 20))])
+def test_what_the_paper_reports(name, ours):
+    reported = {r.who: (r.successes, r.trials) for r in load_scenario(name).reported}
+    assert reported["Ours"] == ours and set(reported) == {"Ours", "Built-in RL", "CTS", "HIM", "DreamWaQ"}
+
+
+def test_the_ground_of_the_shipped_scenarios_is_what_their_titles_say():
+    def top(name: str, x: float) -> float:
+        return float(load_scenario(name).terrain().height([x], [0.0])[0])
+
+    assert top("tile-stairs", 1.15) == pytest.approx(0.155)
+    assert top("tile-stairs", 32.5) == pytest.approx(85 * 0.155)
+    assert (top("obstacle-30cm", 1.4), top("obstacle-30cm", 2.0), top("obstacle-30cm", 2.6)) == (0.0, 0.3, 0.0)
+    assert (top("drop-60cm", 0.0), top("drop-60cm", 1.6)) == (0.6, 0.0)
+    for name in ("slope-30deg", "slope-30deg-fast"):
+        assert (top(name, 3.0) - top(name, 2.0)) == pytest.approx(0.57735, abs=1e-4)  # tan 30°
+    stairs = [top("stairs-at-speed", x) for x in (1.15, 2.65, 3.0, 3.85, 4.75)]
+    assert stairs == pytest.approx([0.1, 0.6, 0.6, 0.45, 0.0])
+
+
+def test_a_scenario_differs_in_its_digest_by_what_decides_about_outcomes_alone(tmp_path):
+    own = load(tmp_path, OWN)
+    assert load(tmp_path, OWN.replace("One's own", "Another title")).digest == own.digest
+    assert load(tmp_path, OWN.replace("friction = 0.6", "friction = 0.7")).digest != own.digest
+
+
+def test_unknown_names_are_refused_with_those_that_are_near():
+    with pytest.raises(ScenarioError, match="there is no scenario 'tile-stair'; did you mean 'tile-stairs'"):
+        load_scenario("tile-stair")
+    with pytest.raises(ScenarioError, match=r"scenario file 'nowhere\.toml' does not exist"):
+        load_scenario("nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("survive = true", "survive = false", "nothing says what success is, so it can never be decided"),
+        ("[success]\nsurvive = true", "", "nothing says what success is"),
+        ("survive = true", "beyond = 3.0", "commands lead no further than to 2 m, so success can never be decided"),
+        ("survive = true", "beyond = 0.0", "success can never be decided; choose a place between"),
+        ("survive = true", "speed = 1.5", "no more than 1 m/s is ever commanded, so success can never be decided"),
+        ("velocity = [1.0", "until_x = 1.0\nvelocity = [1.0", "commands that lead on end at until_x = 1 m"),
+        ("friction = 0.6", "friction = 0.0", "friction is 0.0; it must be greater than 0"),
+        ("seconds = 2.0", "seconds = -1.0", r"commands\[0\].seconds is -1.0"),
+        ("friction = 0.6", "frictoin = 0.6", "unknown field 'frictoin'; did you mean 'friction'"),
+        ("friction = 0.6", 'friction = 0.6\nsuite = "nonesuch"', "there is no suite 'nonesuch'"),
+        ("[success]", "[ground]\nlevel = 3\n[success]", "ground.level is 3 of no terrain"),
+        ("[success]", '[ground]\nterrain = "moon"\n[success]', "unknown terrain 'moon'"),
+        ("[success]", '[ground]\nterrain = "wave"\n[success]', "terrain 'wave' needs a level"),
+        (
+            "[success]",
+            '[ground]\nterrain = "flat"\nstretches = [{ length = 1.0 }]\n[success]',
+            "has the terrain 'flat' and stretches or boxes too",
+        ),
+        ("[success]", "[ground]\nstretches = [{ length = 1.0, rise = -0.1 }]\n[success]", "below the floor"),
+        (
+            "[success]",
+            '[[forces]]\ndirection = "left"\nnewtons = [1.0, 2.0]\nbegin = [0.0, 2.0]\nseconds = [1.0, 1.0]\n[success]',
+            "may begin after 2 s, when the commands, of 2 s, are over",
+        ),
+        (
+            "[success]",
+            '[[forces]]\ndirection = "up"\nnewtons = [1.0, 2.0]\nbegin = [0.0, 1.0]\nseconds = [1.0, 1.0]\n[success]',
+            r"forces\[0\].direction is 'up'",
+        ),
+        (
+            "[success]",
+            '[[forces]]\ndirection = "left"\nnewtons = [3.0, 2.0]\nbegin = [0.0, 1.0]\nseconds = [1.0, 1.0]\n[success]',
+            "newtons is 3 to 2; the least must come first",
+        ),
+    ],
+)
+def test_what_cannot_be_played_or_decided_is_refused_in_one_sentence(tmp_path, old, new, sentence):
+    text = OWN.replace(old, new)
+    if "until_x" in new:
+        text = text.replace("survive = true", "beyond = 1.5")
+    with pytest.raises(ValueError, match=sentence) as caught:
+        load(tmp_path, text)
+    assert str(caught.value).isprintable()
