@@ -14,9 +14,10 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from ..files.parsing import Seed
+from ..files.parsing import Count, NotNegative, Positive, Seed
 from .environment_configuration import Ramp
 
+METHODS: tuple[str, ...] = ("cts", "ac_moe", "mcp", "him", "dreamwaq")
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
 SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "alternate")
 PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
@@ -48,23 +49,24 @@ class NetworkConfiguration:
     """Sizes of the networks. ELU everywhere, PyTorch's own initial weights."""
 
     latent_width: Width = 32
-    """Width of the latent that teacher and student encoders produce on the unit sphere."""
+    """Width of the latent that the encoders produce."""
     teacher_hidden: tuple[Width, ...] = (512, 256)
-    """Hidden layers of the teacher encoder."""
+    """Hidden layers of the teacher encoder; of the next state's encoder (``him``), of the decoder (``dreamwaq``)."""
     student_encoder: str = "moe"
-    """``mlp`` (CTS), ``moe`` (MoE-CTS, the paper's) or ``moe_ng`` (experts that do not see the command)."""
+    """``mlp`` (CTS), ``moe`` (MoE-CTS, the paper's) or ``moe_ng`` (experts that do not see the command); other methods than
+    ``cts`` take ``mlp``."""
     student_hidden: tuple[Width, ...] = (512, 256)
-    """Hidden layers of the student encoder, or of the experts' shared trunk."""
+    """Hidden layers of the student encoder, or of its experts' shared trunk."""
     expert_count: Width = 8
-    """Number of experts."""
+    """Number of experts, of the student encoder or of the actor (``ac_moe``, ``mcp``)."""
     expert_width: Width = 256
     """Private features of each expert."""
     gate_hidden: tuple[Width, ...] = (512, 256)
     """Hidden layers of the gating network."""
     actor_hidden: tuple[Width, ...] = (512, 256, 128)
-    """Hidden layers of the actor, shared by teacher and student."""
+    """Hidden layers of the actor, which a teacher shares, or of its experts' shared trunk."""
     critic_hidden: tuple[Width, ...] = (512, 256, 128)
-    """Hidden layers of the critic, shared by teacher and student."""
+    """Hidden layers of the critic, or of its experts' shared trunk (``ac_moe``)."""
     initial_std: float = 1.0
     """Initial standard deviation of the exploration noise, in network output units."""
     minimum_std: float = 1e-6
@@ -76,11 +78,38 @@ class NetworkConfiguration:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlgorithmConfiguration:
-    """Concurrent teacher-student PPO. Defaults without a remark are the published ones."""
+class HimConfiguration:
+    """The contrast of ``him``: swapped prediction of prototypes. Where the method's paper gives no number, that of SwAV, from which
+    it takes the idea.
+    """
 
+    prototypes: Annotated[int, Field(ge=2, le=65_536)] = 32
+    """Number of prototypes."""
+    temperature: Positive = 0.1
+    """Of the predictions."""
+    code_sharpness: Positive = 0.05
+    """Entropy of the codes in Sinkhorn-Knopp: the smaller, the nearer to one prototype each."""
+    sinkhorn_iterations: Count = 3
+    """Iterations of Sinkhorn-Knopp."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DreamwaqConfiguration:
+    """The variational estimator of ``dreamwaq``."""
+
+    beta: NotNegative = 0.35
+    """Weight of the latent's divergence, a mean over its entries as the other errors are; the method's paper gives no number."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlgorithmConfiguration:
+    """PPO and what the encoder learns from. Defaults without a remark are the published ones."""
+
+    method: str = "cts"
+    """``cts`` (concurrent teacher and student), ``ac_moe`` (the same with experts in actor and critic), ``mcp`` (with an actor that
+    multiplies primitives), ``him`` (hybrid internal model) or ``dreamwaq`` (variational estimator)."""
     student_period: int = 4
-    """Environment i belongs to the student if i is a multiple of this, else to the teacher."""
+    """Environment i belongs to the student if i is a multiple of this, else to the teacher, where the method has one."""
     epochs: int = 5
     """Passes over the rollout."""
     minibatches: int = 4
@@ -105,6 +134,8 @@ class AlgorithmConfiguration:
     """Gradient norm limit, of each optimizer; actor side and critic share one norm."""
     student_learning_rate: float = 1e-3
     """Learning rate of the student encoder's own Adam."""
+    him: HimConfiguration = HimConfiguration()
+    dreamwaq: DreamwaqConfiguration = DreamwaqConfiguration()
     load_balance_coefficient: float = 0.01
     """Weight of the load balancing loss of the Mixture of Experts, a sum over the experts (the paper's equation). The published
     code takes the mean: a collapse of all samples onto one of 8 experts would then cost 0.0011 beside a latent error of the
@@ -121,6 +152,7 @@ class AlgorithmConfiguration:
     ``auto``: ``default`` on a GPU, ``none`` elsewhere. Compiling takes about half a minute at the start."""
 
     def __post_init__(self) -> None:
+        _choose("method", self.method, METHODS)
         _choose("symmetry", self.symmetry, SYMMETRY_MODES)
         _choose("precision", self.precision, PRECISIONS)
         _choose("compile_mode", self.compile_mode, COMPILE_MODES)

@@ -71,7 +71,15 @@ def make_writer(configuration: TrainingConfiguration, log_dir: Path, environment
 class RunLogger:
     """Collects on the device until an iteration ends, then writes; prints nothing."""
 
-    def __init__(self, configuration: TrainingConfiguration, *, num_envs: int, processes: int, device: str) -> None:
+    def __init__(
+        self,
+        configuration: TrainingConfiguration,
+        *,
+        num_envs: int,
+        processes: int,
+        device: str,
+        has_teacher: bool = True,
+    ) -> None:
         """Without a writer nothing is written.
 
         Args:
@@ -79,6 +87,7 @@ class RunLogger:
             num_envs: environments of this process.
             processes: of the run.
             device: of the environments' rewards.
+            has_teacher: whether a teacher acts in the other environments.
         """
         steps = configuration.run.steps_per_iteration
         self.writer: Any = None
@@ -100,7 +109,7 @@ class RunLogger:
         self._lengths = torch.zeros(steps, num_envs, device=device)
         self._step = 0
         self._samples = steps * num_envs * processes
-        self._student_period = configuration.algorithm.student_period
+        self._student_period = configuration.algorithm.student_period if has_teacher else 1
         self._entries: list[tuple[tuple[str, ...], torch.Tensor]] = []
         self._latest = 0
 

@@ -1,7 +1,7 @@
-"""The networks of concurrent teacher-student learning.
+"""The networks of a method, and those of concurrent teacher-student learning.
 
-The student is the very network that is deployed: an architecture of ``policy.networks``, whose actor the teacher
-borrows. The teacher encoder and the critic exist in training only.
+The student is the very network that is deployed: an architecture of ``policy.networks``, whose actor a teacher
+borrows. Teacher encoder and critic exist in training only.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.modules.distribution import Distribution, GaussianDistribution
 from torch import nn
 from torch.nn import functional
 
@@ -64,7 +64,70 @@ def student_architecture(
     }
 
 
-class CtsActor(nn.Module):
+class StudentActor(nn.Module):
+    """The deployed network, called student whatever the method, with its exploration noise; methods add what only training
+    needs.
+    """
+
+    def __init__(
+        self,
+        configuration: NetworkConfiguration,
+        *,
+        architecture: str,
+        arguments: dict[str, Any],
+        distribution: type[Distribution] = GaussianDistribution,
+    ) -> None:
+        """Build student and noise.
+
+        Args:
+            configuration: sizes.
+            architecture: name in ``policy.networks.ARCHITECTURES`` of the student network.
+            arguments: its arguments.
+            distribution: of the actions.
+        """
+        super().__init__()
+        self.architecture = architecture
+        self.arguments = arguments
+        self.student: Any = ARCHITECTURES[architecture](**arguments)
+        self.distribution: Any = distribution(
+            int(arguments["num_actions"]),
+            init_std=configuration.initial_std,  # type: ignore[call-arg]
+            std_range=(configuration.minimum_std, 1e6),  # type: ignore[call-arg]
+        )
+        self._frames = (int(arguments["history_length"]), int(arguments["frame_width"]))
+
+    def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Latents (N, L) and gate weights of the encoder (N, K), None without experts, from flat histories (N, H·F), oldest
+        frame first.
+        """
+        raise NotImplementedError
+
+    def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """What the distribution of the actions is updated with, and the weights of the actor's experts (N, K) where it has any,
+        for latents (N, L) and current frames (N, F).
+        """
+        return self.action_mean(latent, policy), None
+
+    def action_mean(self, latent: torch.Tensor, policy: torch.Tensor) -> torch.Tensor:
+        """Mean actions (N, J) for latents (N, L) and current frames (N, F)."""
+        return last_in_float32(self.student.actor, torch.cat((latent, policy), dim=-1))
+
+    @property
+    def output_std(self) -> torch.Tensor:
+        """Present standard deviation of the exploration noise, (J,)."""
+        std: torch.Tensor = self.distribution.std_param.detach().clamp(*self.distribution.std_range)
+        return std
+
+    def policy_parameters(self) -> list[nn.Parameter]:
+        """What reinforcement learning trains."""
+        return [*self.student.actor.parameters(), *self.distribution.parameters()]
+
+    def student_parameters(self) -> list[nn.Parameter]:
+        """What supervision trains: the encoder, and what only training needs for it."""
+        return list(self.student.encoder.parameters())
+
+
+class CtsActor(StudentActor):
     """Teacher encoder, student network (encoder and the shared actor) and exploration noise."""
 
     def __init__(
@@ -74,6 +137,7 @@ class CtsActor(nn.Module):
         privileged_width: int,
         architecture: str,
         arguments: dict[str, Any],
+        distribution: type[Distribution] = GaussianDistribution,
     ) -> None:
         """Build all parts.
 
@@ -82,54 +146,42 @@ class CtsActor(nn.Module):
             privileged_width: width of the teacher's input.
             architecture: name in ``policy.networks.ARCHITECTURES`` of the student network.
             arguments: its arguments.
+            distribution: of the actions.
         """
-        super().__init__()
-        self.architecture = architecture
-        self.arguments = arguments
-        self.teacher_encoder = multilayer_perceptron(
-            (privileged_width, *configuration.teacher_hidden, configuration.latent_width)
-        )
-        self.student = ARCHITECTURES[architecture](**arguments)
-        self.distribution = GaussianDistribution(
-            int(arguments["num_actions"]),
-            init_std=configuration.initial_std,
-            std_range=(configuration.minimum_std, 1e6),
-        )
-        self._frames = (int(arguments["history_length"]), int(arguments["frame_width"]))
+        teacher = multilayer_perceptron((privileged_width, *configuration.teacher_hidden, configuration.latent_width))
+        super().__init__(configuration, architecture=architecture, arguments=arguments, distribution=distribution)
+        self.teacher_encoder = teacher
 
     def teacher_latent(self, privileged: torch.Tensor) -> torch.Tensor:
         """Unit latents (N, L) from privileged observations (N, P)."""
         return functional.normalize(self.teacher_encoder(privileged), dim=-1)
 
     def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Unit latents (N, L) and gate weights (N, K), None without experts, from flat histories (N, H·F), oldest
-        frame first.
-        """
+        """Unit latents (N, L) and gate weights (N, K), None without experts; see ``StudentActor``."""
         frames = history.unflatten(-1, self._frames)
         if isinstance(self.student.encoder, ExpertMixture):
             latent, weights = self.student.encoder(frames)
             return functional.normalize(latent, dim=-1), weights
         return functional.normalize(self.student.encoder(frames.flatten(1)), dim=-1), None
 
-    def action_mean(self, latent: torch.Tensor, policy: torch.Tensor) -> torch.Tensor:
-        """Mean actions (N, J) of the shared actor for latents (N, L) and current frames (N, F)."""
-        return _last_in_float32(self.student.actor, torch.cat((latent, policy), dim=-1))
-
-    @property
-    def output_std(self) -> torch.Tensor:
-        """Present standard deviation of the exploration noise, (J,)."""
-        return self.distribution.std_param.detach().clamp(*self.distribution.std_range)
-
     def policy_parameters(self) -> list[nn.Parameter]:
         """What reinforcement learning trains: teacher encoder, actor and exploration noise."""
-        return [*self.teacher_encoder.parameters(), *self.student.actor.parameters(), *self.distribution.parameters()]
-
-    def student_parameters(self) -> list[nn.Parameter]:
-        """What imitation of the teacher's latent trains: the student encoder."""
-        return list(self.student.encoder.parameters())
+        return [*self.teacher_encoder.parameters(), *super().policy_parameters()]
 
 
-class CtsCritic(nn.Module):
+class ValueNetwork(nn.Module):
+    """Values for a latent, a privileged observation and the weights of the actor's experts, of which a method takes what it
+    needs.
+    """
+
+    def value(
+        self, latent: torch.Tensor, privileged: torch.Tensor, weights: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Values (N, 1) for detached latents (N, L), privileged observations (N, P) and weights (N, K)."""
+        raise NotImplementedError
+
+
+class CtsCritic(ValueNetwork):
     """A perceptron on ``[latent, privileged]``; callers pass the latent detached, so that values never train the encoders."""
 
     def __init__(self, configuration: NetworkConfiguration, *, privileged_width: int) -> None:
@@ -137,12 +189,15 @@ class CtsCritic(nn.Module):
         inputs = configuration.latent_width + privileged_width
         self.mlp = multilayer_perceptron((inputs, *configuration.critic_hidden, 1))
 
-    def value(self, latent: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
-        """Values (N, 1) for detached latents (N, L) and privileged observations (N, P)."""
-        return _last_in_float32(self.mlp, torch.cat((latent, privileged), dim=-1))
+    def value(
+        self, latent: torch.Tensor, privileged: torch.Tensor, weights: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """See ``ValueNetwork``."""
+        del weights
+        return last_in_float32(self.mlp, torch.cat((latent, privileged), dim=-1))
 
 
-def _last_in_float32(layers: nn.Sequential, values: torch.Tensor) -> torch.Tensor:
+def last_in_float32(layers: nn.Sequential, values: torch.Tensor) -> torch.Tensor:
     """A perceptron whose last layer is computed in float32 whatever the precision of the others: an action in bfloat16 is off by
     hundredths of the exploration noise, and probability ratios live on such differences.
     """

@@ -18,7 +18,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from ..policy.contract import TERM_WIDTH, PolicyContract
-from .algorithms.cts import CTS
+from .algorithms.methods import METHODS
 from .algorithms.symmetry import Mirror
 from .averaging import WeightAverage
 from .checkpoint import copy_checkpoint
@@ -89,7 +89,8 @@ class TrainingRunner:
         self.filmer = filmer
         self.settings = dict(settings or {})
         self.message = message or (lambda _: None)
-        self.alg = CTS.build(
+        method = METHODS[configuration.algorithm.method]
+        self.alg = method.build(
             env.get_observations(),
             configuration,
             num_actions=env.num_actions,
@@ -103,7 +104,13 @@ class TrainingRunner:
             "critic_state_dict": self.alg.critic,
         }
         self.average = WeightAverage(networks, age=configuration.run.average_age)
-        self.logger = RunLogger(configuration, num_envs=env.num_envs, processes=self.processes.count, device=device)
+        self.logger = RunLogger(
+            configuration,
+            num_envs=env.num_envs,
+            processes=self.processes.count,
+            has_teacher=method.has_teacher,
+            device=device,
+        )
         self.iteration = 0
         """Completed iterations of the whole run."""
         self.fresh = True
@@ -203,7 +210,7 @@ class TrainingRunner:
             learn_time=finished - collected,
             losses=losses,
             learning_rate=self.alg.learning_rate,
-            action_std=self.alg.actor.output_std,
+            action_std=self.alg.action_std,
         )
         self._check_finite(losses)
         if self.processes.several:

@@ -86,26 +86,57 @@ _ALL_TERRAINS_ITERATIONS = 5000
 """Two billion steps of 16,384 worlds, in all."""
 
 
-def _moe_cts() -> Task:
+def _all_terrains(name: str, title: str, *, network: NetworkConfiguration, method: str = "cts") -> Task:
+    """A method on the environment that all methods share."""
     return Task(
-        name="go2-moe-cts",
-        title="Unitree Go2 on all terrains, Mixture-of-Experts student (the paper's method)",
+        name=name,
+        title=f"Unitree Go2 on all terrains, {title}",
         environment=_ALL_TERRAINS,
         training=TrainingConfiguration(
-            algorithm=_ALL_TERRAINS_LEARNING, run=RunConfiguration(iterations=_ALL_TERRAINS_ITERATIONS)
+            algorithm=replace(_ALL_TERRAINS_LEARNING, method=method),
+            network=network,
+            run=RunConfiguration(experiment=name.replace("-", "_"), iterations=_ALL_TERRAINS_ITERATIONS),
         ),
     )
 
 
-def _cts() -> Task:
-    return Task(
-        name="go2-cts",
-        title="Unitree Go2 on all terrains, plain student",
-        environment=_ALL_TERRAINS,
-        training=TrainingConfiguration(
-            algorithm=_ALL_TERRAINS_LEARNING,
-            network=NetworkConfiguration(student_encoder="mlp"),
-            run=RunConfiguration(experiment="go2_cts", iterations=_ALL_TERRAINS_ITERATIONS),
+_PLAIN = NetworkConfiguration(student_encoder="mlp")
+_ESTIMATOR = replace(_PLAIN, latent_width=16, student_hidden=(128, 64))
+
+
+def _methods() -> tuple[Task, ...]:
+    """The paper's method, its baselines and its ablations, with their own sizes."""
+    return (
+        _all_terrains("go2-moe-cts", "Mixture-of-Experts student (the paper's method)", network=NetworkConfiguration()),
+        _all_terrains("go2-cts", "plain student", network=_PLAIN),
+        _all_terrains(
+            "go2-moe-ng",
+            "experts that do not see the command (ablation MoE-NG)",
+            network=NetworkConfiguration(student_encoder="moe_ng"),
+        ),
+        _all_terrains(
+            "go2-ac-moe",
+            "experts in actor and critic (ablation AC-MoE)",
+            method="ac_moe",
+            network=replace(_PLAIN, expert_width=128, actor_hidden=(512, 256), critic_hidden=(512, 256)),
+        ),
+        _all_terrains(
+            "go2-mcp",
+            "an actor that multiplies primitives (ablation MCP)",
+            method="mcp",
+            network=replace(_PLAIN, gate_hidden=(512, 256, 128)),
+        ),
+        _all_terrains(
+            "go2-him",
+            "hybrid internal model (baseline HIM)",
+            method="him",
+            network=replace(_ESTIMATOR, teacher_hidden=(128, 64)),
+        ),
+        _all_terrains(
+            "go2-dreamwaq",
+            "variational estimator (baseline DreamWaQ)",
+            method="dreamwaq",
+            network=replace(_ESTIMATOR, teacher_hidden=(64, 128, 48)),
         ),
     )
 
@@ -203,7 +234,7 @@ def _sprint() -> Task:
     )
 
 
-TASKS: Mapping[str, Task] = MappingProxyType({task.name: task for task in (_moe_cts(), _cts(), _flat(), _sprint())})
+TASKS: Mapping[str, Task] = MappingProxyType({task.name: task for task in (*_methods(), _flat(), _sprint())})
 """All tasks by name."""
 
 

@@ -1,4 +1,4 @@
-"""Concurrent teacher-student PPO (paper, method).
+"""Concurrent teacher-student PPO (paper, method): CTS, MoE-CTS and MoE-NG, which differ by the student's encoder.
 
 Most environments are driven by the teacher, which sees the true state, the others by the student, which sees the last
 few observations. Both share one actor and one critic. Per iteration:
@@ -7,392 +7,115 @@ few observations. Both share one actor and one critic. Per iteration:
    gets the latent detached, and so do actor and critic on student samples. Nothing of this trains the student encoder.
 2. The student encoder learns the teacher's latent on its own samples, with its own optimizer; a Mixture of Experts is
    kept balanced by an auxiliary loss.
-
-Nothing in the passes waits for the device.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import torch
 from tensordict import TensorDict
 
-from ...backends.warp.graphs import RecordedFunction
-from ...policy.fence.archive import LARGEST_FILE
-from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
-from ..networks import CtsActor, CtsCritic, student_architecture
-from ..processes import Processes
-from ..schedules import RampTable
+from ..configuration import TrainingConfiguration
+from ..networks import CtsActor, CtsCritic, StudentActor, ValueNetwork, student_architecture
 from .bootstrap import Bootstrap
-from .cts_losses import POLICY_LOSSES, STUDENT_LOSSES, CtsLosses
-from .gradients import FlatGradients, clip_gradients
-from .moments import load_moments
+from .cts_losses import CtsLosses
+from .ppo import PPO, Widths
 from .storage import EnvironmentSplit, RolloutStorage
-from .symmetry import Mirror, passes
-
-POLICY_METRICS = (*POLICY_LOSSES, "gradient_norm", "skipped")
-STUDENT_METRICS = (*STUDENT_LOSSES, "skipped")
-MOST_WEIGHTS = LARGEST_FILE // 24
-"""A checkpoint has each weight as it is and averaged, with two moments, and a part of them once more as the policy, at 4 bytes."""
-GROUPS = ("policy", "history", "privileged")
-Step = Callable[..., None]
 
 
-class CTS:
+class CTS(PPO):
     """PPO with a concurrent student. See the module docstring."""
 
-    def __init__(
-        self,
-        actor: CtsActor,
-        critic: CtsCritic,
-        storage: RolloutStorage,
-        *,
-        configuration: AlgorithmConfiguration,
-        mirror: Mirror | None = None,
-        device: str = "cpu",
-        processes: Processes | None = None,
-    ) -> None:
-        """Prepare optimizers and counters.
-
-        Raises:
-            ConfigurationError: symmetry is asked for but no mirror is given, or CUDA graphs without a CUDA device.
-        """
-        on_gpu = torch.device(device).type == "cuda"
-        if configuration.symmetry != "none" and mirror is None:
-            raise ConfigurationError(
-                f"symmetry is {configuration.symmetry!r}, but the task gives no mirror maps; set it to 'none'."
-            )
-        if configuration.cuda_graphs and not on_gpu:
-            raise ConfigurationError("cuda_graphs is on; it needs a CUDA device.")
-        self.device = device
-        self.actor, self.critic, self.storage = actor.to(device), critic.to(device), storage
-        self.configuration = configuration
-        self.processes = processes or Processes()
-        self.bootstrap: Bootstrap | None = None
-        self._graphs = on_gpu and configuration.cuda_graphs is not False
-        self.losses = CtsLosses(
-            actor,
-            critic,
-            storage,
-            settings=configuration,
-            mirror=mirror.to(device) if mirror is not None and configuration.symmetry != "none" else None,
-            cached_casts=not self._graphs,
-        )
-        # The learning rate lives on the device, where the KL divergence is, so that adapting it needs no round trip.
-        self._rate = torch.tensor(configuration.learning_rate, device=device)
-        self._policy_parameters = [*actor.policy_parameters(), *critic.parameters()]
-        self.optimizer = torch.optim.Adam(self._policy_parameters, lr=self._rate, fused=on_gpu, capturable=on_gpu)
-        self.student_optimizer = torch.optim.Adam(
-            actor.student_parameters(), lr=configuration.student_learning_rate, fused=on_gpu, capturable=on_gpu
-        )
-        self._entropy = RampTable([configuration.entropy_coefficient], device)
-        self.follow(torch.zeros((), device=device))
-        self._policy_metrics = torch.zeros(len(POLICY_METRICS), device=device)
-        self._student_metrics = torch.zeros(len(STUDENT_METRICS), device=device)
-        self._policy_loss, self._student_loss = self.losses.policy, self.losses.student
-        mode = configuration.compile_mode
-        if mode == "default" or (mode == "auto" and on_gpu):
-            self._policy_loss, self._student_loss = torch.compile(self._policy_loss), torch.compile(self._student_loss)
-        self._prepare_steps()
+    losses_class = CtsLosses
+    has_teacher = True
 
     @classmethod
-    def build(
-        cls,
-        observations: TensorDict,
-        configuration: TrainingConfiguration,
-        *,
-        num_actions: int,
-        command_entries: tuple[int, ...] = (),
-        mirror: Mirror | None = None,
-        device: str = "cpu",
-        processes: Processes | None = None,
-    ) -> CTS:
-        """Build networks, storage and algorithm for an environment.
-
-        Args:
-            observations: the groups ``policy`` (N, F), ``history`` (N, H·F) frame by frame, oldest first, and
-                ``privileged`` (N, P).
-            configuration: settings of learning.
-            num_actions: width J of an action.
-            command_entries: entries of a frame that hold the command.
-            mirror: mirror maps, needed for symmetry.
-            device: where to learn.
-            processes: of the run, None for this one alone.
-
-        Raises:
-            ConfigurationError: an observation group is missing or has an impossible width.
-        """
-        for group in GROUPS:
-            if group not in observations or observations[group].dim() != 2:
-                raise ConfigurationError(
-                    f"The environment must give an observation group {group!r} of shape (environments, width)."
-                )
-        frame, history, privileged = (observations[group].shape[-1] for group in GROUPS)
-        if history % frame:
-            raise ConfigurationError(
-                f"The history is {history} wide, which is not a multiple of the frame width {frame}."
-            )
-        settings, network = configuration.algorithm, configuration.network
-        torch.set_float32_matmul_precision("highest" if settings.precision == "float32" else "high")
+    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
+        """See ``PPO``."""
+        network = configuration.network
         architecture, arguments = student_architecture(
             network,
-            frame_width=frame,
-            num_actions=num_actions,
-            history_length=history // frame,
-            command_entries=command_entries,
+            frame_width=widths.frame,
+            num_actions=widths.actions,
+            history_length=widths.history,
+            command_entries=widths.command_entries,
         )
+        actor = CtsActor(network, privileged_width=widths.privileged, architecture=architecture, arguments=arguments)
+        return actor, CtsCritic(network, privileged_width=widths.privileged)
 
-        def networks() -> tuple[CtsActor, CtsCritic]:
-            actor = CtsActor(network, privileged_width=privileged, architecture=architecture, arguments=arguments)
-            return actor, CtsCritic(network, privileged_width=privileged)
-
-        with torch.device("meta"):  # counted before they take memory
-            weights = sum(p.numel() for module in networks() for p in module.parameters())
-        if weights > MOST_WEIGHTS:
-            raise ConfigurationError(
-                f"The networks have {weights:,} weights; at most {MOST_WEIGHTS:,} fit into a checkpoint that can be read again. "
-                "Make training.network.* smaller."
-            )
-        actor, critic = networks()
-        storage = RolloutStorage(
-            EnvironmentSplit.build(observations.batch_size[0], settings.student_period, device),
+    @classmethod
+    def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:
+        """See ``PPO``."""
+        return RolloutStorage(
+            EnvironmentSplit.build(widths.environments, configuration.algorithm.student_period, device),
             configuration.run.steps_per_iteration,
-            frame_width=frame,
-            privileged_width=privileged,
-            history_width=history,
-            latent_width=network.latent_width,
-            num_actions=num_actions,
+            frame_width=widths.frame,
+            privileged_width=widths.privileged,
+            history_width=widths.history * widths.frame,
+            latent_width=configuration.network.latent_width,
+            num_actions=widths.actions,
             device=device,
         )
-        return cls(actor, critic, storage, configuration=settings, mirror=mirror, device=device, processes=processes)
 
-    @property
-    def learning_rate(self) -> float:
-        """Present learning rate of the policy optimizer; reading it waits for the device."""
-        return float(self._rate.item())
-
-    @learning_rate.setter
-    def learning_rate(self, value: float) -> None:
-        self._rate.fill_(float(value))
-
-    def follow(self, progress: torch.Tensor) -> None:
-        """Take the settings of a fraction of the run, a scalar tensor, for the next update."""
-        self.losses.entropy_coefficient.copy_(self._entropy.at(progress)[0])
-
-    def follow_student(self, iterations: int) -> None:
-        """Spend the next iterations on a teacher and a critic for the present student (see ``bootstrap``)."""
-        self.bootstrap = Bootstrap(self, iterations) if iterations > 0 else None
-
-    # Rollout
-
-    @torch.no_grad()
-    def act(self, obs: TensorDict) -> torch.Tensor:
-        """Sample and store actions, (N, J) in environment order: the teacher's in its environments, the student's in the
-        others.
-        """
+    def latents(
+        self, obs: TensorDict, privileged: torch.Tensor, history: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ``PPO``; while a teacher is learned for a student, the student acts everywhere."""
         split, actor = self.storage.split, self.actor
-        # Indexing copies, so an environment may reuse the memory of its observations.
-        policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
-        history = obs["history"][split.order[split.num_teacher :]]
-        with self.losses.autocast():
-            student_latent = actor.student_latent(history)[0]
-            if self.bootstrap is None:
-                teacher_latent = actor.teacher_latent(privileged[: split.num_teacher])
-            else:
-                others = obs["history"][split.order[: split.num_teacher]]
-                teacher_latent = actor.student_latent(others)[0]
-            latent = torch.cat((teacher_latent, student_latent))
-            mean = actor.action_mean(latent, policy).float()
-            values = self.critic.value(latent, privileged).float()
-        actor.distribution.update(mean)
-        actions = actor.distribution.sample()
-        action_mean, action_std = actor.distribution.params
-        self.storage.add(
-            policy=policy,
-            privileged=privileged,
-            student_history=history,
-            student_latent=student_latent,
-            actions=actions,
-            action_mean=action_mean,
-            action_std=action_std,
-            log_prob=actor.distribution.log_prob(actions),
-            values=values.squeeze(-1),
-        )
-        return actions[split.inverse]
+        student = actor.student_latent(history)[0]
+        if self.bootstrap is None:
+            teacher = actor.teacher_latent(privileged[: split.num_teacher])
+        else:
+            teacher = actor.student_latent(obs["history"][split.order[: split.num_teacher]])[0]
+        return torch.cat((teacher, student)), student
 
-    def store_outcome(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, Any]) -> None:
-        """Store the outcome of the actions, (N,) each in environment order. An episode that ends by ``time_outs`` is
-        worth its last value beyond.
-        """
-        storage, order = self.storage, self.storage.split.order
-        rewards = rewards[order]
-        if "time_outs" in extras:
-            time_outs = extras["time_outs"].to(self.device)[order].float()
-            rewards = rewards + self.configuration.discount * (storage.values[storage.step] * time_outs)
-        storage.add(rewards=rewards, dones=dones[order])
-        storage.step += 1
+    def last_values(self, policy: torch.Tensor, privileged: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+        """See ``PPO``."""
+        student = self.actor.student_latent(history)[0]
+        teacher = self.actor.teacher_latent(privileged[: self.storage.split.num_teacher])
+        return self.values(torch.cat((teacher, student)), policy, privileged)
 
-    def compute_returns(self, obs: TensorDict) -> None:
-        """Returns and advantages; advantages are normalized over teacher and student samples together."""
-        split = self.storage.split
-        privileged = obs["privileged"][split.order]
-        with torch.no_grad(), self.losses.autocast():
-            student = self.actor.student_latent(obs["history"][split.order[split.num_teacher :]])[0]
-            latent = torch.cat((self.actor.teacher_latent(privileged[: split.num_teacher]), student))
-            last_values = self.critic.value(latent, privileged).float().squeeze(-1)
-        settings = self.configuration
-        self.storage.compute_returns(last_values, discount=settings.discount, gae_lambda=settings.gae_lambda)
-
-    # Update
-
-    def update(self, wait: Callable[[], None] = lambda: None) -> dict[str, float]:
-        """Run all passes over the rollout.
-
-        Args:
-            wait: called once all work is asked for, to wait for the device.
-
-        Returns:
-            Means over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
-            and were dropped.
-        """
-        self.storage.step = 0
-        if self.bootstrap is not None:
-            losses = self.bootstrap.update()
-            if self.bootstrap.over:
-                self.bootstrap = None
-            return losses
-        storage, settings = self.storage, self.configuration
-        self._policy_metrics.zero_()
-        self._student_metrics.zero_()
-        teacher_rows, student_rows = storage.minibatch_rows(settings.minibatches)
-        self.losses.prepare_policy()
-        for turned in passes(settings.epochs, alternate=settings.symmetry == "alternate"):
-            for teacher, student in zip(teacher_rows, student_rows, strict=True):
-                self._policy_step(turned(teacher), turned(student))
-        self.losses.prepare_student()
-        rows_in_history = storage.student_rows(student_rows)
-        for turned in passes(settings.epochs, alternate=settings.symmetry == "alternate"):
-            for student in rows_in_history:
-                self._student_step(turned(student))
-        wait()
-        return self._report()
-
-    def _report(self) -> dict[str, float]:
-        """Read the counters back, the update's only wait for the device."""
-        total = self.configuration.epochs * self.configuration.minibatches
-        sums = torch.cat((self._policy_metrics, self._student_metrics)).tolist()
-        policy = dict(zip(POLICY_METRICS, sums[: len(POLICY_METRICS)], strict=True))
-        student = dict(zip(STUDENT_METRICS, sums[len(POLICY_METRICS) :], strict=True))
-        skipped = policy.pop("skipped") + student.pop("skipped")
-        if self.configuration.symmetry != "augment":  # no pair of images to compare
-            del policy["symmetry"]
-        if not self.has_experts:
-            del student["load_balance"], student["largest_expert_share"]
-        means = {name: value / total for name, value in (policy | student).items()}
-        return means | {"skipped_minibatches": skipped}
+    def values(self, latent: torch.Tensor, policy: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
+        """Values (N, 1) for latents (N, L), frames (N, F) and states (N, P), without gradients but the critic's own."""
+        del policy
+        return self.critic.value(latent, privileged)
 
     @property
     def has_experts(self) -> bool:
         """Whether the student encoder is a Mixture of Experts."""
-        return self.actor.architecture == "moe_cts"
+        return bool(self.actor.architecture == "moe_cts")
 
-    def _prepare_steps(self) -> None:
-        """Make the steps on one minibatch: gradients, their mean over the processes, and what follows from them."""
-        self._policy_gradients = FlatGradients(self._policy_parameters, extra=len(POLICY_LOSSES))
-        self._student_gradients = FlatGradients(self.actor.student_parameters(), extra=len(STUDENT_LOSSES))
-        self._policy_step = self._joined(self._compute_policy, self._policy_gradients, self._apply_policy)
-        self._student_step = self._joined(self._compute_student, self._student_gradients, self._apply_student)
+    def without_meaning(self) -> tuple[str, ...]:
+        """See ``PPO``."""
+        return () if self.has_experts else ("load_balance", "largest_expert_share")
 
-    def _joined(self, compute: Step, gradients: FlatGradients, apply: Step) -> Step:
-        """One step of two halves. Between several processes each half is a CUDA graph of its own: a message inside a graph
-        could not be given up when a process is lost.
+    def make_bootstrap(self, iterations: int) -> Bootstrap:
+        """The teacher encoder learns the student's latent from what the teacher sees, the critic the values of the student's
+        behaviour; afterwards the teacher acts about as the student does.
         """
-        recorded: Callable[[Step], Step] = RecordedFunction if self._graphs else (lambda step: step)
+        return Bootstrap(
+            self,
+            iterations,
+            parameters=[*self.actor.teacher_encoder.parameters(), *self.critic.parameters()],
+            losses=self._teacher_losses,
+            names=("teacher_latent", "value"),
+        )
 
-        def whole(*rows: torch.Tensor) -> None:
-            compute(*rows)
-            apply()
-
-        if not self.processes.several:
-            return recorded(whole)
-        first, second = recorded(compute), recorded(apply)
-
-        def shared(*rows: torch.Tensor) -> None:
-            first(*rows)
-            self.processes.average(gradients.values)
-            second()
-
-        return shared
-
-    def _compute_policy(self, teacher_rows: torch.Tensor, student_rows: torch.Tensor) -> None:
-        """Gradients of the PPO loss of one minibatch."""
-        loss, metrics = self._policy_loss(teacher_rows, student_rows)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self._policy_gradients.gather()
-        self._policy_gradients.extra.copy_(metrics)
-
-    def _apply_policy(self) -> None:
-        metrics = self._policy_gradients.extra
-        self._adapt_learning_rate(metrics[POLICY_LOSSES.index("kl")])
-        norm, skipped = clip_gradients(self._policy_parameters, self.configuration.max_gradient_norm)
-        self.optimizer.step()
-        self._policy_metrics += torch.nan_to_num(torch.cat((metrics, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
-
-    def _compute_student(self, rows: torch.Tensor) -> None:
-        """Gradients of the student's loss of one minibatch; ``rows`` index the student-only buffers."""
-        loss, metrics = self._student_loss(rows)
-        self.student_optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self._student_gradients.gather()
-        self._student_gradients.extra.copy_(metrics)
-
-    def _apply_student(self) -> None:
-        _, skipped = clip_gradients(self.actor.student_parameters(), self.configuration.max_gradient_norm)
-        self.student_optimizer.step()
-        metrics = torch.cat((self._student_gradients.extra, skipped[None]))
-        self._student_metrics += torch.nan_to_num(metrics, 0.0, 0.0, 0.0)
-
-    def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
-        """rsl_rl's rule, on the device: slower above twice the desired divergence, faster below half of it."""
-        target = self.configuration.desired_kl
-        if target is None:
-            return
-        low, high = self.configuration.learning_rate_range
-        slower, faster = (self._rate / 1.5).clamp(min=low), (self._rate * 1.5).clamp(max=high)
-        rate = torch.where(kl > 2.0 * target, slower, torch.where((kl < 0.5 * target) & (kl > 0.0), faster, self._rate))
-        self._rate.copy_(rate)
-
-    # Checkpoints
-
-    def save(self) -> dict[str, Any]:
-        """State of all networks and of both optimizers, under rsl_rl's names."""
-        return {
-            "actor_state_dict": self.actor.state_dict(),
-            "critic_state_dict": self.critic.state_dict(),
-            "optimizer_state_dict": self.optimizer.state_dict(),
-            "student_optimizer_state_dict": self.student_optimizer.state_dict(),
-        }
-
-    def load(self, state: Mapping[str, Any], *, optimizers: bool = True) -> None:
-        """Take over what ``save`` returned.
-
-        Raises:
-            RuntimeError, LookupError, ValueError, TypeError, AttributeError: it does not fit.
-        """
-        self.actor.load_state_dict(state["actor_state_dict"])
-        self.critic.load_state_dict(state["critic_state_dict"])
-        if optimizers:
-            self.learning_rate = load_moments(self.optimizer, state["optimizer_state_dict"])
-            load_moments(self.student_optimizer, state["student_optimizer_state_dict"])
-            # Loading replaced the rate's tensor by a copy.
-            for group in self.optimizer.param_groups:
-                group["lr"] = self._rate
-        # Captured graphs refer to the replaced optimizer state.
-        self._prepare_steps()
-
-    def share(self) -> None:
-        """Give all processes the networks of the first."""
-        self.processes.copy_first([*self.actor.state_dict().values(), *self.critic.state_dict().values()])
+    def _teacher_losses(self, teacher: torch.Tensor, student: torch.Tensor) -> torch.Tensor:
+        """Latent error on the student's samples and value error on all, (2,)."""
+        actor, storage, mirror = self.actor, self.storage, self.losses.mirror
+        states = storage.privileged.flatten(0, 1)
+        in_history = storage.student_rows(student)
+        privileged = states[student]
+        target = storage.student_latent.flatten(0, 1)[in_history]
+        if mirror is not None:
+            history = storage.student_history.flatten(0, 1)[in_history]
+            privileged = torch.cat((privileged, mirror.privileged(privileged)))
+            with torch.no_grad():
+                target = torch.cat((target, actor.student_latent(mirror.history(history))[0]))
+        latent = actor.teacher_latent(privileged)
+        rows = torch.cat((teacher, student))
+        with torch.no_grad():
+            critic_latent = actor.teacher_latent(states[rows])
+        values = self.values(critic_latent, storage.policy.flatten(0, 1)[rows], states[rows]).squeeze(-1)
+        returns = storage.returns.flatten(0, 1)[rows]
+        return torch.stack(((latent - target).square().mean(), (values - returns).square().mean()))

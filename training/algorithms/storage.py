@@ -41,6 +41,12 @@ class EnvironmentSplit:
         num_student = (num_envs + period - 1) // period
         return cls(num_teacher=num_envs - num_student, num_student=num_student, order=order, inverse=inverse)
 
+    @classmethod
+    def whole(cls, num_envs: int, device: torch.device | str) -> EnvironmentSplit:
+        """All environments are the student's: there is no teacher."""
+        index = torch.arange(num_envs, device=device)
+        return cls(num_teacher=0, num_student=num_envs, order=index, inverse=index)
+
 
 class RolloutStorage:
     """One rollout: T steps of N environments in block order, in memory that stays where it is (CUDA graphs rely on it).
@@ -61,6 +67,7 @@ class RolloutStorage:
         history_width: int,
         latent_width: int,
         num_actions: int,
+        next_state_width: int = 0,
         device: torch.device | str,
     ) -> None:
         """Allocate for ``num_steps`` steps."""
@@ -86,6 +93,8 @@ class RolloutStorage:
         self.dones = zeros(self.num_envs)
         self.returns = zeros(self.num_envs)
         self.advantages = zeros(self.num_envs)
+        self.next_state = zeros(split.num_student, next_state_width)
+        """What the students' next state is predicted as, where a method does."""
 
     def add(self, **entries: torch.Tensor) -> None:
         """Store entries of the present step by name, each (rows, …) in block order."""
@@ -111,21 +120,22 @@ class RolloutStorage:
         advantages = self.returns - self.values
         self.advantages.copy_((advantages - advantages.mean()) / (advantages.std() + 1e-8))
 
-    def minibatch_rows(self, num_minibatches: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def minibatch_rows(self, num_minibatches: int) -> tuple[torch.Tensor, ...]:
         """Draw one random stratified partition of the rollout.
 
         Returns:
-            Teacher rows (M, T·Nt // M) and student rows (M, T·Ns // M), int64, both into the storage flattened over
-            time and block-ordered environments; what does not divide evenly is left out.
+            Teacher rows (M, T·Nt // M), where there is a teacher, and student rows (M, T·Ns // M), int64, both into the
+            storage flattened over time and block-ordered environments; what does not divide evenly is left out.
 
         Raises:
             ValueError: there are fewer student or teacher samples than minibatches.
         """
         steps, teachers, students = self.num_steps, self.split.num_teacher, self.split.num_student
-        if steps * min(teachers, students) < num_minibatches:
+        groups = [(count, first) for count, first in ((teachers, 0), (students, teachers)) if count]
+        if steps * min(count for count, _ in groups) < num_minibatches:
+            named = f"{teachers} teacher and {students} student" if teachers else f"{students}"
             raise ValueError(
-                f"{steps} steps of {teachers} teacher and {students} student environments do not fill "
-                f"{num_minibatches} minibatches; "
+                f"{steps} steps of {named} environments do not fill {num_minibatches} minibatches; "
                 "use more environments or fewer minibatches."
             )
 
@@ -135,7 +145,7 @@ class RolloutStorage:
             rows = shuffled // count * self.num_envs + shuffled % count + first
             return rows.view(num_minibatches, size)
 
-        return draw(teachers, 0), draw(students, teachers)
+        return tuple(draw(count, first) for count, first in groups)
 
     def student_rows(self, rows: torch.Tensor) -> torch.Tensor:
         """Rows of the flattened student-only buffers that belong to student rows of the flattened storage."""

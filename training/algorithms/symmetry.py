@@ -163,6 +163,6 @@ def half_replaced(rows: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
     return torch.cat((images[:half], rows[half:]))
 
 
-def second_halves(rows: torch.Tensor, first: int) -> torch.Tensor:
-    """What ``half_mirrored`` leaves as it is of two blocks one after the other, the first of which has ``first`` rows."""
-    return torch.cat([block[len(block) // 2 :] for block in (rows[:first], rows[first:])])
+def second_halves(rows: torch.Tensor, sizes: Sequence[int]) -> torch.Tensor:
+    """What ``half_mirrored`` leaves as it is of blocks of these sizes, one after the other."""
+    return torch.cat([block[len(block) // 2 :] for block in rows.split(list(sizes))])

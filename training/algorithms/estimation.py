@@ -1,0 +1,195 @@
+"""PPO with an estimator: what DreamWaQ and HIM share.
+
+One network acts everywhere, on the current frame and on what an encoder makes of the history: the base's velocity and a latent.
+The critic sees the true state. PPO trains actor and critic with the estimates that the rollout acted on; nothing of it reaches
+the encoder. Afterwards the encoder learns from the true velocity and from the state one step later, on the same rollout. Samples
+whose episode ended have no next state and count for the velocity alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from ...policy.estimators import VELOCITY
+from ...policy.networks import multilayer_perceptron
+from ..configuration import ConfigurationError, NetworkConfiguration, TrainingConfiguration
+from ..networks import StudentActor, ValueNetwork, last_in_float32
+from .bootstrap import Bootstrap
+from .losses import Losses
+from .ppo import PPO, Widths
+from .storage import EnvironmentSplit, RolloutStorage
+from .symmetry import VECTOR, MirrorMap
+
+
+def estimator_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
+    """Arguments of a network of ``policy.estimators``.
+
+    Raises:
+        ConfigurationError: the encoder is no plain one, or the privileged state does not begin with velocity and frame.
+    """
+    network, method = configuration.network, configuration.algorithm.method
+    if network.student_encoder != "mlp":
+        raise ConfigurationError(
+            f"student_encoder is {network.student_encoder!r}; the method {method!r} has one encoder and takes 'mlp'."
+        )
+    if widths.privileged < VELOCITY + widths.frame:
+        raise ConfigurationError(
+            f"The privileged observation is {widths.privileged} wide; the method {method!r} needs the base's velocity and the "
+            f"frame without noise at its beginning, {VELOCITY + widths.frame} entries."
+        )
+    return {
+        "frame_width": widths.frame,
+        "num_actions": widths.actions,
+        "history_length": widths.history,
+        "latent_width": network.latent_width,
+        "encoder_hidden": list(network.student_hidden),
+        "actor_hidden": list(network.actor_hidden),
+    }
+
+
+class EstimatorActor(StudentActor):
+    """A network that acts on its estimate, with exploration noise; methods add what the encoder learns with."""
+
+    def frames(self, history: torch.Tensor) -> torch.Tensor:
+        """Frames (N, H, F) of flat histories (N, H·F)."""
+        return history.unflatten(-1, self._frames)
+
+    def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Estimates (N, 3 + L), as they are deployed; see ``StudentActor``."""
+        estimate: torch.Tensor = self.student.encode(self.frames(history))[0]
+        return estimate, None
+
+    def acted_on(self, history: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
+        """Estimates (N, 3 + L) as the rollout acts on them, where the true velocity is (N, 3)."""
+        del velocity
+        return self.student_latent(history)[0]
+
+    def helpers(self) -> list[nn.Parameter]:
+        """What only training needs: the encoder learns with it."""
+        raise NotImplementedError
+
+    def student_parameters(self) -> list[nn.Parameter]:
+        """See ``StudentActor``."""
+        return [*super().student_parameters(), *self.helpers()]
+
+
+class StateCritic(ValueNetwork):
+    """A perceptron on the privileged observation."""
+
+    def __init__(self, configuration: NetworkConfiguration, *, privileged_width: int) -> None:
+        super().__init__()
+        self.mlp = multilayer_perceptron((privileged_width, *configuration.critic_hidden, 1))
+
+    def value(
+        self, latent: torch.Tensor, privileged: torch.Tensor, weights: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """See ``ValueNetwork``."""
+        del latent, weights
+        return last_in_float32(self.mlp, privileged)
+
+
+class EstimatorLosses(Losses):
+    """What an estimator learns from: histories, true velocities, next states, and which samples have one."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        """Allocate; see ``Losses``."""
+        super().__init__(*arguments, **settings)
+        self.next_state_map: MirrorMap | None = None
+        if self.mirror is not None:
+            self.next_state_map = MirrorMap.joined([VECTOR.to(self.device), self.mirror.policy])
+
+    def prepare_policy(self) -> None:
+        """What the rollout would have acted on in mirror images."""
+        if (mirror := self.mirror) is not None:
+            history, velocity = self.storage.student_history.flatten(0, 1), self.velocities()
+            flipped = VECTOR.to(self.device)
+            self.fill(
+                self.mirrored_latent,
+                lambda rows: self.actor.acted_on(mirror.history(history[rows]), flipped(velocity[rows])),
+            )
+
+    def prepare_student(self) -> None:
+        """Nothing: all is in the rollout."""
+
+    def velocities(self) -> torch.Tensor:
+        """True velocity of the base of every sample, (T·N, 3)."""
+        return self.storage.privileged[..., :VELOCITY].flatten(0, 1)
+
+    def samples(self, rows: torch.Tensor) -> Sequence[torch.Tensor]:
+        """Of rows of the rollout, mirrored as the symmetry asks for: histories (B, H·F), states one step later, velocity and
+        frame (B, 3 + F), the present velocity (B, 3), and 1 where the episode went on, (B,).
+        """
+        storage, mirror = self.storage, self.mirror
+        history = storage.student_history.flatten(0, 1)[rows]
+        following, velocity = storage.next_state.flatten(0, 1)[rows], self.velocities()[rows]
+        goes_on = 1.0 - storage.dones.flatten(0, 1)[rows]
+        if mirror is None:
+            return history, following, velocity, goes_on
+        if self.settings.symmetry == "augment":
+            goes_on = goes_on.repeat(2)
+        return (
+            self.with_images(history, mirror.history),
+            self.with_images(following, self.next_state_map),
+            self.with_images(velocity, VECTOR.to(self.device)),
+            goes_on,
+        )
+
+
+class EstimatorPPO(PPO):
+    """PPO of an actor with an estimator. See the module docstring."""
+
+    @classmethod
+    def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:
+        """See ``PPO``."""
+        return RolloutStorage(
+            EnvironmentSplit.whole(widths.environments, device),
+            configuration.run.steps_per_iteration,
+            frame_width=widths.frame,
+            privileged_width=widths.privileged,
+            history_width=widths.history * widths.frame,
+            latent_width=VELOCITY + configuration.network.latent_width,
+            num_actions=widths.actions,
+            next_state_width=VELOCITY + widths.frame,
+            device=device,
+        )
+
+    def latents(
+        self, obs: TensorDict, privileged: torch.Tensor, history: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ``PPO``; the state is also the one after the step before."""
+        del obs
+        if self.storage.step > 0:
+            self._store_next(self.storage.step - 1, privileged)
+        estimate = self.actor.acted_on(history, privileged[:, :VELOCITY]).float()
+        return estimate, estimate
+
+    def last_values(self, policy: torch.Tensor, privileged: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+        """See ``PPO``; the state is also the one after the last step."""
+        del policy
+        self._store_next(self.storage.num_steps - 1, privileged)
+        return self.critic.value(history, privileged)
+
+    def _store_next(self, step: int, privileged: torch.Tensor) -> None:
+        following = self.storage.next_state[step]
+        following.copy_(privileged[:, : following.shape[1]])
+
+    def make_bootstrap(self, iterations: int) -> Bootstrap:
+        """The critic learns the values of the policy's behaviour, and what only training needs fits itself to the encoder."""
+        return Bootstrap(
+            self,
+            iterations,
+            parameters=[*self.critic.parameters(), *self.actor.helpers()],
+            losses=self._bare_losses,
+            names=("value", "estimation"),
+        )
+
+    def _bare_losses(self, rows: torch.Tensor) -> torch.Tensor:
+        """Value error and the encoder's loss, (2,)."""
+        states = self.storage.privileged.flatten(0, 1)[rows]
+        error = self.critic.value(states, states).squeeze(-1) - self.storage.returns.flatten(0, 1)[rows]
+        return torch.stack((error.square().mean(), self.losses.student(rows)[0]))

@@ -1,0 +1,56 @@
+"""MCP (paper, ablation): CTS with a plain student encoder, and an actor that multiplies Gaussian primitives (Peng et al., "MCP:
+Learning Composable Hierarchical Control with Multiplicative Compositional Policies", 2019).
+
+The actions' standard deviation is that of the product: it differs from state to state, and no parameter of its own holds it.
+"""
+
+from __future__ import annotations
+
+import torch
+from rsl_rl.modules.distribution import HeteroscedasticGaussianDistribution
+
+from ..configuration import ConfigurationError, TrainingConfiguration
+from ..networks import CtsCritic, StudentActor, ValueNetwork
+from .composed import ComposedActor, composed_arguments
+from .cts import CTS
+from .ppo import Widths
+
+
+class McpActor(ComposedActor):
+    """An actor that multiplies the primitives' distributions."""
+
+    def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Mean and standard deviation of the actions, (N, 2, J); see ``StudentActor``. The critic needs no weights, and no loss
+        keeps them balanced.
+        """
+        (mean, deviation), _ = self.composed(latent, policy)
+        return torch.stack((mean, deviation), dim=-2), None
+
+
+class Mcp(CTS):
+    """CTS with multiplied primitives. See the module docstring."""
+
+    @classmethod
+    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
+        """See ``PPO``.
+
+        Raises:
+            ConfigurationError: there is no command to hide from the primitives.
+        """
+        if not widths.command_entries:
+            raise ConfigurationError("The method 'mcp' hides the command from its primitives; the frame has none.")
+        arguments = composed_arguments(configuration, widths)
+        arguments["primitives_blind_to"] = list(widths.command_entries)
+        actor = McpActor(
+            configuration.network,
+            privileged_width=widths.privileged,
+            architecture="mcp",
+            arguments=arguments,
+            distribution=HeteroscedasticGaussianDistribution,
+        )
+        return actor, CtsCritic(configuration.network, privileged_width=widths.privileged)
+
+    @property
+    def action_std(self) -> torch.Tensor:
+        """Mean standard deviation of the exploration noise in the rollout, (J,)."""
+        return self.storage.action_std.mean(dim=(0, 1))

@@ -1,0 +1,438 @@
+"""What all methods share: PPO on a rollout, then supervised learning of the deployed network's encoder on the same rollout.
+
+A method is a class derived from ``PPO``: its networks, its storage, what the actor is given of an observation, and the losses
+(``losses.Losses``) of the encoder. Nothing in the passes waits for the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import torch
+from tensordict import TensorDict
+
+from ...backends.warp.graphs import RecordedFunction
+from ...policy.fence.archive import LARGEST_FILE
+from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
+from ..networks import StudentActor, ValueNetwork
+from ..processes import Processes
+from ..schedules import RampTable
+from .bootstrap import Bootstrap
+from .gradients import FlatGradients, clip_gradients
+from .losses import Losses
+from .moments import load_moments
+from .storage import RolloutStorage
+from .symmetry import Mirror, passes
+
+MOST_WEIGHTS = LARGEST_FILE // 24
+"""A checkpoint has each weight as it is and averaged, with two moments, and a part of them once more as the policy, at 4 bytes."""
+GROUPS = ("policy", "history", "privileged")
+Step = Callable[..., None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Widths:
+    """Sizes of an environment's observations and actions."""
+
+    environments: int
+    """Number of environments N."""
+    frame: int
+    """Width of a frame F."""
+    history: int
+    """Frames in a history H."""
+    privileged: int
+    """Width of the privileged state P."""
+    actions: int
+    """Width of an action J."""
+    command_entries: tuple[int, ...]
+    """Entries of a frame that hold the command."""
+
+
+class PPO:
+    """The passes over a rollout, their optimizers and counters. See the module docstring."""
+
+    losses_class: ClassVar[type[Losses]]
+    """Losses of the method."""
+    has_teacher: ClassVar[bool] = False
+    """Whether a teacher acts in some environments (``student_period``)."""
+
+    def __init__(
+        self,
+        actor: StudentActor,
+        critic: ValueNetwork,
+        storage: RolloutStorage,
+        *,
+        configuration: AlgorithmConfiguration,
+        mirror: Mirror | None = None,
+        device: str = "cpu",
+        processes: Processes | None = None,
+    ) -> None:
+        """Prepare optimizers and counters.
+
+        Raises:
+            ConfigurationError: symmetry is asked for but no mirror is given, or CUDA graphs without a CUDA device.
+        """
+        on_gpu = torch.device(device).type == "cuda"
+        if configuration.symmetry != "none" and mirror is None:
+            raise ConfigurationError(
+                f"symmetry is {configuration.symmetry!r}, but the task gives no mirror maps; set it to 'none'."
+            )
+        if configuration.cuda_graphs and not on_gpu:
+            raise ConfigurationError("cuda_graphs is on; it needs a CUDA device.")
+        self.device = device
+        self.actor: Any = actor.to(device)
+        self.critic, self.storage = critic.to(device), storage
+        self.configuration = configuration
+        self.processes = processes or Processes()
+        self.bootstrap: Bootstrap | None = None
+        self._graphs = on_gpu and configuration.cuda_graphs is not False
+        self.losses: Any = self.losses_class(
+            actor,
+            critic,
+            storage,
+            settings=configuration,
+            mirror=mirror.to(device) if mirror is not None and configuration.symmetry != "none" else None,
+            cached_casts=not self._graphs,
+        )
+        # The learning rate lives on the device, where the KL divergence is, so that adapting it needs no round trip.
+        self._rate = torch.tensor(configuration.learning_rate, device=device)
+        self._policy_parameters = [*actor.policy_parameters(), *critic.parameters()]
+        self.optimizer = torch.optim.Adam(self._policy_parameters, lr=self._rate, fused=on_gpu, capturable=on_gpu)
+        self.student_optimizer = torch.optim.Adam(
+            actor.student_parameters(), lr=configuration.student_learning_rate, fused=on_gpu, capturable=on_gpu
+        )
+        self._entropy = RampTable([configuration.entropy_coefficient], device)
+        self.follow(torch.zeros((), device=device))
+        self._policy_metrics = torch.zeros(len(self.losses.policy_names) + 2, device=device)
+        self._student_metrics = torch.zeros(len(self.losses.student_names) + 1, device=device)
+        self._policy_loss, self._student_loss = self.losses.policy, self.losses.student
+        mode = configuration.compile_mode
+        if mode == "default" or (mode == "auto" and on_gpu):
+            self._policy_loss, self._student_loss = torch.compile(self._policy_loss), torch.compile(self._student_loss)
+        self._prepare_steps()
+
+    @classmethod
+    def build(
+        cls,
+        observations: TensorDict,
+        configuration: TrainingConfiguration,
+        *,
+        num_actions: int,
+        command_entries: tuple[int, ...] = (),
+        mirror: Mirror | None = None,
+        device: str = "cpu",
+        processes: Processes | None = None,
+    ) -> Self:
+        """Build networks, storage and algorithm for an environment.
+
+        Args:
+            observations: the groups ``policy`` (N, F), ``history`` (N, H·F) frame by frame, oldest first, and
+                ``privileged`` (N, P).
+            configuration: settings of learning.
+            num_actions: width J of an action.
+            command_entries: entries of a frame that hold the command.
+            mirror: mirror maps, needed for symmetry.
+            device: where to learn.
+            processes: of the run, None for this one alone.
+
+        Raises:
+            ConfigurationError: an observation group is missing or has an impossible width, or the networks' settings do not fit.
+        """
+        for group in GROUPS:
+            if group not in observations or observations[group].dim() != 2:
+                raise ConfigurationError(
+                    f"The environment must give an observation group {group!r} of shape (environments, width)."
+                )
+        frame, history, privileged = (observations[group].shape[-1] for group in GROUPS)
+        if history % frame:
+            raise ConfigurationError(
+                f"The history is {history} wide, which is not a multiple of the frame width {frame}."
+            )
+        settings = configuration.algorithm
+        torch.set_float32_matmul_precision("highest" if settings.precision == "float32" else "high")
+        widths = Widths(
+            environments=observations.batch_size[0],
+            frame=frame,
+            history=history // frame,
+            privileged=privileged,
+            actions=num_actions,
+            command_entries=command_entries,
+        )
+        with torch.device("meta"):  # counted before they take memory
+            weights = sum(p.numel() for module in cls.networks(configuration, widths) for p in module.parameters())
+        if weights > MOST_WEIGHTS:
+            raise ConfigurationError(
+                f"The networks have {weights:,} weights; at most {MOST_WEIGHTS:,} fit into a checkpoint that can be read again. "
+                "Make training.network.* smaller."
+            )
+        actor, critic = cls.networks(configuration, widths)
+        storage = cls.rollout_storage(configuration, widths, device)
+        return cls(actor, critic, storage, configuration=settings, mirror=mirror, device=device, processes=processes)
+
+    @classmethod
+    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
+        """The method's actor and critic.
+
+        Raises:
+            ConfigurationError: settings that do not fit.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:
+        """The method's storage of a rollout."""
+        raise NotImplementedError
+
+    @property
+    def learning_rate(self) -> float:
+        """Present learning rate of the policy optimizer; reading it waits for the device."""
+        return float(self._rate.item())
+
+    @learning_rate.setter
+    def learning_rate(self, value: float) -> None:
+        self._rate.fill_(float(value))
+
+    @property
+    def action_std(self) -> torch.Tensor:
+        """Standard deviation of the exploration noise, (J,)."""
+        std: torch.Tensor = self.actor.output_std
+        return std
+
+    def follow(self, progress: torch.Tensor) -> None:
+        """Take the settings of a fraction of the run, a scalar tensor, for the next update."""
+        self.losses.entropy_coefficient.copy_(self._entropy.at(progress)[0])
+
+    def follow_student(self, iterations: int) -> None:
+        """Spend the next iterations on what a bare policy lacks, while it stands still (see ``bootstrap``)."""
+        self.bootstrap = self.make_bootstrap(iterations) if iterations > 0 else None
+
+    def make_bootstrap(self, iterations: int) -> Bootstrap:
+        """The learner of what a bare policy lacks."""
+        raise NotImplementedError
+
+    # Rollout
+
+    @torch.no_grad()
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Sample and store actions, (N, J) in environment order: a teacher's in its environments, the student's in the
+        others.
+        """
+        split, actor = self.storage.split, self.actor
+        # Indexing copies, so an environment may reuse the memory of its observations.
+        policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
+        history = obs["history"][split.order[split.num_teacher :]]
+        with self.losses.autocast():
+            latent, student_latent = self.latents(obs, privileged, history)
+            decision, weights = actor.decide(latent, policy)
+            values = self.critic.value(latent, privileged, weights).float()
+        actor.distribution.update(decision.float())
+        actions = actor.distribution.sample()
+        action_mean, action_std = actor.distribution.params
+        self.storage.add(
+            policy=policy,
+            privileged=privileged,
+            student_history=history,
+            student_latent=student_latent,
+            actions=actions,
+            action_mean=action_mean,
+            action_std=action_std,
+            log_prob=actor.distribution.log_prob(actions),
+            values=values.squeeze(-1),
+        )
+        return actions[split.inverse]
+
+    def latents(
+        self, obs: TensorDict, privileged: torch.Tensor, history: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the actor is given, (N, L) in block order, and the students' part of it, (Ns, L), as it is to be stored.
+
+        Args:
+            obs: all groups, in environment order.
+            privileged: states, (N, P) in block order.
+            history: the students', (Ns, H·F).
+        """
+        raise NotImplementedError
+
+    def store_outcome(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, Any]) -> None:
+        """Store the outcome of the actions, (N,) each in environment order. An episode that ends by ``time_outs`` is
+        worth its last value beyond.
+        """
+        storage, order = self.storage, self.storage.split.order
+        rewards = rewards[order]
+        if "time_outs" in extras:
+            time_outs = extras["time_outs"].to(self.device)[order].float()
+            rewards = rewards + self.configuration.discount * (storage.values[storage.step] * time_outs)
+        storage.add(rewards=rewards, dones=dones[order])
+        storage.step += 1
+
+    @torch.no_grad()
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Returns and advantages; advantages are normalized over all samples together."""
+        split = self.storage.split
+        policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
+        history = obs["history"][split.order[split.num_teacher :]]
+        with self.losses.autocast():
+            last_values = self.last_values(policy, privileged, history).float().squeeze(-1)
+        settings = self.configuration
+        self.storage.compute_returns(last_values, discount=settings.discount, gae_lambda=settings.gae_lambda)
+
+    def last_values(self, policy: torch.Tensor, privileged: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+        """Values (N, 1) of the states after the rollout: frames (N, F) and states (N, P) in block order, the students' histories
+        (Ns, H·F).
+        """
+        raise NotImplementedError
+
+    # Update
+
+    def update(self, wait: Callable[[], None] = lambda: None) -> dict[str, float]:
+        """Run all passes over the rollout.
+
+        Args:
+            wait: called once all work is asked for, to wait for the device.
+
+        Returns:
+            Means over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
+            and were dropped.
+        """
+        self.storage.step = 0
+        if self.bootstrap is not None:
+            losses = self.bootstrap.update()
+            if self.bootstrap.over:
+                self.bootstrap = None
+            return losses
+        storage, settings = self.storage, self.configuration
+        self._policy_metrics.zero_()
+        self._student_metrics.zero_()
+        groups = storage.minibatch_rows(settings.minibatches)
+        self.losses.prepare_policy()
+        for turned in passes(settings.epochs, alternate=settings.symmetry == "alternate"):
+            for minibatch in zip(*groups, strict=True):
+                self._policy_step(*map(turned, minibatch))
+        self.losses.prepare_student()
+        rows_in_history = storage.student_rows(groups[-1])
+        for turned in passes(settings.epochs, alternate=settings.symmetry == "alternate"):
+            for rows in rows_in_history:
+                self._student_step(turned(rows))
+        wait()
+        return self._report()
+
+    def _report(self) -> dict[str, float]:
+        """Read the counters back, the update's only wait for the device."""
+        total = self.configuration.epochs * self.configuration.minibatches
+        sums = torch.cat((self._policy_metrics, self._student_metrics)).tolist()
+        names = (*self.losses.policy_names, "gradient_norm", "skipped")
+        policy = dict(zip(names, sums[: len(names)], strict=True))
+        student = dict(zip((*self.losses.student_names, "skipped"), sums[len(names) :], strict=True))
+        skipped = policy.pop("skipped") + student.pop("skipped")
+        if self.configuration.symmetry != "augment":  # no pair of images to compare
+            del policy["symmetry"]
+        for name in self.without_meaning():
+            del student[name]
+        means = {name: value / total for name, value in (policy | student).items()}
+        return means | {"skipped_minibatches": skipped}
+
+    def without_meaning(self) -> tuple[str, ...]:
+        """Figures of the student's loss that mean nothing with these networks."""
+        return ()
+
+    def _prepare_steps(self) -> None:
+        """Make the steps on one minibatch: gradients, their mean over the processes, and what follows from them."""
+        losses = self.losses
+        self._policy_gradients = FlatGradients(self._policy_parameters, extra=len(losses.policy_names))
+        self._student_gradients = FlatGradients(self.actor.student_parameters(), extra=len(losses.student_names))
+        self._policy_step = self._joined(self._compute_policy, self._policy_gradients, self._apply_policy)
+        self._student_step = self._joined(self._compute_student, self._student_gradients, self._apply_student)
+
+    def _joined(self, compute: Step, gradients: FlatGradients, apply: Step) -> Step:
+        """One step of two halves. Between several processes each half is a CUDA graph of its own: a message inside a graph
+        could not be given up when a process is lost.
+        """
+        recorded: Callable[[Step], Step] = RecordedFunction if self._graphs else (lambda step: step)
+
+        def whole(*rows: torch.Tensor) -> None:
+            compute(*rows)
+            apply()
+
+        if not self.processes.several:
+            return recorded(whole)
+        first, second = recorded(compute), recorded(apply)
+
+        def shared(*rows: torch.Tensor) -> None:
+            first(*rows)
+            self.processes.average(gradients.values)
+            second()
+
+        return shared
+
+    def _compute_policy(self, *groups: torch.Tensor) -> None:
+        """Gradients of the PPO loss of one minibatch."""
+        loss, metrics = self._policy_loss(*groups)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self._policy_gradients.gather()
+        self._policy_gradients.extra.copy_(metrics)
+
+    def _apply_policy(self) -> None:
+        metrics = self._policy_gradients.extra
+        self._adapt_learning_rate(metrics[self.losses.policy_names.index("kl")])
+        norm, skipped = clip_gradients(self._policy_parameters, self.configuration.max_gradient_norm)
+        self.optimizer.step()
+        self._policy_metrics += torch.nan_to_num(torch.cat((metrics, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
+
+    def _compute_student(self, rows: torch.Tensor) -> None:
+        """Gradients of the student's loss of one minibatch; ``rows`` index the student-only buffers."""
+        loss, metrics = self._student_loss(rows)
+        self.student_optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self._student_gradients.gather()
+        self._student_gradients.extra.copy_(metrics)
+
+    def _apply_student(self) -> None:
+        _, skipped = clip_gradients(self.actor.student_parameters(), self.configuration.max_gradient_norm)
+        self.student_optimizer.step()
+        metrics = torch.cat((self._student_gradients.extra, skipped[None]))
+        self._student_metrics += torch.nan_to_num(metrics, 0.0, 0.0, 0.0)
+
+    def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
+        """rsl_rl's rule, on the device: slower above twice the desired divergence, faster below half of it."""
+        target = self.configuration.desired_kl
+        if target is None:
+            return
+        low, high = self.configuration.learning_rate_range
+        slower, faster = (self._rate / 1.5).clamp(min=low), (self._rate * 1.5).clamp(max=high)
+        rate = torch.where(kl > 2.0 * target, slower, torch.where((kl < 0.5 * target) & (kl > 0.0), faster, self._rate))
+        self._rate.copy_(rate)
+
+    # Checkpoints
+
+    def save(self) -> dict[str, Any]:
+        """State of all networks and of both optimizers, under rsl_rl's names."""
+        return {
+            "actor_state_dict": self.actor.state_dict(),
+            "critic_state_dict": self.critic.state_dict(),
+            "optimizer_state_dict": self.optimizer.state_dict(),
+            "student_optimizer_state_dict": self.student_optimizer.state_dict(),
+        }
+
+    def load(self, state: Mapping[str, Any], *, optimizers: bool = True) -> None:
+        """Take over what ``save`` returned.
+
+        Raises:
+            RuntimeError, LookupError, ValueError, TypeError, AttributeError: it does not fit.
+        """
+        self.actor.load_state_dict(state["actor_state_dict"])
+        self.critic.load_state_dict(state["critic_state_dict"])
+        if optimizers:
+            self.learning_rate = load_moments(self.optimizer, state["optimizer_state_dict"])
+            load_moments(self.student_optimizer, state["student_optimizer_state_dict"])
+            # Loading replaced the rate's tensor by a copy.
+            for group in self.optimizer.param_groups:
+                group["lr"] = self._rate
+        # Captured graphs refer to the replaced optimizer state.
+        self._prepare_steps()
+
+    def share(self) -> None:
+        """Give all processes the networks of the first."""
+        self.processes.copy_first([*self.actor.state_dict().values(), *self.critic.state_dict().values()])
