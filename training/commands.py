@@ -53,7 +53,7 @@ def _range_table(
     configuration: CommandConfiguration, terrain_limits: Sequence[tuple[float, float, float]], period: float
 ) -> torch.Tensor:
     """``Ranges`` of every stage and kind of terrain, (stages, kinds, columns): looked up, not computed, in every step."""
-    stages = [(s.forward, s.lateral, s.yaw) for s in configuration.stages]
+    stages = [(s.forward, s.lateral, s.yaw) for s in configuration.drawn_stages]
     bounds, limit = (
         torch.tensor(stages, dtype=torch.float32)[:, None],
         torch.tensor(terrain_limits, dtype=torch.float32),
@@ -69,7 +69,7 @@ def largest_commands(
     configuration: CommandConfiguration, terrain_limits: Sequence[tuple[float, float, float]]
 ) -> tuple[float, float, float]:
     """Largest forward, lateral [m/s] and yaw [rad/s] speed that any stage draws on any kind of terrain."""
-    ranges = [(stage.forward, stage.lateral, stage.yaw) for stage in configuration.stages]
+    ranges = [(stage.forward, stage.lateral, stage.yaw) for stage in configuration.drawn_stages]
     drawn = [max(abs(bound) for stage in ranges for bound in stage[axis]) for axis in range(3)]
     allowed = [max(limits[axis] for limits in terrain_limits) for axis in range(3)]
     forward, lateral, yaw = (min(pair) for pair in zip(drawn, allowed, strict=True))
@@ -106,6 +106,7 @@ class CommandGenerator:
                 f"command stages begin at {begins} of the run; the first must begin at 0 and the others follow in order"
             )
         self._configuration = configuration
+        begins = [stage.begin for stage in configuration.drawn_stages]
         self._begins = torch.tensor(begins, dtype=torch.float32, device=device)
         self._table = _range_table(configuration, terrain_limits, control_period).to(device)
         shares = (

@@ -7,7 +7,7 @@ every difference from the published code and its reason.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from pydantic import Field
@@ -246,12 +246,15 @@ class CommandConfiguration:
         CommandStage(begin=0.1, forward=(-1.0, 1.0), lateral=(-1.0, 1.0), yaw=(-1.5, 1.5)),
         CommandStage(begin=0.3, forward=(-2.0, 2.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
     )
-    """Command curriculum; a terrain's own limits cap every stage."""
+    """Ranges over the run; a terrain's own limits cap every stage."""
+    curriculum: bool = True
+    """Whether commands go through the stages; otherwise they are drawn from the last one's ranges throughout (paper, command
+    curriculum)."""
     interval: Positive = 5.0
     """Time between two draws [s]."""
     dynamic: bool = True
-    """Whether the smallest speed drawn makes sure that the robot can still leave its tile in the rest of the episode.
-    """
+    """Whether the smallest speed drawn makes sure that the robot can still leave its tile in the rest of the episode (paper, dynamic
+    command sampling)."""
     required_distance: float = 5.0
     """Distance that the commands of an episode shall add up to at least [m] (``dynamic``)."""
     straight_probability: Share = 0.3
@@ -272,6 +275,11 @@ class CommandConfiguration:
     """Longest stationary command [s]."""
     generator: str = "gaitgauge.training.commands:CommandGenerator"
     """``module:class`` that draws commands, this one or one derived from it."""
+
+    @property
+    def drawn_stages(self) -> tuple[CommandStage, ...]:
+        """The stages that commands go through."""
+        return self.stages if self.curriculum else tuple(replace(stage, begin=0.0) for stage in self.stages[-1:])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -272,7 +272,7 @@ def find_task(name: str, overrides: Iterable[str] = ()) -> Task:
     elif name in TASKS:
         known = TASKS[name]
     else:
-        near = get_close_matches(name, TASKS, n=2, cutoff=0.3)
+        near = get_close_matches(name, TASKS, n=3, cutoff=0.3)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise TaskError(f"unknown task '{name}'; {hint}the tasks are: {', '.join(TASKS)}")
     chosen = list(overrides)

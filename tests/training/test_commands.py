@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.training.commands import COMMAND_COLUMNS, CommandGenerator
+from gaitgauge.training.commands import COMMAND_COLUMNS, CommandGenerator, largest_commands
 from gaitgauge.training.environment_configuration import CommandConfiguration, CommandStage, Ramp
 
 COUNT = 40_000
@@ -53,6 +53,15 @@ def test_ranges_are_those_of_the_stage_capped_by_the_terrain():
         highest = draw(PLAIN, progress=progress, kind=kind).command.abs().amax(dim=0)
         assert highest.tolist() == pytest.approx([forward, lateral, yaw], rel=1e-3)
         assert (highest <= torch.tensor([forward, lateral, yaw]) + 1e-6).all()
+
+
+def test_without_the_curriculum_all_ranges_are_the_last_stage_s_from_the_start():
+    whole = replace(PLAIN, curriculum=False)
+    for progress in (0.0, 0.4, 0.9):
+        highest = draw(whole, progress=progress).command.abs().amax(dim=0)
+        assert highest.tolist() == pytest.approx([1.5, 1.0, 1.5], rel=1e-3), progress
+    sideways = replace(whole, stages=(replace(STAGES[0], lateral=(-0.9, 0.9)), replace(STAGES[1], lateral=(-0.3, 0.3))))
+    assert largest_commands(sideways, LIMITS) == (1.5, 0.3, 2.0)
 
 
 def test_least_speed_lets_the_robot_leave_its_tile():

@@ -16,6 +16,7 @@ from gaitgauge.training.environment_configuration import (
     PushConfiguration,
     RandomizationConfiguration,
     ResetConfiguration,
+    RewardConfiguration,
     TerminationConfiguration,
 )
 from small_environment import FLAT, STAIRS, gliding, idle, make
@@ -325,6 +326,10 @@ def test_dynamic_sigma():
         [0.25, 0.25, 0.25],
     ]
     assert torch.allclose(parts.read.sigma(memory), torch.tensor(expected), atol=1e-6)
+    fixed = make(5, terrain=replace(STAIRS, levels=9), rewards=RewardConfiguration(dynamic_sigma=False))
+    fixed.parts.memory.command.copy_(torch.tensor(commands))
+    fixed.parts.memory.level.fill_(8)
+    assert torch.equal(fixed.parts.read.sigma(fixed.parts.memory), torch.full((5, 3), 0.25))
 
 
 def test_joint_constants_can_be_overridden():

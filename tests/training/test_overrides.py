@@ -109,12 +109,27 @@ def test_every_key_can_be_set_to_what_it_is():
 
 
 def test_tasks():
-    assert task_names() == ["go2-moe-cts", "go2-cts", "go2-flat", "go2-sprint"]
-    moe, plain, flat, sprint = (find_task(name) for name in task_names())
+    methods = {"go2-moe-cts": "cts", "go2-cts": "cts", "go2-moe-ng": "cts", "go2-ac-moe": "ac_moe", "go2-mcp": "mcp"}
+    methods |= {"go2-him": "him", "go2-dreamwaq": "dreamwaq"}
+    assert task_names() == [*methods, "go2-flat", "go2-sprint"]
+    moe, plain, flat, sprint = map(find_task, ("go2-moe-cts", "go2-cts", "go2-flat", "go2-sprint"))
+    for name, method in methods.items():
+        task = find_task(name)
+        assert task.environment == moe.environment and task.training.algorithm.method == method
+        assert replace(task.training.algorithm, method="cts") == moe.training.algorithm
+        assert task.training.run.experiment == name.replace("-", "_")
     assert moe.training.network.student_encoder == "moe" and plain.training.network.student_encoder == "mlp"
-    assert plain.environment == moe.environment
     assert [t.name for t in flat.environment.terrain.tiles] == ["flat"]
     assert sprint.environment.commands.stages[-1].forward == (-2.0, 4.5)
+
+
+@pytest.mark.parametrize("switch", ["commands.dynamic", "rewards.dynamic_sigma", "commands.curriculum"])
+def test_each_training_strategy_of_the_paper_is_on_and_has_one_switch(switch):
+    group, name = switch.split(".")
+    on = find_task("go2-moe-cts").environment
+    off = find_task("go2-moe-cts", [f"environment.{switch}=false"]).environment
+    assert getattr(getattr(on, group), name) is True
+    assert off == replace(on, **{group: replace(getattr(on, group), **{name: False})})
 
 
 def test_the_contract_says_which_commands_a_task_trains():
@@ -126,7 +141,7 @@ def test_the_contract_says_which_commands_a_task_trains():
 
 
 def test_unknown_task_names_the_nearest():
-    with pytest.raises(TaskError, match=r"unknown task 'go2-moe'; did you mean go2-moe-cts.*the tasks are"):
+    with pytest.raises(TaskError, match=r"unknown task 'go2-moe'; did you mean .*go2-moe-cts.*the tasks are"):
         find_task("go2-moe")
 
 
