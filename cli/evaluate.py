@@ -14,7 +14,7 @@ import typer
 from rich.text import Text
 
 from ..backends.registry import choose_device
-from ..gauge.coverage import COMPLETE, coverage_of, score_label, suite_label
+from ..gauge.coverage import COMPLETE, coverage_of, notes, score_label, suite_label
 from ..gauge.evaluate import Request, Status, evaluate, prepare
 from ..gauge.report import write_report
 from ..gauge.suite import Suite
@@ -124,6 +124,8 @@ def print_results(console: Terminal, results: Mapping[str, Any]) -> None:
             table.add_row(name, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), _interval(row["interval"]))
         console.print(table)
         console.say("  ".join(f"{k} {v:.4f}" for k, v in results["groups"].items()))
+    for note in notes(results):
+        console.say(note)
     health = results["health"]
     troubles = [f"{v} {k}" for k, v in health.items() if k != "episodes" and v]
     if troubles:

@@ -10,12 +10,10 @@ from typing import Any
 import jinja2
 
 from ..files.writing import write_atomically
+from ..policy.contract import PRIVILEGED_TERMS
 from .coverage import COMPLETE, coverage_of
 from .report import TEMPLATES
 from .verify import CardError, load_card
-
-PRIVILEGED = ("base_linear_velocity_b",)
-"""Observation terms that no sensor of a robot measures."""
 
 
 def write_board(folder: Path, page: Path) -> Path:
@@ -46,7 +44,7 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
 
     Returns:
         For each table ``suite``, ``backend``, ``robot``, ``ranked`` (complete cards, best first, with their ``rank``) and
-        ``others`` (parts, custom runs and levels alone, which have no rank).
+        ``others`` (parts, custom runs, levels alone and policies with privileged observations, which have no rank).
     """
     tables: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     suites: dict[tuple[str, str, str], Mapping[str, Any]] = {}
@@ -80,7 +78,7 @@ def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
 def _entry(name: str, card: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """A line of the board."""
     terms: Sequence[str] | None = card["policy"].get("observations")
-    covered = coverage_of(card)
+    covered, privileged = coverage_of(card), bool(set(terms or ()) & set(PRIVILEGED_TERMS))
     return {
         "card": name,
         "policy": PurePath(card["policy"]["path"].replace("\\", "/")).name,
@@ -89,14 +87,10 @@ def _entry(name: str, card: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         "interval": card["score_interval"],
         "note": card["chance"]["note"],
         "level": card["level"],
-        "observations": "not stated"
-        if terms is None
-        else "privileged"
-        if set(terms) & set(PRIVILEGED)
-        else "measurable",
+        "observations": "not stated" if terms is None else "privileged" if privileged else "measurable",
         "terms": list(terms or ()),
         "coverage": f"{covered['kind']}" if covered["kind"] == COMPLETE else f"{covered['kind']}: {covered['text']}",
-        "ranked": covered["kind"] == COMPLETE and card["score"] is not None,
+        "ranked": covered["kind"] == COMPLETE and card["score"] is not None and not privileged,
         "rank": None,
         "command": f"gaitgauge verify {shlex.quote(str(folder / name))} --policy FILE",
     }

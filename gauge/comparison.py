@@ -6,6 +6,7 @@ compared seed by seed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -23,7 +24,8 @@ from .results import ONE_SEED, SCHEMA, environment_weights
 
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
 """What is compared, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
-sub-commands are compared as measured, in the environments where both policies reached the same level; all else counts levels."""
+sub-commands are compared as measured, in the environments where both policies were measured at the same level; all else counts
+levels."""
 _SAME = {"suite": "suite", "backend": "engine", "robot": "robot", "pipeline": "pipeline"}
 """What must be the same in all results, and its name for readers."""
 
@@ -219,7 +221,7 @@ def load_result(path: Path) -> dict[str, Any]:
 
 def chance_rules_of(results: Mapping[str, Any]) -> ChanceRules:
     """The rules of chance that some results carry."""
-    found = {f.name: results["chance"][f.name] for f in fields(ChanceRules)}
+    found = {f.name: results["chance"][f.name] for f in fields(ChanceRules) if f.name in results["chance"]}
     return ChanceRules(**found | {k: tuple(found[k]) for k in ("seeds", "search_seeds")})
 
 
@@ -301,14 +303,33 @@ def _quantities(results: Mapping[str, Any], first: Evidence, second: Evidence) -
     for axis, other in (("friction", "payload"), ("payload", "friction")):
         for value, weights in _sweep(rows, axis, other):
             yield axis, f"{value:g}", partial(_score, weights, (QUALITY,))
-    alike = np.array([bool(a.get("runs")) and a["level"] == b["level"] for a, b in zip(rows, second.rows, strict=True)])
+    at_same = _at_same_levels(first, second)
+    alike = np.array([bool(row.get("runs")) for row in at_same[first].rows])
     if alike.any():
         same = alike / alike.sum()
         commands = next(list(next(iter(row["runs"].values()))["commands"]) for row in rows if row.get("runs"))
         for metric in results["metrics"]:
-            yield "metric", metric, partial(_as_measured, same, (metric,))
+            yield "metric", metric, partial(_as_measured, same, (metric,), at_same)
         for command in commands:
-            yield "command", command, partial(_as_measured, same, (command,))
+            yield "command", command, partial(_as_measured, same, (command,), at_same)
+
+
+def _at_same_levels(first: Evidence, second: Evidence) -> dict[Evidence, Evidence]:
+    """The runs of two evaluations at levels that both were measured at, the lowest one of each environment; no runs elsewhere."""
+    found: tuple[list[dict[str, Any]], list[dict[str, Any]]] = ([], [])
+    for one, other in zip(first.rows, second.rows, strict=True):
+        tables = (_runs_by_level(one), _runs_by_level(other))
+        common = sorted(tables[0].keys() & tables[1].keys(), key=int)
+        for rows, row, table in zip(found, (one, other), tables, strict=True):
+            rows.append({**row, "trials": {}, "runs": table[common[0]] if common else {}})
+    return {first: first.of(found[0]), second: second.of(found[1])}
+
+
+def _runs_by_level(row: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+    """Runs of an environment by the level at which they were played, 0 on flat ground."""
+    if not row.get("runs"):
+        return {}
+    return row.get("runs_by_level") or {str(math.ceil(row["level"] or 0)): row["runs"]}
 
 
 def _score(weights: Array, columns: Sequence[str], evidence: Evidence) -> tuple[float, Chance]:
@@ -319,9 +340,11 @@ def _level(weights: Array, evidence: Evidence) -> tuple[float, Chance]:
     return float(weights @ [row["level"] or 0 for row in evidence.rows]), evidence.level_chance(weights)
 
 
-def _as_measured(weights: Array, columns: Sequence[str], evidence: Evidence) -> tuple[float, Chance]:
-    value = float(weights @ evidence.runs(columns).mean(1))
-    return value, evidence.chance_at_levels(weights, columns)
+def _as_measured(
+    weights: Array, columns: Sequence[str], at_same: Mapping[Evidence, Evidence], evidence: Evidence
+) -> tuple[float, Chance]:
+    found = at_same[evidence]
+    return float(weights @ found.runs(columns).mean(1)), found.chance_at_levels(weights, columns)
 
 
 def _sweep(rows: Sequence[Mapping[str, Any]], axis: str, other: str) -> Iterator[tuple[float, Array]]:

@@ -22,6 +22,7 @@ from ..robots.geometry import total_mass
 from .episodes import Episode
 from .goals import LATERAL_SPEED, Schedule, target_command, target_offset
 from .noise import NoiseReader, make_stream
+from .pushes import sideways
 from .recording import StepRecording
 from .sampling import GRAVITY, SampleTable
 from .segments import SegmentRules
@@ -78,6 +79,7 @@ class ControlStep:
         # which worlds are at work: as ``arrange`` says where that saves something, any of them elsewhere
         self._any_target = self._any_sampled = not early_outs
         self._everyone, self._count = False, 0
+        self._pushing = False
         self.refused = False
         """Whether an early out found that the policy's answer is not finite."""
         self._rows_to_play: torch.Tensor | None = None
@@ -158,9 +160,22 @@ class ControlStep:
             recording.run(self._act)
             if self.refused:
                 return
+            if self.suite.push is not None:
+                self._push()
             worlds = None if self._everyone else buffers.active
             self.backend.step(self._targets, delay=self._delay, sample_at=self._sample_at, worlds=worlds)
             recording.run(self._judge)
+
+    def _push(self) -> None:
+        """Let pushes act on the robots whose time it is."""
+        buffers, steps = self.buffers, self.buffers.commanded_steps
+        pushed = self._commanded & (steps >= buffers.push_begin) & (steps < buffers.push_end)
+        if self.early_outs:
+            before, self._pushing = self._pushing, bool(pushed.any())
+            if not (before or self._pushing):
+                return
+        state = self.backend.state
+        self.backend.apply_force(sideways(state.base_quaternion_w, pushed * buffers.push_force))
 
     def _moving_memory(self) -> tuple[torch.Tensor, ...]:
         """Memory that a captured step uses and that may move."""

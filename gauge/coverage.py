@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from ..policy.contract import PRIVILEGED_TERMS
 from .pipelines import Environment, make_environments
 from .suite import Suite
 
@@ -90,14 +91,28 @@ def suite_label(results: Mapping[str, Any]) -> str:
 
 
 def score_label(results: Mapping[str, Any]) -> str:
-    """What a score is to be called: bare only where it is the suite's."""
+    """What a score is to be called: bare only where it is the suite's, of a policy that a robot could carry."""
     covered = coverage_of(results)
-    return {
+    privileged = results.get("policy", {}).get("kind_of_observations") == "privileged"
+    return ("privileged " if privileged else "") + {
         COMPLETE: "score",
         PART: f"score of a part ({covered['text']})",
         CUSTOM: f"score of a custom run ({covered['text']})",
         UNKNOWN: f"score ({covered['text']})",
     }[covered["kind"]]
+
+
+def notes(results: Mapping[str, Any]) -> list[str]:
+    """Sentences that a reader of the score must know: gains that are not the policy's or the robot's usual ones, privileged
+    observations.
+    """
+    found = []
+    policy = results.get("policy", {})
+    if policy.get("kind_of_observations") == "privileged":
+        terms = ", ".join(t for t in policy["observations"] if t in PRIVILEGED_TERMS)
+        found.append(f"privileged observations: no sensor of a robot measures {terms}")
+    gains = results.get("motors", {}).get("note")
+    return found + ([gains] if gains else [])
 
 
 def _distinct(values: Iterable[Any]) -> list[Any]:

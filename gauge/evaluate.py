@@ -24,7 +24,7 @@ from ..backends.registry import find_backend, make_backend
 from ..files.parsing import shown
 from ..files.provenance import plugins, provenance, versions
 from ..files.writing import json_text, write_atomically
-from ..policy.contract import check_robot
+from ..policy.contract import check_robot, kind_of_observations
 from ..policy.digest import policy_digest
 from ..policy.loading import find_policy, load_policy
 from ..policy.native import FilePolicy
@@ -35,6 +35,7 @@ from .coverage import coverage
 from .dispatcher import Dispatcher, Speculation, play
 from .episodes import QUALITY, Episode
 from .goals import SUB_COMMANDS, TARGET, check_terrain
+from .motors import gains_note, joint_parameters
 from .pipelines import PIPELINES, Environment, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
 from .results import fold, health, rows_csv
@@ -267,12 +268,19 @@ def evaluate(
             "contract_hash": prepared.policy.contract.hash,
             "file_sha256": file_digest(request.policy),
             "observations": [term.name for term in prepared.policy.contract.observation],
+            "kind_of_observations": kind_of_observations(prepared.policy.contract),
             "provenance": dict(prepared.policy.contract.provenance),
         }
         results["coverage"] = coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline)
         results["pipeline"] = request.pipeline
         results["backend"] = request.backend
         results["robot"] = prepared.robot.name
+        motors = joint_parameters(suite, prepared.robot, prepared.policy.contract)
+        results["motors"] = {
+            "stiffness": list(motors.stiffness),
+            "damping": list(motors.damping),
+            "note": gains_note(suite, prepared.robot, prepared.policy.contract),
+        }
         results["health"] = dict(health(outcomes))
         results["solver"] = dict(find_backend(request.backend, request.device).solver_settings(suite.physics))
         results["provenance"] = provenance(
@@ -305,7 +313,7 @@ def _workers(
     places = [
         (e.terrain, level)
         for e in prepared.environments
-        for level in ([e.level] if e.level is not None else range(1, suite.scoring.levels + 1))
+        for level in ([int(e.level)] if e.level is not None else range(1, suite.scoring.levels + 1))
     ]
     required = [episode for found in plans for episode in found.required]
     on_gpu = torch.device(request.device).type != "cpu"

@@ -11,6 +11,7 @@ import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from .episodes import QUALITY
-from .level_chance import redraw_levels, shared_luck, success_curves
+from .level_chance import bisected_levels, redraw_levels, shared_luck, success_curves
+from .level_curve import expected_levels
 
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -122,6 +124,10 @@ class ChanceRules:
     """Whether the environments of a seed share its random numbers."""
     resamples: int
     """Replicates of the level searches."""
+    level: str = "bisection"
+    """How a level is found, as the suite has it; absent from results that are older than the choice."""
+    bracket_seeds: int = 2
+    """Seeds that look for the crossing of a curve."""
 
 
 class Evidence:
@@ -142,7 +148,7 @@ class Evidence:
         """
         self.rows, self._rules = list(rows), rules
         self._flat = np.array([r["terrain"] == "flat" for r in rows], dtype=bool)
-        self._reached = np.array([r["level"] or 0 for r in rows], dtype=np.int64)
+        self._reached = np.array([r["level"] or 0 for r in rows], dtype=np.float64)
         self._searched = np.array([bool(r.get("trials")) for r in rows], dtype=bool)
         self._played = np.array([bool(r.get("runs")) for r in rows], dtype=bool)
         self.redrawn = np.repeat(self._reached[:, None], rules.resamples, axis=1)
@@ -156,15 +162,22 @@ class Evidence:
             {int(level): {int(s): bool(o) for s, o in outcomes.items()} for level, outcomes in row["trials"].items()}
             for row in (self.rows[at] for at in searched)
         ]
-        curves = success_curves(searches, [self.rows[at]["terrain"] for at in searched], self._rules.levels)
+        rules = self._rules
+        curves = success_curves(searches, [self.rows[at]["terrain"] for at in searched], rules.levels)
         self.redrawn[searched] = redraw_levels(
             curves,
-            seeds=len(self._rules.search_seeds),
-            pass_rate=self._rules.pass_rate,
-            luck=shared_luck(searches, curves) if self._rules.shared_noise else 0.0,
-            resamples=self._rules.resamples,
+            seeds=len(rules.search_seeds),
+            find=partial(expected_levels, bracket=rules.bracket_seeds)
+            if rules.level == "curve"
+            else partial(bisected_levels, pass_rate=rules.pass_rate),
+            luck=shared_luck(searches, curves) if rules.shared_noise else 0.0,
+            resamples=rules.resamples,
             generator=generator,
         )
+
+    def of(self, rows: Sequence[Row]) -> Evidence:
+        """The same rules and other rows."""
+        return Evidence(rows, self._rules)
 
     def runs(self, columns: Sequence[str]) -> Array:
         """Mean of some columns in every run, (E, S); zeros where an environment has none.
@@ -191,9 +204,9 @@ class Evidence:
         if QUALITY in columns:
             away = np.where(self._reached > 0, self.redrawn.T - self._reached, 0).T
             means = np.minimum(means * _QUALITY_STEP**away, 1.0)
-        at_levels = rules.level_weight * (self.redrawn - 1) + rules.quality_weight * means
-        levels = weights[:, None] * np.where(self._flat[:, None] | (self.redrawn == 0), 0.0, at_levels)
-        at_reached = self.chance_at_levels(weights * np.where(self._flat, 1.0, rules.quality_weight), columns)
+        levels = weights[:, None] * np.where(self._flat[:, None], 0.0, self._at_levels(self.redrawn, means))
+        share = rules.quality_weight * np.minimum(self._reached, 1.0)
+        at_reached = self.chance_at_levels(weights * np.where(self._flat, 1.0, share), columns)
         return replace(at_reached, **self._of_levels(levels), seeds=(*at_reached.seeds, self._search_seeds(weights)))
 
     def chance_at_levels(self, weights: Array, columns: Sequence[str]) -> Chance:
@@ -208,9 +221,14 @@ class Evidence:
 
     def value(self, weights: Array, columns: Sequence[str] = (QUALITY,)) -> float:
         """Weighted sum over environments of level-weighted values, see ``chance``."""
-        rules, means = self._rules, self.runs(columns).mean(1)
-        at_levels = rules.level_weight * (self._reached - 1) + rules.quality_weight * means
-        return float(weights @ np.where(self._flat, means, np.where(self._reached > 0, at_levels, 0.0)))
+        means = self.runs(columns).mean(1)
+        return float(weights @ np.where(self._flat, means, self._at_levels(self._reached, means)))
+
+    def _at_levels(self, levels: Array, means: Array) -> Array:
+        """``scoring.level_score`` of levels and values that broadcast."""
+        rules = self._rules
+        of_quality = rules.quality_weight * np.minimum(levels, 1.0) * means
+        return rules.level_weight * np.maximum(levels - 1.0, 0.0) + of_quality
 
     def level_chance(self, weights: Array) -> Chance:
         """Chance in a weighted sum of the environments' levels, ``weights`` (E,). Quality seeds play no part."""

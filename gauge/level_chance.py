@@ -8,7 +8,8 @@ from the fit.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,15 +131,29 @@ def shared_luck(searches: Sequence[Trials], curves: Array) -> float:
     return min(math.sin(0.5 * math.pi * min(seen / most, 1.0)), 0.95)
 
 
+def bisected_levels(reached: NDArray[np.bool_], pass_rate: float) -> NDArray[np.int64]:
+    """Level that a bisection over level tests finds, (…,), from whether each seed reaches the target, (…, levels, seeds).
+
+    ``pass_rate`` is the share of the seeds that must.
+    """
+    return bisect(reached.sum(-1) >= math.ceil(pass_rate * reached.shape[-1] - 1e-9))
+
+
 def redraw_levels(
-    curves: Array, *, seeds: int, pass_rate: float, luck: float, resamples: int, generator: np.random.Generator
-) -> NDArray[np.int64]:
+    curves: Array,
+    *,
+    seeds: int,
+    find: Callable[[NDArray[np.bool_]], NDArray[Any]],
+    luck: float,
+    resamples: int,
+    generator: np.random.Generator,
+) -> Array:
     """Maximum levels of searches that are done again with other seeds.
 
     Args:
         curves: chance of success, (E, levels).
         seeds: search seeds a level.
-        pass_rate: share of them that must reach the target.
+        find: the level for each table of outcomes, (…, levels, seeds) to (…,).
         luck: correlation of a seed's luck between environments, see ``shared_luck``.
         resamples: number of replicates B.
         generator: source of the draws.
@@ -147,12 +162,11 @@ def redraw_levels(
         (E, B).
     """
     environments, levels = curves.shape
-    needed = math.ceil(pass_rate * seeds - 1e-9)
     common = math.sqrt(luck) * generator.standard_normal((resamples, 1, seeds))
-    found = np.zeros((environments, resamples), dtype=np.int64)
+    found = np.zeros((environments, resamples))
     for at, thresholds in enumerate(special.ndtri(curves)):
         own = math.sqrt(1.0 - luck) * generator.standard_normal((resamples, levels, seeds))
-        found[at] = bisect((common + own < thresholds[:, None]).sum(-1) >= needed)
+        found[at] = find(common + own < thresholds[:, None])
     return found
 
 

@@ -6,6 +6,7 @@ Paper table ``Metrics for the RoboGauge Framework`` and its appendix ``Stability
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -147,6 +148,21 @@ def quality(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     return torch.exp((logs * weights).sum(1) / (defined * weights).sum(1))
 
 
+def fill_flight(values: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
+    """The metrics of a segment without gaps: where one is not defined stands its mean over the instants that count.
+
+    So flight neither raises nor lowers what contacts say of a motion. Zero where no instant defines the metric.
+
+    Args:
+        values: (T, M), NaN where a metric is not defined; clamped to [0, 1] before they are averaged.
+        keep: whether the instant counts, (T,) bool.
+    """
+    defined = ~torch.isnan(values)
+    told = torch.where(defined & keep[:, None], torch.clamp(values, 0.0, 1.0), torch.zeros_like(values))
+    mean = told.sum(0) / torch.clamp((defined & keep[:, None]).sum(0), min=1)
+    return torch.where(defined, values, mean)
+
+
 class MotionState(Protocol):
     """What the metrics need of a state; ``PhysicsState`` has it, with the same frames and units."""
 
@@ -225,7 +241,7 @@ class MetricEvaluator:
         torque_before: torch.Tensor,
         torque_known: torch.Tensor,
     ) -> torch.Tensor:
-        """Metrics and quality of one instant, (N, M + 1), NaN where a metric is not defined.
+        """Metrics of one instant, (N, M), NaN where a metric is not defined.
 
         Args:
             state: N instants; contacts are looked at only if ``needs_contacts``.
@@ -267,5 +283,18 @@ class MetricEvaluator:
                     f"unknown metric '{name}'; choose from {', '.join(METRIC_NAMES)} (suite, metrics.weights)"
                 )
             columns.append(value)
-        values = torch.stack(columns, dim=1)
-        return torch.cat((values, quality(values, self._weights)[:, None]), dim=1)
+        return torch.stack(columns, dim=1)
+
+    def with_quality(self, values: torch.Tensor, keep: torch.Tensor, counts: Sequence[int]) -> torch.Tensor:
+        """The metrics, and the quality of each instant as their last column, (N, M + 1).
+
+        Args:
+            values: metrics of the instants of some segments, one after the other, (N, M).
+            keep: whether each counts, (N,) bool.
+            counts: number of instants of each segment.
+        """
+        seen = values
+        if self.needs_contacts and self._metrics.flight == "filled":
+            pieces = zip(values.split(list(counts)), keep.split(list(counts)), strict=True)
+            seen = torch.cat([fill_flight(*piece) for piece in pieces])
+        return torch.cat((values, quality(seen, self._weights)[:, None]), dim=1)

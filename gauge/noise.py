@@ -179,9 +179,23 @@ class CounterStream(NoiseStream):
     def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
         self._noise, self._joints = noise, joints
         self._key = torch.zeros(worlds, dtype=torch.int64, device=device)
-        half = [noise.joint_position] * joints + [noise.joint_velocity] * joints + [noise.base_angular_velocity] * 3
+        self._widths = {
+            "joint_position": joints,
+            "joint_velocity": joints,
+            "base_angular_velocity_b": 3,
+            "projected_gravity_b": 3,
+            "base_linear_velocity_b": 3,
+        }
+        halves = (
+            noise.joint_position,
+            noise.joint_velocity,
+            noise.base_angular_velocity,
+            noise.projected_gravity,
+            noise.base_linear_velocity,
+        )
+        half = [h for h, width in zip(halves, self._widths.values(), strict=True) for _ in range(width)]
         self._half = torch.tensor(half, device=device)
-        self._index = torch.arange(2 * joints + 4, dtype=torch.int64, device=device)
+        self._index = torch.arange(len(half) + 1, dtype=torch.int64, device=device)
 
     def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
         """See ``NoiseStream.assign``."""
@@ -193,13 +207,7 @@ class CounterStream(NoiseStream):
         unit = uniform_hash(self._key[:, None], step[..., None], self._index)
         delay = (unit[..., -1] * (self._noise.latency + 1)).to(torch.int64)
         values = (2.0 * unit[..., :-1] - 1.0) * self._half
-        j = self._joints
-        terms = {
-            "joint_position": values[..., :j],
-            "joint_velocity": values[..., j : 2 * j],
-            "base_angular_velocity_b": values[..., -3:],
-        }
-        return terms, delay
+        return dict(zip(self._widths, values.split(list(self._widths.values()), dim=-1), strict=True)), delay
 
 
 def uniform_hash(key: torch.Tensor, step: torch.Tensor, index: torch.Tensor) -> torch.Tensor:

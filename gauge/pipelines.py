@@ -18,8 +18,8 @@ class Environment:
     friction: float
     payload: float
     """Mass added to the base [kg]."""
-    level: int | None
-    """The level to play at, 0 on flat ground; None to search for it."""
+    level: float | None
+    """The level to play at, a whole number, 0 on flat ground; None to search for it."""
 
     @property
     def searched(self) -> bool:

@@ -7,7 +7,7 @@ scheduling of episodes and the folding of results all ask this function; there i
 Two rules hold, and tests check them. What counts depends on the outcomes of the counted episodes alone: records of others,
 played ahead of time, change when something is known and never what. And what is required once stays counted.
 
-Another way to find a level, a curve over several levels for example, is another function of the same arguments.
+A suite says how a level is found: by bisection over level tests, or as the area under a curve (``level_curve``).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from functools import lru_cache
 
 from .episodes import Episode, Record
 from .goals import TARGET
+from .level_curve import CurveSearch, bracketing_levels, fitted_curve, follow, nearness
 from .pipelines import Environment
 from .suite import Suite
 
@@ -41,10 +42,11 @@ class PlanRules:
 class Plan:
     """What is known of an environment and what is to be played there."""
 
-    level: int | None
-    """Level reached or given, None while searched for; 0 on flat ground, and where not even level 1 is passed."""
+    level: float | None
+    """Level reached or given, None while searched for; 0 on flat ground, and where not even level 1 is passed. A whole number but
+    where the suite asks for an expected level."""
     passed: Mapping[int, bool] = field(default_factory=dict)
-    """Outcomes of the levels that the search has asked for, in its order."""
+    """Outcomes of the levels that the search has asked for, in its order; empty while the trials of a curve are open."""
     counted: tuple[Episode, ...]
     """Episodes of which the results consist, in order, as far as they are known."""
     required: tuple[Episode, ...]
@@ -54,18 +56,20 @@ class Plan:
 
 
 def plan(environment: Environment, records: Records, rules: PlanRules) -> Plan:
-    """Plan an environment: the level by bisection over level tests unless it is given, then the quality episodes.
+    """Plan an environment: the level as the suite finds it unless it is given, then the quality episodes.
 
     Args:
         environment: what is gauged.
         records: episodes that have ended, of this environment and of others.
         rules: see ``PlanRules``.
     """
+    if environment.level is None and rules.suite.scoring.level == "curve":
+        return _plan_curve(environment, records, rules)
     counted: list[Episode] = []
     passed: dict[int, bool] = {}
     low, high = 0, rules.suite.scoring.levels
     if environment.level is not None:
-        low = high = environment.level
+        low = high = int(environment.level)
     while low < high:
         test = _level_test(environment, (low + high + 1) // 2, records, rules)
         counted += test.counted
@@ -77,6 +81,17 @@ def plan(environment: Environment, records: Records, rules: PlanRules) -> Plan:
     if level is not None:
         counted += _quality(environment, level, rules)
     possible = dict(_possible(environment, low, high, records, rules, 1.0)) if level is None else {}
+    return _plan(level, passed, counted, possible, records)
+
+
+def _plan(
+    level: float | None,
+    passed: Mapping[int, bool],
+    counted: Sequence[Episode],
+    possible: Mapping[Episode, float],
+    records: Records,
+) -> Plan:
+    """A plan, without what has ended or counts among what is possible."""
     counts = set(counted)
     return Plan(
         level=level,
@@ -179,11 +194,12 @@ def _successes(successes: int, failures: int, more: int) -> tuple[float, ...]:
     return tuple(math.comb(more, k) * beta(successes + k, failures + more - k) / before for k in range(more + 1))
 
 
-def _quality(environment: Environment, level: int, rules: PlanRules) -> list[Episode]:
-    """The quality episodes at a level; none where not even level 1 is passed."""
-    if not rules.quality or (level == 0 and environment.terrain != "flat"):
+def _quality(environment: Environment, level: float, rules: PlanRules) -> list[Episode]:
+    """The quality episodes at a level, or at the two levels beside it; none where not even level 1 is passed."""
+    if not rules.quality:
         return []
-    return [_episode(environment, level, seed, "eval", rules.suite) for seed in rules.seeds]
+    levels = [0] if environment.terrain == "flat" else list(bracketing_levels(level))
+    return [_episode(environment, at, seed, "eval", rules.suite) for at in levels for seed in rules.seeds]
 
 
 def _episode(environment: Environment, level: int, seed: int, stage: str, suite: Suite) -> Episode:
@@ -198,6 +214,45 @@ def _episode(environment: Environment, level: int, seed: int, stage: str, suite:
     )
 
 
+# ---- an expected level ------------------------------------------------------------------------------------------------
+
+
+def _plan_curve(environment: Environment, records: Records, rules: PlanRules) -> Plan:
+    """The level as the area under a curve, then the quality episodes beside it."""
+    suite = rules.suite
+    seeds, levels = suite.matrix.search_seeds, suite.scoring.levels
+
+    def trial(level: int, seed: int) -> Episode:
+        return _episode(environment, level, seed, "search", suite)
+
+    def outcomes(level: int) -> list[bool | None]:
+        found = [records.get(trial(level, seed)) for seed in seeds]
+        return [None if r is None else bool(r.success) for r in found]
+
+    found = follow(outcomes, levels, len(seeds), suite.scoring.bracket_seeds)
+    counted = [trial(level, seed) for level, count in found.seeds.items() for seed in seeds[:count]]
+    if found.level is None:
+        likely = _likely_levels(found, levels)
+        possible = {trial(level, seed): p for level, p in likely.items() for seed in seeds}
+        for level in range(1, levels + 1):
+            chance = 0.5 * nearness(level, found.lowest, found.highest)
+            possible |= dict.fromkeys(_quality(environment, level, rules), chance)
+        return _plan(None, {}, counted, possible, records)
+    fit = fitted_curve({level: [bool(o) for o in outcomes(level)[:count]] for level, count in found.seeds.items()})
+    passed = {level: fit[level] >= 0.5 for level in found.seeds}
+    return _plan(found.level, passed, [*counted, *_quality(environment, found.level, rules)], {}, records)
+
+
+def _likely_levels(found: CurveSearch, levels: int) -> dict[int, float]:
+    """Levels of which all seeds may count yet, and how probable that is, roughly."""
+    below = range(1, found.lowest) if found.goes_down else range(0)
+    above = range(found.highest + 1, levels + 1) if found.goes_up else range(0)
+    within = range(max(found.lowest, 1), min(found.highest, levels) + 1)
+    # the longer the range of which the crossing is still to be found, the less is known of each of its levels
+    share = min(4.0 / max(len(within), 1), 0.8)
+    return {level: share * nearness(level, found.lowest, found.highest) for level in (*within, *below, *above)}
+
+
 # ---- the end ----------------------------------------------------------------------------------------------------------
 
 
@@ -206,11 +261,12 @@ class EnvironmentResult(Environment):
     """An environment at the level reached or given, and what came of it."""
 
     search: Mapping[int, bool] | None
-    """Levels that the search asked for, and whether they were passed; None where the level was given."""
+    """Levels that the search asked for, and whether they were passed (by half of the seeds or more, where the level is an expected
+    one); None where the level was given."""
     trials: Sequence[Record]
     """Episodes of the level tests."""
     records: Sequence[Record]
-    """Quality episodes, in the order of the seeds."""
+    """Quality episodes, level by level, in the order of the seeds."""
 
     @property
     def searched(self) -> bool:

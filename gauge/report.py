@@ -13,7 +13,7 @@ from ..files.parsing import edited, read_results
 from ..files.writing import write_atomically
 from . import charts
 from .charts import FLAT, Row, number, terrain_label
-from .coverage import coverage_of, score_label, suite_label
+from .coverage import coverage_of, notes, score_label, suite_label
 from .results import SCHEMA
 from .store import StoreError
 
@@ -182,6 +182,9 @@ def warnings(results: Mapping[str, Any]) -> list[dict[str, Any]]:
         headline = f"not even level 1 passed in {len(failed)} of {searched} searched environments"
         meaning = "They score zero and no quality is measured there."
         found.append(_warning("note", headline, meaning, _places(failed, None)))
+    found += [
+        _warning("note", "for the reader of the score", f"{text[0].upper()}{text[1:]}.", []) for text in notes(results)
+    ]
     restarted = sum(r.get("restarted", 0) for r in rows)
     if restarted:
         headline = f"restarts in {restarted} of {total}"

@@ -13,6 +13,7 @@ import numpy as np
 from .episodes import Record
 from .goals import SUB_COMMANDS, command_name
 from .intervals import CONFIDENCE, ChanceRules, Evidence
+from .level_curve import bracketing_levels, fitted_curve
 from .plan import EnvironmentResult
 from .scoring import STATISTICS, Array, command_statistics, group_values, level_score, rounded, run_statistics
 from .suite import Suite
@@ -33,6 +34,8 @@ def chance_rules(suite: Suite, seeds: Sequence[int]) -> ChanceRules:
         search_seeds=suite.matrix.search_seeds,
         shared_noise=suite.noise.stream == "reference",
         resamples=scoring.bootstrap,
+        level=scoring.level,
+        bracket_seeds=scoring.bracket_seeds,
     )
 
 
@@ -62,7 +65,8 @@ def fold(
         values[environment.key] = statistics
     if evaluated is None:
         evaluated = any(e.records for e in environments)
-    seeds = next(([r.episode.seed for r in e.records] for e in environments if e.records), list(suite.matrix.seeds))
+    played = next((dict.fromkeys(r.episode.seed for r in e.records) for e in environments if e.records), None)
+    seeds = list(suite.matrix.seeds if played is None else played)
     rules = chance_rules(suite, seeds)
     evidence = Evidence(rows, rules)
     weights = environment_weights([e.terrain for e in environments])
@@ -130,6 +134,11 @@ def environment_weights(terrains: Sequence[str]) -> Array:
     return np.array([1.0 / (count * list(terrains).count(t)) for t in terrains])
 
 
+def _level(found: float | None) -> float | None:
+    """A level as results have it: a whole number as such."""
+    return None if found is None else int(found) if found == int(found) else _number(found)
+
+
 def _mean_level(environments: Sequence[EnvironmentResult]) -> float:
     return float(np.mean([e.level or 0 for e in environments if e.terrain != "flat"]))
 
@@ -144,7 +153,7 @@ def _environment(
         "terrain": environment.terrain,
         "friction": environment.friction,
         "payload": environment.payload,
-        "level": None if flat else environment.level,
+        "level": None if flat else _level(environment.level),
         "quality": None,
         "score": None,
         "interval": None,
@@ -154,14 +163,24 @@ def _environment(
         row["trials"] = {str(level): {} for level in sorted({t.episode.level for t in environment.trials})}
         for trial in sorted(environment.trials, key=lambda t: t.episode):
             row["trials"][str(trial.episode.level)][str(trial.episode.seed)] = bool(trial.success)
+        if scoring.level == "curve":
+            fit = fitted_curve({int(at): list(found.values()) for at, found in row["trials"].items()})
+            row["curve"] = {str(at): _number(share) for at, share in fit.items()}
     if environment.level == 0 and not flat:
         row["score"] = 0.0
     if not environment.records:
         return row, statistics
+    weights = {0: 1.0} if flat else bracketing_levels(level)
+    of_seed: dict[int, list[tuple[float, Record]]] = {}
+    for record in environment.records:
+        of_seed.setdefault(record.episode.seed, []).append((weights[record.episode.level], record))
     plain: dict[str, Array] = {}
-    row["runs"] = {str(r.episode.seed): {} for r in environment.records}
+    row["runs"] = {str(seed): {} for seed in of_seed}
     for index, column in enumerate(columns):
-        runs = [rounded(run_statistics(r, index), scoring) for r in environment.records]
+        runs = [
+            rounded(np.sum([weight * run_statistics(r, index) for weight, r in found], axis=0), scoring)
+            for found in of_seed.values()
+        ]
         mean = rounded(np.mean(runs, axis=0), scoring)
         plain[column] = mean
         name = column if index < len(columns) - 1 else "score"
@@ -170,13 +189,10 @@ def _environment(
         statistics[name] = rounded(np.mean(weighted, axis=0), scoring)
         for run, values in zip(row["runs"].values(), runs, strict=True):
             run[column] = _number(values[2])
-    for record in environment.records:
-        played = command_statistics(record, len(columns) - 1)
-        row["runs"][str(record.episode.seed)]["commands"] = {
-            command_name(name, part): _number(played[goal, part][2]) if (goal, part) in played else 0.0
-            for goal, name in enumerate(record.episode.goals)
-            for part in range(len(SUB_COMMANDS[name]))
-        }
+    for seed, found in of_seed.items():
+        row["runs"][str(seed)]["commands"] = _commands(found, len(columns) - 1)
+    if len(weights) > 1:
+        row["runs_by_level"] = {str(at): _runs_at(environment, at, columns) for at in weights}
     row["quality"] = {s: _number(v) for s, v in zip(STATISTICS, plain[columns[-1]], strict=True)}
     row["score"] = _number(statistics["score"][2])
     row["metrics"] = {c: {s: _number(v) for s, v in zip(STATISTICS, plain[c], strict=True)} for c in columns[:-1]}
@@ -185,6 +201,29 @@ def _environment(
     for name in ("diverged", "overflowed", "restarted"):
         row[name] = sum(bool(getattr(r, name)) for r in environment.records)
     return row, statistics
+
+
+def _runs_at(environment: EnvironmentResult, level: int, columns: Sequence[str]) -> dict[str, Any]:
+    """The runs at one of the two levels beside an expected one, as ``runs`` has them in between."""
+    runs: dict[str, Any] = {}
+    for record in environment.records:
+        if record.episode.level == level:
+            run = {column: _number(run_statistics(record, index)[2]) for index, column in enumerate(columns)}
+            runs[str(record.episode.seed)] = run | {"commands": _commands([(1.0, record)], len(columns) - 1)}
+    return runs
+
+
+def _commands(found: Sequence[tuple[float, Record]], column: int) -> dict[str, float]:
+    """Mean@50 of a column in each sub-command of a run, from its records at one or two levels and their weights."""
+    values: dict[str, float] = {}
+    for weight, record in found:
+        played = command_statistics(record, column)
+        for goal, name in enumerate(record.episode.goals):
+            for part in range(len(SUB_COMMANDS[name])):
+                command = command_name(name, part)
+                value = float(played[goal, part][2]) if (goal, part) in played else 0.0
+                values[command] = values.get(command, 0.0) + weight * value
+    return {command: _number(value) for command, value in values.items()}
 
 
 def _number(value: float | np.floating) -> float:

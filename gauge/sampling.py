@@ -148,17 +148,22 @@ class SampleTable:
         owner = np.repeat(worlds, counts)
         first = np.repeat(np.asarray(worlds) * (self.capacity + 1) - np.cumsum(counts) + counts, counts)
         at, world = torch.tensor(np.stack((first + np.arange(len(owner)), owner)), device=self._device)
-        batches = list(counts) if self._one_by_one else [len(owner)]
-        rows = (self.rows[at], limits[world], friction[world])
-        values = torch.cat([self._evaluate(*batch) for batch in zip(*(x.split(batches) for x in rows), strict=True)])
+        batches = [[count] for count in counts] if self._one_by_one else [list(counts)]
+        rows = [x.split([sum(batch) for batch in batches]) for x in (self.rows[at], limits[world], friction[world])]
+        values = torch.cat([self._evaluate(*batch) for batch in zip(*rows, batches, strict=True)])
         pieces = np.split(values.cpu().numpy(), np.cumsum(counts)[:-1])
         return [(piece[:, :-1], piece[:, -1] > 0) for piece in pieces]
 
-    def _evaluate(self, rows: torch.Tensor, limits: torch.Tensor, friction: torch.Tensor) -> torch.Tensor:
-        """Metrics and quality of rows of the table, then whether they count, (N, columns + 1) float32."""
+    def _evaluate(
+        self, rows: torch.Tensor, limits: torch.Tensor, friction: torch.Tensor, counts: Sequence[int]
+    ) -> torch.Tensor:
+        """Metrics and quality of rows of the table, then whether they count, (N, columns + 1) float32.
+
+        The rows are those of some segments, one after the other, with so many samples each.
+        """
         *values, command, before, known, keep = rows.split(self._split, dim=1)
         if not self._metrics.needs_contacts:
             values += [values[0][:, :0]] * len(_CONTACTS)
         state = SampledState(**dict(zip(_MOTION + _JOINTS + _CONTACTS, values, strict=True)))
         metrics = self._metrics.evaluate(state, command, limits, friction, before, known[:, 0] > 0)
-        return torch.cat((metrics, keep), dim=1).to(torch.float32)
+        return torch.cat((self._metrics.with_quality(metrics, keep[:, 0] > 0, counts), keep), dim=1).to(torch.float32)

@@ -47,13 +47,16 @@ def command_statistics(record: Record, column: int) -> dict[tuple[int, int], Arr
     return found
 
 
-def level_score(value: Array | float, level: int, scoring: Scoring, *, flat: bool) -> Array | float:
-    """Score of a quality (or metric) at a level: 0.09 (L - 1) + 0.19 q; the quality itself on flat ground; 0 at level 0."""
+def level_score(value: Array | float, level: float, scoring: Scoring, *, flat: bool) -> Array | float:
+    """Score of a quality (or metric) at a level: 0.09 (L - 1) + 0.19 q; the quality itself on flat ground; 0 at level 0.
+
+    Between two levels it lies between their scores, below level 1 between zero and that of level 1.
+    """
     if flat:
         return value
     if level == 0:
         return np.zeros_like(value) if isinstance(value, np.ndarray) else 0.0
-    return scoring.level_weight * (level - 1) + scoring.quality_weight * value
+    return scoring.level_weight * max(level - 1, 0) + scoring.quality_weight * min(level, 1) * value
 
 
 def rounded(value: Array, scoring: Scoring) -> Array:

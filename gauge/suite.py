@@ -32,6 +32,7 @@ SUITE_FOLDER = Path(__file__).parent / "suites"
 _Speed = Annotated[float, Field(ge=0.0, le=100.0)]
 _Time = Annotated[float, Field(gt=0.0, le=3600.0)]
 _Noise = Annotated[float, Field(ge=0.0, le=1000.0)]
+_Force = Annotated[float, Field(ge=0.0, le=10_000.0)]
 _Tilt = Annotated[float, Field(gt=0.0, le=3.1416)]
 Limits = tuple[_Speed, _Speed, _Speed]
 Friction = Annotated[float, Field(gt=0.0, le=10.0)]
@@ -106,6 +107,10 @@ class Noise:
     """[rad]."""
     joint_velocity: _Noise
     """[rad/s]."""
+    projected_gravity: _Noise = 0.0
+    """Of each component of the direction of gravity in the body frame, a unit vector."""
+    base_linear_velocity: _Noise = 0.0
+    """[m/s]; no robot measures it, and a policy that is told it counts as privileged all the same."""
     latency: Annotated[int, Field(ge=0)]
     """Largest delay of an action in substeps; drawn anew at every control step, 0 to this, uniformly."""
     stream: Literal["reference", "counter"]
@@ -166,6 +171,9 @@ class Metrics:
     """Diagonal stance span that normalizes the ZMP distance [m]; None: that of the robot's default pose."""
     contact_share: Share = 0.05
     """Share of the weight that the ground must carry for the contact metrics to be defined."""
+    flight: Literal["left-out", "filled"] = "left-out"
+    """What stands for a contact metric in the quality of a sample without contact: nothing (``left-out``), or the metric's mean
+    over the sub-command's other samples (``filled``; zero where there are none)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,6 +194,25 @@ class Scoring:
     """Metrics averaged in each group, on their level-weighted mean@50."""
     bootstrap: Annotated[int, Field(ge=1, le=100_000)]
     """Number of bootstrap resamples for the confidence intervals."""
+    level: Literal["bisection", "curve"] = "bisection"
+    """``bisection``: the highest level that a bisection of level tests finds passed, a whole number; ``curve``: the expected level,
+    the area under the share of successes by level (``gauge/level_curve.py``)."""
+    bracket_seeds: Annotated[int, Field(ge=1, le=1000)] = 2
+    """Search seeds with which a curve's crossing is looked for, before all of them are played around it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Push:
+    """A sudden lateral push: a force on the base's centre of mass, to the left or right of its heading, chance says which."""
+
+    goal: GoalName
+    """Velocity goal of whose sub-commands each has a push."""
+    after: _Time
+    """When it begins, from the first commanded control step on [s]."""
+    duration: _Time
+    """[s]."""
+    force: tuple[_Force, _Force]
+    """Smallest and largest force, all between equally likely [N]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,13 +234,20 @@ class Suite:
     settling: Settling
     metrics: Metrics
     scoring: Scoring
+    gains: Literal["suite", "contract"] = "suite"
+    """Whose motor gains kp and kd every policy is played with: those of ``parameters``, or those of its own contract."""
+    push: Push | None = None
+    """None: nothing pushes."""
 
     @property
     def digest(self) -> str:
         """SHA-256 over every rule, hexadecimal: two suites of one name and different rules differ in it."""
         rules = asdict(self)
-        if not self.physics.torque_speed_limit:
-            del rules["physics"]["torque_speed_limit"]  # suites that were published before it existed keep their digest
+        for path, plain in _ADDED.items():  # suites that were published before these existed keep their digest
+            *tables, field = path.split(".")
+            table = rules[tables[0]] if tables else rules
+            if table[field] == plain:
+                del table[field]
         return hashlib.sha256(json.dumps(rules, sort_keys=True).encode()).hexdigest()
 
     def goal(self, name: str) -> Goal:
@@ -223,6 +257,19 @@ class Suite:
     def command_limits(self, family: str) -> Limits:
         """Command limits on a terrain family."""
         return self.commands.flat if family == "flat" else self.commands.levelled
+
+
+_ADDED: Mapping[str, Any] = {
+    "physics.torque_speed_limit": False,
+    "noise.projected_gravity": 0.0,
+    "noise.base_linear_velocity": 0.0,
+    "metrics.flight": "left-out",
+    "scoring.level": "bisection",
+    "scoring.bracket_seeds": 2,
+    "gains": "suite",
+    "push": None,
+}
+"""Rules that came after suites had been published, and the values that say what held before."""
 
 
 def suite_names() -> list[str]:
@@ -316,7 +363,19 @@ def _check(suite: Suite, source: str) -> None:
             settling.shortest <= settling.longest
         ),
         f"goals has a goal twice: {', '.join(goals)}": len(set(goals)) == len(goals),
+        f"scoring.bracket_seeds is {suite.scoring.bracket_seeds}; at most the {len(matrix.search_seeds)} of matrix.search_seeds "
+        "are possible": suite.scoring.level == "bisection" or suite.scoring.bracket_seeds <= len(matrix.search_seeds),
     }
+    for name in ("projected_gravity", "base_linear_velocity"):
+        half = getattr(suite.noise, name)
+        rules[
+            f"noise.{name} is {half:g}, which the stream 'reference' does not draw; let it be 0, or the stream 'counter'"
+        ] = half == 0.0 or suite.noise.stream == "counter"
+    if (push := suite.push) is not None:
+        rules[f"push.force ({push.force[0]:g} to {push.force[1]:g} N) must rise"] = push.force[0] <= push.force[1]
+        rules[f"push.goal ({push.goal}) is none of goals with sub-commands ({', '.join(goals)})"] = any(
+            g.name == push.goal and g.phases for g in suite.goals
+        )
     for name in ("terrains", "frictions", "payloads", "seeds", "search_seeds"):
         values = getattr(matrix, name)
         rules[f"matrix.{name} has an entry twice: {shown(list(values))}"] = len(set(values)) == len(values)

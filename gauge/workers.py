@@ -35,6 +35,7 @@ from ..policy.loading import load_policy
 from ..robots import Robot
 from ..terrains.registry import make_terrain
 from .episodes import Episode, Record
+from .motors import joint_parameters
 from .rollout import Rollout
 from .suite import Suite
 
@@ -151,7 +152,7 @@ class Job:
         """
         return Scene(
             robot=self.robot,
-            parameters=self.robot.parameters[self.suite.parameters],
+            parameters=joint_parameters(self.suite, self.robot, self.policy.contract),
             terrains=tuple(make_terrain(name, level) for name, level in self.places),
             terrain_index=(0,) * self.worlds,
             physics=self.suite.physics,

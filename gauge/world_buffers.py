@@ -15,6 +15,7 @@ from ..robots.base import Robot
 from ..robots.rotation import from_yaw
 from ..terrains.base import Terrain
 from .goals import TARGET, Schedule
+from .pushes import push_force, push_steps
 from .segments import Segment, SegmentRules
 from .suite import Suite
 
@@ -77,6 +78,11 @@ class WorldBuffers:
     """Control steps of the sub-command, or those that the target goal may take."""
     noise_start: Counts
     """Where the segment begins in its episode's noise [control steps]."""
+    push_force: Numbers
+    """Sideways push, to the left of the heading [N]."""
+    push_begin: Counts
+    push_end: Counts
+    """Commanded steps from which and before which it acts; none where both are the same."""
     aims: Flags
     """Whether the segment aims at a target."""
     sampled: Flags
@@ -196,6 +202,12 @@ class WorldBuffers:
         ]
         write(self.length, lengths)
         write(self.noise_start, [rules.noise_start(s) for s in segments])
+        if suite.push is not None:
+            begin, end = push_steps(suite)
+            pushed = [s.goal == suite.push.goal for s in segments]
+            write(self.push_force, [push_force(suite.push, s) for s in segments])
+            write(self.push_begin, [begin if p else 0 for p in pushed])
+            write(self.push_end, [end if p else 0 for p in pushed])
         write(self.aims, aims)
         write(self.watched, [rules.restarts and not s.again for s in segments])
         write(self.sampled, [e.stage == "eval" for e in episodes])

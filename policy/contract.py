@@ -33,6 +33,10 @@ TERM_WIDTH: Mapping[str, int | None] = {
 }
 
 
+PRIVILEGED_TERMS = ("base_linear_velocity_b",)
+"""Observation terms that no sensor of a robot measures."""
+
+
 class ContractError(ValueError):
     """A contract is malformed, or does not fit the robot, suite or policy at hand."""
 
@@ -186,6 +190,11 @@ class PolicyContract:
         data = self.to_dict()
         del data["provenance"]
         return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def kind_of_observations(contract: PolicyContract) -> Literal["measurable", "privileged"]:
+    """Whether a robot can measure all that a policy is told."""
+    return "privileged" if any(t.name in PRIVILEGED_TERMS for t in contract.observation) else "measurable"
 
 
 def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:

@@ -50,7 +50,7 @@ def test_other_rules_engines_and_robots_have_tables_of_their_own():
     assert len(board_data(cards)) == 4
 
 
-def test_privileged_observations_are_marked():
+def test_privileged_observations_are_marked_and_have_no_rank():
     cards = {
         "1": card(0.9, observations=("command", "base_linear_velocity_b")),
         "2": card(0.8, observations=("command", "joint_position")),
@@ -58,7 +58,8 @@ def test_privileged_observations_are_marked():
     }
     del cards["3"]["policy"]["observations"]
     (table,) = board_data(cards)
-    assert [e["observations"] for e in table["ranked"]] == ["privileged", "measurable", "not stated"]
+    assert [(e["rank"], e["observations"]) for e in table["ranked"]] == [(1, "measurable"), (2, "not stated")]
+    assert [(e["rank"], e["observations"]) for e in table["others"]] == [(None, "privileged")]
 
 
 def test_the_page_is_well_formed_and_hostile_text_stays_text():

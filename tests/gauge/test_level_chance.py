@@ -1,8 +1,10 @@
 """Success by level, the search done again, and a seed's luck."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from gaitgauge.gauge.level_chance import bisect, redraw_levels, shared_luck, success_curves
+from gaitgauge.gauge.level_chance import bisect, bisected_levels, redraw_levels, shared_luck, success_curves
 
 
 def outcomes(reached, played, first=0):
@@ -58,9 +60,14 @@ def test_redrawn_levels_have_the_distribution_of_the_search():
     """Three levels, five seeds, four needed; chances .99, .8, .2: P(pass) = .99902, .73728, .00672."""
     curves = np.array([[0.99, 0.8, 0.2]])
     levels = redraw_levels(
-        curves, seeds=5, pass_rate=0.8, luck=0.0, resamples=20_000, generator=np.random.default_rng(0)
+        curves,
+        seeds=5,
+        find=partial(bisected_levels, pass_rate=0.8),
+        luck=0.0,
+        resamples=20_000,
+        generator=np.random.default_rng(0),
     )[0]
-    shares = np.bincount(levels, minlength=4) / levels.size
+    shares = np.bincount(levels.astype(int), minlength=4) / levels.size
     # asked first is 2; then 3, or 1
     assert shares == pytest.approx([0.0003, 0.2625, 0.7323, 0.005], abs=0.01)
 
@@ -71,7 +78,12 @@ def test_luck_moves_environments_together():
 
     def correlation(luck):
         drawn = redraw_levels(
-            curves, seeds=5, pass_rate=0.8, luck=luck, resamples=4000, generator=np.random.default_rng(1)
+            curves,
+            seeds=5,
+            find=partial(bisected_levels, pass_rate=0.8),
+            luck=luck,
+            resamples=4000,
+            generator=np.random.default_rng(1),
         )
         return np.corrcoef(drawn)[0, 1]
 

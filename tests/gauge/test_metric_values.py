@@ -13,6 +13,7 @@ from gaitgauge.gauge.metrics import (
     METRIC_NAMES,
     MetricEvaluator,
     angular_velocity,
+    fill_flight,
     friction_margin,
     joint_limits,
     joint_power,
@@ -170,9 +171,9 @@ def evaluator(suite, robot=GO2):
 def evaluate(suite, state, command=(0.0, 0.0, 0.0), limits=(1.0, 1.0, 1.5), friction=0.6, before=None):
     known = before is not None
     torque = state.joint_torque if before is None else before
-    found = evaluator(suite).evaluate(
-        state, rows(*command), rows(*limits), scalar(friction), torque, torch.tensor([known])
-    )
+    metrics = evaluator(suite)
+    values = metrics.evaluate(state, rows(*command), rows(*limits), scalar(friction), torque, torch.tensor([known]))
+    found = metrics.with_quality(values, torch.tensor([True]), [1])
     names = (*suite.metrics.weights, "quality")
     return dict(zip(names, found[0].tolist(), strict=True))
 
@@ -241,7 +242,11 @@ def test_friction_margin_weighs_contacts_by_their_load():
 FLAT = Terrain(name="flat", family="flat")
 
 
-def scene(robot=GO2, terrain=FLAT, *, parameters=None, physics=OWN.physics):
+PLAIN = replace(OWN.physics, torque_speed_limit=False)
+"""Motors that MuJoCo's own actuators can mirror."""
+
+
+def scene(robot=GO2, terrain=FLAT, *, parameters=None, physics=PLAIN):
     return Scene(
         robot=robot,
         parameters=parameters or robot.parameters["gauge"],
@@ -367,19 +372,46 @@ def test_the_contact_wrench_is_that_of_all_bodies(bench):
     assert max(margins) - min(margins) > 0.1
 
 
-def test_a_robot_in_flight_has_no_contact_metrics_and_a_quality_without_them(bench):
+def test_a_robot_in_flight_has_no_contact_metrics(bench):
     pose = put(bench, 3.0)
     for _ in range(3):
         bench.step(pose)
-    values = evaluate(OWN, bench.state)
-    assert math.isnan(values["zmp_margin"])
-    assert math.isnan(values["friction_margin"])
+    left_out = replace(OWN, metrics=replace(OWN.metrics, flight="left-out"))
+    values, counted = evaluate(left_out, bench.state), evaluate(OWN, bench.state)
+    assert math.isnan(values["zmp_margin"]) and math.isnan(counted["zmp_margin"])
+    assert math.isnan(values["friction_margin"]) and math.isnan(counted["friction_margin"])
     weights = OWN.metrics.weights
     rest = {n: v for n, v in values.items() if n in weights and not math.isnan(v)}
-    expected = math.exp(
-        sum(weights[n] * math.log(min(v, 1.0)) for n, v in rest.items()) / sum(weights[n] for n in rest)
-    )
-    assert values["quality"] == pytest.approx(expected)
+    product = sum(weights[n] * math.log(min(v, 1.0)) for n, v in rest.items())
+    assert values["quality"] == pytest.approx(math.exp(product / sum(weights[n] for n in rest)))
+    # nothing but flight: two metrics are zero, of which 1e-9 is left in the product
+    assert counted["quality"] == pytest.approx(math.exp((product + 2 * math.log(1e-9)) / sum(weights.values())))
+
+
+def test_flight_neither_raises_nor_lowers_what_contacts_say():
+    """Four instants, the second and the fourth in flight; the fourth does not count, nor what it would define."""
+    nan = math.nan
+    values = torch.tensor([[0.9, 0.4], [0.9, nan], [0.9, 0.6], [0.9, 0.1]])
+    filled = fill_flight(values, torch.tensor([True, True, True, False]))
+    assert filled[:, 1].tolist() == pytest.approx([0.4, 0.5, 0.6, 0.1])
+    assert torch.equal(filled[:, 0], values[:, 0])
+    assert fill_flight(values[1:2], torch.tensor([True]))[0, 1] == 0.0
+    # the quality of flight is that of a sample whose contacts are as usual: it was .9, above all others
+    weights = torch.ones(2)
+    flying, usual = quality(filled[1:2], weights), quality(torch.tensor([[0.9, 0.5]]), weights)
+    assert flying == pytest.approx(usual) and quality(values[1:2], weights) > 1.3 * flying
+
+
+def test_segments_stand_in_for_themselves_alone_in_flight():
+    metrics = evaluator(OWN)
+    values = torch.full((4, 8), 0.5)
+    values[1, 6:] = values[3, 6:] = math.nan
+    values[2, 6:] = 0.9
+    together = metrics.with_quality(values, torch.ones(4, dtype=torch.bool), [2, 2])
+    apart = [metrics.with_quality(v, torch.ones(2, dtype=torch.bool), [2]) for v in values.split(2)]
+    assert torch.equal(together[:, -1], torch.cat(apart)[:, -1])
+    assert together[1, -1] == pytest.approx(0.5) and together[3, -1] > 0.55
+    assert together[1, 6:8].isnan().all()
 
 
 BLOCK = """

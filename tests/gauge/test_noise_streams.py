@@ -8,6 +8,7 @@ import torch
 from gaitgauge.gauge import noise
 from gaitgauge.gauge.noise import CounterStream, ReferenceStream, make_stream, uniform_hash
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.observation import NOISE_TERMS
 from scripted_gauge import MAXIMUM, episode
 
 REFERENCE, OWN = load_suite("robogauge-1.1").noise, load_suite("gaitgauge-1").noise
@@ -97,6 +98,18 @@ def test_the_own_stream_is_uniform_within_its_widths():
     counts = torch.bincount(delays.flatten(), minlength=10)
     assert len(counts) == 10
     assert ((counts - 400.0) ** 2 / 400.0).sum() < 27.9  # chi square with 9 degrees of freedom, one in a thousand
+
+
+def test_gravity_and_what_no_robot_measures_are_noisy_too_in_the_own_suite():
+    """Both were read exactly; so they still are in the reference, whose policies are told no velocity."""
+    made = stream(OWN, (0, 1))
+    terms = [made.draw(torch.tensor([step, step]))[0] for step in range(2000)]
+    for name, half in {"projected_gravity_b": 0.05, "base_linear_velocity_b": 0.1}.items():
+        unit = torch.stack([t[name] for t in terms]).double() / half
+        assert unit.shape == (2000, 2, 3) and 0.99 < unit.abs().max() <= 1.0
+        assert (unit**2).mean().item() == pytest.approx(1 / 3, abs=0.02)
+    assert terms[0].keys() == set(NOISE_TERMS)
+    assert "projected_gravity_b" not in stream(REFERENCE).draw(torch.tensor([0]))[0]
 
 
 def test_delays_reach_from_zero_to_the_latency():

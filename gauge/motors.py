@@ -1,0 +1,49 @@
+"""Which motor gains a policy is played with, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from ..policy.contract import PolicyContract, check_robot
+from ..robots import Robot
+from ..robots.base import JointParameters
+from .suite import Suite
+
+
+def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> JointParameters:
+    """Joint and motor constants with which a suite plays a policy: those that it names, with the contract's gains if it says so.
+
+    Raises:
+        ContractError: the policy is not for this robot.
+    """
+    own = robot.parameters[suite.parameters]
+    if suite.gains == "suite":
+        return own
+    stiffness, damping = list(own.stiffness), list(own.damping)
+    for policy_joint, robot_joint in enumerate(check_robot(contract, robot)):
+        stiffness[robot_joint] = contract.stiffness[policy_joint]
+        damping[robot_joint] = contract.damping[policy_joint]
+    return replace(own, stiffness=tuple(stiffness), damping=tuple(damping))
+
+
+def gains_note(suite: Suite, robot: Robot, contract: PolicyContract) -> str | None:
+    """One sentence on gains that are not the ones that a policy was made for, or not the suite's usual ones; None where all agree."""
+    usual = robot.parameters[suite.parameters]
+    made_for = joint_parameters(replace(suite, gains="contract"), robot, contract)
+    if (made_for.stiffness, made_for.damping) == (usual.stiffness, usual.damping):
+        return None
+    own, others = _gains(made_for), _gains(usual)
+    if suite.gains == "contract":
+        return f"played with {own}, as the policy's contract says; {robot.name} usually has {others}"
+    return f"played with {others}, as {suite.name} plays every policy; this one was made for {own}"
+
+
+def _gains(parameters: JointParameters) -> str:
+    return f"kp {_few(parameters.stiffness)} N·m/rad and kd {_few(parameters.damping)} N·m·s/rad"
+
+
+def _few(values: Sequence[float]) -> str:
+    """``20``, or ``20 to 40`` where joints differ."""
+    low, high = min(values), max(values)
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"

@@ -1,0 +1,40 @@
+"""Sudden lateral pushes during velocity goals: how hard, to which side and when."""
+
+from __future__ import annotations
+
+import random
+
+import torch
+
+from ..robots.rotation import yaw_of
+from .segments import Segment
+from .suite import Push, Suite
+
+
+def push_force(push: Push, segment: Segment) -> float:
+    """Force of a segment's push, to the left of the heading [N]: a draw that belongs to the segment alone."""
+    draw = random.Random(f"push {segment.episode.key} {segment.goal} {segment.sub_command}")
+    side = draw.choice((-1.0, 1.0))
+    return side * draw.uniform(*push.force)
+
+
+def push_steps(suite: Suite) -> tuple[int, int]:
+    """Commanded control steps, counted from 1, from which and before which the push acts."""
+    push, period = suite.push, suite.physics.control_period
+    assert push is not None
+    begin = round(push.after / period) + 1
+    return begin, begin + max(round(push.duration / period), 1)
+
+
+def sideways(quaternion: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
+    """A force to the left of the heading in world axes.
+
+    Args:
+        quaternion: base orientation wxyz, (N, 4).
+        force: [N], (N,).
+
+    Returns:
+        [N], (N, 3), horizontal.
+    """
+    yaw = yaw_of(quaternion)
+    return torch.stack((-torch.sin(yaw) * force, torch.cos(yaw) * force, torch.zeros_like(force)), dim=1)
