@@ -58,12 +58,12 @@ def run_verification(
         played, whole = found["environments"]
         console.say(f"played {played} of the card's {whole} environments" + (", one of each terrain" if quick else ""))
         if found["score"] is not None:
-            low_high = "no interval" if found["interval"] is None else "{:.4f} to {:.4f}".format(*found["interval"])
-            console.say(f"score on the card {found['score']:.4f} ({low_high}), here {found['replayed']:.4f}")
+            band = "no interval" if found["band"] is None else "a replay within {:.4f} to {:.4f}".format(*found["band"])
+            console.say(f"score on the card {found['score']:.4f} ({band}), here {found['replayed']:.4f}")
         if found["equal"]:
             console.say("the card holds: every outcome is the same to the last digit")
         elif found["holds"]:
-            console.say("the card holds: the score lies within its interval, single outcomes differ")
+            console.say("the card holds: the score lies within its band, single outcomes differ")
         else:
             console.say("the card does NOT hold on this machine")
     if not found["holds"]:

@@ -80,6 +80,7 @@ class ControlStep:
         self._any_target = self._any_sampled = not early_outs
         self._everyone, self._count = False, 0
         self._pushing = False
+        self._force: torch.Tensor | None = None
         self.refused = False
         """Whether an early out found that the policy's answer is not finite."""
         self._rows_to_play: torch.Tensor | None = None
@@ -160,22 +161,11 @@ class ControlStep:
             recording.run(self._act)
             if self.refused:
                 return
-            if self.suite.push is not None:
-                self._push()
+            if self._force is not None:
+                self.backend.apply_force(self._force)
             worlds = None if self._everyone else buffers.active
             self.backend.step(self._targets, delay=self._delay, sample_at=self._sample_at, worlds=worlds)
             recording.run(self._judge)
-
-    def _push(self) -> None:
-        """Let pushes act on the robots whose time it is."""
-        buffers, steps = self.buffers, self.buffers.commanded_steps
-        pushed = self._commanded & (steps >= buffers.push_begin) & (steps < buffers.push_end)
-        if self.early_outs:
-            before, self._pushing = self._pushing, bool(pushed.any())
-            if not (before or self._pushing):
-                return
-        state = self.backend.state
-        self.backend.apply_force(sideways(state.base_quaternion_w, pushed * buffers.push_force))
 
     def _moving_memory(self) -> tuple[torch.Tensor, ...]:
         """Memory that a captured step uses and that may move."""
@@ -228,6 +218,19 @@ class ControlStep:
             self._due = buffers.active & buffers.sampled & (ahead <= self._substeps)
             self._sample_at = ahead * self._due
         self._targets = self._builder.targets(self._action)
+        if self.suite.push is not None:
+            self._push()
+
+    def _push(self) -> None:
+        """The force on every base: that of a push on the robots whose time it is, zero on the others."""
+        buffers, steps = self.buffers, self.buffers.commanded_steps
+        pushed = self._commanded & (steps >= buffers.push_begin) & (steps < buffers.push_end)
+        self._force = None
+        if self.early_outs:
+            before, self._pushing = self._pushing, bool(pushed.any())
+            if not (before or self._pushing):
+                return
+        self._force = sideways(self.backend.state.base_quaternion_w, pushed * buffers.push_force)
 
     def _check_action(self) -> None:
         """A policy must answer finite observations with finite actions; a world in which it does not stands still."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -108,12 +109,13 @@ def verify(
 def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
     """Whether a card holds, given the results of a replay of all or some of its environments.
 
-    It holds where the replay's score lies within the card's interval: the printed one, or for a sample that of the card's
-    own rows over the sampled environments. Where the card has no interval (one seed, or levels alone) only the same outcome holds.
+    It holds where the replay's score lies within the band of the card's (``tolerance_band``); for a sample the interval is that
+    of the card's own rows over the sampled environments. Where the card has no interval (one seed, or levels alone) only the
+    same outcome holds.
 
     Returns:
         ``holds``, ``equal`` (every outcome the same to the last digit), ``quick``, ``environments`` (played, of the card),
-        ``score`` and ``interval`` of the card and the ``replayed`` score over what was played, and ``levels``: for each
+        ``score``, ``interval`` and ``band`` of the card and the ``replayed`` score over what was played, and ``levels``: for each
         environment whose level differs its terrain, friction, payload, ``card`` and ``here``.
     """
     by_key = {_key(row): row for row in card["environments"]}
@@ -126,7 +128,8 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
         weights = environment_weights([row["terrain"] for row in olds])
         score = round(float(weights @ np.array([row["score"] for row in olds])), 6)
         interval = Evidence(olds, chance_rules_of(card)).chance(weights).interval(score)
-    within = interval is not None and here is not None and interval[0] <= here <= interval[1]
+    band = tolerance_band(score, interval)
+    within = band is not None and here is not None and band[0] <= here <= band[1]
     return {
         "holds": equal or within,
         "equal": equal,
@@ -134,6 +137,7 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
         "environments": [len(pairs), len(by_key)],
         "score": score,
         "interval": None if interval is None else [round(float(end), 6) for end in interval],
+        "band": band,
         "replayed": here,
         "levels": [
             {**{k: old[k] for k in ("terrain", "friction", "payload")}, "card": old["level"], "here": new["level"]}
@@ -141,6 +145,18 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
             if old["level"] != new["level"]
         ],
     }
+
+
+def tolerance_band(score: float | None, interval: Sequence[float] | None) -> list[float] | None:
+    """Where the score of a replay must lie; None where there is no interval.
+
+    Another machine's rounding makes other episodes of the same seeds, so card and replay are two draws: what two may differ by is
+    √2 times what one may be off.
+    """
+    if score is None or interval is None:
+        return None
+    low, high = (score + math.sqrt(2.0) * (end - score) for end in interval)
+    return [round(max(float(low), 0.0), 6), round(min(float(high), 1.0), 6)]
 
 
 def load_card(path: Path) -> dict[str, Any]:

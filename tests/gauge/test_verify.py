@@ -19,8 +19,10 @@ def test_the_same_outcomes_hold_and_are_equal(card):
     assert found["interval"] == card["score_interval"]
 
 
-def test_a_score_within_the_interval_holds_and_one_outside_does_not(card):
-    low, high = card["score_interval"]
+def test_a_score_within_the_band_holds_and_one_outside_does_not(card):
+    """Two draws differ by √2 times what one is off: within the interval alone one replay in six of a true card failed."""
+    score = card["score"]
+    low, high = (score + 2**0.5 * (end - score) for end in card["score_interval"])
     for value, holds in ((low + 1e-4, True), (high + 1e-4, False), (low - 1e-4, False)):
         replay = deepcopy(card) | {"score": value}
         replay["environments"][0]["score"] += 0.001
@@ -46,8 +48,8 @@ def test_a_sample_is_held_against_the_same_environments(card):
     found = judge(card, replay)
     assert (found["quick"], found["environments"], found["equal"]) == (True, [2, 4], True)
     assert found["score"] == pytest.approx(expected, abs=1e-6)
-    low, high = found["interval"]
-    assert low < expected < high
+    low, high = found["band"]
+    assert low < found["interval"][0] < expected < found["interval"][1] < high
     replay["environments"][0]["score"] += 0.2
     assert not judge(card, replay | {"score": high + 0.01})["holds"]
 

@@ -1,0 +1,111 @@
+"""Make the score cards that ship: a robot that stands, the hand-made trot, a published CTS policy and ``pretrained``.
+
+    python benchmarks/score_cards.py --threads 13 --folder /tmp/cards --cts go2_cts_public.npz --out docs/data/scorecards
+
+Each policy is evaluated on each suite, whole; what the folder holds is not played again. A card is the run's ``results.json``
+with the policy's name in place of its path and without the machine's name, and with the band in which the score of a replay on
+another machine must lie. Weights of others are not written to ``--out``: of the CTS policy its card alone. ``--only`` and
+``--suite`` choose, ``--terrain`` and ``--friction`` take a part for a first try.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import import_public_cts
+import make_trot_policy
+import numpy as np
+import torch
+from gaitgauge.files.writing import json_text, write_atomically
+from gaitgauge.gauge.evaluate import Request, evaluate
+from gaitgauge.gauge.report import write_report
+from gaitgauge.gauge.store import StoreError
+from gaitgauge.gauge.verify import tolerance_band
+from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.loading import PRETRAINED
+from gaitgauge.policy.native import StoredNetwork, save_policy
+from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.robots import load_robot
+
+NAMES = ("standing", "trotting", "cts", "pretrained")
+SUITES = ("robogauge-1.1", "gaitgauge-1")
+
+
+def make_policy(name: str, path: Path, cts: Path | None) -> None:
+    """Write a policy's file; the same bytes come out every time."""
+    if name == "standing":
+        save_constant(path, [0.0] * 12, kind="stands in its default pose")
+    elif name == "trotting":
+        contract, network = make_trot_policy.make()
+        save_policy(path, contract, network)
+    else:
+        assert cts is not None
+        with np.load(cts) as archive:
+            provenance = {"adapter": "published CTS weights", "file": cts.name}
+            contract = go2_contract(load_robot("go2"), provenance=provenance)
+            save_policy(path, contract, import_public_cts.read_network(archive))
+
+
+def save_constant(path: Path, action: list[float], *, kind: str) -> None:
+    """Write a policy that always answers with one action, (12,)."""
+    arguments: dict[str, Any] = {"frame_width": 45, "num_actions": 12, "hidden": [1]}
+    state = {key: torch.zeros_like(value) for key, value in MlpNetwork(**arguments).state_dict().items()}
+    last = [key for key, value in state.items() if value.shape == (12,)][-1]
+    state[last] = torch.tensor(action)
+    contract = go2_contract(load_robot("go2"), provenance={"made_by": "benchmarks/score_cards.py", "kind": kind})
+    save_policy(path, contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=state))
+
+
+def card_of(results: dict[str, Any], name: str) -> dict[str, Any]:
+    """A card that names no folder and no machine."""
+    path = "pretrained" if name == "pretrained" else f"{name}.gauge.pt"
+    suite = results["suite"]["name"]
+    provenance = {k: v for k, v in results["provenance"].items() if k not in ("host", "command")}
+    provenance["command"] = f"gaitgauge evaluate {path} --suite {suite}"
+    provenance["host"] = ""
+    band = tolerance_band(results["score"], results["score_interval"])
+    return {**results, "policy": {**results["policy"], "path": path}, "provenance": provenance, "tolerance": band}
+
+
+def main() -> None:
+    """Make the policies, play, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--folder", type=Path, required=True, help="policies and runs stay here")
+    parser.add_argument("--out", type=Path, required=True, help="where the cards go")
+    parser.add_argument("--cts", type=Path, help="NumPy archive of the published CTS policy's weights")
+    parser.add_argument("--only", nargs="+", choices=NAMES, default=list(NAMES))
+    parser.add_argument("--suite", nargs="+", default=list(SUITES))
+    parser.add_argument("--terrain", action="append", default=[])
+    parser.add_argument("--friction", action="append", type=float, default=[])
+    arguments = parser.parse_args()
+    if "cts" in arguments.only and arguments.cts is None:
+        parser.error("the card of 'cts' needs the archive of its weights; give --cts, or choose others with --only")
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name in arguments.only:
+        path = PRETRAINED if name == "pretrained" else arguments.folder / f"{name}.gauge.pt"
+        if name != "pretrained":
+            make_policy(name, path, arguments.cts)
+        for suite in arguments.suite:
+            request = Request(
+                policy="pretrained" if name == "pretrained" else str(path),
+                suite=suite,
+                threads=arguments.threads,
+                terrains=tuple(arguments.terrain),
+                frictions=tuple(arguments.friction),
+            )
+            run = arguments.folder / f"{name}-{suite}"
+            card = card_of(evaluate(request, run, resume=True), name)
+            write_report(run)
+            write_atomically(arguments.out / f"{run.name}.json", json_text(json.loads(json.dumps(card))), StoreError)
+            low, high = card["tolerance"] or (float("nan"),) * 2
+            where = f" ({card['coverage']['text']})" if card["coverage"]["kind"] != "complete" else ""
+            print(f"{name} {suite}: {card['score']:.4f}, a replay within {low:.4f} to {high:.4f}{where}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
