@@ -99,18 +99,17 @@ class EstimatorLosses(Losses):
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         """Allocate; see ``Losses``."""
         super().__init__(*arguments, **settings)
-        self.next_state_map: MirrorMap | None = None
-        if self.mirror is not None:
-            self.next_state_map = MirrorMap.joined([VECTOR.to(self.device), self.mirror.policy])
+        # Made once: nothing may travel to the device in a recorded step.
+        self.velocity_map = VECTOR.to(self.device)
+        self.next_state_map = None if self.mirror is None else MirrorMap.joined([self.velocity_map, self.mirror.policy])
 
     def prepare_policy(self) -> None:
         """What the rollout would have acted on in mirror images."""
         if (mirror := self.mirror) is not None:
             history, velocity = self.storage.student_history.flatten(0, 1), self.velocities()
-            flipped = VECTOR.to(self.device)
             self.fill(
                 self.mirrored_latent,
-                lambda rows: self.actor.acted_on(mirror.history(history[rows]), flipped(velocity[rows])),
+                lambda rows: self.actor.acted_on(mirror.history(history[rows]), self.velocity_map(velocity[rows])),
             )
 
     def prepare_student(self) -> None:
@@ -135,7 +134,7 @@ class EstimatorLosses(Losses):
         return (
             self.with_images(history, mirror.history),
             self.with_images(following, self.next_state_map),
-            self.with_images(velocity, VECTOR.to(self.device)),
+            self.with_images(velocity, self.velocity_map),
             goes_on,
         )
 
