@@ -1,126 +1,94 @@
-"""The same in a browser, through viser: the robot's geoms as meshes, sliders for the command."""
+"""The same in a browser, through viser: terrain, level, friction, policies and the command are chosen on the page."""
 
 from __future__ import annotations
 
-import ipaddress
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from http import HTTPStatus
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlsplit
 
-import mujoco
 import numpy as np
-import trimesh
 import viser
-import websockets.asyncio.server
 
+from ..backends.base import BackendError
+from ..policy.base import PolicyError
+from ..policy.contract import ContractError
+from ..policy.loading import find_policy
+from ..terrains.gauge_terrains import LEVELS
+from ..terrains.registry import TerrainError, gauge_terrain_names
+from .browser_access import is_loopback, own_requests_only
+from .browser_stage import Stage, distance_between
 from .console import Terminal
 from .errors import UserError
-from .play_session import Command, PlaySession
-from .scenery import COLLISION_GROUP, show, visual_model
+from .overlay import summary, table
+from .play_session import Command, PlaySession, clip
+from .worlds import WorldMaker, labels
 
 _REFRESH = 0.04
 """Time between two poses sent to the browser [s]."""
+_TOLD_EVERY = 0.2
+"""Time between two readings of speed and falls [s]."""
+_AIMING = 2.0
+"""Time for which a new camera is aimed at the robots [s]."""
+_LOST = 4.0
+"""How far from the robots a camera may look before it is aimed again [m]."""
+_FRICTIONS = (0.05, 1.5)
+_NAMED = ("pretrained", "best", "latest")
+_REFUSALS = (PolicyError, ContractError, TerrainError, BackendError, UserError)
+"""What may be wrong with a choice; the page says it and goes on as before."""
 
 
-def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-    """The surface of a geom in its own frame, None for a plane or a shape that cannot be drawn here."""
-    size = model.geom_size[geom]
-    kind = mujoco.mjtGeom(model.geom_type[geom])
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return trimesh.creation.box(extents=2.0 * size)
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return trimesh.creation.icosphere(subdivisions=2, radius=size[0])
-    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
-        ball.apply_scale(size)
-        return ball
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return trimesh.creation.capsule(radius=size[0], height=2.0 * size[1], count=[16, 16])
-    if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
-        return _field_mesh(model, int(model.geom_dataid[geom]))
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        mesh = int(model.geom_dataid[geom])
-        corners = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
-        faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
-        return trimesh.Trimesh(model.mesh_vert[corners], model.mesh_face[faces])
-    return None
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """What is chosen on the page and takes new worlds."""
 
-
-def _field_mesh(model: mujoco.MjModel, field: int) -> trimesh.Trimesh:
-    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
-    half_x, half_y, top, _ = model.hfield_size[field]
-    start = int(model.hfield_adr[field])
-    heights = model.hfield_data[start : start + rows * columns].reshape(rows, columns) * top
-    x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
-    node = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = node[:-1, :-1].ravel(), node[:-1, 1:].ravel(), node[1:, 1:].ravel(), node[1:, :-1].ravel()
-    faces = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
-    return trimesh.Trimesh(np.stack((x, y, heights), axis=2).reshape(-1, 3), faces, process=False)
-
-
-def geom_color(model: mujoco.MjModel, geom: int) -> tuple[int, int, int]:
-    """Red, green and blue of a geom, 0 to 255."""
-    material = int(model.geom_matid[geom])
-    rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
-    red, green, blue = (round(255 * float(v)) for v in rgba[:3])
-    return red, green, blue
-
-
-class Stage:
-    """Robot and ground in the browser: one frame per body, that moves; its geoms hang below it."""
-
-    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel) -> None:
-        """Send the geoms."""
-        self._model = model
-        self._frames: dict[int, Any] = {}
-        server.scene.set_up_direction("+z")
-        server.scene.add_grid("/floor", width=40.0, height=40.0, cell_size=1.0, section_size=5.0)
-        for geom in range(model.ngeom):
-            mesh = geom_mesh(model, geom)
-            if mesh is None or model.geom_group[geom] == COLLISION_GROUP:
-                continue
-            body = int(model.geom_bodyid[geom])
-            if body not in self._frames:
-                self._frames[body] = server.scene.add_frame(f"/body_{body}", show_axes=False)
-            server.scene.add_mesh_simple(
-                f"/body_{body}/geom_{geom}",
-                vertices=np.asarray(mesh.vertices, dtype=np.float32),
-                faces=np.asarray(mesh.faces, dtype=np.uint32),
-                color=geom_color(model, geom),
-                flat_shading=bool(model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX),
-                position=model.geom_pos[geom],
-                wxyz=model.geom_quat[geom],
-            )
-
-    def move(self, data: mujoco.MjData) -> None:
-        """Move the bodies to where they are now."""
-        for body, frame in self._frames.items():
-            if body:
-                frame.position = data.xpos[body]
-                frame.wxyz = data.xquat[body]
+    terrain: str
+    level: int | None
+    policies: tuple[str, ...]
+    """From left to right."""
 
 
 class Panel:
-    """Sliders and buttons."""
+    """Menus, sliders and buttons."""
 
-    def __init__(self, server: viser.ViserServer, limits: Command, command: Command | None) -> None:
+    def __init__(
+        self, server: viser.ViserServer, chosen: Choice, sessions: Sequence[PlaySession], command: Command | None
+    ) -> None:
         """Add them to the page."""
         gui = server.gui
-        self.auto: Any = gui.add_checkbox("find its own way", initial_value=command is None)
-        start = command or (0.0, 0.0, 0.0)
-        names = ("forward [m/s]", "left [m/s]", "turn [rad/s]")
-        self._sliders: list[Any] = [
-            gui.add_slider(name, min=-limit, max=limit, step=0.05, initial_value=max(-limit, min(limit, value)))
-            for name, limit, value in zip(names, limits, start, strict=True)
-        ]
-        self.follow = gui.add_checkbox("camera follows", initial_value=True)
+        self._server = server
+        with gui.add_folder("ground"):
+            terrains = list(dict.fromkeys([*gauge_terrain_names(), chosen.terrain]))
+            self._terrain: Any = gui.add_dropdown("terrain", terrains, initial_value=chosen.terrain)
+            middle = WorldMaker.default_level("stairs_fd") or LEVELS[0]
+            self._level: Any = gui.add_slider(
+                "level", min=LEVELS[0], max=LEVELS[-1], step=1, initial_value=chosen.level or middle
+            )
+            least, most = _FRICTIONS
+            friction = sessions[0].friction
+            self._friction: Any = gui.add_slider(
+                "friction", min=min(least, friction), max=max(most, friction), step=0.05, initial_value=friction
+            )
+        names = _policies(chosen.policies)
+        self._policies: list[Any] = []
+        self._readings: list[Any] = []
+        for number, choice in enumerate(chosen.policies, 1):
+            with gui.add_folder("policy" if len(chosen.policies) == 1 else f"policy {number}"):
+                self._policies.append(gui.add_dropdown("file", names, initial_value=choice))
+                self._readings.append(gui.add_markdown(""))
+        with gui.add_folder("command"):
+            self.auto: Any = gui.add_checkbox("find its own way", initial_value=command is None)
+            limits = _limits(sessions)
+            start = clip(command or (0.0, 0.0, 0.0), limits)
+            self._sliders: list[Any] = [
+                gui.add_slider(name, min=-limit, max=limit, step=0.05, initial_value=value)
+                for name, limit, value in zip(("forward m/s", "left m/s", "turn rad/s"), limits, start, strict=True)
+            ]
+            stand = gui.add_button("stand")
+        self.follow: Any = gui.add_checkbox("camera follows", initial_value=True)
         self.restart = False
-        stand, restart = gui.add_button("stand"), gui.add_button("back to the start")
+        restart = gui.add_button("back to the start")
         stand.on_click(lambda _: self._stand())
         restart.on_click(lambda _: setattr(self, "restart", True))
 
@@ -130,6 +98,19 @@ class Panel:
             slider.value = 0.0
 
     @property
+    def chosen(self) -> Choice:
+        """What is chosen now."""
+        terrain = self._terrain.value
+        self._level.disabled = terrain == "flat"
+        level = None if terrain == "flat" else int(self._level.value)
+        return Choice(terrain=terrain, level=level, policies=tuple(p.value for p in self._policies))
+
+    @property
+    def friction(self) -> float:
+        """Of the ground."""
+        return float(self._friction.value)
+
+    @property
     def command(self) -> Command | None:
         """What the sliders say, None for the robot's own way."""
         if self.auto.value:
@@ -137,55 +118,144 @@ class Panel:
         forward, lateral, yaw = (float(slider.value) for slider in self._sliders)
         return forward, lateral, yaw
 
+    def tell(self, sessions: Sequence[PlaySession]) -> None:
+        """Write down what is measured."""
+        for reading, session in zip(self._readings, sessions, strict=True):
+            readout = session.readout()
+            head, *rows = (f"| {' | '.join(cells)} |" for cells in table(readout))
+            reading.content = "\n".join((head, "| --- | ---: | ---: | ---: |", *rows, "", summary(readout)))
 
-def is_loopback(host: str) -> bool:
-    """Whether a host name or address is this machine's own."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    def refit(self, sessions: Sequence[PlaySession]) -> None:
+        """Let the sliders end where the policies do."""
+        for slider, limit in zip(self._sliders, _limits(sessions), strict=True):
+            slider.value = max(-limit, min(limit, slider.value))
+            slider.min, slider.max = -limit, limit
+
+    def refuse(self, reason: str, chosen: Choice) -> None:
+        """Say what is wrong, and go back to what is shown."""
+        for client in self._server.get_clients().values():
+            client.add_notification("this cannot be shown", reason, color="red")
+        self._terrain.value = chosen.terrain
+        if chosen.level is not None:
+            self._level.value = chosen.level
+        for menu, policy in zip(self._policies, chosen.policies, strict=True):
+            menu.value = policy
 
 
-def is_own_request(headers: Any, host: str) -> bool:
-    """Whether a request may come from the viewer's own page.
+def _limits(sessions: Sequence[PlaySession]) -> Command:
+    """The largest command that any of the policies takes; a slider needs some length."""
+    forward, lateral, yaw = (max(0.05, *(s.limits[axis] for s in sessions)) for axis in range(3))
+    return forward, lateral, yaw
+
+
+def _policies(chosen: Sequence[str]) -> list[str]:
+    """What the menu of policies offers: those that were named on the command line, and those that have names."""
+    found = list(chosen)
+    for name in _NAMED:
+        with suppress(PolicyError):
+            find_policy(name)
+            found.append(name)
+    return list(dict.fromkeys(found))
+
+
+class Page:
+    """The worlds on the page, side by side."""
+
+    def __init__(self, server: viser.ViserServer, sessions: Sequence[PlaySession]) -> None:
+        """Show some; the page closes them when others come."""
+        self._server = server
+        self.stages: list[Stage] = []
+        self.show(sessions)
+
+    def show(self, sessions: Sequence[PlaySession]) -> None:
+        """Replace the worlds."""
+        self.close()
+        apart = distance_between(sessions[0].terrain)
+        for i, session in enumerate(sessions):
+            aside = apart * (0.5 * (len(sessions) - 1) - i)  # from left to right for who looks along x
+            self.stages.append(Stage(self._server, session, f"world_{i}", aside, titled=len(sessions) > 1))
+
+    @property
+    def sessions(self) -> list[PlaySession]:
+        """Of all worlds."""
+        return [stage.session for stage in self.stages]
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Of the robots, (3,) [m]."""
+        return np.asarray(np.mean([stage.middle for stage in self.stages], axis=0))
+
+    def close(self) -> None:
+        """Take the worlds off and free their physics."""
+        for stage in self.stages:
+            stage.remove()
+            stage.session.close()
+        self.stages = []
+
+
+class Cameras:
+    """Those of all who look: aimed at the robots at first, then taken along, and otherwise theirs to move."""
+
+    def __init__(self, server: viser.ViserServer, page: Page) -> None:
+        """Look at a page's robots."""
+        self._server, self._page = server, page
+        self._aim_until: dict[int, float] = {}
+        self._middle = page.middle
+        self.new_worlds()
+
+    def new_worlds(self) -> None:
+        """Aim all of them again, and those that are still to come."""
+        self._aim_until.clear()
+        self._aim(self._server.initial_camera)
+
+    def _aim(self, camera: Any) -> None:
+        """Look at the robots, from as far as it takes to see all of them."""
+        away = (
+            np.array([-1.2, -1.8, 0.9]) if len(self._page.stages) == 1 else self._farther * np.array([-2.0, 0.0, 1.1])
+        )
+        camera.position, camera.look_at = self._page.middle + away, self._page.middle
+
+    @property
+    def _farther(self) -> float:
+        """How much farther away than from a single robot."""
+        return 1.0 + 0.8 * max(abs(stage.aside) for stage in self._page.stages)
+
+    def follow(self, wanted: bool) -> None:
+        """Take them along with the robots, where that is wanted."""
+        middle, now = self._page.middle, time.monotonic()
+        moved, self._middle = middle - self._middle, middle
+        for number, client in self._server.get_clients().items():
+            # A browser that has just come overwrites what it is told with where it was made to look first.
+            until = self._aim_until.setdefault(number, now + _AIMING)
+            camera = client.camera
+            if now < until:
+                self._aim(camera)
+            elif wanted:
+                if np.linalg.norm(camera.look_at - middle) > _LOST * self._farther:
+                    self._aim_until[number] = now + _AIMING
+                camera.position = camera.position + moved  # the point that it looks at comes along
+
+
+def serve(
+    sessions: Sequence[PlaySession],
+    maker: WorldMaker,
+    chosen: Choice,
+    *,
+    command: Command | None,
+    seconds: float | None,
+    port: int,
+    host: str,
+) -> None:
+    """Serve the page until Ctrl-C or until the time is over.
 
     Args:
-        headers: of the request, by name.
-        host: the interface that is listened on. On a loopback one a request must be addressed to this machine, so that no page
-            of another server gets here by giving its own name this machine's address.
-    """
-    addressed = headers.get("Host") or ""
-    origin = headers.get("Origin")
-    if origin is not None and urlsplit(origin).netloc != addressed:
-        return False
-    return not is_loopback(host) or is_loopback(urlsplit(f"//{addressed}").hostname or "")
-
-
-@contextmanager
-def own_requests_only(host: str) -> Iterator[None]:
-    """Servers of web sockets that are started meanwhile refuse what does not come from their own page: viser takes any origin
-    and has no setting for it.
-    """
-    library: Any = websockets.asyncio.server
-    original: Callable[..., Any] = library.serve
-
-    def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        def check(connection: Any, request: Any) -> Any:
-            if not is_own_request(request.headers, host):
-                return connection.respond(HTTPStatus.FORBIDDEN, "not from this page\n")
-            return None if process_request is None else process_request(connection, request)
-
-        return original(*arguments, process_request=check, **options)
-
-    library.serve = guarded
-    try:
-        yield
-    finally:
-        library.serve = original
-
-
-def serve(session: PlaySession, command: Command | None, seconds: float | None, port: int, host: str) -> None:
-    """Serve the page until Ctrl-C or until the time is over.
+        sessions: the first worlds, one for each policy; all worlds are closed at the end.
+        maker: makes others when they are chosen on the page.
+        chosen: what the first worlds are.
+        command: what the robots are told at first; None: to the target, or a tour.
+        seconds: simulated time until the end [s]; None: until Ctrl-C.
+        port: of the page.
+        host: the interface that is listened on.
 
     Raises:
         UserError: the port is taken, or the host is none of this machine's.
@@ -194,39 +264,72 @@ def serve(session: PlaySession, command: Command | None, seconds: float | None, 
         with own_requests_only(host):
             server = viser.ViserServer(host=host, port=port, verbose=False)
     except OSError as error:
+        for session in sessions:
+            session.close()
         raise UserError(
             f"port {port} of {host} cannot be used: {error.strerror or error}; choose another --port or --host"
         ) from error
-    model = visual_model(session.robot, session.terrain)
-    data = mujoco.MjData(model)
-    stage, panel = Stage(server, model), Panel(server, session.limits, command)
-    middle = session.position()[:3]
-
-    server.initial_camera.position = middle + np.array([-1.2, -1.8, 0.9])
-    server.initial_camera.look_at = middle
+    server.scene.set_up_direction("+z")
+    server.scene.add_grid("/floor", width=40.0, height=40.0, cell_size=1.0, section_size=5.0)
+    panel, page = Panel(server, chosen, sessions, command), Page(server, sessions)
     console = Terminal()
     shown = "localhost" if is_loopback(host) else host
     console.say(f"open http://{shown}:{server.get_port()} in a browser; Ctrl-C ends")
     if not is_loopback(host):
         console.say(f"everybody who reaches {host} can steer this robot; leave --host out to serve this machine alone")
-    due, sent = time.monotonic(), 0.0
     try:
-        while seconds is None or session.time < seconds:
-            if panel.restart:
-                panel.restart = False
-                session.reset()
-            session.step(panel.command or session.autopilot())
-            if session.time - sent >= _REFRESH - 1e-9:
-                sent = session.time
-                show(model, data, session.position())
-                with server.atomic():
-                    stage.move(data)
-                moved, middle = session.position()[:3] - middle, session.position()[:3]
-                if panel.follow.value:
-                    for client in server.get_clients().values():
-                        # Takes the point that it looks at along.
-                        client.camera.position = client.camera.position + moved
-            due = max(due + session.period, time.monotonic() - session.period)
-            time.sleep(max(0.0, due - time.monotonic()))
+        _run(server, panel, page, maker, chosen, seconds)
     finally:
+        page.close()
         server.stop()
+
+
+def _run(
+    server: viser.ViserServer, panel: Panel, page: Page, maker: WorldMaker, shown: Choice, seconds: float | None
+) -> None:
+    """Play in real time what the panel says."""
+    time_played, told = 0.0, -_TOLD_EVERY
+    due, cameras = time.monotonic(), Cameras(server, page)
+    while seconds is None or time_played < seconds - 1e-9:
+        chosen = panel.chosen
+        if chosen != shown:
+            try:
+                page.show(_make(maker, chosen, panel.friction))
+            except _REFUSALS as error:
+                panel.refuse(str(error), shown)
+            else:
+                shown = chosen
+                panel.refit(page.sessions)
+                cameras.new_worlds()
+        for session in page.sessions:
+            if session.friction != panel.friction:
+                session.set_friction(panel.friction)
+            if panel.restart:
+                session.reset()
+        panel.restart = False
+        time_played += _REFRESH
+        for session in page.sessions:
+            until = session.time + _REFRESH - 1e-9
+            while session.time < until:
+                session.step(panel.command or session.autopilot())
+        with server.atomic():
+            for stage in page.stages:
+                stage.move()
+        if time_played - told >= _TOLD_EVERY:
+            told = time_played
+            panel.tell(page.sessions)
+        cameras.follow(panel.follow.value)
+        due = max(due + _REFRESH, time.monotonic() - _REFRESH)
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def _make(maker: WorldMaker, chosen: Choice, friction: float) -> list[PlaySession]:
+    """Worlds for a choice, all or none."""
+    with ExitStack() as stack:
+        sessions = []
+        for policy, label in zip(chosen.policies, labels(chosen.policies), strict=True):
+            session = maker.make(policy, chosen.terrain, chosen.level, friction, label)
+            stack.callback(session.close)
+            sessions.append(session)
+        stack.pop_all()
+    return sessions

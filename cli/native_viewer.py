@@ -10,7 +10,8 @@ import mujoco.viewer
 from .console import Terminal
 from .errors import UserError
 from .gamepad import Gamepad
-from .play_session import Command, PlaySession
+from .overlay import summary, table
+from .play_session import Command, PlaySession, Readout, clip
 from .scenery import COLLISION_GROUP, show, visual_model
 
 # GLFW's numbers of keys that the viewer does not use itself.
@@ -56,11 +57,18 @@ class Keyboard:
             self.command = (0.0, 0.0, 0.0)
         elif key in steps:
             now = self.command or (0.0, 0.0, 0.0)
-            forward, lateral, yaw = (
-                max(-limit, min(limit, round(value + change, 3)))
-                for value, change, limit in zip(now, steps[key], self._limits, strict=True)
-            )
-            self.command = (forward, lateral, yaw)
+            forward, lateral, yaw = (round(value + change, 3) for value, change in zip(now, steps[key], strict=True))
+            self.command = clip((forward, lateral, yaw), self._limits)
+
+
+def texts(readout: Readout) -> tuple[str, str]:
+    """What stands in the window's corner, names and values; the window's font has no more than ASCII."""
+    head, *rows = table(readout)
+    lines = [
+        (name, "  ".join(f"{value} {of}" for value, of in zip(values, head[1:], strict=True))) for name, *values in rows
+    ]
+    lines += [(readout.label, readout.place), ("", summary(readout).replace("  ·  ", ", ").replace(" × ", " times "))]
+    return "\n".join(name for name, _ in lines), "\n".join(text for _, text in lines)
 
 
 def watch(session: PlaySession, command: Command | None, seconds: float | None, gamepad: Gamepad | None = None) -> None:
@@ -79,31 +87,23 @@ def watch(session: PlaySession, command: Command | None, seconds: float | None, 
         )
     except (RuntimeError, mujoco.FatalError) as error:
         raise UserError(f"the window cannot be opened: {error}; use --viewer viser, or --out FILE.mp4") from error
-    console = Terminal()
-    console.say(KEYS)
+    Terminal().say(KEYS)
     with viewer:
         viewer.opt.geomgroup[COLLISION_GROUP] = 0
         viewer.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         viewer.cam.trackbodyid = model.body(session.robot.base_body).id
         viewer.cam.distance, viewer.cam.elevation, viewer.cam.azimuth = 2.2, -18.0, 55.0
-        due, told = time.monotonic(), keyboard.command
+        due = time.monotonic()
         while viewer.is_running() and (seconds is None or session.time < seconds):
             if keyboard.restart:
                 keyboard.restart = False
                 session.reset()
             if gamepad is not None and (asked := gamepad.moved()) is not None:
-                keyboard.command = told = asked  # not told: it changes with every step
+                keyboard.command = asked
             session.step(keyboard.command or session.autopilot())
             with viewer.lock():
                 show(model, data, session.position())
+            viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT, *texts(session.readout())))
             viewer.sync()
-            if keyboard.command != told:
-                told = keyboard.command
-                words = (
-                    "own way"
-                    if told is None
-                    else "forward {:+.1f} m/s, left {:+.1f} m/s, turn {:+.2f} rad/s".format(*told)
-                )
-                console.say(words)
             due = max(due + session.period, time.monotonic() - session.period)
             time.sleep(max(0.0, due - time.monotonic()))

@@ -1,149 +1,159 @@
-"""``gaitgauge play``: watch a policy walk, in a window, in a browser or in a video file."""
+"""``gaitgauge play``: watch policies walk, in a window, in a browser or in a video file."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .console import Terminal
 from .errors import UserError
+from .picture import choose_renderer
 from .progress import ProgressDisplay
-from .video import check_video_path, choose_renderer
+from .video import CLIP_ENDINGS, VIDEO_ENDINGS, check_film_path
 
 if TYPE_CHECKING:
-    from .play_session import PlaySession
+    from .play_session import Command, PlaySession
 
 VIEWERS = ("native", "viser", "video")
-_WIDTH, _HEIGHT = 1280, 720
+MOST = 4
+"""Policies side by side."""
 _SHORTEST, _LONGEST = 0.1, 3600.0
-_FRAME_TIME = 0.04
-"""Time between two pictures of a video [s]; drawing without a GPU takes about half a second each."""
+_LONGEST_CLIP = 60.0
+"""The encoder of a GIF keeps all its pictures in memory [s]."""
 _VIDEO_SECONDS = 10.0
 """Length of a video where none is asked for [s]."""
 
 
-def run_play(
-    choice: str,
-    *,
-    terrain: str,
-    level: int | None,
-    backend: str,
-    device: str | None,
-    viewer: str | None,
-    out: Path | None,
-    seconds: float | None,
-    command: tuple[float, float, float] | None,
-    friction: float,
-    seed: int,
-    port: int,
-    host: str = "127.0.0.1",
-    gamepad: bool = False,
-    trust: bool = False,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class PlayRequest:
+    """What the user asked for."""
+
+    policies: tuple[str, ...]
+    terrain: str
+    level: int | None
+    backend: str
+    device: str | None
+    viewer: str | None
+    out: Path | None
+    gif: Path | None
+    seconds: float | None
+    command: Command | None
+    friction: float
+    seed: int
+    port: int
+    host: str
+    gamepad: bool
+    trust: bool
+
+
+def run_play(asked: PlayRequest) -> None:
     """Load, build, and hand over to the viewer.
 
     Raises:
         UserError: an option that makes no sense, or a viewer that this machine has no display for.
         PolicyError, ContractError, TerrainError, BackendError: one sentence on what is wrong.
     """
-    chosen = _viewer(viewer, out)
-    if seconds is not None and not _SHORTEST <= seconds <= _LONGEST:
-        raise UserError(f"--seconds is {seconds:g}; give {_SHORTEST:g} to {_LONGEST:g} seconds")
-    if gamepad and chosen != "native":
-        raise UserError(
-            f"--gamepad steers the window and the viewer is '{chosen}'; add --viewer native, or leave it out"
-        )
-    if not 0.0 < friction <= 10.0:
-        raise UserError(f"--friction is {friction:g}; give a coefficient above 0 and at most 10")
-    video = out or Path("play.mp4")
-    if chosen == "video":
-        check_video_path(video)
-        choose_renderer()  # before MuJoCo is imported
-    from ..backends.registry import choose_device
-    from ..gauge.suite import load_suite
-    from ..policy.loading import load_policy
-    from ..robots import load_robot
-    from ..terrains.gauge_terrains import LEVELS
-    from ..terrains.registry import gauge_terrain_names, make_terrain
-    from .play_session import PlaySession, PlaySettings
-    from .policies import policy_file
+    viewer = _check(asked)
+    quality = choose_renderer() if viewer == "video" else None  # before MuJoCo is imported
+    from .play_session import beyond
+    from .worlds import WorldMaker, labels
 
-    if level is None and terrain != "flat" and terrain in gauge_terrain_names():
-        level = LEVELS[len(LEVELS) // 2 - 1]
-    ground = make_terrain(terrain, level)
-    path = policy_file(choice)
-    policy = load_policy(path, trust=trust)
-    robot = load_robot(policy.contract.robot)
-    settings = PlaySettings(
-        backend=backend,
-        device=choose_device(backend, device),
-        friction=friction,
-        seed=seed,
-        suite=load_suite("gaitgauge-1"),
-    )
-    session = PlaySession(policy, robot, ground, settings)
-    where = terrain if not ground.level else f"{terrain} level {ground.level}"
-    Terminal().say(f"{path} on {where}, {backend}, friction {friction:g}")
-    try:
-        if chosen == "video":
-            _record(session, video, seconds or _VIDEO_SECONDS, command)
-        elif chosen == "native":
+    console = Terminal()
+    maker = WorldMaker(backend=asked.backend, device=asked.device, seed=asked.seed, trust=asked.trust)
+    level = maker.default_level(asked.terrain) if asked.level is None else asked.level
+    with ExitStack() as stack:
+        sessions = []
+        for choice, label in zip(asked.policies, labels(asked.policies), strict=True):
+            session = maker.make(choice, asked.terrain, level, asked.friction, label)
+            stack.callback(session.close)
+            sessions.append(session)
+            console.say(
+                f"{session.policy.path} on {session.readout().place}, {asked.backend}, friction {asked.friction:g}"
+            )
+            if asked.command and (sentence := beyond(asked.command, session.limits)):
+                console.say(f"{label}: {sentence}" if len(asked.policies) > 1 else sentence)
+        if quality is not None:
+            from .recording import Recording, record
+
+            seconds = asked.seconds or _VIDEO_SECONDS
+            video = asked.out or (None if asked.gif else Path("play.mp4"))
+            wanted = Recording(sessions=sessions, seconds=seconds, command=asked.command, video=video, clip=asked.gif)
+            with ProgressDisplay(console, "recording") as display:
+                record(wanted, quality, lambda share: display.update(share, f"{share * seconds:.1f} of {seconds:g} s"))
+            for path in filter(None, (video, asked.gif)):
+                console.say(f"wrote {path}, {seconds:g} s{_told(sessions)}")
+        elif viewer == "native":
             from .gamepad import Gamepad
             from .native_viewer import watch
 
-            pad = Gamepad(session.limits) if gamepad else None
+            pad = Gamepad(sessions[0].limits) if asked.gamepad else None
             try:
-                watch(session, command, seconds, pad)
+                watch(sessions[0], asked.command, asked.seconds, pad)
             finally:
                 if pad is not None:
                     pad.close()
         else:
-            from .browser_viewer import serve
+            from .browser_viewer import Choice, serve
 
-            serve(session, command, seconds, port, host)
-    finally:
-        session.close()
+            stack.pop_all()  # the page closes them: it may play others by then
+            serve(
+                sessions,
+                maker,
+                Choice(terrain=asked.terrain, level=level, policies=asked.policies),
+                command=asked.command,
+                seconds=asked.seconds,
+                port=asked.port,
+                host=asked.host,
+            )
 
 
-def _viewer(asked: str | None, out: Path | None) -> str:
-    """The viewer that is asked for, or the best that this machine has."""
+def _told(sessions: Sequence[PlaySession]) -> str:
+    """What happened meanwhile, where anything did."""
+    counts = ((sum(s.falls for s in sessions), "falls"), (sum(s.arrivals for s in sessions), "times at the target"))
+    return "".join(f", {count} {what}" for count, what in counts if count)
+
+
+def _check(asked: PlayRequest) -> str:
+    """The viewer that is asked for, or the best that this machine has.
+
+    Raises:
+        UserError: options that make no sense.
+    """
+    films = {"--out": (asked.out, VIDEO_ENDINGS), "--gif": (asked.gif, CLIP_ENDINGS)}
+    named = [option for option, (path, _) in films.items() if path is not None]
+    viewer = _viewer(asked.viewer, named, several=len(asked.policies) > 1)
+    longest = _LONGEST_CLIP if asked.gif else _LONGEST
+    if asked.seconds is not None and not _SHORTEST <= asked.seconds <= longest:
+        raise UserError(f"--seconds is {asked.seconds:g}; give {_SHORTEST:g} to {longest:g} seconds")
+    if asked.gamepad and viewer != "native":
+        raise UserError(
+            f"--gamepad steers the window and the viewer is '{viewer}'; add --viewer native, or leave it out"
+        )
+    if not 0.0 < asked.friction <= 10.0:
+        raise UserError(f"--friction is {asked.friction:g}; give a coefficient above 0 and at most 10")
+    if len(asked.policies) > MOST:
+        raise UserError(f"{len(asked.policies)} policies are given; at most {MOST} are shown side by side")
+    for option, (path, endings) in films.items():
+        if path is not None:
+            check_film_path(path, option, endings)
+    return viewer
+
+
+def _viewer(asked: str | None, films: Sequence[str], *, several: bool) -> str:
     if asked is not None and asked not in VIEWERS:
         raise UserError(f"there is no viewer '{asked}'; choose one of: {', '.join(VIEWERS)} (--viewer)")
-    if out is not None:
+    if films:
         if asked not in (None, "video"):
-            raise UserError(f"--out writes a video and --viewer {asked} opens a viewer; give one of them")
+            raise UserError(f"{films[0]} writes a video and --viewer {asked} opens a viewer; give one of them")
         return "video"
+    if asked == "native" and several:
+        raise UserError("the window shows one policy; for several use --viewer viser for a browser, or --out FILE.mp4")
     display = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if asked == "native" and not display:
         raise UserError("there is no display for a window; use --viewer viser for a browser, or --out FILE.mp4")
-    return asked or ("native" if display else "viser")
-
-
-def _record(session: PlaySession, out: Path, seconds: float, command: tuple[float, float, float] | None) -> None:
-    """Write a video of so much simulated time."""
-    from .scenery import visual_model
-    from .video import Picture, Video
-
-    model = visual_model(session.robot, session.terrain, width=_WIDTH, height=_HEIGHT)
-    heading = session.terrain.spawns["level_search"].yaw
-    picture = Picture(model, width=_WIDTH, height=_HEIGHT, heading=heading)
-    steps = max(1, round(_FRAME_TIME / session.period))
-    between = steps * session.period
-    frames = max(1, round(seconds / between))
-    console = Terminal()
-    try:
-        with (
-            Video(out, fps=1.0 / between, width=_WIDTH, height=_HEIGHT) as video,
-            ProgressDisplay(console, "recording") as display,
-        ):
-            for frame in range(frames):
-                for _ in range(steps):
-                    session.step(command or session.autopilot())
-                video.add(picture.draw(session.position(), between))
-                display.update((frame + 1) / frames, f"{(frame + 1) * between:.1f} of {seconds:g} s")
-    finally:
-        picture.close()
-    told = [f"{n} {what}" for n, what in ((session.falls, "falls"), (session.arrivals, "times at the target")) if n]
-    console.say(f"wrote {out}, {seconds:g} s" + (f", {', '.join(told)}" if told else ""))
+    return asked or ("native" if display and not several else "viser")

@@ -16,13 +16,15 @@ from ..gauge.suite import Suite
 from ..policy.base import Policy
 from ..policy.observation import ObservationBuilder
 from ..robots import Robot
-from ..robots.rotation import from_yaw
+from ..robots.rotation import from_yaw, yaw_of
 from ..terrains.base import Terrain
 from .errors import UserError
 
 Command = tuple[float, float, float]
 """Forward, lateral [m/s] and yaw [rad/s] speed."""
 
+_SPEED_OVER = 0.3
+"""Time over which the measured speed is averaged [s]."""
 _SETTLE = 0.4
 """Time after a reset in which the robot is told to stand [s]."""
 _FALLEN_TILT = 1.4
@@ -43,6 +45,46 @@ _TOUR: tuple[tuple[Command, float], ...] = (
 
 
 @dataclass(frozen=True, kw_only=True)
+class Readout:
+    """One robot at one instant, for people."""
+
+    label: str
+    """Of the policy."""
+    place: str
+    """Terrain and level."""
+    friction: float
+    """Of the ground."""
+    time: float
+    """Simulated time in all [s]."""
+    command: Command
+    """What the policy is told."""
+    speed: Command
+    """What the base does in its own heading, averaged over a moment."""
+    falls: int
+    """How often it lay on the ground."""
+    arrivals: int
+    """How often it was at the target."""
+
+
+def clip(command: Command, limits: Command) -> Command:
+    """A command within limits."""
+    forward, lateral, yaw = (max(-most, min(most, value)) for value, most in zip(command, limits, strict=True))
+    return forward, lateral, yaw
+
+
+def beyond(command: Command, limits: Command) -> str | None:
+    """A sentence on what of a command is beyond the limits of a policy, None where nothing is."""
+    parts = [
+        f"{name} {value:g} {unit} (it was made for at most {most:g})"
+        for name, unit, value, most in zip(
+            ("forward", "sideways", "turning"), ("m/s", "m/s", "rad/s"), command, limits, strict=True
+        )
+        if abs(value) > most
+    ]
+    return f"the policy's contract clips the command: {', '.join(parts)}" if parts else None
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlaySettings:
     """Where and how a policy is played."""
 
@@ -51,13 +93,15 @@ class PlaySettings:
     friction: float
     seed: int
     suite: Suite
-    """Gives the physics, the robot's joint constants and the command limits."""
+    """Gives the physics, the robot's joint constants, and the speeds at which a robot goes its own way."""
 
 
 class PlaySession:
     """The loop: observation, action, physics; starts again after a fall and at the target."""
 
-    def __init__(self, policy: Policy, robot: Robot, terrain: Terrain, settings: PlaySettings) -> None:
+    def __init__(
+        self, policy: Policy, robot: Robot, terrain: Terrain, settings: PlaySettings, label: str = "policy"
+    ) -> None:
         """Build the world and put the robot at the start.
 
         Raises:
@@ -74,8 +118,11 @@ class PlaySession:
                 f"the policy's control period is {period:g} s, no multiple of the physics step of {physics.timestep:g} s"
             )
         self.policy, self.robot, self.terrain, self.period = policy, robot, terrain, period
-        self.limits = suite.command_limits(terrain.family)
-        self._speed = suite.commands.target_speed.get(terrain.family, 0.5 * self.limits[0])
+        self.label = label
+        self.limits = policy.contract.command_limits
+        """Largest commands that the policy was made for."""
+        self._own_limits = clip(suite.command_limits(terrain.family), self.limits)
+        self._speed = min(suite.commands.target_speed.get(terrain.family, 0.5 * self._own_limits[0]), self.limits[0])
         scene = Scene(
             robot=robot,
             parameters=robot.parameters[suite.parameters],
@@ -84,8 +131,8 @@ class PlaySession:
             physics=physics,
         )
         self.backend = make_backend(settings.backend, scene, device=settings.device)
-        device, dtype = self.backend.device, self.backend.dtype
-        self.backend.randomize(Randomization(friction=torch.tensor([settings.friction], device=device, dtype=dtype)))
+        device = self.backend.device
+        self.set_friction(settings.friction)
         self._builder = ObservationBuilder(policy.contract, robot, 1, device)
         self._network = policy.session(1, device=str(device))
         self._random = np.random.default_rng(settings.seed)
@@ -100,6 +147,12 @@ class PlaySession:
     def state(self) -> PhysicsState:
         """State of the one world."""
         return self.backend.state
+
+    def set_friction(self, friction: float) -> None:
+        """Change the ground's friction coefficient."""
+        self.friction = friction
+        values = torch.tensor([friction], device=self.backend.device, dtype=self.backend.dtype)
+        self.backend.randomize(Randomization(friction=values))
 
     def reset(self) -> None:
         """Put the robot back to the start, turned a little at random."""
@@ -121,12 +174,13 @@ class PlaySession:
         self.since_reset = 0.0
         """Simulated time since the robot was put to the start [s]."""
         self._down = 0.0
+        self._told = self._speed_now = (0.0, 0.0, 0.0)
 
     def step(self, command: Command) -> None:
-        """Advance one control period; a command beyond the limits of the terrain is clipped."""
+        """Advance one control period; a command beyond the limits of the policy is clipped."""
         if self.since_reset < _SETTLE:
             command = (0.0, 0.0, 0.0)
-        limited = [max(-limit, min(limit, value)) for value, limit in zip(command, self.limits, strict=True)]
+        limited = self._told = clip(command, self.limits)
         device, dtype = self.backend.device, self.backend.dtype
         observation = self._builder.build(self.state, torch.tensor([limited], device=device, dtype=dtype), self._action)
         self._action = self._network.act(observation)
@@ -135,7 +189,37 @@ class PlaySession:
         self.backend.step(self._builder.targets(self._action).to(dtype), substeps=self.substeps)
         self.time += self.period
         self.since_reset += self.period
+        self._measure()
         self._start_again()
+
+    def _measure(self) -> None:
+        """Follow the speed of the base: an exponential average, which a trunk that swings at every step does not shake."""
+        state = self.state
+        x, y, _ = state.base_linear_velocity_w[0].tolist()
+        heading = float(yaw_of(state.base_quaternion_w)[0])
+        turn = float(state.base_angular_velocity_b[0, 2])
+        now = (
+            x * math.cos(heading) + y * math.sin(heading),
+            y * math.cos(heading) - x * math.sin(heading),
+            turn,
+        )
+        share = min(1.0, self.period / _SPEED_OVER)
+        forward, lateral, yaw = (old + share * (new - old) for old, new in zip(self._speed_now, now, strict=True))
+        self._speed_now = (forward, lateral, yaw)
+
+    def readout(self) -> Readout:
+        """What there is to be told of this instant."""
+        level = f" level {self.terrain.level}" if self.terrain.level else ""
+        return Readout(
+            label=self.label,
+            place=f"{self.terrain.name}{level}",
+            friction=self.friction,
+            time=self.time,
+            command=self._told,
+            speed=self._speed_now,
+            falls=self.falls,
+            arrivals=self.arrivals,
+        )
 
     def _start_again(self) -> None:
         """Back to the start once the robot has lain on the ground for a while, or has reached the target."""
@@ -180,14 +264,15 @@ class PlaySession:
                 offset,
                 torch.tensor([self.terrain.backward], device=offset.device),
                 torch.full_like(offset[:, 0], self._speed),
-                torch.full_like(offset[:, 0], self.limits[2]),
+                torch.full_like(offset[:, 0], self._own_limits[2]),
             )
             forward, lateral, yaw = command[0].tolist()
             return forward, lateral, yaw
         at = (self.since_reset - _SETTLE) % sum(seconds for _, seconds in _TOUR)
         for shares, seconds in _TOUR:
             if at < seconds:
-                return shares[0] * self.limits[0], shares[1] * self.limits[1], shares[2] * self.limits[2]
+                most = self._own_limits
+                return shares[0] * most[0], shares[1] * most[1], shares[2] * most[2]
             at -= seconds
         return 0.0, 0.0, 0.0
 

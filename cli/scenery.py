@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from scipy.ndimage import zoom
 
 from ..robots import Robot
-from ..terrains.base import Terrain
+from ..terrains.base import FloatArray, Terrain
+from .picture import RICH, Quality
 
 VISUAL_GROUP = 2
 """Geom group of what is seen of a robot."""
@@ -16,22 +18,23 @@ BOX_COLORS = ((0.66, 0.70, 0.76, 1.0), (0.58, 0.62, 0.69, 1.0))
 """Neighbouring boxes differ a little, so that steps can be told apart."""
 _FLOOR_REACH = 40.0
 """Half extent of the drawn floor [m]."""
+_SAME_GROUND = 0.01
+"""Difference in height that nobody sees [m]."""
 _EXTENT = 3.0
 """Size of what is looked at [m]."""
 
 
-def visual_model(robot: Robot, terrain: Terrain, *, width: int = 1280, height: int = 720) -> mujoco.MjModel:
+def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> mujoco.MjModel:
     """A model of robot, terrain, sky and light.
 
     Args:
         robot: whose ``qpos`` the model takes.
         terrain: walls are left out, they would hide the robot.
-        width: largest picture [pixels].
-        height: largest picture [pixels].
+        quality: what a picture may cost.
     """
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
-    _set_light(spec, width, height)
-    _add_floor(spec)
+    _set_light(spec, quality)
+    _add_floor(spec, reflectance=0.04 if quality.reflections else 0.0)
     steps = [box for box in terrain.boxes if not box.wall]
     for i, box in enumerate(steps):
         spec.worldbody.add_geom(
@@ -45,7 +48,7 @@ def visual_model(robot: Robot, terrain: Terrain, *, width: int = 1280, height: i
             conaffinity=0,
         )
     if terrain.height_field is not None:
-        _add_field(spec, terrain)
+        _add_field(spec, terrain, quality.field_nodes)
     if terrain.target is not None:
         spec.worldbody.add_geom(
             name="target",
@@ -67,11 +70,13 @@ def _ground(terrain: Terrain, x: float, y: float) -> float:
     return float(terrain.height(x, y))
 
 
-def _set_light(spec: mujoco.MjSpec, width: int, height: int) -> None:
+def _set_light(spec: mujoco.MjSpec, quality: Quality) -> None:
     visual = spec.visual
-    visual.global_.offwidth, visual.global_.offheight = width, height
-    visual.quality.shadowsize = 4096
-    visual.quality.offsamples = 4
+    visual.global_.offwidth, visual.global_.offheight = quality.size
+    visual.quality.shadowsize = quality.shadow_pixels
+    visual.quality.offsamples = quality.samples
+    visual.quality.numslices, visual.quality.numstacks = quality.slices, quality.stacks
+    visual.quality.numquads = 1  # of a box's side: the light of one sun needs no more
     visual.headlight.ambient = [0.38, 0.38, 0.40]
     visual.headlight.diffuse = [0.30, 0.30, 0.30]
     visual.headlight.specular = [0.05, 0.05, 0.05]
@@ -80,7 +85,7 @@ def _set_light(spec: mujoco.MjSpec, width: int, height: int) -> None:
     visual.map.znear = 0.01
     # Shadows are sharp where they fall within this distance of the sun's axis, and absent beyond it.
     spec.stat.extent = _EXTENT
-    visual.map.shadowclip = 1.0
+    visual.map.shadowclip = quality.shadow_reach / _EXTENT
     # The sun follows the robot: a shadow map that covers the whole ground would be too coarse.
     sun = spec.worldbody.add_light(
         name="sun",
@@ -102,7 +107,7 @@ def _set_light(spec: mujoco.MjSpec, width: int, height: int) -> None:
     )
 
 
-def _add_floor(spec: mujoco.MjSpec) -> None:
+def _add_floor(spec: mujoco.MjSpec, reflectance: float) -> None:
     texture = spec.add_texture(
         name="checker",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -114,7 +119,7 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         width=512,
         height=512,
     )
-    material = spec.add_material(name="floor", texrepeat=[1.0, 1.0], texuniform=True, reflectance=0.04)
+    material = spec.add_material(name="floor", texrepeat=[1.0, 1.0], texuniform=True, reflectance=reflectance)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
     spec.worldbody.add_geom(
         name="floor",
@@ -126,13 +131,14 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     )
 
 
-def _add_field(spec: mujoco.MjSpec, terrain: Terrain) -> None:
+def _add_field(spec: mujoco.MjSpec, terrain: Terrain, most_nodes: int) -> None:
     field = terrain.height_field
     assert field is not None
-    top = max(float(field.heights.max()), 1e-6)
-    hfield = spec.add_hfield(name="ground", nrow=field.heights.shape[0], ncol=field.heights.shape[1])
+    heights = drawn_heights(field.heights, most_nodes)
+    top = max(float(heights.max()), 1e-6)
+    hfield = spec.add_hfield(name="ground", nrow=heights.shape[0], ncol=heights.shape[1])
     hfield.size = np.array([*field.half_size, top, field.base])
-    hfield.userdata = (field.heights / top).astype(np.float32).ravel()
+    hfield.userdata = (heights / top).astype(np.float32).ravel()
     spec.worldbody.add_geom(
         name="ground",
         type=mujoco.mjtGeom.mjGEOM_HFIELD,
@@ -142,6 +148,19 @@ def _add_field(spec: mujoco.MjSpec, terrain: Terrain) -> None:
         contype=0,
         conaffinity=0,
     )
+
+
+def drawn_heights(heights: FloatArray, most_nodes: int) -> FloatArray:
+    """Heights with fewer nodes where these show the same ground, else as they are.
+
+    Args:
+        heights: at the nodes [m], (rows, columns).
+        most_nodes: rows and columns that are wanted at most.
+    """
+    factors = [min(1.0, most_nodes / n) for n in heights.shape]
+    fewer = zoom(heights, factors, order=1)
+    back = zoom(fewer, [n / m for n, m in zip(heights.shape, fewer.shape, strict=True)], order=1)
+    return np.asarray(fewer) if np.abs(back - heights).max() <= _SAME_GROUND else heights
 
 
 def show(model: mujoco.MjModel, data: mujoco.MjData, position: np.ndarray) -> None:

@@ -1,10 +1,7 @@
-"""Videos without a display: MuJoCo's renderer off the screen, and a camera that follows the robot."""
+"""Films: MP4 files, and GIF or WebP files that play by themselves in a page."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from types import TracebackType
 
@@ -13,73 +10,59 @@ import numpy as np
 from ..files.writing import replacing
 from .errors import UserError
 
-RENDERERS = ("egl", "osmesa")
-"""Ways to draw without a display, the faster first; the value of MUJOCO_GL."""
-_PROBE = """
-import mujoco
-model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-with mujoco.Renderer(model, 32, 32) as renderer:
-    renderer.update_scene(data)
-    assert renderer.render().max() > 0
-"""
+VIDEO_ENDINGS = (".mp4",)
+CLIP_ENDINGS = (".gif", ".webp")
+_PALETTE = "split[a][b];[a]palettegen=max_colors=96:stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+_CODECS: dict[str, tuple[str, str, list[str]]] = {
+    ".mp4": ("libx264", "yuv420p", ["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"]),
+    ".gif": ("gif", "pal8", ["-filter_complex", _PALETTE, "-loop", "0"]),
+    ".webp": ("libwebp_anim", "yuv420p", ["-q:v", "55", "-compression_level", "3", "-loop", "0"]),
+}
+"""Codec, format of the pixels and options of ffmpeg by the file's ending."""
 
 
-def choose_renderer() -> str:
-    """A way to draw that works here, put into ``MUJOCO_GL``; must be called before MuJoCo is imported.
+def check_film_path(path: Path, option: str, endings: tuple[str, ...]) -> None:
+    """Refuse a file that cannot be.
 
     Raises:
-        UserError: none works.
+        UserError: the folder is not there, or the name ends in something else.
     """
-    asked = os.environ.get("MUJOCO_GL")
-    for name in (asked,) if asked else RENDERERS:
-        environment = {**os.environ, "MUJOCO_GL": name}
-        tried = subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True, check=False)
-        if tried.returncode == 0:
-            os.environ["MUJOCO_GL"] = name
-            return name
-    named = f"MUJOCO_GL={asked} does not draw" if asked else "neither EGL nor OSMesa draws"
-    raise UserError(
-        f"videos need off-screen rendering, and {named} on this machine; install libegl1 and libgl1-mesa-dri, or "
-        "libosmesa6, or watch in a browser with --viewer viser"
-    )
-
-
-def check_video_path(path: Path) -> None:
-    """Refuse a video file that cannot be.
-
-    Raises:
-        UserError: the folder is not there, or the file does not end in .mp4.
-    """
-    if path.suffix.lower() != ".mp4":
-        raise UserError(f"--out is '{path}'; a video needs a name that ends in .mp4")
+    if path.suffix.lower() not in endings:
+        raise UserError(f"{option} is '{path}'; give a name that ends in {' or '.join(endings)}")
     if not path.absolute().parent.is_dir():
-        raise UserError(f"folder '{path.parent}' of --out does not exist; create it first")
+        raise UserError(f"folder '{path.parent}' of {option} does not exist; create it first")
 
 
-class Video:
-    """Writes an MP4 file; the file gets its name when it is whole."""
+class Film:
+    """Writes pictures to a file in the format that its ending names; the file gets its name when it is whole."""
 
-    def __init__(self, path: Path, *, fps: float, width: int, height: int) -> None:
-        """Start the encoder for a path that ``check_video_path`` lets pass."""
+    def __init__(self, path: Path, *, fps: float, size: tuple[int, int]) -> None:
+        """Start the encoder for a path that ``check_film_path`` lets pass.
+
+        Args:
+            path: of the file.
+            fps: pictures a second.
+            size: width and height [pixels].
+        """
         import imageio_ffmpeg
 
         self.path = path
+        codec, pixels, options = _CODECS[path.suffix.lower()]
         self._whole = replacing(path, UserError, ending=path.suffix)
         self._writer = imageio_ffmpeg.write_frames(
             str(self._whole.__enter__()),
-            (width, height),
+            size,
             fps=fps,
-            codec="libx264",
+            codec=codec,
+            quality=None,
             pix_fmt_in="rgb24",
-            pix_fmt_out="yuv420p",
+            pix_fmt_out=pixels,
             macro_block_size=2,
-            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
+            output_params=options,
         )
         self._writer.send(None)
 
-    def __enter__(self) -> Video:
+    def __enter__(self) -> Film:
         return self
 
     def add(self, picture: np.ndarray) -> None:
@@ -98,54 +81,3 @@ class Video:
     ) -> None:
         self._writer.close()
         self._whole.__exit__(kind, error, trace)
-
-
-class Picture:
-    """Draws a robot on its ground from a camera that follows it smoothly."""
-
-    AZIMUTH = 55.0
-    """Direction in which the camera looks, against the robot's first heading [deg]."""
-    ELEVATION = -16.0
-    DISTANCE = 1.9
-    LAG = 0.25
-    """Time constant of the camera [s]."""
-
-    def __init__(self, model: object, *, width: int, height: int, heading: float) -> None:
-        """Prepare the renderer.
-
-        Args:
-            model: what ``scenery.visual_model`` made.
-            width: of the picture [pixels].
-            height: of the picture [pixels].
-            heading: of the robot at the start [rad].
-        """
-        import mujoco
-
-        assert isinstance(model, mujoco.MjModel)
-        self._model, self._data = model, mujoco.MjData(model)
-        self._renderer = mujoco.Renderer(model, height, width)
-        self._camera = mujoco.MjvCamera()
-        self._camera.azimuth = np.degrees(heading) + self.AZIMUTH
-        self._camera.elevation, self._camera.distance = self.ELEVATION, self.DISTANCE
-        self._options = mujoco.MjvOption()
-        self._options.geomgroup[:] = 1
-        self._options.sitegroup[:] = 0
-        self._looks_at: np.ndarray | None = None
-
-    def draw(self, position: np.ndarray, seconds: float) -> np.ndarray:
-        """The picture of a pose (7 + J,), ``seconds`` after the one before; (height, width, 3) uint8."""
-        from .scenery import show
-
-        show(self._model, self._data, position)
-        target = position[:3] - np.array([0.0, 0.0, 0.06])
-        # A robot that was put back to the start is not followed on its way there.
-        if self._looks_at is None or np.linalg.norm(target - self._looks_at) > 1.5:
-            self._looks_at = target
-        self._looks_at = self._looks_at + (target - self._looks_at) * min(1.0, seconds / self.LAG)
-        self._camera.lookat[:] = self._looks_at
-        self._renderer.update_scene(self._data, self._camera, self._options)
-        return self._renderer.render()
-
-    def close(self) -> None:
-        """Free the renderer."""
-        self._renderer.close()

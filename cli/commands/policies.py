@@ -43,8 +43,12 @@ def export(
 @app.command()
 @report_errors
 def play(
-    policy: Annotated[
-        str, typer.Argument(help="A policy file, a run directory, or latest, best, pretrained.", metavar="POLICY")
+    policies: Annotated[
+        list[str],
+        typer.Argument(
+            help="Policy files, run directories, or latest, best, pretrained; up to four, side by side.",
+            metavar="POLICY...",
+        ),
     ],
     terrain: Annotated[str, typer.Option(help="Terrain, see 'gaitgauge list terrains'.")] = "flat",
     level: Annotated[int | None, typer.Option(help="Level of the terrain, 1 to 10. Default: 5.")] = None,
@@ -52,7 +56,12 @@ def play(
         str | None,
         typer.Option(help="native: a window; viser: in a browser; video. Default: a window where there is a display."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Write a video (.mp4); needs no display.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "--video", help="Write a video (.mp4); needs no display.")
+    ] = None,
+    gif: Annotated[
+        Path | None, typer.Option(help="Write a small one that plays by itself in a page (.gif, .webp).")
+    ] = None,
     seconds: Annotated[float | None, typer.Option(help="How long [s]. Default: 10 for a video, else no end.")] = None,
     command: Annotated[
         tuple[float, float, float] | None,
@@ -72,25 +81,28 @@ def play(
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
     trust: TrustOption = False,
 ) -> None:
-    """Watch a policy walk: in MuJoCo's viewer, in a browser, or in a video file without a display."""
-    from ..play import run_play
+    """Watch policies walk: in MuJoCo's viewer, in a browser, or in a video file without a display."""
+    from ..play import PlayRequest, run_play
 
     run_play(
-        policy,
-        terrain=terrain,
-        level=level,
-        backend=backend,
-        device=device,
-        viewer=viewer,
-        out=out,
-        seconds=seconds,
-        command=command,
-        friction=friction,
-        seed=seed,
-        port=port,
-        host=host,
-        gamepad=gamepad,
-        trust=trust,
+        PlayRequest(
+            policies=tuple(policies),
+            terrain=terrain,
+            level=level,
+            backend=backend,
+            device=device,
+            viewer=viewer,
+            out=out,
+            gif=gif,
+            seconds=seconds,
+            command=command,
+            friction=friction,
+            seed=seed,
+            port=port,
+            host=host,
+            gamepad=gamepad,
+            trust=trust,
+        )
     )
 
 

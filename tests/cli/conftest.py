@@ -1,10 +1,12 @@
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from gaitgauge.cli.main import app
+from gaitgauge.cli.play_session import PlaySession
+from gaitgauge.cli.worlds import WorldMaker
 from gaitgauge.policy.contract import PolicyContract, go2_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
@@ -76,3 +78,18 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (run,) = (root / "go2_flat").iterdir()
     assert str(run) in result.output.replace("\n", "")
     return run
+
+
+@pytest.fixture
+def session(policy: Path) -> Iterator[Callable[..., PlaySession]]:
+    """Makes worlds in which that policy stands."""
+    made = []
+
+    def make(terrain: str = "flat", level: int | None = None, friction: float = 0.8) -> PlaySession:
+        maker = WorldMaker(backend="mujoco", device="cpu", seed=0, trust=False)
+        made.append(maker.make(str(policy), terrain, level, friction, "standing"))
+        return made[-1]
+
+    yield make
+    for played in made:
+        played.close()

@@ -1,8 +1,6 @@
-"""``gaitgauge play``: the loop, the scenery, the keyboard, the browser's shapes, videos, and bad requests."""
+"""``gaitgauge play``: the loop, the scenery, the keyboard, the gamepad, and bad requests."""
 
 import math
-import socket
-import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -12,27 +10,13 @@ import pytest
 import torch
 from gaitgauge.backends import ResetState
 from gaitgauge.cli import scenery
-from gaitgauge.cli.browser_viewer import Stage, geom_color, geom_mesh, is_own_request, serve
-from gaitgauge.cli.errors import UserError
-from gaitgauge.cli.play_session import PlaySession, PlaySettings
-from gaitgauge.cli.video import Video, choose_renderer
+from gaitgauge.cli.play_session import beyond
+from gaitgauge.cli.worlds import labels
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.registry import make_terrain
 
 ROBOT = load_robot("go2")
-
-
-@pytest.fixture
-def session(policy):
-    def make(terrain: str = "flat", level: int | None = None, friction: float = 0.8) -> PlaySession:
-        settings = PlaySettings(
-            backend="mujoco", device="cpu", friction=friction, seed=0, suite=load_suite("gaitgauge-1")
-        )
-        return PlaySession(load_policy(policy), ROBOT, make_terrain(terrain, level), settings)
-
-    return make
 
 
 # ---- the loop -------------------------------------------------------------------------------------------------------
@@ -96,6 +80,39 @@ def test_tour_shows_every_direction_within_the_limits(session):
     assert (values == 0.0).all(axis=1).any()
 
 
+def test_commands_reach_as_far_as_the_policys_contract_and_clipping_is_said(session):
+    """A command of 4 m/s became 2 m/s in silence; on stairs it became 1 m/s, which the policy was not made for either."""
+    played = session("stairs_fd", 3)
+    assert played.limits == (2.0, 1.0, 2.0)
+    sentence = beyond((4.0, -0.5, -3.0), played.limits)
+    assert sentence == (
+        "the policy's contract clips the command: forward 4 m/s (it was made for at most 2), "
+        "turning -3 rad/s (it was made for at most 2)"
+    )
+    assert beyond((2.0, -1.0, 2.0), played.limits) is None
+    for _ in range(25):
+        played.step((4.0, -0.5, -3.0))
+    assert played.readout().command == (2.0, -0.5, -2.0)
+
+
+def test_measured_speed_is_in_the_robots_heading_and_friction_acts(session):
+    played = session()
+    turned = torch.tensor([[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]], dtype=torch.float64)  # faces +y
+    state = ResetState(
+        base_position=torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64),  # in free fall nothing brakes
+        base_quaternion=turned,
+        base_linear_velocity=torch.tensor([[0.3, 1.2, 0.0]], dtype=torch.float64),
+    )
+    played.backend.reset(state)
+    for _ in range(45):
+        played.step((0.0, 0.0, 0.0))
+    share = 1.0 - (1.0 - 0.02 / 0.3) ** 45  # of an exponential average over 0.3 s after 45 steps of 20 ms
+    forward, lateral, _ = played.readout().speed
+    assert (forward, lateral) == (pytest.approx(1.2 * share, abs=0.1), pytest.approx(-0.3 * share, abs=0.1))
+    played.set_friction(0.25)
+    assert played.readout().friction == 0.25
+
+
 # ---- scenery --------------------------------------------------------------------------------------------------------
 
 
@@ -124,6 +141,14 @@ def test_drawn_ground_is_the_terrains():
                 model, data, above, np.array([0.0, 0.0, -1.0]), group, 1, -1, np.zeros(1, np.int32)
             )
             assert 20.0 - distance == pytest.approx(float(terrain.height(x, 0.7)), abs=5e-3), (name, x)
+
+
+def test_fewer_nodes_are_drawn_where_they_show_the_same_ground():
+    wave = make_terrain("wave", 5).height_field.heights
+    assert scenery.drawn_heights(wave, 64).shape == (64, 64)
+    np.testing.assert_allclose(scenery.drawn_heights(wave, 1024), wave)
+    stones = np.random.default_rng(0).uniform(0.0, 0.1, (128, 128))
+    assert scenery.drawn_heights(stones, 64) is stones
 
 
 def test_collision_shapes_are_not_drawn_and_the_robot_is():
@@ -155,6 +180,16 @@ def test_keys():
     assert not keyboard.restart
     keyboard.press(260)
     assert keyboard.restart
+
+
+def test_window_shows_what_is_measured(session):
+    from gaitgauge.cli.native_viewer import texts
+
+    names, values = texts(session("wave", 3).readout())
+    assert names.split("\n") == ["command", "measured", "standing", ""]
+    assert values.split("\n")[0] == "+0.00 forward m/s  +0.00 left m/s  +0.00 turn rad/s"
+    assert values.split("\n")[2:] == ["wave level 3", "friction 0.8, 0 falls, 0.0 s"]
+    assert (names + values).isascii()
 
 
 # ---- gamepad --------------------------------------------------------------------------------------------------------
@@ -210,132 +245,6 @@ def test_no_gamepad_and_no_extra(refused, policy, monkeypatch):
     assert "--viewer native" in refused("play", policy, "--viewer", "viser", "--gamepad")
 
 
-# ---- browser --------------------------------------------------------------------------------------------------------
-
-
-def test_surfaces_of_geoms():
-    text = """<mujoco><asset><material name="red" rgba="1 0 0 1"/><hfield name="f" nrow="3" ncol="4" size="2 1 0.5 0.1"
-      elevation="0 0 0 0  0 1 1 0  0 0 0 0"/></asset><worldbody>
-      <geom type="box" size="0.1 0.2 0.3" material="red"/><geom type="sphere" size="0.5" rgba="0 0.2 1 1"/>
-      <geom type="ellipsoid" size="0.1 0.2 0.3"/><geom type="cylinder" size="0.1 0.5"/><geom type="capsule" size="0.1 0.5"/>
-      <geom type="hfield" hfield="f"/><geom type="plane" size="1 1 1"/></worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(text)
-    meshes = [geom_mesh(model, i) for i in range(model.ngeom)]
-    extents = [None if m is None else m.bounds[1] - m.bounds[0] for m in meshes]
-    wanted = [(0.2, 0.4, 0.6), (1, 1, 1), (0.2, 0.4, 0.6), (0.2, 0.2, 1.0), (0.2, 0.2, 1.2), (4.0, 2.0, 0.5)]
-    for found, expected in zip(extents[:6], wanted, strict=True):
-        np.testing.assert_allclose(found, expected, atol=0.01)
-    assert meshes[6] is None
-    for solid in meshes[:5]:
-        np.testing.assert_allclose(solid.center_mass, 0.0, atol=0.01)
-    assert (meshes[5].face_normals[:, 2] > 0).all()
-    assert geom_color(model, 0) == (255, 0, 0)
-    assert geom_color(model, 1) == (0, 51, 255)
-
-
-def test_page_is_served_and_ends(session, monkeypatch):
-    moved = []
-    monkeypatch.setattr(Stage, "move", lambda self, data: moved.append(data.qpos[2]))
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        port = probe.getsockname()[1]
-    serve(session(), (0.0, 0.0, 0.0), 0.1, port, "127.0.0.1")
-    assert len(moved) == 2
-
-
-def test_only_this_machine_and_only_the_own_page(session, monkeypatch):
-    """The page listened on every interface and took any origin."""
-    from http.client import HTTPConnection
-
-    answers = {}
-
-    def ask(name: str, **headers: str) -> None:
-        connection = HTTPConnection("127.0.0.1", port, timeout=10)
-        upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
-        key = {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": "viser-v0"}
-        connection.request("GET", "/", headers=upgrade | key | headers)
-        answers[name] = connection.sock and connection.getresponse().status
-        connection.close()
-
-    def look(self, data):
-        if answers:
-            return
-        own = f"localhost:{port}"
-        ask("own page", Host=own, Origin=f"http://{own}")
-        ask("no browser", Host=own)
-        ask("other page", Host=own, Origin="http://evil.example")
-        ask("other name", Host=f"evil.example:{port}", Origin=f"http://evil.example:{port}")
-        others = [a[4][0] for a in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
-        for address in (a for a in others if not a.startswith("127.")):
-            with pytest.raises(OSError):
-                socket.create_connection((address, port), timeout=5).close()
-
-    monkeypatch.setattr(Stage, "move", look)
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        port = probe.getsockname()[1]
-    serve(session(), (0.0, 0.0, 0.0), 0.1, port, "127.0.0.1")
-    assert answers == {"own page": 101, "no browser": 101, "other page": 403, "other name": 403}
-
-
-def test_requests_from_other_machines_are_welcome_where_asked_for():
-    page = {"Host": "robot.lan:8080", "Origin": "http://robot.lan:8080"}
-    assert is_own_request(page, "0.0.0.0")
-    assert not is_own_request(page, "127.0.0.1")
-    assert not is_own_request(page | {"Origin": "http://evil.example"}, "0.0.0.0")
-
-
-# ---- video ----------------------------------------------------------------------------------------------------------
-
-
-def test_video_file_is_whole_or_not_there(tmp_path):
-    import imageio.v3 as imageio
-
-    path = tmp_path / "walk.mp4"
-    with Video(path, fps=25, width=64, height=48) as video:
-        for i in range(10):
-            video.add(np.full((48, 64, 3), 20 * i, dtype=np.uint8))
-    frames = imageio.imread(path, plugin="FFMPEG")
-    assert frames.shape == (10, 48, 64, 3)
-    assert frames[9].mean() > frames[0].mean() + 100
-    with pytest.raises(RuntimeError, match="gone"), Video(tmp_path / "half.mp4", fps=25, width=64, height=48) as video:
-        video.add(np.zeros((48, 64, 3), dtype=np.uint8))
-        raise RuntimeError("gone")
-    assert [f.name for f in tmp_path.glob("*.mp4")] == ["walk.mp4"]
-
-
-def test_machine_without_a_renderer(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr(subprocess, "run", lambda *a, **k: subprocess.CompletedProcess(a, 1))
-    with pytest.raises(UserError, match="MUJOCO_GL=osmesa does not draw"):
-        choose_renderer()
-    monkeypatch.delenv("MUJOCO_GL")
-    with pytest.raises(UserError, match="neither EGL nor OSMesa draws"):
-        choose_renderer()
-
-
-@pytest.mark.slow
-def test_video_of_a_walk(policy, tmp_path, monkeypatch):
-    import imageio.v3 as imageio
-
-    try:
-        monkeypatch.setenv("MUJOCO_GL", choose_renderer())
-    except UserError as error:
-        pytest.skip(str(error))
-    path = tmp_path / "walk.mp4"
-    # In a process of its own: MuJoCo chooses the renderer when it is imported.
-    command = [sys.executable, "-m", "gaitgauge.cli.main", "play", str(policy), "--terrain", "wave", "--level", "3"]
-    command += ["--out", str(path), "--seconds", "0.2"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert str(path) in done.stdout.replace("\n", "")
-    frames = imageio.imread(path, plugin="FFMPEG")
-    assert frames.shape == (5, 720, 1280, 3)
-    middle, sky = frames[2][200:550, 400:900], frames[2][:60]
-    assert middle.std() > 20, "no robot in the middle"
-    assert sky[..., 2].mean() > sky[..., 0].mean() + 20, "no blue sky"
-
-
 # ---- bad requests ---------------------------------------------------------------------------------------------------
 
 
@@ -351,6 +260,10 @@ def test_video_of_a_walk(policy, tmp_path, monkeypatch):
         (("standing.gauge.pt", "--viewer", "viser", "--friction", 0), ("--friction", "0")),
         (("standing.gauge.pt", "--viewer", "viser", "--seconds", 0), ("--seconds", "0")),
         (("standing.gauge.pt", "--viewer", "viser", "--backend", "mujoko"), ("'mujoko'", "mujoco")),
+        (("standing.gauge.pt",) * 2 + ("--viewer", "native"), ("one policy", "viser")),
+        (("standing.gauge.pt",) * 5 + ("--viewer", "viser"), ("5 policies", "at most 4")),
+        (("standing.gauge.pt", "--gif", "walk.avi"), ("--gif", ".gif or .webp")),
+        (("standing.gauge.pt", "--gif", "walk.gif", "--seconds", 300), ("300", "60")),
     ],
 )
 def test_bad_request(refused, policy, arguments, named):
@@ -368,9 +281,12 @@ def test_window_without_a_display(refused, policy, monkeypatch):
     assert "--out" in message
 
 
-def test_video_into_a_wrong_file(refused, policy, monkeypatch):
-    from gaitgauge.cli import play
-
-    monkeypatch.setattr(play, "choose_renderer", lambda: "egl")
+def test_video_into_a_wrong_file(refused, policy):
     assert ".mp4" in refused("play", policy, "--out", "walk.avi")
     assert "nowhere" in refused("play", policy, "--out", "nowhere/walk.mp4")
+
+
+def test_labels_differ():
+    assert labels(["pretrained", "runs/a/model_50.pt", "mine.gauge.pt"]) == ["pretrained", "model_50", "mine"]
+    assert labels(["runs/a/model_50.pt", "runs/b/model_50.pt"]) == ["a/model_50.pt", "b/model_50.pt"]
+    assert labels(["latest", "latest"]) == ["1: latest", "2: latest"]

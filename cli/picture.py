@@ -1,0 +1,149 @@
+"""Pictures without a display: MuJoCo's renderer off the screen, how much it may cost, and a camera that follows the robot."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import UserError
+
+RENDERERS = ("egl", "osmesa")
+"""Ways to draw without a display, the faster first; the value of MUJOCO_GL."""
+_ON_THE_CPU = ("llvmpipe", "softpipe", "swrast", "swiftshader")
+"""What drivers that draw without a GPU call themselves."""
+_PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 32, 32) as renderer:
+    renderer.update_scene(data)
+    assert renderer.render().max() > 0
+    from OpenGL import GL
+    print(GL.glGetString(GL.GL_RENDERER).decode())
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quality:
+    """What a picture may cost."""
+
+    size: tuple[int, int]
+    """Width and height of a picture of one robot [pixels]."""
+    tile: tuple[int, int]
+    """Width and height of each picture where several stand side by side [pixels]."""
+    samples: int
+    """Samples of each pixel, for smooth edges; 0 for one."""
+    shadow_pixels: int
+    """Width of the map of the sun's shadow [pixels]."""
+    shadow_reach: float
+    """How far from the robot there are shadows [m]."""
+    reflections: bool
+    """Whether the floor shines; everything is drawn twice then."""
+    slices: int
+    """Corners on the circumference of what is round."""
+    stacks: int
+    """Rings along the axis of what is round."""
+    field_nodes: int
+    """Nodes of a height field along each side, where so many show it as it is."""
+
+
+RICH = Quality(
+    size=(1280, 720),
+    tile=(640, 480),
+    samples=4,
+    shadow_pixels=4096,
+    shadow_reach=3.0,
+    reflections=True,
+    slices=28,
+    stacks=16,
+    field_nodes=1024,
+)
+"""For a GPU."""
+PLAIN = Quality(
+    size=(960, 540),
+    tile=(480, 360),
+    samples=0,
+    shadow_pixels=768,
+    shadow_reach=0.9,
+    reflections=False,
+    slices=16,
+    stacks=6,
+    field_nodes=64,
+)
+"""For a CPU that draws: a tenth of the time of ``RICH`` (``benchmarks/video_speed.py``)."""
+
+
+def choose_renderer() -> Quality:
+    """What can be drawn here; the way to do so is put into ``MUJOCO_GL``. Must be called before MuJoCo is imported.
+
+    Raises:
+        UserError: nothing draws.
+    """
+    asked = os.environ.get("MUJOCO_GL")
+    for name in (asked,) if asked else RENDERERS:
+        environment = {**os.environ, "MUJOCO_GL": name}
+        tried = subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True, check=False)
+        if tried.returncode == 0:
+            os.environ["MUJOCO_GL"] = name
+            driver = tried.stdout.decode(errors="replace").lower()
+            return PLAIN if name == "osmesa" or any(n in driver for n in _ON_THE_CPU) else RICH
+    named = f"MUJOCO_GL={asked} does not draw" if asked else "neither EGL nor OSMesa draws"
+    raise UserError(
+        f"videos need off-screen rendering, and {named} on this machine; install libegl1 and libgl1-mesa-dri, or "
+        "libosmesa6, or watch in a browser with --viewer viser"
+    )
+
+
+class Picture:
+    """Draws a robot on its ground from a camera that follows it smoothly."""
+
+    AZIMUTH = 55.0
+    """Direction in which the camera looks, against the robot's first heading [deg]."""
+    ELEVATION = -16.0
+    DISTANCE = 1.9
+    LAG = 0.25
+    """Time constant of the camera [s]."""
+
+    def __init__(self, model: object, *, size: tuple[int, int], heading: float) -> None:
+        """Prepare the renderer.
+
+        Args:
+            model: what ``scenery.visual_model`` made.
+            size: width and height of the picture [pixels].
+            heading: of the robot at the start [rad].
+        """
+        import mujoco
+
+        assert isinstance(model, mujoco.MjModel)
+        self._model, self._data = model, mujoco.MjData(model)
+        self._renderer = mujoco.Renderer(model, size[1], size[0])
+        self._camera = mujoco.MjvCamera()
+        self._camera.azimuth = np.degrees(heading) + self.AZIMUTH
+        self._camera.elevation, self._camera.distance = self.ELEVATION, self.DISTANCE
+        self._options = mujoco.MjvOption()
+        self._options.geomgroup[:] = 1
+        self._options.sitegroup[:] = 0
+        self._looks_at: np.ndarray | None = None
+
+    def draw(self, position: np.ndarray, seconds: float) -> np.ndarray:
+        """The picture of a pose (7 + J,), ``seconds`` after the one before; (height, width, 3) uint8."""
+        from .scenery import show
+
+        show(self._model, self._data, position)
+        target = position[:3] - np.array([0.0, 0.0, 0.06])
+        # A robot that was put back to the start is not followed on its way there.
+        if self._looks_at is None or np.linalg.norm(target - self._looks_at) > 1.5:
+            self._looks_at = target
+        self._looks_at = self._looks_at + (target - self._looks_at) * min(1.0, seconds / self.LAG)
+        self._camera.lookat[:] = self._looks_at
+        self._renderer.update_scene(self._data, self._camera, self._options)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._renderer.close()
