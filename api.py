@@ -94,12 +94,13 @@ def load_results(path: str | Path) -> Results:
     return found
 
 
-def load_policy(policy: str | Path, *, robot: str = "go2", trust: bool = False) -> Policy:
+def load_policy(policy: str | Path, *, robot: str | None = None, trust: bool = False) -> Policy:
     """Load a policy: own format, TorchScript, ONNX or an rsl_rl checkpoint.
 
     Args:
         policy: a file, or ``latest``, ``best`` or ``pretrained``.
-        robot: name of the robot, or the path of its ``robot.toml``; a foreign file gets its contract from it.
+        robot: name of the robot, or the path of its ``robot.toml``; a foreign file gets its contract from it, from the Go2 if
+            this is None.
         trust: run the program that a file of the project's own format carries inside.
 
     Raises:
@@ -108,7 +109,7 @@ def load_policy(policy: str | Path, *, robot: str = "go2", trust: bool = False) 
     from .policy.loading import load_policy as load
     from .robots import load_robot
 
-    return load(str(policy), load_robot(robot), trust=trust)
+    return load(str(policy), None if robot is None else load_robot(robot), trust=trust)
 
 
 def evaluate(
@@ -118,7 +119,7 @@ def evaluate(
     pipeline: str = "stress",
     backend: str = "mujoco",
     device: str | None = None,
-    robot: str = "go2",
+    robot: str | None = None,
     terrains: Sequence[str] = (),
     level: int | None = None,
     frictions: Sequence[float] = (),
@@ -138,7 +139,7 @@ def evaluate(
         pipeline: ``base``, ``multi``, ``level`` or ``stress``.
         backend: the physics engine.
         device: ``cpu`` or ``cuda``; None for what the engine is made for.
-        robot: name of the robot, or the path of its ``robot.toml``.
+        robot: name of the robot, or the path of its ``robot.toml``; None for the one that the policy is for.
         terrains: names; empty for the suite's own.
         level: to play at; None to search for the highest.
         frictions: coefficients; empty for the suite's own.

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.robots import load_robot
@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("destination", type=Path)
     arguments = parser.parse_args()
     with np.load(arguments.source) as archive:
-        contract = go2_contract(
+        contract = standard_contract(
             load_robot("go2"), provenance={"adapter": "published CTS weights", "file": arguments.source.name}
         )
         save_policy(arguments.destination, contract, read_network(archive))

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.cts import CTS
 from gaitgauge.training.algorithms.symmetry import build_mirror
@@ -58,7 +58,7 @@ def measure(settings: dict[str, Any], *, num_envs: int, steps: int, repeat: int,
         algorithm=AlgorithmConfiguration(**settings), run=RunConfiguration(steps_per_iteration=steps)
     )
     robot = load_robot("go2")
-    mirror = build_mirror(ObservationConfiguration(), contract=go2_contract(robot), robot=robot)
+    mirror = build_mirror(ObservationConfiguration(), contract=standard_contract(robot), robot=robot)
     groups = {name: torch.randn(num_envs, width, device=device) for name, width in WIDTHS.items()}
     observations = TensorDict(groups, batch_size=[num_envs])
     algorithm = CTS.build(observations, configuration, num_actions=robot.num_joints, mirror=mirror, device=device)

@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import PRETRAINED
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.robots import load_robot
@@ -51,7 +51,9 @@ GAIT: dict[str, Any] = {
 def make() -> tuple[Any, StoredNetwork]:
     """The policy's contract and network."""
     robot = load_robot("go2")
-    contract = go2_contract(robot, provenance={"made_by": "benchmarks/make_trot_policy.py", "kind": "hand-made trot"})
+    contract = standard_contract(
+        robot, provenance={"made_by": "benchmarks/make_trot_policy.py", "kind": "hand-made trot"}
+    )
     motors = robot.parameters[robot.default_parameters]
     arguments = {
         "default_joint_position": list(robot.default_joint_position),

@@ -24,7 +24,7 @@ from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.report import write_report
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.verify import tolerance_band
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import PRETRAINED
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
@@ -45,7 +45,7 @@ def make_policy(name: str, path: Path, cts: Path | None) -> None:
         assert cts is not None
         with np.load(cts) as archive:
             provenance = {"adapter": "published CTS weights", "file": cts.name}
-            contract = go2_contract(load_robot("go2"), provenance=provenance)
+            contract = standard_contract(load_robot("go2"), provenance=provenance)
             save_policy(path, contract, import_public_cts.read_network(archive))
 
 
@@ -55,7 +55,7 @@ def save_constant(path: Path, action: list[float], *, kind: str) -> None:
     state = {key: torch.zeros_like(value) for key, value in MlpNetwork(**arguments).state_dict().items()}
     last = [key for key, value in state.items() if value.shape == (12,)][-1]
     state[last] = torch.tensor(action)
-    contract = go2_contract(load_robot("go2"), provenance={"made_by": "benchmarks/score_cards.py", "kind": kind})
+    contract = standard_contract(load_robot("go2"), provenance={"made_by": "benchmarks/score_cards.py", "kind": kind})
     save_policy(path, contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=state))
 
 

@@ -16,6 +16,7 @@ from ..policy.export import (
     export_unitree,
     first_steps,
 )
+from ..policy.its_robot import robot_for
 from ..policy.loading import load_policy
 from ..robots import Robot, load_robot
 from .console import Terminal
@@ -55,7 +56,15 @@ _ABOUT = {
 LAYOUTS = ("plain", "unitree")
 
 
-def run_export(choice: str, *, out: Path | None, form: str, layout: str = "plain", trust: bool = False) -> None:
+def run_export(
+    choice: str,
+    *,
+    out: Path | None,
+    form: str,
+    layout: str = "plain",
+    trust: bool = False,
+    robot_name: str | None = None,
+) -> None:
     """Export, and print each file with its check against the policy.
 
     Raises:
@@ -71,8 +80,8 @@ def run_export(choice: str, *, out: Path | None, form: str, layout: str = "plain
     if layout == "unitree" and form != "all":
         raise UserError(f"--layout unitree always writes ONNX and deploy.yaml; leave out --format {form}")
     path = policy_file(choice)
-    policy = load_policy(path, trust=trust)
-    robot = load_robot(policy.contract.robot)
+    policy = load_policy(path, None if robot_name is None else load_robot(robot_name), trust=trust)
+    robot = robot_for(policy.contract, robot_name)
     # Beside the checkpoint of a run, where users of Isaac Lab look for it.
     folder = out or (path.parent if (path.parent / "run.json").is_file() else Path()) / (
         "unitree" if layout == "unitree" else "exported"

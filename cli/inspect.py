@@ -32,6 +32,7 @@ def import_file(
     raw: bool = False,
     trust: bool = False,
     contract: Path | None = None,
+    robot: str | None = None,
 ) -> None:
     """Write a foreign policy as the project's own file, and print the contract that it got.
 
@@ -43,6 +44,7 @@ def import_file(
         raw: with ``trainable``, the weights after the last update instead of their average.
         trust: run the program that a file of the project's own format carries inside.
         contract: a ``contract.toml`` that says how a TorchScript or ONNX file is to be run.
+        robot: name or path of the robot that the policy is for; None for what the file says, else the Go2.
 
     Raises:
         CheckpointError: ``trainable``, and the source is no training checkpoint.
@@ -66,7 +68,7 @@ def import_file(
     else:
         from ..policy.importing import carries_program, import_policy
 
-        stored = import_policy(source, destination, trust=trust, contract_file=contract)
+        stored = import_policy(source, destination, robot, trust=trust, contract_file=contract)
     console = Terminal()
     console.say(f"wrote {destination}")
     if not trainable and carries_program(destination):
@@ -76,6 +78,8 @@ def import_file(
 
 def contract_table(contract: PolicyContract) -> Table:
     """A policy contract for people."""
+    from ..policy.its_robot import REMEMBERED
+
     table = Table(show_header=False)
     table.add_column("field")
     table.add_column("value", overflow="fold")
@@ -95,7 +99,7 @@ def contract_table(contract: PolicyContract) -> Table:
         else f"{history.length} frames, {history.order}, starts with {history.start}",
         "observation width": str(contract.observation_width),
         "command limits": "forward {:g} m/s, sideways {:g} m/s, turning {:g} rad/s".format(*contract.command_limits),
-        "made from": ", ".join(f"{k} {v}" for k, v in contract.provenance.items()) or "unknown",
+        "made from": ", ".join(f"{k} {v}" for k, v in contract.provenance.items() if k != REMEMBERED) or "unknown",
         "contract hash": contract.hash,
     }
     for name, value in rows.items():

@@ -19,7 +19,9 @@ TrustOption = Annotated[
 SuiteOption = Annotated[str, typer.Option(help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.")]
 BackendOption = Annotated[str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.")]
 DeviceOption = Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")]
-RobotOption = Annotated[str, typer.Option(help="Robot name, or a robot.toml.")]
+RobotOption = Annotated[
+    str | None, typer.Option(help="Robot name, or a robot.toml. Default: the robot that the policy is for.")
+]
 TerrainsOption = Annotated[list[str] | None, typer.Option(help="Terrain; repeatable. Default: the suite's.")]
 LevelOption = Annotated[
     int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")

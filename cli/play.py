@@ -49,6 +49,7 @@ class PlayRequest:
     host: str
     gamepad: bool
     trust: bool
+    robot: str | None = None
 
 
 def run_play(asked: PlayRequest) -> None:
@@ -64,7 +65,9 @@ def run_play(asked: PlayRequest) -> None:
     from .worlds import WorldMaker, labels
 
     console = Terminal()
-    maker = WorldMaker(backend=asked.backend, device=asked.device, seed=asked.seed, trust=asked.trust)
+    maker = WorldMaker(
+        backend=asked.backend, device=asked.device, seed=asked.seed, trust=asked.trust, robot=asked.robot
+    )
     level = maker.default_level(asked.terrain) if asked.level is None else asked.level
     with ExitStack() as stack:
         sessions = []

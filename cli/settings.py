@@ -18,13 +18,13 @@ from .console import Terminal
 _WIDTH = 80
 
 
-def print_settings(task: str, overrides: Sequence[str]) -> None:
-    """Print the settings of a task, with some changed, group by group.
+def print_settings(task: str, overrides: Sequence[str], robot: str | None = None) -> None:
+    """Print the settings of a task, for a robot and with some changed, group by group.
 
     Raises:
         TaskError: no such task, or a key or value that does not fit.
     """
-    chosen = find_task(task, overrides)
+    chosen = find_task(task, overrides, robot=robot)
     console = Terminal()
 
     def say(text: str, indent: int, style: str = "") -> None:

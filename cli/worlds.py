@@ -8,6 +8,7 @@ from pathlib import Path
 from ..backends.registry import choose_device
 from ..gauge.suite import load_suite
 from ..policy.base import Policy
+from ..policy.its_robot import robot_for
 from ..policy.loading import load_policy
 from ..robots import load_robot
 from ..terrains.gauge_terrains import LEVELS
@@ -19,7 +20,7 @@ from .policies import policy_file
 class WorldMaker:
     """What all worlds of one command share. Policies are loaded once."""
 
-    def __init__(self, *, backend: str, device: str | None, seed: int, trust: bool) -> None:
+    def __init__(self, *, backend: str, device: str | None, seed: int, trust: bool, robot: str | None = None) -> None:
         """Choose an engine.
 
         Args:
@@ -27,12 +28,13 @@ class WorldMaker:
             device: where it computes, None for what it is made for.
             seed: of the heading at each start.
             trust: run the program that a policy file carries inside.
+            robot: name or path of the robot; None for the one that each policy is for.
 
         Raises:
             BackendError: no such engine or device.
         """
         self._backend, self._device = backend, choose_device(backend, device)
-        self._seed, self._trust = seed, trust
+        self._seed, self._trust, self._robot = seed, trust, robot
         self._suite = load_suite("gaitgauge-1")
         self._policies: dict[str, Policy] = {}
 
@@ -44,12 +46,13 @@ class WorldMaker:
         """
         ground = make_terrain(terrain, level)
         if choice not in self._policies:
-            self._policies[choice] = load_policy(policy_file(choice), trust=self._trust)
+            asked = None if self._robot is None else load_robot(self._robot)
+            self._policies[choice] = load_policy(policy_file(choice), asked, trust=self._trust)
         policy = self._policies[choice]
         settings = PlaySettings(
             backend=self._backend, device=self._device, friction=friction, seed=self._seed, suite=self._suite
         )
-        return PlaySession(policy, load_robot(policy.contract.robot), ground, settings, label)
+        return PlaySession(policy, robot_for(policy.contract, self._robot), ground, settings, label)
 
     @staticmethod
     def default_level(terrain: str) -> int | None:

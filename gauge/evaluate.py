@@ -24,8 +24,9 @@ from ..backends.registry import find_backend, make_backend
 from ..files.parsing import shown
 from ..files.provenance import plugins, provenance, versions
 from ..files.writing import json_text, write_atomically
-from ..policy.contract import check_robot, kind_of_observations
+from ..policy.contract import kind_of_observations
 from ..policy.digest import policy_digest
+from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import find_policy, load_policy
 from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
@@ -63,7 +64,8 @@ class Request:
     pipeline: str = "stress"
     backend: str = "mujoco"
     device: str = "cpu"
-    robot: str = "go2"
+    robot: str | None = None
+    """Name of a robot or path of its description; None for the one that the policy is for."""
     terrains: tuple[str, ...] = ()
     level: int | None = None
     frictions: tuple[float, ...] = ()
@@ -115,12 +117,6 @@ def prepare(request: Request) -> Prepared:
         SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError: one sentence on what is wrong.
     """
     suite = load_suite(request.suite)
-    robot = load_robot(request.robot)
-    if suite.parameters not in robot.parameters:
-        raise RobotError(
-            f"suite '{suite.name}' needs the joint parameters '{suite.parameters}', which robot '{robot.name}' lacks; "
-            f"it has {', '.join(sorted(robot.parameters))} (robot.toml)"
-        )
     find_backend(request.backend, request.device)
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:
@@ -151,8 +147,12 @@ def prepare(request: Request) -> Prepared:
     for name, environment in {e.terrain: e for e in environments}.items():
         highest = suite.scoring.levels if environment.level is None else environment.level
         check_terrain(suite, make_terrain(name, highest), searched=environment.searched)
-    policy = load_policy(request.policy, robot, trust=request.trust)
-    check_robot(policy.contract, robot)
+    robot, policy = _robot_and_policy(request)
+    if suite.parameters not in robot.parameters:
+        raise RobotError(
+            f"suite '{suite.name}' needs the joint parameters '{suite.parameters}', which robot '{robot.name}' lacks; "
+            f"it has {', '.join(sorted(robot.parameters))} (robot.toml)"
+        )
     if abs(policy.contract.control_period - suite.physics.control_period) > 1e-9:
         raise SuiteError(
             f"the policy was made for a control period of {policy.contract.control_period:g} s, suite '{suite.name}' runs "
@@ -166,6 +166,13 @@ def prepare(request: Request) -> Prepared:
         environments=tuple(environments),
         seeds=tuple(dict.fromkeys(seeds)),
     )
+
+
+def _robot_and_policy(request: Request) -> tuple[Robot, FilePolicy]:
+    """What is gauged, on which robot: foreign files take their contract from the robot that is asked for."""
+    asked = None if request.robot is None else load_robot(request.robot)
+    policy = load_policy(request.policy, asked, trust=request.trust)
+    return robot_for(policy.contract, request.robot), policy
 
 
 def _terrains(request: Request, suite: Suite) -> list[str]:
@@ -208,7 +215,7 @@ def identity(prepared: Prepared) -> dict[str, Any]:
         "pipeline": request.pipeline,
         "backend": request.backend,
         "device": torch.device(request.device).type,
-        "robot": request.robot,
+        "robot": request.robot or prepared.robot.name,
         "level": request.level,
         "environments": [e.key for e in prepared.environments],
         "seeds": list(prepared.seeds),
@@ -269,7 +276,7 @@ def evaluate(
             "file_sha256": file_digest(request.policy),
             "observations": [term.name for term in prepared.policy.contract.observation],
             "kind_of_observations": kind_of_observations(prepared.policy.contract),
-            "provenance": dict(prepared.policy.contract.provenance),
+            "provenance": without_copy(prepared.policy.contract.provenance),
         }
         results["coverage"] = coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline)
         results["pipeline"] = request.pipeline

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..robots import robot_names
 from ..robots.loading import robot_digest
 from .comparison import chance_rules_of, load_result
 from .evaluate import Prepared, Request, Status, evaluate, file_digest, prepare
@@ -74,7 +75,7 @@ def prepare_replay(
             suite=suite or wanted["name"],
             pipeline="level" if card["pipeline"] == "level" else "stress",
             backend=card["backend"],
-            robot=card["robot"],
+            robot=card["robot"] if card["robot"] in robot_names() else None,  # else the policy carries it
             device=device,
             seeds=tuple(card["chance"]["seeds"]),
             threads=threads,

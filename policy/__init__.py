@@ -3,7 +3,15 @@
 Only the contract is imported here, so that reading one does not wait for torch.
 """
 
-from .contract import ContractError, History, ObservationTerm, PolicyContract, check_robot, difference, go2_contract
+from .contract import (
+    ContractError,
+    History,
+    ObservationTerm,
+    PolicyContract,
+    check_robot,
+    difference,
+    standard_contract,
+)
 
 __all__ = [
     "ContractError",
@@ -12,5 +20,5 @@ __all__ = [
     "PolicyContract",
     "check_robot",
     "difference",
-    "go2_contract",
+    "standard_contract",
 ]

@@ -15,7 +15,7 @@ import torch
 from ..files.parsing import parse_toml, parse_yaml, read_text
 from ..robots.base import Robot
 from .base import PolicyError
-from .contract import ContractError, History, HistoryOrder, ObservationTerm, PolicyContract, go2_contract
+from .contract import ContractError, History, HistoryOrder, ObservationTerm, PolicyContract, standard_contract
 from .native import StoredNetwork
 
 # Observation terms as Isaac Lab and mjlab name them.
@@ -60,7 +60,7 @@ def described_contract(path: Path, robot: Robot) -> PolicyContract:
     source = f"contract file '{path}'"
     data = parse_toml(read_text(path, "contract file", PolicyError), source, PolicyError)
     provenance = {"adapter": "contract.toml", "file": path.name}
-    standard = go2_contract(robot, provenance=provenance).to_dict()
+    standard = standard_contract(robot, provenance=provenance).to_dict()
     try:
         return PolicyContract.from_dict({**standard, **data})
     except ContractError as error:
@@ -75,7 +75,7 @@ def contract_for_width(
     Raises:
         PolicyError: the width is not that of 1 to ``LONGEST_HISTORY`` frames.
     """
-    frame = go2_contract(robot).frame_width
+    frame = standard_contract(robot).frame_width
     frames, rest = divmod(width, frame)
     if rest or not 1 <= frames <= LONGEST_HISTORY:
         raise PolicyError(
@@ -84,7 +84,7 @@ def contract_for_width(
         )
     history = History(length=frames, order=order if frames > 1 else "frame-major")
     assumed = f"{frames} frame(s) of the standard observation of {frame} entries, {history.order}; gains of the robot"
-    return go2_contract(robot, history=history, provenance={**provenance, "assumed": assumed})
+    return standard_contract(robot, history=history, provenance={**provenance, "assumed": assumed})
 
 
 def assumptions(contract: PolicyContract) -> str | None:
@@ -353,7 +353,7 @@ def _checkpoint_network(
             f"(it has '{(strange or list(weights) or ['nothing'])[0]}')"
         )
     activation = _activation(path)
-    contract = go2_contract(
+    contract = standard_contract(
         robot, provenance={"adapter": "rsl_rl checkpoint", "assumed": f"standard observation, {activation}"}
     )
     frame = contract.frame_width

@@ -244,7 +244,7 @@ def _flat(contract: PolicyContract) -> dict[str, str]:
     return rows
 
 
-def go2_contract(
+def standard_contract(
     robot: Robot, *, history: History | None = None, provenance: Mapping[str, Any] | None = None
 ) -> PolicyContract:
     """The interface that the CTS family of policies for the Unitree Go2 shares (paper, section on observations).

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from ..robots import Robot
+from ..robots import load_robot
+from ..robots.identity import identify
 from .base import PolicyError
 from .contract import PolicyContract
+from .its_robot import REMEMBERED
 from .loading import LOG_ROOT, load_policy
 from .native import ForeignFile, load_entries, read_policy, save_policy
 
@@ -15,7 +17,7 @@ from .native import ForeignFile, load_entries, read_policy, save_policy
 def import_policy(
     source: str | Path,
     destination: str | Path,
-    robot: Robot | None = None,
+    robot: str | None = None,
     *,
     trust: bool = False,
     log_root: Path = LOG_ROOT,
@@ -29,7 +31,7 @@ def import_policy(
     Args:
         source: a file or name as in ``load_policy``.
         destination: the file to write; an existing file is replaced only once the source has been loaded.
-        robot: as in ``load_policy``.
+        robot: name or path of the robot, as in ``load_policy``; the file remembers it.
         trust: as in ``load_policy``; the imported file, if it carries a program, needs it in turn.
         log_root: as in ``load_policy``.
         contract_file: as in ``load_policy``.
@@ -41,10 +43,12 @@ def import_policy(
         PolicyError: the source cannot be loaded, or the destination cannot be written.
         ContractError: the policy is for another robot.
     """
-    policy = load_policy(source, robot, trust=trust, log_root=log_root, contract_file=contract_file)
-    contract = replace(
-        policy.contract, provenance={**policy.contract.provenance, "imported_from": Path(policy.path).name}
-    )
+    asked = None if robot is None else load_robot(robot)
+    policy = load_policy(source, asked, trust=trust, log_root=log_root, contract_file=contract_file)
+    provenance = {**policy.contract.provenance, "imported_from": Path(policy.path).name}
+    if asked is not None and robot is not None:
+        provenance[REMEMBERED] = identify(asked, robot)
+    contract = replace(policy.contract, provenance=provenance)
     try:
         save_policy(destination, contract, policy.stored)
     except OSError as error:

@@ -22,7 +22,7 @@ from .adapters import (
     sidecar_contract,
 )
 from .base import PolicyError
-from .contract import ContractError, PolicyContract, check_robot, go2_contract
+from .contract import ContractError, PolicyContract, check_robot, standard_contract
 from .fence.archive import archive_names, read_limited
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 from .rebuilt import rebuilt
@@ -194,7 +194,7 @@ def _torchscript_contract(child: Child, text: str, path: Path, source: str, robo
         contract = _stored_contract(text, source)
     if contract is not None:
         return contract
-    frame = go2_contract(robot).frame_width
+    frame = standard_contract(robot).frame_width
     width = program_width(child, [frame * n for n in range(1, LONGEST_HISTORY + 1)]) or frame
     provenance = {"adapter": "TorchScript", "file": path.name}
     return contract_for_width(width, robot, order="frame-major", provenance=provenance, source=source)
@@ -217,7 +217,7 @@ def _onnx_contract(child: Child, metadata: Mapping[str, str], path: Path, source
     contract = mjlab_contract(metadata, robot, source=source)
     if contract is not None:
         return contract
-    frame = go2_contract(robot).frame_width
+    frame = standard_contract(robot).frame_width
     provenance = {"adapter": "ONNX", "file": path.name}
     return contract_for_width(
         program_width(child) or frame, robot, order="term-major", provenance=provenance, source=source

@@ -33,7 +33,7 @@ _WIDTH = 50
 
 
 class TrotController(nn.Module):
-    """Trots, walks on the spot or stands, in the observation frame of ``go2_contract`` (45 entries)."""
+    """Trots, walks on the spot or stands, in the observation frame of ``standard_contract`` (45 entries)."""
 
     hips: torch.Tensor
     side: torch.Tensor

@@ -39,11 +39,16 @@ def load_robot(name_or_path: str | Path, *, check: bool = True) -> Robot:
             does not give a robot.
     """
     text = os.fspath(name_or_path)
-    given = isinstance(name_or_path, Path) or "/" in text or os.sep in text or text.endswith(".toml")
+    given = isinstance(name_or_path, Path) or is_path(text)
     robot = load_robot_file(text) if given else _named(text)
     if check:
         check_robot(robot, foreign=given)
     return robot
+
+
+def is_path(text: str) -> bool:
+    """Whether a text names a robot by a path: it contains a path separator or ends in ``.toml``."""
+    return "/" in text or os.sep in text or text.endswith(".toml")
 
 
 def _named(text: str) -> Robot:

@@ -19,8 +19,10 @@ from tensordict import TensorDict
 from ..backends.base import PhysicsBackend, ResetState, Scene
 from ..backends.registry import make_backend
 from ..backends.warp.graphs import WARM_UP, RecordedFunction
-from ..policy.contract import History, PolicyContract, go2_contract
+from ..policy.contract import History, PolicyContract, standard_contract
+from ..policy.its_robot import REMEMBERED
 from ..robots.base import JointParameters, Robot
+from ..robots.identity import identify
 from ..robots.registry import load_robot
 from .commands import largest_commands
 from .configuration import ConfigurationError
@@ -392,8 +394,11 @@ def training_contract(
     commands of the training.
     """
     tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
+    provenance = {REMEMBERED: identify(robot, configuration.robot)}
     return replace(
-        go2_contract(robot, history=History(start=configuration.observations.history_start)),
+        standard_contract(
+            robot, history=History(start=configuration.observations.history_start), provenance=provenance
+        ),
         command_limits=largest_commands(configuration.commands, [tile.command_limits for tile in tiles]),
         stiffness=parameters.stiffness,
         damping=parameters.damping,

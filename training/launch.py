@@ -18,6 +18,7 @@ from ..files.parsing import build, shown
 from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
 from ..policy.loading import find_policy
+from ..robots.registry import is_path
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .configuration import ConfigurationError, TrainingConfiguration, to_plain
@@ -65,6 +66,8 @@ class TrainRequest:
     """CPU threads of engines that use them."""
     num_envs: int | None = None
     """Worlds, in each process of a run on several GPUs."""
+    robot: str | None = None
+    """Name of a robot or path of its description, for which the task is scaled; None for the task's own."""
     seed: int | None = None
     iterations: int | None = None
     """Of the whole run, what a resumed run has done before included."""
@@ -124,8 +127,12 @@ def prepare(request: TrainRequest) -> TrainPlan:
         raise ConfigurationError(
             "--resume continues a run and --init-from begins a new one with its networks; give one of them"
         )
-    own = _own_overrides(request)
-    known, task = find_task(request.task), find_task(request.task, own)
+    if request.resume is not None and request.robot is not None:
+        raise ConfigurationError(
+            "a resumed run keeps its robot; leave --robot out, or begin a new run with --init-from"
+        )
+    own, robot = _own_overrides(request), _absolute(request.robot)
+    known, task = find_task(request.task), find_task(request.task, own, robot=robot)
     checkpoint, run, notice = None, None, ""
     if request.resume is not None:
         checkpoint = find_checkpoint(
@@ -152,7 +159,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
     else:
         backend = request.backend or DEFAULT_BACKEND
         begun = _going_on(task, _first_weights(request, task)) if request.init_from is not None else []
-        task = find_task(request.task, [*begun, *own])
+        task = find_task(request.task, [*begun, *own], robot=robot)
     check_logger(task.training.run.logger)
     device = _device(request.device, backend)
     if request.capture and not device.startswith("cuda"):
@@ -251,6 +258,11 @@ def _first_weights(request: TrainRequest, task: Task) -> Path:
     if request.init_from == "pretrained":
         return find_policy(request.init_from)
     return find_checkpoint(request.init_from, experiment=task.training.run.experiment, root=request.log_root)
+
+
+def _absolute(robot: str | None) -> str | None:
+    """A robot's name, or the absolute path of its description, which holds wherever a run is continued."""
+    return os.path.abspath(os.path.expanduser(robot)) if robot is not None and is_path(robot) else robot
 
 
 def _own_overrides(request: TrainRequest) -> list[str]:

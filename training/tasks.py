@@ -8,6 +8,8 @@ from difflib import get_close_matches
 from importlib import import_module
 from types import MappingProxyType
 
+from ..robots import load_robot
+from ..robots.loading import robot_digest
 from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
 from .environment_configuration import (
     FLAT_TILE,
@@ -22,6 +24,7 @@ from .environment_configuration import (
     TerrainConfiguration,
 )
 from .overrides import TaskError, apply_overrides
+from .scaling import renamed_run, scaled_environment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +48,22 @@ class Task:
         """
         settings = apply_overrides(_Settings(environment=self.environment, training=self.training), overrides)
         return replace(self, environment=settings.environment, training=settings.training)
+
+    def for_robot(self, source: str) -> Task:
+        """The task for another robot than its own, a name or the path of a description, scaled by its sizes.
+
+        Raises:
+            RobotError: it cannot be found, or is wrong.
+        """
+        own, robot = load_robot(self.environment.robot, check=False), load_robot(source)
+        if robot_digest(robot) == robot_digest(own):
+            return self
+        run = renamed_run(self.training.run, robot.name, own.name)
+        return replace(
+            self,
+            environment=scaled_environment(self.environment, source),
+            training=replace(self.training, run=run),
+        )
 
     def with_horizon(self) -> Task:
         """The task with schedules spread over exactly the run's own iterations."""
@@ -255,17 +274,19 @@ def task_names() -> list[str]:
     return list(TASKS)
 
 
-def find_task(name: str, overrides: Iterable[str] = ()) -> Task:
-    """A task, with settings changed.
+def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = None) -> Task:
+    """A task, for a robot, with settings changed.
 
     Schedules are spread over the run's iterations, unless ``environment.schedule.horizon_steps`` is set.
 
     Args:
         name: one of ``task_names()``, or ``module:attribute`` of a ``Task`` of one's own.
-        overrides: ``environment.…=value`` and ``training.…=value``.
+        overrides: ``environment.…=value`` and ``training.…=value``, which change what is scaled for the robot.
+        robot: name or path of a robot; None for the task's own.
 
     Raises:
         TaskError: unknown task, or a key or value that does not fit.
+        RobotError: the robot cannot be found, or is wrong.
     """
     if ":" in name:
         known = _own_task(name)
@@ -276,6 +297,10 @@ def find_task(name: str, overrides: Iterable[str] = ()) -> Task:
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise TaskError(f"unknown task '{name}'; {hint}the tasks are: {', '.join(TASKS)}")
     chosen = list(overrides)
+    if robot is not None:
+        if any(o.split("=", 1)[0].strip() == "environment.robot" for o in chosen):
+            raise TaskError(f"the robot is given twice, as '{robot}' and with environment.robot=; leave one out")
+        known = known.for_robot(robot)
     task = known.with_overrides(chosen)
     own_horizon = any(o.split("=", 1)[0].strip() == "environment.schedule.horizon_steps" for o in chosen)
     return task if own_horizon else task.with_horizon()

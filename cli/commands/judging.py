@@ -38,7 +38,7 @@ def evaluate(
     suite: SuiteOption = "gaitgauge-1",
     backend: BackendOption = "mujoco",
     device: DeviceOption = None,
-    robot: RobotOption = "go2",
+    robot: RobotOption = None,
     terrain: TerrainsOption = None,
     level: LevelOption = None,
     friction: FrictionsOption = None,
@@ -93,7 +93,7 @@ def compare(
     suite: SuiteOption = "gaitgauge-1",
     backend: BackendOption = "mujoco",
     device: DeviceOption = None,
-    robot: RobotOption = "go2",
+    robot: RobotOption = None,
     terrain: TerrainsOption = None,
     level: LevelOption = None,
     friction: FrictionsOption = None,
@@ -222,7 +222,7 @@ def consistency(
         str | None, typer.Option(help="cpu or cuda, for the engines that can use a GPU. Default: a GPU.")
     ] = None,
     suite: SuiteOption = "robogauge-1.1",
-    robot: RobotOption = "go2",
+    robot: RobotOption = None,
     terrain: TerrainsOption = None,
     friction: Annotated[
         list[float] | None,

@@ -32,6 +32,10 @@ def train(
     num_envs: Annotated[
         int | None, typer.Option(min=1, help="Parallel worlds, for each GPU. Default: the task's.")
     ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(help="Robot name, or a robot.toml; the task is scaled by its size. Default: the task's."),
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of everything random. Default: the task's.")] = None,
     iterations: Annotated[
         int | None, typer.Option(min=1, help="Updates of the whole run, resumed ones included. Default: the task's.")
@@ -90,7 +94,7 @@ def train(
     if list_settings:
         from ..settings import print_settings
 
-        print_settings(task, tuple(overrides or ()))
+        print_settings(task, tuple(overrides or ()), robot)
         return
     from ..train import run_training
 
@@ -100,6 +104,7 @@ def train(
         backend=backend,
         device=device,
         num_envs=num_envs,
+        robot=robot,
         seed=seed,
         iterations=iterations,
         time=time,

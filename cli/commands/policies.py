@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..errors import report_errors
-from ..options import BackendOption, DeviceOption, TrustOption
+from ..options import BackendOption, DeviceOption, RobotOption, TrustOption
 
 app = typer.Typer()
 
@@ -33,11 +33,12 @@ def export(
         ),
     ] = "plain",
     trust: TrustOption = False,
+    robot: RobotOption = None,
 ) -> None:
     """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it."""
     from ..export import run_export
 
-    run_export(policy, out=out, form=form, layout=layout, trust=trust)
+    run_export(policy, out=out, form=form, layout=layout, trust=trust, robot_name=robot)
 
 
 @app.command()
@@ -80,6 +81,7 @@ def play(
     ] = "127.0.0.1",
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
     trust: TrustOption = False,
+    robot: RobotOption = None,
 ) -> None:
     """Watch policies walk: in MuJoCo's viewer, in a browser, or in a video file without a display."""
     from ..play import PlayRequest, run_play
@@ -102,6 +104,7 @@ def play(
             host=host,
             gamepad=gamepad,
             trust=trust,
+            robot=robot,
         )
     )
 
@@ -125,8 +128,18 @@ def import_command(
     contract: Annotated[
         Path | None, typer.Option(help="A contract.toml that says how a TorchScript or ONNX file is to be run.")
     ] = None,
+    robot: Annotated[str | None, typer.Option(help="Robot name, or a robot.toml. Default: go2.")] = None,
 ) -> None:
     """Turn a foreign policy into the project's own file, with its contract."""
     from ..inspect import import_file
 
-    import_file(source, destination, force=force, trainable=trainable or raw, raw=raw, trust=trust, contract=contract)
+    import_file(
+        source,
+        destination,
+        force=force,
+        trainable=trainable or raw,
+        raw=raw,
+        trust=trust,
+        contract=contract,
+        robot=robot,
+    )

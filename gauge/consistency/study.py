@@ -54,7 +54,8 @@ class StudyRequest:
     device: str | None = None
     """Device of the engines that can use a GPU; None: a GPU, and engines made for one are left out where there is none."""
     suite: str = "robogauge-1.1"
-    robot: str = "go2"
+    robot: str | None = None
+    """Name or path; None for the one that the policies are for."""
     terrains: tuple[str, ...] = ()
     """Empty: all of the suite's."""
     levels: tuple[int, ...] = ()
@@ -180,6 +181,11 @@ def prepare_study(request: StudyRequest) -> _Prepared:
                 trust=request.trust,
             )
         )
+        if robot is not None and robot_digest(robot) != robot_digest(prepared_policy.robot):
+            raise ConsistencyError(
+                f"policy '{name}' is for robot '{prepared_policy.robot.name}', the others for '{robot.name}'; one study is of "
+                "one robot"
+            )
         robot = prepared_policy.robot
         policies.append((name, prepared_policy.policy))
     assert robot is not None
@@ -386,7 +392,7 @@ class _Policy:
             "pipeline": "consistency",
             "variant": variant.label,
             "device": torch.device(variant.device).type,
-            "robot": prepared.request.robot,
+            "robot": prepared.request.robot or prepared.robot.name,
             "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in prepared.cells],
             "seeds": list(prepared.seeds),
             "versions": versions(),

@@ -7,7 +7,7 @@ import torch
 from gaitgauge.cli.main import app
 from gaitgauge.cli.play_session import PlaySession
 from gaitgauge.cli.worlds import WorldMaker
-from gaitgauge.policy.contract import PolicyContract, go2_contract
+from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import load_robot
@@ -46,7 +46,7 @@ def refused(run: Callable[..., Result]) -> Callable[..., str]:
 
 @pytest.fixture(scope="session")
 def contract() -> PolicyContract:
-    return go2_contract(load_robot("go2"))
+    return standard_contract(load_robot("go2"))
 
 
 @pytest.fixture(scope="session")

@@ -254,7 +254,7 @@ def test_a_resumed_run_has_the_settings_of_its_checkpoint_whatever_the_task_says
     elsewhere = prepare(
         TrainRequest(task=name, backend="fake", device="cpu", overrides=("training.algorithm.clip=0.9",))
     )
-    monkeypatch.setattr(launch, "find_task", lambda *_: elsewhere.task)
+    monkeypatch.setattr(launch, "find_task", lambda *_, **__: elsewhere.task)
     resumed = prepare(TrainRequest(task=name, device="cpu", resume=str(path)))
     assert resumed.task.environment == made.task.environment
     assert resumed.task.training == made.task.training

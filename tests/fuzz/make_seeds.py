@@ -8,7 +8,7 @@ from pathlib import Path
 
 import onnx
 import torch
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.export import deploy_settings, stacked_contract
 from gaitgauge.policy.native import ForeignFile, StoredNetwork, save_policy
 from gaitgauge.policy.networks import CtsNetwork, MlpNetwork
@@ -44,7 +44,7 @@ def main() -> None:
 
     torch.manual_seed(0)
     robot = load_robot("go2")
-    contract = go2_contract(robot)
+    contract = standard_contract(robot)
 
     def place(name: str, file: str) -> Path:
         (SEEDS / name).mkdir(parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ from gaitgauge.gauge.episodes import Episode, Record
 from gaitgauge.gauge.rollout import Rollout
 from gaitgauge.gauge.suite import Goal, Suite, load_suite
 from gaitgauge.policy.base import Policy, PolicySession
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Pose, Terrain
 
@@ -25,7 +25,7 @@ class ScriptedPolicy(Policy):
     """Answers each observation on its own, entry by entry, and remembers what it was asked."""
 
     def __init__(self, act: Act | None = None) -> None:
-        self.contract = go2_contract(GO2)
+        self.contract = standard_contract(GO2)
         self.path = "scripted"
         self.act = act or (lambda observation: torch.zeros(len(observation), 12))
         self.seen: list[torch.Tensor] = []

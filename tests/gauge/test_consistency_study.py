@@ -18,7 +18,7 @@ from gaitgauge.gauge.consistency.page import render, verdict, write_page
 from gaitgauge.gauge.consistency.statistics import Estimate
 from gaitgauge.gauge.consistency.study import StudyRequest, study
 from gaitgauge.gauge.store import StoreError
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import load_robot
@@ -66,7 +66,9 @@ def request_of(tmp_path):
     arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
     zeros = {name: torch.zeros_like(value) for name, value in MlpNetwork(**arguments).state_dict().items()}
     policy = tmp_path / "standing <b>.gauge.pt"
-    save_policy(policy, go2_contract(GO2), StoredNetwork(architecture="mlp", arguments=arguments, state_dict=zeros))
+    save_policy(
+        policy, standard_contract(GO2), StoredNetwork(architecture="mlp", arguments=arguments, state_dict=zeros)
+    )
     suite = tmp_path / "tiny.toml"
     suite.write_text(SUITE)
     whole = StudyRequest(

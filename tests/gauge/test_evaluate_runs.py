@@ -26,7 +26,7 @@ from gaitgauge.gauge.evaluate import Request, identity, prepare
 from gaitgauge.gauge.store import RunFolder, StoreError
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.terrains.registry import TerrainError
@@ -101,7 +101,7 @@ def request_for(tmp_path, monkeypatch):
     network = MlpNetwork(**arguments)
     policy = tmp_path / "policy.gauge.pt"
     stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
-    save_policy(policy, go2_contract(GO2), stored)
+    save_policy(policy, standard_contract(GO2), stored)
     monkeypatch.setattr(evaluation, "_WATCH_INTERVAL", 0.0)
 
     def make(base="gaitgauge-1", **choices):
@@ -287,7 +287,9 @@ def test_a_damaged_episode_is_set_aside_and_played_again(request_for, tmp_path):
 
 
 def test_results_are_written_whatever_the_provenance_holds(request_for, tmp_path):
-    contract = replace(go2_contract(GO2), provenance={"note": float("nan"), "name": "\ud800", "[/x]": [float("inf")]})
+    contract = replace(
+        standard_contract(GO2), provenance={"note": float("nan"), "name": "\ud800", "[/x]": [float("inf")]}
+    )
     request = request_for()
     prepared = prepare(request)
     prepared.policy.contract = contract
@@ -342,7 +344,9 @@ def test_a_policy_that_answers_nonsense_leaves_what_was_finished(request_for, tm
     arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
     broken = {k: torch.full_like(v, torch.nan) for k, v in MlpNetwork(**arguments).state_dict().items()}
     save_policy(
-        request.policy, go2_contract(GO2), StoredNetwork(architecture="mlp", arguments=arguments, state_dict=broken)
+        request.policy,
+        standard_contract(GO2),
+        StoredNetwork(architecture="mlp", arguments=arguments, state_dict=broken),
     )
     with pytest.raises(
         PolicyError,
@@ -480,7 +484,7 @@ def test_an_error_in_a_process_is_the_runs_error(real_request, tmp_path):
     network = MlpNetwork(**arguments)
     network.network[-1].bias.data.fill_(float("nan"))
     stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
-    save_policy(Path(real_request.policy), go2_contract(GO2), stored)
+    save_policy(Path(real_request.policy), standard_contract(GO2), stored)
     with pytest.raises(PolicyError, match="returned nan"):
         evaluate(replace(real_request, threads=2), tmp_path / "run")
 

@@ -6,11 +6,11 @@ import pytest
 from gaitgauge.gauge.coverage import notes, score_label
 from gaitgauge.gauge.motors import gains_note, joint_parameters
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.policy.contract import ContractError, ObservationTerm, go2_contract, kind_of_observations
+from gaitgauge.policy.contract import ContractError, ObservationTerm, kind_of_observations, standard_contract
 from scripted_gauge import GO2
 
 OWN, REFERENCE = load_suite("gaitgauge-1"), load_suite("robogauge-1.1")
-USUAL = go2_contract(GO2)
+USUAL = standard_contract(GO2)
 STIFF = replace(USUAL, stiffness=(80.0,) * 12, damping=(5.0,) * 12)
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.base import PolicySession
-from gaitgauge.policy.contract import PolicyContract, go2_contract
+from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import CtsNetwork
 from gaitgauge.robots import Robot, load_robot
@@ -19,7 +19,7 @@ def go2() -> Robot:
 
 @pytest.fixture(scope="session")
 def contract(go2: Robot) -> PolicyContract:
-    return go2_contract(go2)
+    return standard_contract(go2)
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from gaitgauge.policy.contract import (
     PolicyContract,
     check_robot,
     difference,
-    go2_contract,
+    standard_contract,
 )
 from gaitgauge.robots import load_robot
 
@@ -18,7 +18,7 @@ GO2_HASH = "a39d917c21f5da0f009218783dcf44cabfcd6e01b12999d81604a0d806afa182"
 
 @pytest.fixture(scope="module")
 def contract() -> PolicyContract:
-    return go2_contract(load_robot("go2"))
+    return standard_contract(load_robot("go2"))
 
 
 def changed(contract: PolicyContract, **changes: object) -> dict:
@@ -33,7 +33,7 @@ def test_standard_contract_follows_the_published_interface(contract):
     assert contract.control_period == 0.02
     assert contract.command_limits == (2.0, 1.0, 2.0)
     assert contract.default_joint_position == (0.1, 0.8, -1.5, -0.1, 0.8, -1.5, 0.1, 1.0, -1.5, -0.1, 1.0, -1.5)
-    assert go2_contract(load_robot("go2"), history=History(length=5)).observation_width == 225
+    assert standard_contract(load_robot("go2"), history=History(length=5)).observation_width == 225
 
 
 def test_hash_is_stable(contract):

@@ -11,7 +11,7 @@ import yaml
 from gaitgauge.policy import export
 from gaitgauge.policy.adapters import deploy_contract
 from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.contract import History, PolicyContract, go2_contract
+from gaitgauge.policy.contract import History, PolicyContract, standard_contract
 from gaitgauge.policy.export import (
     ExportError,
     export_deploy,
@@ -61,13 +61,13 @@ def make_policy(kind: str, contract: PolicyContract | None = None) -> NativePoli
         network.mean.normal_()
         network.deviation.uniform_(0.5, 2.0)
     stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=network.state_dict())
-    contract = contract or go2_contract(load_robot("go2"), provenance={"run": "2026-01-01_00-00-00"})
+    contract = contract or standard_contract(load_robot("go2"), provenance={"run": "2026-01-01_00-00-00"})
     return NativePolicy(contract, stored, path=f"{kind}.pt")
 
 
 def starting_with(start: str) -> PolicyContract:
     provenance = {"run": "2026-01-01_00-00-00"}
-    return go2_contract(load_robot("go2"), history=History(start=start), provenance=provenance)
+    return standard_contract(load_robot("go2"), history=History(start=start), provenance=provenance)
 
 
 def test_a_history_that_starts_with_copies_of_the_first_frame(tmp_path):
@@ -159,7 +159,7 @@ def moe_onnx(tmp_path_factory):
     """An exporter's run takes seconds, so that the fast tests share one."""
     path = tmp_path_factory.mktemp("export") / "policy.onnx"
     third = 1.0 / 3.0
-    policy = make_policy("moe", replace(go2_contract(load_robot("go2")), action_scale=(third,) * 12))
+    policy = make_policy("moe", replace(standard_contract(load_robot("go2")), action_scale=(third,) * 12))
     assert export_onnx(policy, path) <= 1e-5
     return policy, path
 
@@ -239,14 +239,14 @@ def test_a_contract_file_says_how_a_file_is_run(moe_onnx, tmp_path):
     policy = import_policy(moe_onnx[1], tmp_path / "mine.gauge.pt", contract_file=tmp_path / "contract.toml")
     assert policy.history == History(length=5, order="frame-major-newest-first", start="repeat")
     assert policy.observation[0].name == "command" and policy.action_scale == (0.5,) * 12
-    assert policy.stiffness == go2_contract(load_robot("go2")).stiffness and "assumed" not in policy.provenance
+    assert policy.stiffness == standard_contract(load_robot("go2")).stiffness and "assumed" not in policy.provenance
     (tmp_path / "contract.toml").write_text("actionscale = 1")
     with pytest.raises(PolicyError, match="actionscale"):
         import_policy(moe_onnx[1], tmp_path / "mine.gauge.pt", contract_file=tmp_path / "contract.toml")
 
 
 def test_term_major_order():
-    contract = go2_contract(load_robot("go2"))
+    contract = standard_contract(load_robot("go2"))
     order = term_major_order(contract, 5)
     assert sorted(order.tolist()) == list(range(225))
     # Frame 0 begins the block of every term, the next frame follows within the block.
@@ -258,9 +258,9 @@ def test_deploy_file_says_what_the_contract_says(tmp_path):
     robot = load_robot("go2")
     stiffness = tuple(20.0 + i / 7.0 for i in range(12))
     terms = tuple(
-        replace(t, clip=100.0 if t.name == "joint_velocity" else None) for t in go2_contract(robot).observation
+        replace(t, clip=100.0 if t.name == "joint_velocity" else None) for t in standard_contract(robot).observation
     )
-    contract = replace(go2_contract(robot), stiffness=stiffness, observation=terms)
+    contract = replace(standard_contract(robot), stiffness=stiffness, observation=terms)
     policy = make_policy("moe", contract)
     export_deploy(policy, tmp_path / "deploy.yaml", robot)
     data = yaml.safe_load((tmp_path / "deploy.yaml").read_text())
@@ -274,9 +274,9 @@ def test_deploy_file_says_what_the_contract_says(tmp_path):
 def test_deploy_refuses_what_it_cannot_say(tmp_path):
     robot = load_robot("go2")
     terms = tuple(
-        replace(t, clip=(1.0, 2.0, 3.0)) if t.name == "command" else t for t in go2_contract(robot).observation
+        replace(t, clip=(1.0, 2.0, 3.0)) if t.name == "command" else t for t in standard_contract(robot).observation
     )
-    policy = make_policy("moe", replace(go2_contract(robot), observation=terms))
+    policy = make_policy("moe", replace(standard_contract(robot), observation=terms))
     with pytest.raises(ExportError, match="one clip for all entries"):
         export_deploy(policy, tmp_path / "deploy.yaml", robot)
     assert not list(tmp_path.iterdir())

@@ -13,7 +13,7 @@ from gaitgauge.cli.play_session import PlaySession, PlaySettings
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.adapters import deploy_contract
 from gaitgauge.policy.base import Policy, PolicySession
-from gaitgauge.policy.contract import History, ObservationTerm, go2_contract
+from gaitgauge.policy.contract import History, ObservationTerm, standard_contract
 from gaitgauge.policy.export import deploy_settings, export_deploy, export_unitree, first_steps, term_major_order
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy
@@ -106,9 +106,9 @@ def test_wide_clips_change_nothing(bundle, tmp_path):
 
 
 def test_clips_of_the_contract_stay():
-    terms = [ObservationTerm(name=t.name, scale=t.scale, clip=None) for t in go2_contract(ROBOT).observation]
+    terms = [ObservationTerm(name=t.name, scale=t.scale, clip=None) for t in standard_contract(ROBOT).observation]
     terms[4] = replace(terms[4], clip=5.0)
-    contract = replace(go2_contract(ROBOT), observation=tuple(terms), target_range=((-1.0, 2.0),) * 12)
+    contract = replace(standard_contract(ROBOT), observation=tuple(terms), target_range=((-1.0, 2.0),) * 12)
     settings = deploy_settings(contract, ROBOT, finite_clips=True)
     assert settings["actions"]["JointPositionAction"]["clip"] == [[-1.0, 2.0]] * 12
     assert settings["observations"]["joint_vel_rel"]["clip"] == [-5.0, 5.0]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.backends.base import PhysicsState
-from gaitgauge.policy.contract import ContractError, History, ObservationTerm, go2_contract
+from gaitgauge.policy.contract import ContractError, History, ObservationTerm, standard_contract
 from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.robots import load_robot
 from scipy.spatial.transform import Rotation
@@ -36,7 +36,7 @@ def make_inputs(seed: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def permuted_contract():
-    contract = go2_contract(ROBOT)
+    contract = standard_contract(ROBOT)
 
     def pick(values: tuple) -> tuple:
         return tuple(values[i] for i in SDK_ORDER)
@@ -51,7 +51,7 @@ def permuted_contract():
 
 def test_frame_has_the_published_order_and_scales():
     state, (command, action) = make_state(), make_inputs()
-    frame = ObservationBuilder(go2_contract(ROBOT), ROBOT, EPISODES).build(state, command, action)
+    frame = ObservationBuilder(standard_contract(ROBOT), ROBOT, EPISODES).build(state, command, action)
     assert frame.shape == (EPISODES, 45)
     assert frame.dtype == torch.float32
     down = Rotation.from_quat(state.base_quaternion_w, scalar_first=True).inv().apply([0, 0, -1.0])
@@ -67,12 +67,14 @@ def test_frame_has_the_published_order_and_scales():
 def test_upright_gravity_points_down():
     state, inputs = make_state(), make_inputs()
     state.base_quaternion_w[:] = torch.tensor([1.0, 0, 0, 0])
-    frame = ObservationBuilder(go2_contract(ROBOT), ROBOT, EPISODES).build(state, *inputs)
+    frame = ObservationBuilder(standard_contract(ROBOT), ROBOT, EPISODES).build(state, *inputs)
     assert torch.equal(frame[0, 3:6], torch.tensor([0.0, 0.0, -1.0]))
 
 
 def test_base_linear_velocity_is_in_the_body_frame():
-    contract = replace(go2_contract(ROBOT), observation=(ObservationTerm(name="base_linear_velocity_b", scale=(2.0,)),))
+    contract = replace(
+        standard_contract(ROBOT), observation=(ObservationTerm(name="base_linear_velocity_b", scale=(2.0,)),)
+    )
     state, inputs = make_state(), make_inputs()
     frame = ObservationBuilder(contract, ROBOT, EPISODES).build(state, *inputs)
     turn = Rotation.from_quat(state.base_quaternion_w, scalar_first=True)
@@ -81,7 +83,7 @@ def test_base_linear_velocity_is_in_the_body_frame():
 
 def test_noise_is_added_in_physical_units_before_scaling():
     state, inputs = make_state(), make_inputs()
-    builder = ObservationBuilder(go2_contract(ROBOT), ROBOT, EPISODES)
+    builder = ObservationBuilder(standard_contract(ROBOT), ROBOT, EPISODES)
     clean = builder.build(state, *inputs)
     noise = {
         "base_angular_velocity_b": torch.full((EPISODES, 3), 0.8),
@@ -98,7 +100,7 @@ def test_noise_is_added_in_physical_units_before_scaling():
 
 def test_joint_permutation_in_observation_noise_and_targets():
     state, inputs = make_state(), make_inputs()
-    straight = ObservationBuilder(go2_contract(ROBOT), ROBOT, EPISODES)
+    straight = ObservationBuilder(standard_contract(ROBOT), ROBOT, EPISODES)
     permuted = ObservationBuilder(permuted_contract(), ROBOT, EPISODES)
     noise = {"joint_position": torch.arange(12.0).expand(EPISODES, -1)}
     a, b = straight.build(state, *inputs, noise), permuted.build(state, *inputs, noise)
@@ -114,7 +116,7 @@ def test_joint_permutation_in_observation_noise_and_targets():
 def test_targets_clip_scale_and_offset():
     action = torch.full((EPISODES, 12), 4.0)
     default = torch.tensor(ROBOT.default_joint_position)
-    contract = go2_contract(ROBOT)
+    contract = standard_contract(ROBOT)
     np.testing.assert_allclose(ObservationBuilder(contract, ROBOT, EPISODES).targets(action)[0], default + 1.0)
     clipped = replace(contract, action_clip=2.0)
     np.testing.assert_allclose(ObservationBuilder(clipped, ROBOT, EPISODES).targets(-action)[0], default - 0.5)
@@ -130,7 +132,7 @@ def test_observation_clip_acts_after_scaling():
         ObservationTerm(name="joint_velocity", scale=(1.0,)),
         ObservationTerm(name="base_angular_velocity_b", scale=(10.0,), clip=(1.0, 2.0, 3.0)),
     )
-    contract = replace(go2_contract(ROBOT), observation=terms)
+    contract = replace(standard_contract(ROBOT), observation=terms)
     state, (_, action) = make_state(), make_inputs()
     state.base_angular_velocity_b[:] = -5.0
     frame = ObservationBuilder(contract, ROBOT, EPISODES).build(state, torch.full((EPISODES, 3), 1.0), action)
@@ -157,7 +159,7 @@ def frames_of(
 
 @pytest.mark.parametrize("start", ["zeros", "repeat"])
 def test_frame_major_history_oldest_first(start):
-    contract = go2_contract(ROBOT, history=History(length=3, order="frame-major", start=start))
+    contract = standard_contract(ROBOT, history=History(length=3, order="frame-major", start=start))
     observations, frames = frames_of(contract, 4)
     first = torch.zeros_like(frames[0]) if start == "zeros" else frames[0]
     assert torch.equal(observations[0], torch.cat([first, first, frames[0]], dim=1))
@@ -166,13 +168,13 @@ def test_frame_major_history_oldest_first(start):
 
 
 def test_newest_first_history():
-    contract = go2_contract(ROBOT, history=History(length=3, order="frame-major-newest-first"))
+    contract = standard_contract(ROBOT, history=History(length=3, order="frame-major-newest-first"))
     observations, frames = frames_of(contract, 3)
     assert torch.equal(observations[2], torch.cat(frames[::-1], dim=1))
 
 
 def test_term_major_history():
-    contract = go2_contract(ROBOT, history=History(length=3, order="term-major"))
+    contract = standard_contract(ROBOT, history=History(length=3, order="term-major"))
     observations, frames = frames_of(contract, 3)
     blocks = [
         torch.cat([f[:, a:b] for f in frames], dim=1) for a, b in ((0, 3), (3, 6), (6, 9), (9, 21), (21, 33), (33, 45))
@@ -182,7 +184,7 @@ def test_term_major_history():
 
 @pytest.mark.parametrize("start", ["zeros", "repeat"])
 def test_reset_forgets_single_rows(start):
-    contract = go2_contract(ROBOT, history=History(length=3, start=start))
+    contract = standard_contract(ROBOT, history=History(length=3, start=start))
     observations, frames = frames_of(contract, 4, reset_row_before=3)
     undisturbed, _ = frames_of(contract, 4)
     others = torch.arange(EPISODES) != 1
@@ -192,7 +194,7 @@ def test_reset_forgets_single_rows(start):
 
 
 def test_rows_are_independent():
-    contract = go2_contract(ROBOT, history=History(length=3))
+    contract = standard_contract(ROBOT, history=History(length=3))
     state, (command, action) = make_state(), make_inputs()
     clean = ObservationBuilder(contract, ROBOT, EPISODES).build(state, command, action)
     state.joint_position[2] = float("nan")
@@ -203,7 +205,7 @@ def test_rows_are_independent():
 
 
 def test_other_robots_joints_are_refused():
-    contract = go2_contract(ROBOT)
+    contract = standard_contract(ROBOT)
     renamed = replace(contract, joint_names=("tail", *contract.joint_names[1:]))
     with pytest.raises(ContractError, match="tail"):
         ObservationBuilder(renamed, ROBOT, EPISODES)

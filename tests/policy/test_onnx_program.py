@@ -8,7 +8,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from gaitgauge.policy.contract import History, go2_contract
+from gaitgauge.policy.contract import History, standard_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.onnx_program import onnx_program
 from gaitgauge.policy.program import NotUnderstoodError, ProgramSession
@@ -45,7 +45,7 @@ def compare(data: bytes, width: int, contract) -> None:
 
 @pytest.fixture(scope="module")
 def stacked(go2):
-    return go2_contract(go2, history=History(length=5, order="term-major"))
+    return standard_contract(go2, history=History(length=5, order="term-major"))
 
 
 class Mixture(nn.Module):

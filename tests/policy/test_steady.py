@@ -3,7 +3,7 @@
 import pytest
 import torch
 from gaitgauge.policy.base import Policy, PolicySession, RowwiseSession
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.export import export_onnx, export_torchscript
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
@@ -21,7 +21,7 @@ def tiny(tmp_path):
     torch.manual_seed(0)
     arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8], "history_length": 3}
     stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=MlpNetwork(**arguments).state_dict())
-    save_policy(tmp_path / "tiny.gauge.pt", go2_contract(ROBOT), stored)
+    save_policy(tmp_path / "tiny.gauge.pt", standard_contract(ROBOT), stored)
     return load_policy(str(tmp_path / "tiny.gauge.pt"), ROBOT)
 
 

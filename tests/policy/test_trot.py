@@ -5,7 +5,7 @@ import pytest
 import torch
 from gaitgauge.backends import Scene, make_backend
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import NativePolicy, save_policy
 from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.policy.trot import TrotController
@@ -85,7 +85,7 @@ def test_walks_as_told_despite_noise_and_latency(go2):
     backend = make_backend("mujoco", scene, threads=1)
     policy = NativePolicy(*make_trot_policy.make(), path="trot")
     session = policy.session(count)
-    builder = ObservationBuilder(go2_contract(go2), go2, count)
+    builder = ObservationBuilder(standard_contract(go2), go2, count)
     action, generator = torch.zeros(count, 12), torch.Generator().manual_seed(3)
     total, fallen = torch.zeros(count, 3), torch.zeros(count, dtype=torch.bool)
     for step in range(150):

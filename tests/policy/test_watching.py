@@ -1,7 +1,7 @@
 import pytest
 import torch
 from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork
 from gaitgauge.policy.networks import ARCHITECTURES
@@ -13,7 +13,7 @@ def policy_of(architecture: str, **arguments: object) -> NativePolicy:
     torch.manual_seed(0)
     network = ARCHITECTURES[architecture](**arguments)
     stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=network.state_dict())
-    return NativePolicy(go2_contract(load_robot("go2")), stored, path=architecture)
+    return NativePolicy(standard_contract(load_robot("go2")), stored, path=architecture)
 
 
 def test_a_watched_policy_acts_as_ever_and_shows_latent_and_weights():

@@ -9,48 +9,11 @@ from gaitgauge.backends.base import TRAINING_PHYSICS, Scene
 from gaitgauge.backends.mujoco.model import build_models
 from gaitgauge.gauge.metrics import MetricEvaluator
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.robots import JointParameters, Robot, RobotError, check_robot, load_robot
+from gaitgauge.robots import RobotError, check_robot, load_robot
 from gaitgauge.robots.body_plan import body_plan, mirror_image
 from gaitgauge.robots.loading import robot_digest
 from gaitgauge.terrains.registry import make_terrain
-from unseen_robot import LEGS, LOWER, MASS, UPPER, write_unseen
-
-
-@pytest.fixture(scope="module")
-def unseen(tmp_path_factory):
-    """The unseen robot with its knees bent by 1 rad: forwards in front, backwards behind; joints legs last."""
-    mjcf = write_unseen(tmp_path_factory.mktemp("unseen"))
-    kinds = ("bend", "spread", "swing")
-    pose = {
-        "bend": lambda leg: leg[1] * leg[5] * 1.0,
-        "swing": lambda leg: -leg[1] * leg[4] * 0.5,
-        "spread": lambda _: 0.0,
-    }
-    same = (1.0,) * 12
-    motors = JointParameters(
-        stiffness=(60.0,) * 12,
-        damping=same,
-        torque_limit=(60.0,) * 12,
-        armature=(0.02,) * 12,
-        joint_damping=same,
-        friction_loss=same,
-    )
-    return Robot(
-        name="unseen",
-        title="Unseen",
-        mjcf=mjcf,
-        joint_names=tuple(f"{kind}.{leg[0]}" for kind in kinds for leg in LEGS),
-        default_joint_position=tuple(pose[kind](leg) for kind in kinds for leg in LEGS),
-        base_body="corpus",
-        foot_names=tuple(leg[0] for leg in LEGS),
-        foot_shapes=tuple(f"sole of {leg[0]}" for leg in LEGS),
-        collision_bodies=("corpus", *(f"femur.{leg[0]}" for leg in LEGS)),
-        trunk_shapes=("shell",),
-        stand_height=0.6,
-        default_parameters="gauge",
-        parameters={"gauge": motors},
-        command_limits=(1.5, 0.7, 1.5),
-    )
+from unseen_robot import LEGS, LOWER, MASS, UPPER
 
 
 def test_the_unseen_robot_is_sound(unseen):

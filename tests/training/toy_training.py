@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from gaitgauge.policy.contract import PolicyContract, go2_contract
+from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.symmetry import Mirror, build_mirror
 from gaitgauge.training.configuration import (
@@ -86,7 +86,7 @@ class ToyEnv(VecEnv):
 
 
 def toy_contract() -> PolicyContract:
-    return go2_contract(load_robot("go2"))
+    return standard_contract(load_robot("go2"))
 
 
 def toy_mirror() -> Mirror:
