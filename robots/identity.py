@@ -139,7 +139,8 @@ def _unpacked(known: RobotIdentity) -> Robot:
             raise
         raise RobotError(f"{source} cannot be unpacked: {one_line(error)}") from error
     mjcf = folder / str(known.description.get("mjcf"))
-    stray = [path for path in [mjcf, *model_files(mjcf)] if not path.resolve().is_relative_to(folder)]
+    own = mjcf.resolve().is_relative_to(folder)
+    stray = [path for path in (model_files(mjcf) if own else [mjcf]) if not path.resolve().is_relative_to(folder)]
     if stray:
         raise RobotError(f"{source} names the file '{one_line(stray[0])}', which is none of its own")
     robot = build(Robot, {**known.description, "mjcf": str(mjcf)}, source, RobotError)
