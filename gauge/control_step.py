@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import torch
 
-from ..backends.base import PhysicsBackend, ResetState
+from ..backends.base import BackendError, PhysicsBackend, ResetState, unsupported
 from ..policy.base import Policy
 from ..policy.observation import ObservationBuilder
 from ..policy.steady import steady_session
@@ -55,7 +55,15 @@ class ControlStep:
             backend: the worlds.
             early_outs: whether values may be read during a step; without, nothing in it waits for the device.
             capture: whether to capture steps as CUDA graphs (a CUDA device, and no early outs).
+
+        Raises:
+            BackendError: the engine cannot push robots, and the suite does.
         """
+        if suite.push is not None and unsupported(["external_force"], backend.capabilities()):
+            raise BackendError(
+                f"suite '{suite.name}' pushes robots, and engine '{backend.name}' knows no external force; choose another engine "
+                "(--backend), or a suite with push = false"
+            )
         self.suite, self.backend, self.early_outs = suite, backend, early_outs
         scene, count = backend.scene, backend.num_worlds
         self.robot, self._substeps = scene.robot, scene.physics.substeps

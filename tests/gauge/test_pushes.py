@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gaitgauge.backends.base import BackendError, Capability, Support
 from gaitgauge.gauge.pushes import push_force, push_steps, sideways
 from gaitgauge.gauge.segments import Segment
 from gaitgauge.gauge.suite import Push, load_suite
@@ -87,3 +88,12 @@ def test_the_own_suite_pushes_as_the_papers_trials_did():
     # 2.5 s into 5 s of a command, for 0.2 s
     assert push_steps(load_suite("gaitgauge-1")) == (126, 136)
     assert load_suite("robogauge-1.1").push is None
+
+
+def test_an_engine_that_cannot_push_is_refused_in_one_sentence(monkeypatch):
+    able = Pushed.capabilities()
+    unable = {**able, "external_force": Capability(support=Support.NONE)}
+    monkeypatch.setattr(Pushed, "capabilities", classmethod(lambda cls: unable))
+    with pytest.raises(BackendError, match="suite 'gaitgauge-1' pushes robots, and engine 'fake' knows no external"):
+        pushed(MAXIMUM)
+    assert pushed(MAXIMUM, suite=replace(short_suite("gaitgauge-1"), push=None))
