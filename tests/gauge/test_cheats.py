@@ -9,7 +9,7 @@ import pytest
 from gaitgauge.gauge.board import board_data
 from gaitgauge.gauge.coverage import notes, score_label
 from gaitgauge.gauge.evaluate import Request, evaluate
-from gaitgauge.policy.contract import ObservationTerm, go2_contract
+from gaitgauge.policy.contract import ObservationTerm, standard_contract
 from gaitgauge.policy.loading import PRETRAINED
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
@@ -78,7 +78,7 @@ def test_one_action_for_everything_scores_far_below_walking(moment, name):
 def test_a_policy_that_knows_what_no_robot_knows_has_no_plain_score(folder):
     """Base linear velocity is noisy, and the score is called what it is wherever it stands."""
     arguments = {"frame_width": 48, "num_actions": 12, "hidden": [1]}
-    contract = go2_contract(GO2)
+    contract = standard_contract(GO2)
     terms = (ObservationTerm(name="base_linear_velocity_b", scale=(2.0,)), *contract.observation)
     network = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=MlpNetwork(**arguments).state_dict())
     save_policy(folder / "told.gauge.pt", replace(contract, observation=terms), network)
