@@ -67,7 +67,7 @@ def texts(readout: Readout) -> tuple[str, str]:
     lines = [
         (name, "  ".join(f"{value} {of}" for value, of in zip(values, head[1:], strict=True))) for name, *values in rows
     ]
-    lines += [(readout.label, readout.place), ("", summary(readout).replace("  ·  ", ", ").replace(" × ", " times "))]
+    lines += [(readout.label, readout.place), ("", summary(readout).replace("  ·  ", ", "))]
     return "\n".join(name for name, _ in lines), "\n".join(text for _, text in lines)
 
 

@@ -27,7 +27,8 @@ def table(readout: Readout) -> list[tuple[str, str, str, str]]:
 def summary(readout: Readout) -> str:
     """Everything else in one line."""
     falls = "1 fall" if readout.falls == 1 else f"{readout.falls} falls"
-    arrivals = f"  ·  {readout.arrivals} × at the target" if readout.arrivals else ""
+    times = "once" if readout.arrivals == 1 else f"{readout.arrivals} times"
+    arrivals = f"  ·  {times} at the target" if readout.arrivals else ""
     return f"friction {readout.friction:g}  ·  {falls}{arrivals}  ·  {readout.time:.1f} s"
 
 
@@ -56,7 +57,7 @@ def annotate(picture: np.ndarray, readouts: Sequence[Readout]) -> np.ndarray:
 
 
 def _panel(image: Image.Image, left: int, width: int, points: int, readout: Readout) -> None:
-    """Draw one robot's panel into the lower left corner of its tile."""
+    """Draw one robot's panel into the upper left corner of its tile."""
     font = ImageFont.load_default(size=points)
     line, pad, margin = round(1.35 * points), round(0.6 * points), round(0.5 * points)
     rows = table(readout)
@@ -68,7 +69,7 @@ def _panel(image: Image.Image, left: int, width: int, points: int, readout: Read
     last = _fitting(summary(readout), font, width - 2 * (margin + pad))
     widest = max(ends[-1], font.getlength(title), font.getlength(last))
     box_width, box_height = round(widest) + 2 * pad, line * (len(rows) + 2) + 2 * pad
-    x, y = left + margin, image.height - margin - box_height
+    x, y = left + margin, margin
     region = (x, y, x + box_width, y + box_height)
     behind = image.crop(region)
     image.paste(Image.blend(behind, Image.new("RGB", behind.size, _DARK), _SHARE), region)

@@ -68,8 +68,8 @@ PLAIN = Quality(
     size=(960, 540),
     tile=(480, 360),
     samples=0,
-    shadow_pixels=768,
-    shadow_reach=0.9,
+    shadow_pixels=1024,
+    shadow_reach=2.5,
     reflections=False,
     slices=16,
     stacks=6,
@@ -106,6 +106,8 @@ class Picture:
     """Direction in which the camera looks, against the robot's first heading [deg]."""
     ELEVATION = -16.0
     DISTANCE = 1.9
+    ABOVE = 0.06
+    """How far above the base it looks, which leaves room for words above the robot [m]."""
     LAG = 0.25
     """Time constant of the camera [s]."""
 
@@ -135,7 +137,7 @@ class Picture:
         from .scenery import show
 
         show(self._model, self._data, position)
-        target = position[:3] - np.array([0.0, 0.0, 0.06])
+        target = position[:3] + np.array([0.0, 0.0, self.ABOVE])
         # A robot that was put back to the start is not followed on its way there.
         if self._looks_at is None or np.linalg.norm(target - self._looks_at) > 1.5:
             self._looks_at = target

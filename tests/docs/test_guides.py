@@ -79,6 +79,15 @@ def test_every_command_that_is_shown_exists_with_these_options(page, words):
     command.make_context("gaitgauge", list(words))
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_pictures_that_pages_show_are_there_and_small(page):
+    """README showed a picture that nobody had made."""
+    for target in re.findall(r"!\[[^]]*\]\((?!https?:)([^)]+)\)", page.read_text(encoding="utf-8")):
+        picture = page.parent / target
+        assert picture.is_file(), f"{page.name} shows {target}"
+        assert picture.stat().st_size <= 3_000_000
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in PAGES if any(b.mark for b in blocks(p))], ids=lambda p: p.name)
 def test_marked_blocks_run(page, tmp_path):
