@@ -17,6 +17,8 @@ class WatchedNetwork:
     """What the actor was given of the history, (N, L); None where there is no encoder."""
     weights: torch.Tensor | None = None
     """The gate's weights, (N, K); None where there are no experts."""
+    history: torch.Tensor
+    """What it was given, (N, H, F)."""
 
     def __init__(self, network: Any) -> None:
         """Watch a network that has ``encode`` and no memory of its own."""
@@ -25,6 +27,7 @@ class WatchedNetwork:
 
     def __call__(self, history: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for ``history`` (N, H, F)."""
+        self.history = history
         self.latent, self.weights = self._network.encode(history)
         action: torch.Tensor = self._network(history)
         return action

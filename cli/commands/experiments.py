@@ -1,4 +1,4 @@
-"""Commands of the paper's experiments beside the score: trial."""
+"""Commands of the paper's experiments beside the score: trial, latent."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..errors import report_errors
-from ..options import DeviceOption, RobotOption, ThreadsOption, TrustOption
+from ..options import DeviceOption, RobotOption, SuiteOption, ThreadsOption, TrustOption
 
 app = typer.Typer()
 
@@ -54,6 +54,48 @@ def trial(
         seed=seed,
         backend=backend,
         device=device,
+        robot=robot,
+        threads=threads,
+        out=out,
+        json_output=json_output,
+        trust=trust,
+    )
+
+
+@app.command()
+@report_errors
+def latent(
+    policies: PoliciesArgument,
+    terrain: Annotated[list[str] | None, typer.Option(help="Terrain; repeatable. Default: the gauge's seven.")] = None,
+    level: Annotated[int, typer.Option(min=1, help="Level of the terrains that have levels.")] = 5,
+    friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.8,
+    suite: SuiteOption = "gaitgauge-1",
+    seconds: Annotated[float, typer.Option(min=0.2, max=60.0, help="How long every robot walks [s].")] = 5.0,
+    robots: Annotated[
+        int,
+        typer.Option(min=2, max=1000, help="Robots for each terrain and command; the probe is tried on each in turn."),
+    ] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first robots; the others' follow it.")] = 0,
+    backend: EngineOption = "mujoco",
+    robot: RobotOption = "go2",
+    threads: ThreadsOption = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder. Default: results/latent-<policies>.")] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print latent.json instead of tables.")] = False,
+    trust: TrustOption = False,
+) -> None:
+    """Look into policies: how well terrains and commands separate in the encoder's latent and in the experts' weights."""
+    from ..latent import run_latent
+
+    run_latent(
+        policies=policies,
+        terrains=tuple(terrain or ()),
+        level=level,
+        friction=friction,
+        suite=suite,
+        seconds=seconds,
+        robots=robots,
+        seed=seed,
+        backend=backend,
         robot=robot,
         threads=threads,
         out=out,

@@ -1,0 +1,78 @@
+"""``gaitgauge latent``: how well terrains and commands can be told apart inside policies, in numbers and pictures."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from ..gauge.latent.figures import label
+from ..gauge.latent.study import PAIRS, LatentRequest, study_latents
+from .console import Terminal, make_table
+from .errors import UserError
+from .policies import policy_file
+from .progress import ProgressDisplay
+
+_SPACES = {"latent": "latent", "experts": "experts' weights", "input": "the network's input"}
+
+
+def run_latent(
+    *, policies: Sequence[str], threads: int | None, out: Path | None, json_output: bool, **choices: Any
+) -> None:
+    """Walk, look, print tables and where the files are; exit code 1 where something was left out."""
+    request = LatentRequest(
+        policies=tuple(str(policy_file(p)) if Path(p).is_dir() else p for p in policies),
+        threads=threads or os.cpu_count() or 1,
+        **choices,
+    )
+    names = "-".join(Path(p).name.partition(".")[0] for p in policies[:3])
+    folder = out or Path("results") / f"latent-{names}"
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"'{folder}' is a file; give another folder with --out")
+    errors = Terminal(stderr=True)
+    with ProgressDisplay(errors, "looking") as display:
+        results = study_latents(
+            request,
+            folder,
+            command=["gaitgauge", *sys.argv[1:]],
+            watch=lambda turn, turns, name: display.update((turn - 1) / turns, f"{turn} of {turns}: {name}"),
+        )
+    if json_output:
+        print(json.dumps(results, indent=1))
+    else:
+        console = Terminal()
+        print_latents(console, results)
+        console.say(f"results  {folder / 'latent.json'}\npage     {folder / 'latent.html'}")
+    for refused in results["refused"]:
+        errors.say(f"{refused['what']} was left out: {refused['reason']}")
+    if results["refused"]:
+        raise typer.Exit(1)
+
+
+def print_latents(console: Terminal, results: Mapping[str, Any]) -> None:
+    """A table for terrains and one for commands, then a sentence on the experts of each policy."""
+    for pair, words in PAIRS.items():
+        columns = ("policy", "of what", "silhouette", "probe", "guessing", *map(label, results[pair]))
+        table = make_table(f"{pair} told apart: {words}", *columns, numbers=True)
+        table.columns[1].justify = "left"
+        for entry in results["policies"]:
+            for space, name in _SPACES.items():
+                if (found := entry[pair].get(space)) is not None:
+                    numbers = (found["silhouette"], found["probe"], found["chance"], *found["recall"].values())
+                    table.add_row(entry["label"], name, *(f"{n:.2f}" for n in numbers))
+        console.print(table)
+    for entry in results["policies"]:
+        if (experts := entry["experts"]) is not None:
+            count = len(next(iter(experts["terrains"].values())))
+            console.say(
+                f"{entry['label']}: {experts['at_once']:.1f} of {count} experts count at once, {experts['in_all']:.1f} in all"
+            )
+        if entry["falls"]:
+            console.say(
+                f"{entry['label']}: {entry['falls']} of {entry['walkers']} robots fell, and were not watched further"
+            )

@@ -1,0 +1,174 @@
+"""Robots of one policy on every terrain and with every command, and what their encoder and experts said meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...backends.base import PhysicsBackend, Randomization, Scene
+from ...backends.registry import make_backend
+from ...policy.base import Policy
+from ...policy.watching import watched_session
+from ...robots import Robot
+from ...robots.rotation import from_yaw, tilt
+from ...terrains.base import Terrain
+from ..episodes import Episode
+from ..suite import Suite
+from ..walking import Walk
+
+COMMANDS = {
+    "forward": (1.0, 0.0, 0.0),
+    "backward": (-1.0, 0.0, 0.0),
+    "left turn": (0.0, 0.0, 1.0),
+    "right turn": (0.0, 0.0, -1.0),
+}
+"""The paper's commands as multiples of ``Walks.speed`` and ``Walks.turn``."""
+SETTLING = 1.0
+"""Time for which robots stand before anything is noted [s]."""
+INTERVAL = 0.1
+"""Time between two notes [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walks:
+    """What is walked."""
+
+    suite: Suite
+    """Gives physics, sensor noise and latency."""
+    terrains: tuple[Terrain, ...]
+    friction: float = 0.8
+    seconds: float = 5.0
+    """How long each robot walks, and is watched [s]."""
+    speed: float = 0.8
+    """Commanded forward and backward [m/s]."""
+    turn: float = 1.0
+    """Commanded turning speed [rad/s]."""
+    robots: int = 6
+    """Robots for each terrain and command; they differ in noise and latency."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Notes:
+    """What was noted, a row for each robot and moment; robots that have fallen are not watched any longer."""
+
+    latent: NDArray[np.float64] | None
+    """What the actor was given of the history, (N, L); None without an encoder."""
+    weights: NDArray[np.float64] | None
+    """The experts' weights, (N, K); None without experts."""
+    history: NDArray[np.float64]
+    """What the network was given, (N, H·F)."""
+    terrain: NDArray[np.int64]
+    """Index into ``Walks.terrains``, (N,)."""
+    command: NDArray[np.int64]
+    """Index into ``COMMANDS``, (N,)."""
+    robot: NDArray[np.int64]
+    """Which of the robots of its terrain and command, (N,)."""
+    time: NDArray[np.float64]
+    """Since the command was given [s], (N,)."""
+    falls: int
+    """Robots that fell."""
+    walkers: int
+    """Robots in all."""
+
+
+def collect(
+    policy: Policy,
+    robot: Robot,
+    walks: Walks,
+    *,
+    backend: str = "mujoco",
+    threads: int = 1,
+    make: Callable[..., PhysicsBackend] = make_backend,
+) -> Notes:
+    """Let a policy's robots walk, and note what its encoder and experts say.
+
+    Args:
+        policy: whose inside is looked at.
+        robot: its body.
+        walks: where, how and how long.
+        backend: engine, by name, on the CPU.
+        threads: CPU threads; results do not depend on them.
+        make: builds engines by name.
+
+    Raises:
+        BackendError: the engine cannot do it.
+        PolicyError: the policy has neither encoder nor experts, or its output is not finite.
+        ContractError: it is not for this robot.
+    """
+    places = [(t, c, r) for t in range(len(walks.terrains)) for c in range(len(COMMANDS)) for r in range(walks.robots)]
+    scene = Scene(
+        robot=robot,
+        parameters=robot.parameters[walks.suite.parameters],
+        terrains=walks.terrains,
+        terrain_index=tuple(t for t, _, _ in places),
+        physics=walks.suite.physics,
+    )
+    session, network = watched_session(policy, len(places))
+    torch.set_num_threads(1)  # several would change the last bits of the policy's output
+    period = scene.physics.control_period
+    stands, steps, every = (round(s / period) for s in (SETTLING, walks.seconds, INTERVAL))
+    up: list[torch.Tensor] = []
+    seen: list[tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor]] = []
+    with closing(make(backend, scene, device="cpu", threads=threads)) as physics, torch.inference_mode():
+        walk = Walk(policy, physics, walks.suite.noise, _episodes(walks, places), steps=stands + steps, session=session)
+        physics.randomize(Randomization(friction=walk.tensor([walks.friction] * len(places))))
+        poses = [walks.terrains[t].spawns["level_eval"] for t, _, _ in places]
+        stand = robot.stand_height
+        walk.reset(
+            walk.tensor([(*p.position[:2], p.position[2] + stand) for p in poses]),
+            from_yaw(walk.tensor([p.yaw for p in poses])),
+        )
+        shares = walk.tensor(list(COMMANDS.values()))[torch.tensor([c for _, c, _ in places])]
+        command = shares * walk.tensor([walks.speed, walks.speed, walks.turn])
+        fallen = torch.zeros(len(places), dtype=torch.bool)
+        for step in range(stands + steps):
+            walk.step(command if step >= stands else torch.zeros_like(command))
+            fallen = (
+                fallen | physics.state.diverged | (tilt(physics.state.base_quaternion_w) > walks.suite.events.fall_tilt)
+            )
+            if step >= stands and (step - stands + 1) % every == 0:
+                up.append(~fallen)
+                seen.append((network.latent, network.weights, network.history.flatten(1)))
+    keep = torch.cat(up).numpy()
+    latents, weights, histories = zip(*seen, strict=True)
+    index = np.tile(np.array(places, dtype=np.int64), (len(up), 1))[keep]
+    return Notes(
+        latent=None if latents[0] is None else _table(latents)[keep],
+        weights=None if weights[0] is None else _table(weights)[keep],
+        history=_table(histories)[keep],
+        terrain=index[:, 0],
+        command=index[:, 1],
+        robot=index[:, 2],
+        time=np.repeat((np.arange(len(up)) + 1) * every * period, len(places))[keep],
+        falls=int(fallen.sum()),
+        walkers=len(places),
+    )
+
+
+def _table(parts: Sequence[torch.Tensor]) -> NDArray[np.float64]:
+    """Rows of all moments, one after another."""
+    found: NDArray[np.float64] = torch.cat(tuple(parts)).double().numpy()
+    return found
+
+
+def _episodes(walks: Walks, places: Sequence[tuple[int, int, int]]) -> list[Episode]:
+    """One for each robot, which gives it noise and latency of its own."""
+    commands = list(COMMANDS)
+    return [
+        Episode(
+            terrain=walks.terrains[t].name,
+            level=walks.terrains[t].level,
+            friction=walks.friction,
+            payload=0.0,
+            seed=walks.seed + r,
+            stage=f"latent {commands[c]}",
+            goals=(),
+        )
+        for t, c, r in places
+    ]

@@ -1,0 +1,157 @@
+"""Figures of latents as SVG files that stand alone, and the page that shows them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jinja2
+import markupsafe
+import numpy as np
+from numpy.typing import NDArray
+
+from ..report import TEMPLATES
+from .collecting import Notes
+
+FIGURES = ("terrains", "commands", "experts")
+LABELS = {
+    "slope_fd": "slope up",
+    "slope_bd": "slope down",
+    "stairs_fd": "stairs up",
+    "stairs_bd": "stairs down",
+    "obstacle": "obstacles",
+}
+"""Terrains as a robot meets them that walks forward from where quality episodes start."""
+_COLOURS = ("#0072b2", "#e69f00", "#d55e00", "#cc79a7", "#009e73", "#56b4e9", "#5c4033", "#9a9a00")
+"""Okabe and Ito's, without yellow and black; readers who see colours differently can tell them apart."""
+_SIDE, _LEFT, _TOP, _GAP = 300.0, 34.0, 46.0, 26.0
+_MOST_POINTS = 1500
+"""Points of a policy that are drawn; all of them are in the CSV file."""
+_ROW, _CELL, _NAMES = 22.0, 40.0, 96.0
+
+Points = Sequence[tuple[str, Notes, Mapping[str, NDArray[np.float64]]]]
+
+
+def label(name: str) -> str:
+    """A terrain's or a command's name for readers."""
+    return LABELS.get(name, name.replace("_", " "))
+
+
+def render_figure(name: str, results: Mapping[str, Any], points: Points) -> str | None:
+    """A figure as an SVG file with a panel for each policy; None where no policy has what it shows."""
+    if name == "experts":
+        panels = [_weights_panel(e) for e in results["policies"] if e["experts"] is not None]
+        legend: list[dict[str, Any]] = []
+    else:
+        entries = {e["label"]: e for e in results["policies"]}
+        classes = [label(n) for n in results[name]]
+        panels = [_scatter(name, entries[who], notes, places[name]) for who, notes, places in points if name in places]
+        legend = [{"text": text, "colour": _COLOURS[i % len(_COLOURS)]} for i, text in enumerate(classes)]
+    if not panels:
+        return None
+    x = _LEFT
+    for panel in panels:
+        panel["x"] = x
+        x += panel["width"] + _GAP + (_LEFT if name != "experts" else 0.0)
+    at, line = _LEFT, 0
+    for item in legend:
+        width = 22.0 + 7.0 * len(item["text"])
+        if at + width > max(x, 360.0) and at > _LEFT:
+            at, line = _LEFT, line + 1
+        item["x"], item["line"] = round(at, 1), line
+        at += width
+    height = _TOP + max(p["height"] for p in panels) + 44.0
+    return (
+        _environment()
+        .get_template("latent.svg.j2")
+        .render(
+            name=name,
+            panels=panels,
+            legend=legend,
+            top=_TOP,
+            legend_y=height,
+            size=(round(max(x, 380.0), 1), round(height + 18.0 * (line + 1) if legend else height - 30.0, 1)),
+        )
+    )
+
+
+def render_page(results: Mapping[str, Any], pictures: Mapping[str, str]) -> str:
+    """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
+    # the figures' templates have escaped what is in them
+    figures = {name: markupsafe.Markup(text) for name, text in pictures.items()}
+    return _environment().get_template("latent.html.j2").render(results=results, figures=figures)
+
+
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"label": label, "fixed": _fixed}
+    return environment
+
+
+def _fixed(value: float) -> str:
+    return f"{value:.2f}".replace("-", "−")
+
+
+def _scatter(name: str, entry: Mapping[str, Any], notes: Notes, places: NDArray[np.float64]) -> dict[str, Any]:
+    """Points on the first two principal axes, a colour for each class."""
+    classes = notes.terrain if name == "terrains" else notes.command
+    rows = np.flatnonzero(~np.isnan(places[:, 0]))
+    # the same share of every class: an even walk through them, class by class
+    rows = rows[np.argsort(classes[rows], kind="stable")]
+    rows = rows[:: max(math.ceil(len(rows) / _MOST_POINTS), 1)]
+    low, high = places[rows].min(axis=0), places[rows].max(axis=0)
+    scale = 0.94 * _SIDE / max(float((high - low).max()), 1e-9)
+    middle = (low + high) / 2
+    spots = (places[rows] - middle) * (scale, -scale) + _SIDE / 2
+    found = entry[name].get("latent")
+    words = (
+        "" if found is None else f"silhouette {found['silhouette']:.2f}, probe {found['probe']:.2f}".replace("-", "−")
+    )
+    return {
+        "title": entry["label"],
+        "words": words,
+        "width": _SIDE,
+        "height": _SIDE,
+        "axes": [f"PC {i + 1} ({100 * share:.0f} %)" for i, share in enumerate(entry[name]["explained"])],
+        "paths": [
+            {
+                "colour": _COLOURS[c % len(_COLOURS)],
+                "path": "".join(f"M{x:.0f} {y:.0f}h0" for x, y in spots[classes[rows] == c]),
+            }
+            for c in range(int(classes.max()) + 1)
+        ],
+    }
+
+
+def _weights_panel(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Mean weights of the experts: a row for each terrain and each command, a column for each expert."""
+    experts = entry["experts"]
+    rows = [(label(name), means) for pair in ("terrains", "commands") for name, means in experts[pair].items()]
+    most = max(max(means) for _, means in rows)
+    count = len(rows[0][1])
+    return {
+        "title": entry["label"],
+        "words": f"{experts['at_once']:.1f} of {count} at once, {experts['in_all']:.1f} in all",
+        "width": _NAMES + _CELL * count,
+        "height": _ROW * (len(rows) + 1),
+        "columns": [{"x": _NAMES + _CELL * (k + 0.5), "text": str(k + 1)} for k in range(count)],
+        "rows": [
+            {
+                "y": _ROW * (i + 1) + (4.0 if i >= len(experts["terrains"]) else 0.0),
+                "name": name,
+                "cells": [
+                    {"x": _NAMES + _CELL * k, "share": round(w / most, 3), "text": f"{w:.2f}".removeprefix("0")}
+                    for k, w in enumerate(means)
+                ],
+            }
+            for i, (name, means) in enumerate(rows)
+        ],
+        "cell": (_CELL, _ROW),
+    }

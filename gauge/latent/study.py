@@ -1,0 +1,260 @@
+"""The latents of several policies: ``latent.json``, ``points.csv``, three figures and ``latent.html``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...backends.base import BackendError, PhysicsBackend
+from ...backends.registry import find_backend, make_backend
+from ...files.provenance import provenance
+from ...files.writing import json_text, write_atomically
+from ...policy.base import PolicyError
+from ...policy.contract import ContractError
+from ...policy.native import FilePolicy
+from ...robots import RobotError, load_robot
+from ...terrains.registry import gauge_terrain_names, make_terrain
+from ..policies import Refused, describe, load_policies
+from ..suite import SuiteError, load_suite
+from .collecting import COMMANDS, Notes, Walks, collect
+from .figures import FIGURES, render_figure, render_page
+from .separation import Separation, principal_components, separation
+
+PAIRS = {"terrains": "forward on every terrain", "commands": "every command on all terrains"}
+"""What is told apart, as in the paper's two figures."""
+
+
+class LatentError(ValueError):
+    """Nothing of what was asked for can be looked at."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatentRequest:
+    """Whose latent is looked at, and where."""
+
+    policies: tuple[str, ...]
+    terrains: tuple[str, ...] = ()
+    """Names; none for the gauge's seven."""
+    level: int = 5
+    """Of the terrains that have levels."""
+    friction: float = 0.8
+    suite: str = "gaitgauge-1"
+    """Gives physics, sensor noise and latency."""
+    seconds: float = 5.0
+    """How long every robot walks [s]."""
+    robots: int = 4
+    """For each terrain and command, at least 2."""
+    seed: int = 0
+    backend: str = "mujoco"
+    robot: str = "go2"
+    threads: int = 1
+    """CPU threads; they change the time, never the results."""
+    trust: bool = False
+    """Run the program that a policy file of the project's own format carries inside."""
+
+
+def study_latents(
+    request: LatentRequest,
+    folder: Path,
+    *,
+    command: Sequence[str] = (),
+    watch: Callable[[int, int, str], None] | None = None,
+    make: Callable[..., PhysicsBackend] = make_backend,
+) -> dict[str, Any]:
+    """Look at the latents of some policies. What cannot be looked at is said under ``refused``; the others are.
+
+    Args:
+        request: whose, and where.
+        folder: where the files go.
+        command: the command line, for the provenance.
+        watch: called before each policy's turn with the turn's number, their count, and its label.
+        make: builds engines by name.
+
+    Returns:
+        The content of ``latent.json`` (docs/latent.md).
+
+    Raises:
+        LatentError: no policy has anything to look at.
+        BackendError, RobotError, SuiteError, TerrainError: no such engine, robot, suite or terrain.
+    """
+    began = time.perf_counter()
+    find_backend(request.backend, "cpu")
+    robot, walks = load_robot(request.robot), _walks(request)
+    if walks.suite.parameters not in robot.parameters:
+        raise RobotError(
+            f"suite '{walks.suite.name}' needs the joint parameters '{walks.suite.parameters}', which robot '{robot.name}' "
+            f"lacks; it has {', '.join(sorted(robot.parameters))} (robot.toml)"
+        )
+    policies, refused = load_policies(request.policies, robot, trust=request.trust)
+    entries: list[dict[str, Any]] = []
+    points: list[tuple[str, Notes, dict[str, NDArray[np.float64]]]] = []
+    for number, (label, policy) in enumerate(policies.items(), 1):
+        if watch is not None:
+            watch(number, len(policies), label)
+        try:
+            notes = collect(policy, robot, walks, backend=request.backend, threads=request.threads, make=make)
+            entry, places = look(label, policy, notes, walks)
+        except (PolicyError, ContractError, BackendError, LatentError) as error:
+            refused.append(Refused(what=label, reason=str(error)))
+        else:
+            entries.append(entry)
+            points.append((label, notes, places))
+    if not entries:
+        raise LatentError("; ".join(r.reason for r in refused) or "there is nothing to look at; name a policy")
+    results = {
+        "schema": 1,
+        "policies": entries,
+        "terrains": [t.name for t in walks.terrains],
+        "commands": list(COMMANDS),
+        "level": request.level,
+        "friction": request.friction,
+        "seconds": request.seconds,
+        "robots": request.robots,
+        "suite": {"name": walks.suite.name, "version": walks.suite.version, "digest": walks.suite.digest},
+        "refused": [asdict(r) for r in refused],
+        "backend": request.backend,
+        "robot": robot.name,
+        "provenance": provenance(
+            command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)
+        ),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = {name: render_figure(name, results, points) for name in FIGURES}
+    pictures = {name: text for name, text in drawn.items() if text}
+    for name, text in pictures.items():
+        write_atomically(folder / f"latent-{name}.svg", text, LatentError)
+    write_atomically(folder / "points.csv", as_csv(results, points), LatentError)
+    write_atomically(folder / "latent.html", render_page(results, pictures), LatentError)
+    write_atomically(folder / "latent.json", json_text(results), LatentError)
+    return results
+
+
+def _walks(request: LatentRequest) -> Walks:
+    suite = load_suite(request.suite)
+    if not 0.0 < request.friction <= 10.0:
+        raise SuiteError(
+            f"friction {request.friction:g} is not possible; give a coefficient above 0 and at most 10 (--friction)"
+        )
+    names = request.terrains or tuple(gauge_terrain_names())
+    terrains = tuple(make_terrain(n, None if n == "flat" else request.level) for n in dict.fromkeys(names))
+    for terrain in terrains:
+        if "level_eval" not in terrain.spawns:
+            raise SuiteError(f"terrain '{terrain.name}' has no spawn 'level_eval'; add it, or choose another terrain")
+    return Walks(
+        suite=suite,
+        terrains=terrains,
+        friction=request.friction,
+        seconds=request.seconds,
+        robots=request.robots,
+        seed=request.seed,
+    )
+
+
+def look(
+    label: str, policy: FilePolicy, notes: Notes, walks: Walks
+) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+    """What ``latent.json`` says of a policy, and its points on the principal axes by figure, (N, 2); NaN where a point is not
+    part of it.
+
+    Raises:
+        LatentError: on some terrain, or with some command, every robot fell before anything could be noted.
+    """
+    chosen = {
+        "terrains": notes.command == list(COMMANDS).index("forward"),
+        "commands": np.ones(len(notes.time), dtype=bool),
+    }
+    classes = {"terrains": notes.terrain, "commands": notes.command}
+    names = {"terrains": [t.name for t in walks.terrains], "commands": list(COMMANDS)}
+    spaces = {"latent": notes.latent, "experts": notes.weights, "input": notes.history}
+    entry: dict[str, Any] = {
+        **describe(label, policy),
+        "walkers": notes.walkers,
+        "falls": notes.falls,
+        "samples": len(notes.time),
+    }
+    places: dict[str, NDArray[np.float64]] = {}
+    for pair, rows in chosen.items():
+        seen = np.bincount(classes[pair][rows], minlength=len(names[pair]))
+        if not seen.all():
+            raise LatentError(
+                f"'{policy.path}' fell at once on '{names[pair][int(seen.argmin())]}', so there is nothing to look at; choose "
+                "other terrains or a lower --level"
+            )
+        found: dict[str, Any] = {}
+        for space, values in spaces.items():
+            if values is not None and len(names[pair]) > 1:
+                found[space] = _plain(separation(values[rows], classes[pair][rows], notes.robot[rows]), names[pair])
+        if notes.latent is not None:
+            spread, shares = principal_components(notes.latent[rows])
+            found["explained"] = [float(s) for s in shares]
+            places[pair] = np.full((len(rows), 2), np.nan)
+            places[pair][rows] = spread
+        entry[pair] = found
+    entry["experts"] = None if notes.weights is None else _experts(notes, names, chosen, classes)
+    return entry, places
+
+
+def _plain(found: Separation, names: Sequence[str]) -> dict[str, Any]:
+    return {**asdict(found), "recall": dict(zip(names, found.recall, strict=True))}
+
+
+def _experts(
+    notes: Notes,
+    names: Mapping[str, Sequence[str]],
+    chosen: Mapping[str, NDArray[np.bool_]],
+    classes: Mapping[str, NDArray[np.int64]],
+) -> dict[str, Any]:
+    """Mean weights by terrain and by command, and how many experts are at work.
+
+    ``at_once`` is the exponential of the weights' mean entropy: 1 where a single expert decides at every moment, K where all of
+    them always count the same. ``in_all`` is that of the mean weights' entropy: how many are used at all.
+    """
+    weights = notes.weights
+    assert weights is not None
+
+    def entropy(shares: NDArray[np.float64]) -> NDArray[np.float64]:
+        found: NDArray[np.float64] = -(shares * np.log(np.maximum(shares, 1e-12))).sum(axis=-1)
+        return found
+
+    means = {
+        pair: {
+            name: [float(w) for w in weights[rows & (classes[pair] == i)].mean(axis=0)]
+            for i, name in enumerate(names[pair])
+        }
+        for pair, rows in chosen.items()
+    }
+    return {
+        **means,
+        "at_once": float(np.exp(entropy(weights).mean())),
+        "in_all": float(np.exp(entropy(weights.mean(axis=0)))),
+    }
+
+
+def as_csv(results: Mapping[str, Any], points: Sequence[tuple[str, Notes, Mapping[str, NDArray[np.float64]]]]) -> str:
+    """One row for each robot and moment: where it was, its places in both figures, its latent and the experts' weights."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    latents = max((n.latent.shape[1] for _, n, _ in points if n.latent is not None), default=0)
+    experts = max((n.weights.shape[1] for _, n, _ in points if n.weights is not None), default=0)
+    axes = [f"{pair}_pc{i}" for pair in PAIRS for i in (1, 2)]
+    numbered = [f"latent_{i}" for i in range(latents)], [f"expert_{i}" for i in range(experts)]
+    writer.writerow(["policy", "terrain", "command", "robot", "time", *axes, *numbered[0], *numbered[1]])
+    for label, notes, places in points:
+        columns = [*(places.get(pair) for pair in PAIRS), notes.latent, notes.weights]
+        widths = [2, 2, latents, experts]
+        for row in range(len(notes.time)):
+            values: list[str] = []
+            for column, width in zip(columns, widths, strict=True):
+                own = [] if column is None else ["" if np.isnan(v) else f"{v:.4f}" for v in column[row]]
+                values += own + [""] * (width - len(own))
+            terrain, told = results["terrains"][notes.terrain[row]], results["commands"][notes.command[row]]
+            writer.writerow([label, terrain, told, notes.robot[row], f"{notes.time[row]:.2f}", *values])
+    return text.getvalue()
