@@ -28,8 +28,6 @@ COMMANDS = {
     "right turn": (0.0, 0.0, -1.0),
 }
 """The paper's commands as multiples of ``Walks.speed`` and ``Walks.turn``."""
-SETTLING = 1.0
-"""Time for which robots stand before anything is noted [s]."""
 INTERVAL = 0.1
 """Time between two notes [s]."""
 
@@ -42,6 +40,8 @@ class Walks:
     """Gives physics, sensor noise and latency."""
     terrains: tuple[Terrain, ...]
     friction: float = 0.8
+    settling: float = 1.0
+    """How long robots stand before they are told to walk [s]."""
     seconds: float = 5.0
     """How long each robot walks, and is watched [s]."""
     speed: float = 0.8
@@ -112,7 +112,7 @@ def collect(
     session, network = watched_session(policy, len(places))
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
     period = scene.physics.control_period
-    stands, steps, every = (round(s / period) for s in (SETTLING, walks.seconds, INTERVAL))
+    stands, steps, every = (round(s / period) for s in (walks.settling, walks.seconds, INTERVAL))
     up: list[torch.Tensor] = []
     seen: list[tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor]] = []
     with closing(make(backend, scene, device="cpu", threads=threads)) as physics, torch.inference_mode():

@@ -48,6 +48,8 @@ class LatentRequest:
     friction: float = 0.8
     suite: str = "gaitgauge-1"
     """Gives physics, sensor noise and latency."""
+    settling: float = 1.0
+    """How long every robot stands before it is told to walk [s]."""
     seconds: float = 5.0
     """How long every robot walks [s]."""
     robots: int = 4
@@ -152,6 +154,7 @@ def _walks(request: LatentRequest) -> Walks:
         suite=suite,
         terrains=terrains,
         friction=request.friction,
+        settling=request.settling,
         seconds=request.seconds,
         robots=request.robots,
         seed=request.seed,
@@ -203,7 +206,8 @@ def look(
 
 
 def _plain(found: Separation, names: Sequence[str]) -> dict[str, Any]:
-    return {**asdict(found), "recall": dict(zip(names, found.recall, strict=True))}
+    recall = dict(zip(names, found.recall, strict=True))
+    return {**asdict(found), "probe_range": list(found.probe_range), "recall": recall}
 
 
 def _experts(

@@ -1,0 +1,22 @@
+"""``gaitgauge latent``, where it takes a moment."""
+
+import json
+
+SHORT = ("--terrain", "flat", "--terrain", "wave", "--seconds", 0.2, "--robots", 2, "--threads", 1)
+
+
+def test_tables_and_a_sentence_on_what_was_left_out(run, policy, tmp_path):
+    result = run("latent", "pretrained", policy, *SHORT, "--out", "here")
+    assert result.exit_code == 1
+    assert "terrains told apart" in result.stdout and "of 8 experts count at once" in result.stdout
+    assert result.stderr.splitlines()[-1].startswith("standing was left out: ")
+    found = json.loads((tmp_path / "here" / "latent.json").read_text())
+    assert found["policies"][0]["label"] == "pretrained" and found["terrains"] == ["flat", "wave"]
+
+
+def test_one_sentence_for_a_policy_with_nothing_to_look_at(refused, policy):
+    sentence = refused("latent", policy, *SHORT)
+    assert sentence == (
+        f"'{policy}' has neither an encoder nor experts (network 'mlp'), so there is no latent to look at; give a policy of "
+        "another network, such as cts or moe_cts"
+    )

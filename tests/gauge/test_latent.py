@@ -1,0 +1,151 @@
+"""How well classes separate, on points that can be worked out by hand, and a moment of walking."""
+
+import csv
+import json
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from gaitgauge.gauge.latent.collecting import COMMANDS, Walks, collect
+from gaitgauge.gauge.latent.separation import principal_components, separation, silhouette
+from gaitgauge.gauge.latent.study import LatentError, LatentRequest, study_latents
+from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.loading import load_policy
+from gaitgauge.policy.native import StoredNetwork, save_policy
+from gaitgauge.policy.networks import ARCHITECTURES
+from gaitgauge.robots import load_robot
+from gaitgauge.terrains.registry import make_terrain
+
+
+def test_principal_components_of_points_on_a_cross():
+    # variances 2·9/4 and 2·1/4 along axes turned by the 3-4-5 triangle
+    long, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
+    points = np.array([3 * long, -3 * long, across, -across])
+    points += (5.0, 7.0)
+    spread, shares = principal_components(points)
+    assert np.allclose(shares, [0.9, 0.1])
+    # of the second axis the largest coefficient, -0.8, is made positive
+    assert np.allclose(spread, [[3, 0], [-3, 0], [0, -1], [0, 1]])
+
+
+def test_silhouette_of_two_pairs():
+    points, classes = np.array([[0.0], [1.0], [10.0], [11.0]]), np.array([0, 0, 1, 1])
+    # (10.5 − 1) / 10.5 at the ends, (9.5 − 1) / 9.5 inside
+    assert silhouette(points, classes) == pytest.approx((9.5 / 10.5 + 8.5 / 9.5) / 2)
+    # pairs of one class around a point of the other: the single one counts 0
+    points, classes = np.array([[0.0], [2.0], [1.0]]), np.array([0, 0, 1])
+    assert silhouette(points, classes) == pytest.approx((1 - 2) / 2 * 2 / 3)
+
+
+def test_a_probe_finds_what_lies_apart_and_guesses_where_nothing_does():
+    random = np.random.default_rng(0)
+    classes, robots = np.repeat([0, 1, 2], 200), np.tile(np.repeat([0, 1, 2, 3], 50), 3)
+    apart = np.eye(3)[classes] + 0.05 * random.standard_normal((600, 3))
+    found = separation(apart, classes, robots)
+    assert found.probe == 1.0 and found.silhouette > 0.85 and found.chance == pytest.approx(1 / 3)
+    same = separation(random.standard_normal((600, 3)), classes, robots)
+    assert 0.25 < same.probe < 0.42 and abs(same.silhouette) < 0.03
+    assert same.probe_range[0] <= same.probe <= same.probe_range[1]
+
+
+def test_a_probe_is_not_told_what_robots_are_by_other_samples_of_theirs():
+    """Every robot has a place of its own, which says nothing of its class: knowing it by heart would find every class."""
+    random = np.random.default_rng(1)
+    robots, classes = np.repeat(np.arange(60), 8), np.repeat(random.permutation(np.arange(60) % 2), 8)
+    places = random.standard_normal((60, 80))[robots] + 0.01 * random.standard_normal((480, 80))
+    assert separation(places, classes, robots).probe < 0.7
+    assert separation(places, classes, np.arange(480) % 8).probe == 1.0  # where each fold has seen every robot
+
+
+def test_classes_that_lost_samples_count_as_much_as_the_others():
+    random = np.random.default_rng(2)
+    classes = np.array([0] * 400 + [1] * 40)
+    robots = np.arange(440) % 4
+    points = classes[:, None] + 0.8 * random.standard_normal((440, 1))
+    found = separation(points, classes, robots)
+    assert min(found.recall) > 0.6 and found.probe == pytest.approx(sum(found.recall) / 2)
+
+
+@pytest.fixture(scope="module")
+def walks() -> Walks:
+    terrains = (make_terrain("flat"), make_terrain("slope_bd", 3))
+    return Walks(suite=load_suite("gaitgauge-1"), terrains=terrains, settling=0.2, seconds=0.2, robots=2)
+
+
+def test_what_robots_noted_belongs_to_where_they_were(walks):
+    policy, robot = load_policy("pretrained"), load_robot("go2")
+    notes = collect(policy, robot, walks, threads=2)
+    # two terrains, four commands, two robots, 0.1 s and 0.2 s
+    assert notes.walkers == 16 and notes.falls == 0 and len(notes.time) == 32
+    assert np.bincount(notes.terrain).tolist() == [16, 16] and np.bincount(notes.command).tolist() == [8] * 4
+    assert sorted(set(notes.time.round(3))) == [0.1, 0.2]
+    assert np.allclose(np.linalg.norm(notes.latent, axis=1), 1.0, atol=1e-5)
+    assert np.allclose(notes.weights.sum(axis=1), 1.0, atol=1e-5)
+    # the newest frame holds the command, scaled by 2, 2 and 0.25 (protocol §5)
+    told = notes.history[:, -45 + 6 : -45 + 9] / (2.0, 2.0, 0.25)
+    expected = np.array(list(COMMANDS.values()))[notes.command] * (walks.speed, walks.speed, walks.turn)
+    assert np.allclose(told, expected, atol=1e-6)
+    again = collect(policy, robot, walks)
+    assert np.array_equal(notes.latent, again.latent)
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory) -> dict[str, str]:
+    """A plain student and a perceptron, both of which stand more or less still."""
+    folder = tmp_path_factory.mktemp("policies")
+    networks = {
+        "a<b>": ("cts", {"encoder_hidden": [16], "actor_hidden": [8]}),
+        "plain": ("mlp", {"frame_width": 45, "num_actions": 12, "hidden": [8]}),
+    }
+    paths = {}
+    for name, (architecture, arguments) in networks.items():
+        torch.manual_seed(3)
+        weights = ARCHITECTURES[architecture](**arguments).state_dict()
+        weights |= {k: 0.01 * v for k, v in weights.items() if k.startswith(("actor", "network"))}
+        paths[name] = str(folder / f"{name}.gauge.pt")
+        stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=weights)
+        save_policy(paths[name], go2_contract(load_robot("go2")), stored)
+    return paths
+
+
+def test_several_policies_side_by_side_and_one_that_has_nothing_to_look_at(policies, tmp_path):
+    request = LatentRequest(
+        policies=("pretrained", policies["plain"], policies["a<b>"]),
+        terrains=("flat", "slope_fd"),
+        seconds=0.2,
+        robots=2,
+    )
+    results = study_latents(request, tmp_path)
+    assert results == json.loads((tmp_path / "latent.json").read_text())
+    assert [r["what"] for r in results["refused"]] == ["plain"]
+    assert "has neither an encoder nor experts" in results["refused"][0]["reason"]
+    mixture, student = results["policies"]
+    assert mixture["terrains"].keys() == {"latent", "experts", "input", "explained"}
+    assert student["terrains"].keys() == {"latent", "input", "explained"} and student["experts"] is None
+    for pair, count in (("terrains", 2), ("commands", 4)):
+        rows = np.array(list(mixture["experts"][pair].values()))
+        assert rows.shape == (count, 8) and np.allclose(rows.sum(axis=1), 1.0, atol=1e-5)
+    assert 1.0 <= mixture["experts"]["at_once"] <= mixture["experts"]["in_all"] <= 8.0
+    rows = list(csv.DictReader((tmp_path / "points.csv").open()))
+    assert len(rows) == mixture["samples"] + student["samples"] == 64
+    assert rows[0]["policy"] == "pretrained" and rows[-1]["expert_0"] == "" and rows[-1]["latent_31"] != ""
+    forward = [r for r in rows if r["command"] == "forward"]
+    assert all((r["terrains_pc1"] != "") == (r in forward) for r in rows)
+    for name in ("terrains", "commands", "experts"):
+        picture = ElementTree.parse(tmp_path / f"latent-{name}.svg").getroot()
+        titles = [t.text for t in picture.iter("{http://www.w3.org/2000/svg}text")]
+        assert "pretrained" in titles and ("a<b>" in titles) == (name != "experts")
+    page = (tmp_path / "latent.html").read_text()
+    assert "a<b>" not in page and "plain was left out" in page and page.count("<svg") == 3
+
+
+def test_one_sentence_where_there_is_nothing_to_look_at(policies, tmp_path):
+    with pytest.raises(LatentError, match="neither an encoder nor experts"):
+        study_latents(LatentRequest(policies=(policies["plain"],)), tmp_path)
+    with pytest.raises(ValueError, match="unknown terrain 'moon'"):
+        study_latents(LatentRequest(policies=("pretrained",), terrains=("moon",)), tmp_path)
+    with pytest.raises(ValueError, match="friction 0 is not possible"):
+        study_latents(LatentRequest(policies=("pretrained",), friction=0.0), tmp_path)
+    assert not list(tmp_path.iterdir())
