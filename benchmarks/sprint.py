@@ -19,8 +19,8 @@ import torch
 from gaitgauge.backends.base import PhysicsState
 from gaitgauge.gauge.trials.running import Trial, run_scenario
 from gaitgauge.gauge.trials.scenario import Scenario, load_scenario
+from gaitgauge.policy.its_robot import robot_for
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.robots import load_robot
 
 
 def scenario(*, speed: float, reach: float, runway: float, friction: float, suite: str) -> Scenario:
@@ -53,7 +53,7 @@ def run(policy_path: str, sprint: Scenario, *, robots: int, seed: int) -> tuple[
         joint_speeds.append(state.joint_velocity[moving].float().abs())
 
     trials = run_scenario(
-        policy, load_robot(policy.contract.robot), sprint, range(seed, seed + robots), backend="mujoco", watch=watch
+        policy, robot_for(policy.contract), sprint, range(seed, seed + robots), backend="mujoco", watch=watch
     )
     return trials, torch.cat(joint_speeds)
 

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from ..policy.base import PolicyError
-from ..policy.contract import ContractError, check_robot
+from ..policy.contract import ContractError
+from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import find_policy, load_policy
 from ..policy.native import FilePolicy
-from ..robots import Robot
+from ..robots import Robot, RobotError, load_robot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,43 +26,57 @@ class Refused:
     """One sentence."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Loaded:
+    """A policy and its body."""
+
+    policy: FilePolicy
+    robot: Robot
+
+
 def load_policies(
-    names: Sequence[str], robot: Robot, *, trust: bool = False
-) -> tuple[dict[str, FilePolicy], list[Refused]]:
+    names: Sequence[str], robot: str | None = None, *, trust: bool = False
+) -> tuple[dict[str, Loaded], list[Refused]]:
     """Load policies.
 
     Args:
         names: what ``gaitgauge evaluate`` takes; one that is named twice is loaded once.
-        robot: the robot that they have to fit.
+        robot: name of the robot that they have to fit, or its ``robot.toml``; None for each one's own.
         trust: run programs that files of the project's own format carry inside.
 
     Returns:
         Policies by label, the shortest that tells them apart, and those that could not be loaded.
+
+    Raises:
+        RobotError: the robot that was asked for cannot be had.
     """
-    found: dict[str, FilePolicy] = {}
+    asked = None if robot is None else load_robot(robot)
+    found: dict[str, Loaded] = {}
     refused: list[Refused] = []
     names = list(dict.fromkeys(names))
     short = [Path(name).name.partition(".")[0] for name in names]
     for name, stem in zip(names, short, strict=True):
         try:
-            policy = load_policy(name, robot, trust=trust)
-            check_robot(policy.contract, robot)
-        except (PolicyError, ContractError) as error:
+            policy = load_policy(name, asked, trust=trust)
+            loaded = Loaded(policy=policy, robot=robot_for(policy.contract, robot))
+        except (PolicyError, ContractError, RobotError) as error:
             refused.append(Refused(what=name, reason=str(error)))
         else:
-            found[stem if short.count(stem) == 1 else name] = policy
+            found[stem if short.count(stem) == 1 else name] = loaded
     return found, refused
 
 
-def describe(label: str, policy: FilePolicy) -> dict[str, Any]:
+def describe(label: str, loaded: Loaded) -> dict[str, Any]:
     """What a result says of a policy, as plain data."""
+    policy = loaded.policy
     with find_policy(policy.path).open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {
         "label": label,
         "path": policy.path,
         "file_sha256": digest,
+        "robot": loaded.robot.name,
         "contract_hash": policy.contract.hash,
         "command_limits": list(policy.contract.command_limits),
-        "provenance": dict(policy.contract.provenance),
+        "provenance": without_copy(policy.contract.provenance),
     }

@@ -14,10 +14,11 @@ from ...backends.base import PhysicsBackend, Randomization, Scene
 from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...policy.watching import watched_session
-from ...robots import Robot
+from ...robots import Robot, RobotError
 from ...robots.rotation import from_yaw, tilt
 from ...terrains.base import Terrain
 from ..episodes import Episode
+from ..motors import joint_parameters
 from ..suite import Suite
 from ..walking import Walk
 
@@ -98,13 +99,19 @@ def collect(
 
     Raises:
         BackendError: the engine cannot do it.
+        RobotError: the robot lacks the joint parameters of the suite.
         PolicyError: the policy has neither encoder nor experts, or its output is not finite.
         ContractError: it is not for this robot.
     """
+    if walks.suite.parameters not in robot.parameters:
+        raise RobotError(
+            f"suite '{walks.suite.name}' needs the joint parameters '{walks.suite.parameters}', which robot '{robot.name}' "
+            f"lacks; it has {', '.join(sorted(robot.parameters))} (robot.toml)"
+        )
     places = [(t, c, r) for t in range(len(walks.terrains)) for c in range(len(COMMANDS)) for r in range(walks.robots)]
     scene = Scene(
         robot=robot,
-        parameters=robot.parameters[walks.suite.parameters],
+        parameters=joint_parameters(walks.suite, robot, policy.contract),
         terrains=walks.terrains,
         terrain_index=tuple(t for t, _, _ in places),
         physics=walks.suite.physics,

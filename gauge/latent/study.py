@@ -19,10 +19,9 @@ from ...files.provenance import provenance
 from ...files.writing import json_text, write_atomically
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
-from ...policy.native import FilePolicy
-from ...robots import RobotError, load_robot
+from ...robots import RobotError
 from ...terrains.registry import gauge_terrain_names, make_terrain
-from ..policies import Refused, describe, load_policies
+from ..policies import Loaded, Refused, describe, load_policies
 from ..suite import SuiteError, load_suite
 from .collecting import COMMANDS, Notes, Walks, collect
 from .figures import FIGURES, render_figure, render_page
@@ -56,7 +55,8 @@ class LatentRequest:
     """For each terrain and command, at least 2."""
     seed: int = 0
     backend: str = "mujoco"
-    robot: str = "go2"
+    robot: str | None = None
+    """Name of a robot, or its ``robot.toml``; None for the one that each policy is for."""
     threads: int = 1
     """CPU threads; they change the time, never the results."""
     trust: bool = False
@@ -89,22 +89,19 @@ def study_latents(
     """
     began = time.perf_counter()
     find_backend(request.backend, "cpu")
-    robot, walks = load_robot(request.robot), _walks(request)
-    if walks.suite.parameters not in robot.parameters:
-        raise RobotError(
-            f"suite '{walks.suite.name}' needs the joint parameters '{walks.suite.parameters}', which robot '{robot.name}' "
-            f"lacks; it has {', '.join(sorted(robot.parameters))} (robot.toml)"
-        )
-    policies, refused = load_policies(request.policies, robot, trust=request.trust)
+    walks = _walks(request)
+    policies, refused = load_policies(request.policies, request.robot, trust=request.trust)
     entries: list[dict[str, Any]] = []
     points: list[tuple[str, Notes, dict[str, NDArray[np.float64]]]] = []
-    for number, (label, policy) in enumerate(policies.items(), 1):
+    for number, (label, loaded) in enumerate(policies.items(), 1):
         if watch is not None:
             watch(number, len(policies), label)
         try:
-            notes = collect(policy, robot, walks, backend=request.backend, threads=request.threads, make=make)
-            entry, places = look(label, policy, notes, walks)
-        except (PolicyError, ContractError, BackendError, LatentError) as error:
+            notes = collect(
+                loaded.policy, loaded.robot, walks, backend=request.backend, threads=request.threads, make=make
+            )
+            entry, places = look(label, loaded, notes, walks)
+        except (PolicyError, ContractError, BackendError, RobotError, LatentError) as error:
             refused.append(Refused(what=label, reason=str(error)))
         else:
             entries.append(entry)
@@ -123,7 +120,6 @@ def study_latents(
         "suite": {"name": walks.suite.name, "version": walks.suite.version, "digest": walks.suite.digest},
         "refused": [asdict(r) for r in refused],
         "backend": request.backend,
-        "robot": robot.name,
         "provenance": provenance(
             command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)
         ),
@@ -162,7 +158,7 @@ def _walks(request: LatentRequest) -> Walks:
 
 
 def look(
-    label: str, policy: FilePolicy, notes: Notes, walks: Walks
+    label: str, loaded: Loaded, notes: Notes, walks: Walks
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     """What ``latent.json`` says of a policy, and its points on the principal axes by figure, (N, 2); NaN where a point is not
     part of it.
@@ -178,7 +174,7 @@ def look(
     names = {"terrains": [t.name for t in walks.terrains], "commands": list(COMMANDS)}
     spaces = {"latent": notes.latent, "experts": notes.weights, "input": notes.history}
     entry: dict[str, Any] = {
-        **describe(label, policy),
+        **describe(label, loaded),
         "walkers": notes.walkers,
         "falls": notes.falls,
         "samples": len(notes.time),
@@ -188,7 +184,7 @@ def look(
         seen = np.bincount(classes[pair][rows], minlength=len(names[pair]))
         if not seen.all():
             raise LatentError(
-                f"'{policy.path}' fell at once on '{names[pair][int(seen.argmin())]}', so there is nothing to look at; choose "
+                f"'{loaded.policy.path}' fell at once on '{names[pair][int(seen.argmin())]}', so there is nothing to look at; choose "
                 "other terrains or a lower --level"
             )
         found: dict[str, Any] = {}

@@ -35,7 +35,6 @@ def render_page(results: Mapping[str, Any]) -> str:
         policies=results["policies"],
         refused=results["refused"],
         backend=results["backend"],
-        robot=results["robot"],
         provenance=results["provenance"],
     )
 

@@ -22,6 +22,7 @@ from ...policy.base import Policy
 from ...robots import Robot, RobotError
 from ...robots.rotation import from_yaw, rotate_inverse, tilt, yaw_of
 from ..episodes import Episode
+from ..motors import joint_parameters
 from ..suite import load_suite
 from ..walking import Walk
 from .scenario import Force, Scenario, ScenarioError
@@ -159,7 +160,7 @@ def make_scene(scenario: Scenario, robot: Robot, policy: Policy, count: int) -> 
         )
     return Scene(
         robot=robot,
-        parameters=robot.parameters[suite.parameters],
+        parameters=joint_parameters(suite, robot, policy.contract),
         terrains=(scenario.terrain(),),
         terrain_index=(0,) * count,
         physics=replace(

@@ -16,9 +16,8 @@ from ...backends.registry import find_backend, make_backend
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_atomically
 from ...policy.base import PolicyError
-from ...policy.contract import ContractError
-from ...policy.native import FilePolicy
-from ...robots import Robot, RobotError, load_robot
+from ...policy.contract import ContractError, PolicyContract
+from ...robots import RobotError
 from ..consistency.statistics import wilson_interval
 from ..policies import Refused, describe, load_policies
 from ..suite import SuiteError
@@ -45,7 +44,8 @@ class TrialRequest:
     """The first robot's seed; the others' follow it."""
     backend: str = "mujoco"
     device: str = "cpu"
-    robot: str = "go2"
+    robot: str | None = None
+    """Name of a robot, or its ``robot.toml``; None for the one that each policy is for."""
     threads: int = 1
     """CPU threads; they change the time, never the results."""
     trust: bool = False
@@ -77,8 +77,7 @@ def run_trials(
     """
     began = time.perf_counter()
     find_backend(request.backend, request.device)
-    robot = load_robot(request.robot)
-    policies, refused = load_policies(request.policies, robot, trust=request.trust)
+    policies, refused = load_policies(request.policies, request.robot, trust=request.trust)
     scenarios: dict[str, Scenario] = {}
     names = [n for name in request.scenarios for n in (scenario_names() if name == ALL else [name])]
     for name in dict.fromkeys(names):
@@ -91,7 +90,7 @@ def run_trials(
             scenarios[scenario.name] = scenario
         except (ScenarioError, SuiteError) as error:
             refused.append(Refused(what=name, reason=str(error)))
-    entries = [_about(scenario, robot) for scenario in scenarios.values()]
+    entries = [_about(scenario) for scenario in scenarios.values()]
     turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]
     for number, (scenario, entry, label) in enumerate(turns, 1):
         if watch is not None:
@@ -99,8 +98,8 @@ def run_trials(
         seeds = range(request.seed, request.seed + (request.repeats or scenario.repeats))
         try:
             trials = run_scenario(
-                policies[label],
-                robot,
+                policies[label].policy,
+                policies[label].robot,
                 scenario,
                 seeds,
                 backend=request.backend,
@@ -111,16 +110,15 @@ def run_trials(
         except (BackendError, ContractError, PolicyError, RobotError, ScenarioError) as error:
             refused.append(Refused(what=f"{label} in {scenario.name}", reason=str(error)))
         else:
-            entry["results"].append(summary(label, policies[label], scenario, trials))
+            entry["results"].append(summary(label, policies[label].policy.contract, scenario, trials))
     if not any(entry["results"] for entry in entries):
         raise ScenarioError("; ".join(r.reason for r in refused) or "there is nothing to try; name a scenario")
     results = {
         "schema": 1,
-        "policies": [describe(label, policy) for label, policy in policies.items()],
+        "policies": [describe(label, loaded) for label, loaded in policies.items()],
         "scenarios": entries,
         "refused": [asdict(r) for r in refused],
         "backend": request.backend,
-        "robot": robot.name,
         "provenance": provenance(
             command=command,
             device=request.device,
@@ -135,7 +133,7 @@ def run_trials(
     return results
 
 
-def _about(scenario: Scenario, robot: Robot) -> dict[str, Any]:
+def _about(scenario: Scenario) -> dict[str, Any]:
     """What a result says of a scenario."""
     terrain, start = scenario.terrain(), scenario.start
     return {
@@ -149,7 +147,6 @@ def _about(scenario: Scenario, robot: Robot) -> dict[str, Any]:
         "success": asdict(scenario.success),
         "reported": [asdict(r) for r in scenario.reported],
         "start": [start.x, start.y],
-        "stand_height": robot.stand_height,
         "profile": profile(terrain, start.x, start.y, scenario.success.beyond),
         "results": [],
     }
@@ -172,12 +169,12 @@ def _straight(a: tuple[float, float], b: tuple[float, float], c: tuple[float, fl
     return abs((b[1] - a[1]) - (c[1] - b[1])) < 2e-3
 
 
-def summary(label: str, policy: FilePolicy, scenario: Scenario, trials: Sequence[Trial]) -> dict[str, Any]:
+def summary(label: str, contract: PolicyContract, scenario: Scenario, trials: Sequence[Trial]) -> dict[str, Any]:
     """Counts, Wilson's interval and medians of a policy's trials, and each of these."""
     outcomes = [t.outcome for t in trials]
     successes, count = outcomes.count("success"), len(trials)
     asked = [max(abs(p.velocity[i]) for p in scenario.commands) for i in range(3)]
-    limits = policy.contract.command_limits
+    limits = contract.command_limits
     above = [
         f"{a:g} {unit}"
         for a, limit, unit in zip(asked, limits, ("m/s", "m/s sideways", "rad/s"), strict=True)

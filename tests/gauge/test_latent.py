@@ -11,7 +11,7 @@ from gaitgauge.gauge.latent.collecting import COMMANDS, Walks, collect
 from gaitgauge.gauge.latent.separation import principal_components, separation, silhouette
 from gaitgauge.gauge.latent.study import LatentError, LatentRequest, study_latents
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import ARCHITECTURES
@@ -106,7 +106,7 @@ def policies(tmp_path_factory) -> dict[str, str]:
         weights |= {k: 0.01 * v for k, v in weights.items() if k.startswith(("actor", "network"))}
         paths[name] = str(folder / f"{name}.gauge.pt")
         stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=weights)
-        save_policy(paths[name], go2_contract(load_robot("go2")), stored)
+        save_policy(paths[name], standard_contract(load_robot("go2")), stored)
     return paths
 
 
