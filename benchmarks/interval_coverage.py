@@ -26,6 +26,7 @@ from gaitgauge.gauge.comparison import chance_rules_of, compare
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.intervals import Chance, ChanceRules, Evidence
 from gaitgauge.gauge.level_chance import bisect
+from gaitgauge.gauge.level_curve import expected_levels, follow
 from gaitgauge.gauge.results import SCHEMA, environment_weights
 from gaitgauge.gauge.store import StoreError
 from numpy.typing import NDArray
@@ -42,6 +43,9 @@ RULES = ChanceRules(
     resamples=1000,
 )
 """Those of ``robogauge-1.1``."""
+EXPECTED = replace(RULES, shared_noise=False, level="curve", search_seeds=(0, 1, 2, 3, 4, 5))
+"""Those of ``gaitgauge-1``."""
+_LEVELS = np.arange(1, 11)
 SUITE = """
 extends = "robogauge-1.1"
 name = "repeated-{index}"
@@ -150,12 +154,15 @@ def synthetic(policy: Known, rules: ChanceRules, generator: np.random.Generator)
         if terrain != "flat":
             draws = np.sqrt(1.0 - luck) * generator.standard_normal((10, len(rules.search_seeds))) + lucky
             reached = draws < _quantile(policy.success[at])[:, None]
-            row["level"] = int(bisect(reached.sum(1) >= needed))
-            row["trials"] = dict(_trials(reached, rules, needed))
+            if rules.level == "curve":
+                row["level"], row["trials"] = _expected(reached, rules)
+            else:
+                row["level"] = int(bisect(reached.sum(1) >= needed))
+                row["trials"] = dict(_trials(reached, rules, needed))
         level = row["level"] or 0
         if terrain == "flat" or level:
             own = np.sqrt(1.0 - shared) * generator.standard_normal(len(rules.seeds))
-            runs = policy.quality[at, max(level, 1) - 1] + policy.spread * (noise + own)
+            runs = np.interp(max(level, 1), _LEVELS, policy.quality[at]) + policy.spread * (noise + own)
             row["runs"] = {str(s): {"quality": q, "commands": {}} for s, q in zip(rules.seeds, runs, strict=True)}
         rows.append(row)
     evidence = Evidence(rows, rules)
@@ -191,6 +198,18 @@ def _trials(reached: NDArray[np.bool_], rules: ChanceRules, needed: int) -> Iter
         low, high = (level, high) if sum(played) >= needed else (low, level - 1)
 
 
+def _expected(reached: NDArray[np.bool_], rules: ChanceRules) -> tuple[float, dict[str, dict[str, bool]]]:
+    """The expected level, and the trials that its design plays."""
+    seeds = rules.search_seeds
+    found = follow(lambda level: [bool(o) for o in reached[level - 1]], 10, len(seeds), rules.bracket_seeds)
+    assert found.level is not None
+    trials = {
+        str(level): {str(s): bool(o) for s, o in zip(seeds[:count], reached[level - 1], strict=False)}
+        for level, count in found.seeds.items()
+    }
+    return found.level, trials
+
+
 def _quantile(chance: NDArray[np.float64]) -> NDArray[np.float64]:
     from scipy.stats import norm
 
@@ -199,8 +218,11 @@ def _quantile(chance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def expected_score(policy: Known, rules: ChanceRules) -> float:
-    """The exact mean score over all seeds; a seed's luck must be zero."""
+    """The mean score over all seeds: exact, or of many draws where levels are expected ones. A seed's luck must be zero."""
     from scipy.stats import binom
+
+    if rules.level == "curve":
+        return _mean_of_draws(policy, rules)
 
     seeds = len(rules.search_seeds)
     passed = binom.sf(round(rules.pass_rate * seeds) - 1, seeds, policy.success)
@@ -222,27 +244,42 @@ def expected_score(policy: Known, rules: ChanceRules) -> float:
     return float(environment_weights([t for t, _ in policy.environments]) @ scores)
 
 
+def _mean_of_draws(policy: Known, rules: ChanceRules, draws: int = 2000) -> float:
+    generator, scores = np.random.default_rng(9), []
+    for at, (terrain, _) in enumerate(policy.environments):
+        if terrain == "flat":
+            scores.append(policy.quality[at, 0])
+            continue
+        chance = policy.success[at][:, None]
+        levels = expected_levels(
+            generator.uniform(size=(draws, 10, len(rules.search_seeds))) < chance, rules.bracket_seeds
+        )
+        quality = np.minimum(levels, 1.0) * np.interp(levels, _LEVELS, policy.quality[at])
+        found = rules.level_weight * np.maximum(levels - 1.0, 0.0) + rules.quality_weight * quality
+        scores.append(found.mean())
+    return float(environment_weights([t for t, _ in policy.environments]) @ scores)
+
+
+NINE = tuple(0.1 * n for n in range(2, 11))
+ALL = ("flat", "a", "b", "c", "d", "e", "f")
 KINDS = {
-    "flat alone": (("flat",), (0.6,), True),
-    "one terrain, one friction": (("wave",), (0.6,), True),
-    "waves and obstacles, one friction": (("wave", "obstacle"), (0.6,), True),
-    "one terrain, nine frictions": (("wave",), tuple(0.1 * n for n in range(2, 11)), True),
-    "all terrains, one friction": (("flat", "a", "b", "c", "d", "e", "f"), (0.6,), True),
-    "all terrains, nine frictions": (
-        ("flat", "a", "b", "c", "d", "e", "f"),
-        tuple(0.1 * n for n in range(2, 11)),
-        True,
-    ),
-    "the same, noise not shared": (("flat", "a", "b", "c", "d", "e", "f"), tuple(0.1 * n for n in range(2, 11)), False),
+    "flat alone": (("flat",), (0.6,), RULES),
+    "one terrain, one friction": (("wave",), (0.6,), RULES),
+    "waves and obstacles, one friction": (("wave", "obstacle"), (0.6,), RULES),
+    "one terrain, nine frictions": (("wave",), NINE, RULES),
+    "all terrains, one friction": (ALL, (0.6,), RULES),
+    "all terrains, nine frictions": (ALL, NINE, RULES),
+    "the same, noise not shared": (ALL, NINE, replace(RULES, shared_noise=False)),
+    "expected levels, one friction": (ALL, (0.6,), EXPECTED),
+    "expected levels, nine frictions": (ALL, NINE, EXPECTED),
 }
-"""Synthetic evaluations: terrains, frictions, and whether environments share a seed's noise."""
+"""Synthetic evaluations: terrains, frictions, and rules."""
 
 
 def coverage(kind: str, count: int, seed: int = 0) -> float:
     """Share of the intervals of ``count`` synthetic evaluations, each of another policy, that hold the expected score."""
-    terrains, frictions, shared = KINDS[kind]
+    terrains, frictions, rules = KINDS[kind]
     generator = np.random.default_rng(seed)
-    rules = replace(RULES, shared_noise=shared)
     hits = 0
     for _ in range(count):
         policy = make_policy(generator, terrains, frictions)
@@ -253,10 +290,9 @@ def coverage(kind: str, count: int, seed: int = 0) -> float:
 
 def false_alarms(kind: str, count: int, seed: int = 1) -> tuple[float, float]:
     """Shares of synthetic policies that are told apart from themselves with other seeds: by the score, and by any detail."""
-    terrains, frictions, shared = KINDS[kind]
+    terrains, frictions, rules = KINDS[kind]
     generator = np.random.default_rng(seed)
-    rules = replace(RULES, shared_noise=shared)
-    other = replace(rules, seeds=(10, 11, 12), search_seeds=(10, 11, 12, 13, 14))
+    other = replace(rules, seeds=(10, 11, 12), search_seeds=tuple(10 + s for s in rules.search_seeds))
     alarms = np.zeros(2)
     for _ in range(count):
         policy = make_policy(generator, terrains, frictions)

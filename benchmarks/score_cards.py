@@ -3,8 +3,8 @@
     python benchmarks/score_cards.py --threads 13 --folder /tmp/cards --cts go2_cts_public.npz --out docs/data/scorecards
 
 Each policy is evaluated on each suite, whole; what the folder holds is not played again. A card is the run's ``results.json``
-with the policy's name in place of its path and without the machine's name, and with the band in which the score of a replay on
-another machine must lie. Weights of others are not written to ``--out``: of the CTS policy its card alone. ``--only`` and
+with the policy's name in place of its path and without the machine's name, with the band in which the score of a replay on
+another machine must lie, and with the repeatability of its suite (``--repeatability``). Weights of others are not written to ``--out``: of the CTS policy its card alone. ``--only`` and
 ``--suite`` choose, ``--terrain`` and ``--friction`` take a part for a first try.
 """
 
@@ -59,15 +59,19 @@ def save_constant(path: Path, action: list[float], *, kind: str) -> None:
     save_policy(path, contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=state))
 
 
-def card_of(results: dict[str, Any], name: str) -> dict[str, Any]:
-    """A card that names no folder and no machine."""
+def card_of(results: dict[str, Any], name: str, repeated: dict[str, Any] | None) -> dict[str, Any]:
+    """A card that names no folder and no machine, with the figures of repeated evaluations by the same rules if there are any."""
     path = "pretrained" if name == "pretrained" else f"{name}.gauge.pt"
     suite = results["suite"]["name"]
     provenance = {k: v for k, v in results["provenance"].items() if k not in ("host", "command")}
     provenance["command"] = f"gaitgauge evaluate {path} --suite {suite}"
     provenance["host"] = ""
     band = tolerance_band(results["score"], results["score_interval"])
-    return {**results, "policy": {**results["policy"], "path": path}, "provenance": provenance, "tolerance": band}
+    card = {**results, "policy": {**results["policy"], "path": path}, "provenance": provenance, "tolerance": band}
+    if repeated and repeated["suite"]["digest"] == results["suite"]["digest"]:
+        figures = ("sigma", "mean", "coverage", "control_steps", "cost", "policy")
+        card["repeatability"] = {k: repeated[k] for k in figures} | {"evaluations": len(repeated["evaluations"])}
+    return card
 
 
 def main() -> None:
@@ -77,6 +81,9 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="policies and runs stay here")
     parser.add_argument("--out", type=Path, required=True, help="where the cards go")
     parser.add_argument("--cts", type=Path, help="NumPy archive of the published CTS policy's weights")
+    parser.add_argument(
+        "--repeatability", type=Path, help="figures that benchmarks/repeatability.py wrote, for the cards"
+    )
     parser.add_argument("--only", nargs="+", choices=NAMES, default=list(NAMES))
     parser.add_argument("--suite", nargs="+", default=list(SUITES))
     parser.add_argument("--terrain", action="append", default=[])
@@ -84,6 +91,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if "cts" in arguments.only and arguments.cts is None:
         parser.error("the card of 'cts' needs the archive of its weights; give --cts, or choose others with --only")
+    repeated = None
+    if arguments.repeatability is not None:
+        repeated = json.loads(arguments.repeatability.read_text(encoding="utf-8"))
     arguments.folder.mkdir(parents=True, exist_ok=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.only:
@@ -99,7 +109,7 @@ def main() -> None:
                 frictions=tuple(arguments.friction),
             )
             run = arguments.folder / f"{name}-{suite}"
-            card = card_of(evaluate(request, run, resume=True), name)
+            card = card_of(evaluate(request, run, resume=True), name, repeated)
             write_report(run)
             write_atomically(arguments.out / f"{run.name}.json", json_text(json.loads(json.dumps(card))), StoreError)
             low, high = card["tolerance"] or (float("nan"),) * 2

@@ -232,10 +232,9 @@ def _plan_curve(environment: Environment, records: Records, rules: PlanRules) ->
     found = follow(outcomes, levels, len(seeds), suite.scoring.bracket_seeds)
     counted = [trial(level, seed) for level, count in found.seeds.items() for seed in seeds[:count]]
     if found.level is None:
-        likely = _likely_levels(found, levels)
-        possible = {trial(level, seed): p for level, p in likely.items() for seed in seeds}
+        possible = {trial(level, seed): p for level, p in _likely_levels(found, levels).items() for seed in seeds}
         for level in range(1, levels + 1):
-            chance = 0.5 * nearness(level, found.lowest, found.highest)
+            chance = _share(found, levels, 2) * nearness(level, found.lowest, found.highest)
             possible |= dict.fromkeys(_quality(environment, level, rules), chance)
         return _plan(None, {}, counted, possible, records)
     fit = fitted_curve({level: [bool(o) for o in outcomes(level)[:count]] for level, count in found.seeds.items()})
@@ -248,9 +247,13 @@ def _likely_levels(found: CurveSearch, levels: int) -> dict[int, float]:
     below = range(1, found.lowest) if found.goes_down else range(0)
     above = range(found.highest + 1, levels + 1) if found.goes_up else range(0)
     within = range(max(found.lowest, 1), min(found.highest, levels) + 1)
-    # the longer the range of which the crossing is still to be found, the less is known of each of its levels
-    share = min(4.0 / max(len(within), 1), 0.8)
+    share = _share(found, levels, 4)
     return {level: share * nearness(level, found.lowest, found.highest) for level in (*within, *below, *above)}
+
+
+def _share(found: CurveSearch, levels: int, wanted: int) -> float:
+    """Part of the levels in question that ``wanted`` of them are, at most 0.8: the more are in question, the less is known of each."""
+    return min(wanted / (min(found.highest, levels) - max(found.lowest, 1) + 1), 0.8)
 
 
 # ---- the end ----------------------------------------------------------------------------------------------------------

@@ -33,6 +33,11 @@ def test_synthetic_intervals_hold_the_truth(kind):
     assert 0.9 <= bench.coverage(kind, 120) <= 0.995
 
 
+def test_intervals_of_expected_levels_hold_the_truth():
+    """As many as 30 trials can tell; the slow test has twenty times as many."""
+    assert bench.coverage("expected levels, one friction", 30) >= 0.83
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", bench.KINDS)
 def test_many_synthetic_intervals_hold_the_truth(kind):
@@ -45,6 +50,12 @@ def test_a_policy_is_hardly_ever_told_apart_from_itself(recorded):
     pairs = list(zip(recorded[::2], recorded[1::2], strict=False))
     assert len(pairs) >= 10
     assert np.sum([bench.alarm(pair) for pair in pairs], axis=0).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.slow
+def test_expected_levels_tell_a_policy_from_itself_as_seldom():
+    by_score, by_detail = bench.false_alarms("expected levels, one friction", 60)
+    assert by_score <= 0.1 and by_detail <= 0.1
 
 
 def test_a_policy_that_is_better_is_told_apart():
