@@ -4,7 +4,8 @@
 
 Each policy is evaluated on each suite, whole; what the folder holds is not played again. A card is the run's ``results.json``
 with the policy's name in place of its path and without the machine's name, with the band in which the score of a replay on
-another machine must lie, and with the repeatability of its suite (``--repeatability``). Weights of others are not written to ``--out``: of the CTS policy its card alone. ``--only`` and
+another machine must lie, and with the repeatability of its suite (``--repeatability``). Weights of others are not written to
+``--out``: of the CTS policy its card alone. ``--only`` and
 ``--suite`` choose, ``--terrain`` and ``--friction`` take a part for a first try.
 """
 

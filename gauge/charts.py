@@ -41,8 +41,8 @@ def terrain_label(name: str) -> str:
 
 
 def number(value: float) -> str:
-    """A number as short as it goes, with a true minus sign."""
-    return f"{value:g}".replace("-", "−")
+    """A number as short as it goes, to three decimals, with a true minus sign."""
+    return f"{round(value, 3):g}".replace("-", "−")
 
 
 def strip(row: Mapping[str, Any]) -> dict[str, Any]:
