@@ -47,8 +47,13 @@ from .tasks import TASKS, Task, find_task
 DEFAULT_BACKEND = "mujoco-warp"
 QUICK_SUITE = "quick"
 _WAIT = "training.run.gauge_wait"
-_GOING_ON_RATE, _GOING_ON_KL, _GOING_ON_STD = 3e-4, 0.006, 0.3
-"""First learning rate, wanted change of the policy in an update, and exploration noise of a run that begins with trained networks."""
+_GOING_ON = {
+    "training.algorithm.learning_rate": 3e-4,
+    "training.algorithm.student_learning_rate": 3e-4,
+    "training.algorithm.desired_kl": 0.003,
+    "training.network.initial_std": 0.3,
+}
+"""Settings of a run that begins with trained networks: small steps, of the policy and of the student's encoder, and little noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,9 +246,7 @@ def _going_on(task: Task, weights: Path) -> list[str]:
     return [
         f"environment.schedule.begin={reached(read_checkpoint(weights, training_state=False)):g}",
         f"environment.terrain.highest_start_level={task.environment.terrain.levels - 1}",
-        f"training.algorithm.desired_kl={_GOING_ON_KL}",
-        f"training.algorithm.learning_rate={_GOING_ON_RATE}",
-        f"training.network.initial_std={_GOING_ON_STD}",
+        *(f"{key}={value}" for key, value in _GOING_ON.items()),
     ]
 
 

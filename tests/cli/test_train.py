@@ -81,6 +81,7 @@ def test_trained_networks_go_on_where_their_schedules_stood(trained):
     begun = plan("pretrained").task
     assert begun.environment.schedule.begin == 1.0
     assert begun.training.algorithm.learning_rate == pytest.approx(3e-4)
+    assert begun.training.algorithm.desired_kl == pytest.approx(0.003)
     assert begun.training.network.initial_std == pytest.approx(0.3)
     spelled = plan("pretrained", "environment.schedule.begin=0.5", "training.algorithm.learning_rate=1e-4")
     assert spelled.task.environment.schedule.begin == 0.5

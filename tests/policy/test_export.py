@@ -111,8 +111,9 @@ def test_deploy_file_is_exact_for_a_history_that_starts_with_copies(tmp_path):
     assert load_policy(tmp_path / "policy.onnx").contract.history == runtime.history
 
 
-@pytest.mark.parametrize("start", ["zeros", "repeat"])
-@pytest.mark.parametrize("kind", list(NETWORKS))
+@pytest.mark.parametrize(
+    ("kind", "start"), [*((kind, "zeros") for kind in NETWORKS), ("moe", "repeat"), ("him", "repeat")]
+)
 def test_torchscript_runs_step_by_step_like_the_policy(kind, start, tmp_path):
     policy = make_policy(kind, starting_with(start))
     assert export_torchscript(policy, tmp_path / "policy.pt") <= 1e-5
