@@ -120,7 +120,7 @@ def judge(evaluations: Sequence[dict[str, Any]], before: dict[str, Any] | None) 
 def report(found: dict[str, Any]) -> None:
     """Print the figures."""
     kept = "below" if found["sigma"] < BOUND else "NOT below"
-    print(f"score {found['mean']:.4f}, σ {found['sigma']:.4f}, {kept} {BOUND}")
+    print(f"score {found['mean']:.4f}, σ {found['sigma']:.4f}, {kept} the {BOUND} of a whole evaluation")
     print("σ of terrains: " + ", ".join(f"{name} {value:.4f}" for name, value in found["sigma_of_terrains"].items()))
     print(f"intervals: median half width {found['half_width']:.4f}, {found['covered']:.0%} hold the mean")
     cost = "" if found["cost"] is None else f", {found['cost']:.2f} times as many as before (at most {MOST_COST:g})"

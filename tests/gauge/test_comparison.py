@@ -95,6 +95,28 @@ def test_metrics_are_compared_where_both_reached_one_level():
     assert found["metric", "dof_power"].values[0] == pytest.approx(np.mean(runs), abs=1e-6)
 
 
+def test_metrics_are_compared_at_a_whole_level_that_both_were_measured_at():
+    """Expected levels are hardly ever equal: 5.5 and 6.25 have level 6 in common, 5.5 and 7.5 have none."""
+    choices = {"suite": "gaitgauge-1", "terrains": ("wave",), "frictions": (0.6,)}
+    first, second = results(**choices), results(path="b/second.pt", **choices)
+
+    def measured(result, level, power):
+        for row in result["environments"]:
+            row["level"] = level + 0.5
+            row["runs_by_level"] = {
+                str(at): {seed: {**run, "dof_power": power + at} for seed, run in row["runs"].items()}
+                for at in (level, level + 1)
+            }
+
+    measured(first, 5, 0.0)
+    measured(second, 6, 0.1)
+    found = {(d.kind, d.name): d for d in compare([first, second]).differences}
+    assert found["metric", "dof_power"].values == pytest.approx((6.0, 6.1))
+    assert found["level", "mean level"].difference == pytest.approx(1.0)
+    measured(second, 7, 0.1)
+    assert not [d for d in compare([first, second]).differences if d.kind in ("metric", "command")]
+
+
 def test_one_seed_says_so():
     one = [results(suite="demo", path=f"{n}.pt", terrains=("flat", "slope_fd", "stairs_fd")) for n in "ab"]
     found = compare(one)

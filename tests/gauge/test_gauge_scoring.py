@@ -83,7 +83,16 @@ def test_sub_commands_have_statistics_of_their_own_where_they_were_played():
 
 @pytest.mark.parametrize(
     ("quality", "level", "flat", "expected"),
-    [(0.7, 0, True, 0.7), (1.0, 10, False, 1.0), (0.0, 1, False, 0.0), (0.5, 6, False, 0.545), (0.9, 0, False, 0.0)],
+    [
+        (0.7, 0, True, 0.7),
+        (1.0, 10, False, 1.0),
+        (0.0, 1, False, 0.0),
+        (0.5, 6, False, 0.545),
+        (0.9, 0, False, 0.0),
+        # expected levels: half way between two scores, and half way from nothing to level 1
+        (0.5, 5.5, False, 0.5),
+        (0.8, 0.5, False, 0.076),
+    ],
 )
 def test_level_score(quality, level, flat, expected):
     assert level_score(quality, level, REFERENCE.scoring, flat=flat) == pytest.approx(expected)
@@ -197,6 +206,29 @@ def test_fold_weighs_terrains_the_same_and_counts_unpassed_environments_zero():
     # metrics are weighted by level like quality, over environments and not over terrains
     assert result["metrics"]["dof_limits"]["mean50"] == pytest.approx((0.7 + 2 * wave) / 3, abs=1e-4)
     assert [row["score"] for row in result["environments"]] == pytest.approx([0.7, 2 * wave, 0.0])
+
+
+def test_the_score_of_an_expected_level_lies_between_those_of_the_levels_beside_it():
+    """Level 5.25, qualities 0.6 and 0.4 there: 3/4 of 0.36 + 0.114 and 1/4 of 0.45 + 0.076."""
+    suite = replace(OWN, scoring=replace(OWN.scoring, bootstrap=5))
+    names = [*suite.metrics.weights, "quality"]
+    halves = {"goals": [0, 0, 1, 1], "parts": [0, 1, 0, 1], "terrain": "wave"}
+    low, high = (
+        [record(np.full((4, 9), q + 0.02 * (seed - 1)), **halves, seed=seed, level=at) for seed in range(3)]
+        for at, q in ((5, 0.6), (6, 0.4))
+    )
+    environment = replace(flat_environment([], 0.6, "wave", 5.25, True), records=[*low, *high])
+    result = fold(suite, [environment], names)
+    (row,) = result["environments"]
+    assert row["score"] == pytest.approx(0.75 * 0.474 + 0.25 * 0.526)
+    assert row["level"] == result["level"] == 5.25
+    assert row["quality"]["mean50"] == pytest.approx(0.55)
+    assert [run["quality"] for run in row["runs"].values()] == pytest.approx([0.53, 0.55, 0.57])
+    assert {at: run["1"]["dof_power"] for at, run in row["runs_by_level"].items()} == pytest.approx(
+        {"5": 0.6, "6": 0.4}
+    )
+    assert row["runs"]["2"]["commands"]["max_velocity +x"] == pytest.approx(0.57)
+    assert result["score"] == pytest.approx(row["score"])
 
 
 def test_fold_rounds_a_run_before_it_averages_as_the_reference_does():
