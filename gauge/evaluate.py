@@ -35,7 +35,7 @@ from ..terrains.registry import make_terrain, terrain_names
 from .coverage import coverage
 from .dispatcher import Dispatcher, Speculation, play
 from .episodes import QUALITY, Episode
-from .goals import SUB_COMMANDS, TARGET, check_terrain
+from .goals import TARGET, check_terrain, count_sub_commands
 from .motors import gains_note, joint_parameters
 from .pipelines import PIPELINES, Environment, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
@@ -328,9 +328,12 @@ def _workers(
     if on_gpu:
         # a GPU plays nearly every level of every search at once: a few long batches instead of many short ones
         speculation = Speculation(at_work=_GPU_WORLDS, test_probability=0.02, quality_probability=0.5)
-        worlds = min(max(sum(map(count_segments, (*required, *speculation.choose(plans, required)))), 1), _GPU_WORLDS)
+        worlds = min(
+            max(sum(count_segments(e, suite) for e in (*required, *speculation.choose(plans, required))), 1),
+            _GPU_WORLDS,
+        )
     else:
-        walk = sum(len(SUB_COMMANDS[g.name]) for g in suite.goals if g.name != TARGET)
+        walk = sum(count_sub_commands(suite, g.name) for g in suite.goals if g.name != TARGET)
         worlds = min(
             len(prepared.environments) * max(len(prepared.seeds) * walk, len(suite.matrix.search_seeds)), _WORLDS
         )
@@ -359,7 +362,10 @@ def _watcher(
     crossing = 0.4 * max(suite.commands.target_time.values(), default=25.0)
     settling = suite.settling.shortest
     usual: dict[str, float] = {
-        g.name: sum(sum(g.phases or (crossing,)) + settling for _ in SUB_COMMANDS[g.name])
+        g.name: sum(
+            sum([p.seconds for p in g.sub_commands[part]] if g.sub_commands else g.phases or (crossing,)) + settling
+            for part in range(count_sub_commands(suite, g.name))
+        )
         / suite.physics.control_period
         for g in suite.goals
     }

@@ -9,6 +9,7 @@ import torch
 from ..backends.base import PhysicsState
 from ..robots.rotation import rotate_inverse, yaw_of
 from ..terrains.base import Terrain
+from .commands import Command
 from .suite import Suite, SuiteError
 
 # Sub-commands as multiples of the limits (forward, lateral, yaw), in the order in which they run.
@@ -29,13 +30,17 @@ _AXES = ("x", "y", "yaw")
 
 
 def command_name(goal: str, part: int) -> str:
-    """Name of a goal's sub-command for readers: ``max_velocity -x``, ``diagonal_velocity +x+y``."""
+    """Name of a goal's sub-command for readers: ``max_velocity -x``, ``diagonal_velocity +x+y``, of one's own ``slalom 1``."""
+    if goal not in SUB_COMMANDS:
+        return f"{goal} {part + 1}"
     signs = SUB_COMMANDS[goal][part]
     axes = "".join(f"{'+' if sign > 0 else '-'}{axis}" for sign, axis in zip(signs, _AXES, strict=True) if sign)
     return f"{goal} {axes}" if axes else goal
 
 
-Command = tuple[float, float, float]
+def count_sub_commands(suite: Suite, goal: str) -> int:
+    """How many sub-commands a suite's goal has; one for the goal that ends at its target."""
+    return len(SUB_COMMANDS[goal]) if goal in SUB_COMMANDS else len(suite.goal(goal).sub_commands)
 
 
 class Schedule:
@@ -53,13 +58,13 @@ class Schedule:
             SuiteError: a goal that is not known, or phases that do not suit it.
         """
         names = [g.name for g in suite.goals]
-        unknown = [n for n in names if n not in SUB_COMMANDS]
+        unknown = [g.name for g in suite.goals if g.name not in SUB_COMMANDS and not g.sub_commands]
         if unknown:
             raise SuiteError(
                 f"suite '{suite.name}' has the unknown goal '{unknown[0]}'; choose from {', '.join(SUB_COMMANDS)}"
             )
         for g in suite.goals:
-            wanted = 0 if g.name == TARGET else 2
+            wanted = 0 if g.name == TARGET or g.sub_commands else 2
             if len(g.phases) != wanted or any(phase <= 0.0 for phase in g.phases):
                 raise SuiteError(
                     f"goal '{g.name}' of suite '{suite.name}' has the phases {list(g.phases)}; "
@@ -72,7 +77,11 @@ class Schedule:
         """Control steps that the target goal may take, by terrain family."""
         early = suite.commands.clock_offset * period
         self.sub_commands: dict[str, tuple[tuple[Command, ...], ...]] = {
-            g.name: ((),) if g.name == TARGET else _velocity_commands(g.name, g.phases, period, early)
+            g.name: ((),)
+            if g.name == TARGET
+            else tuple(tuple(p.velocity for p in row for _ in range(p.steps(period))) for row in g.sub_commands)
+            if g.sub_commands
+            else _velocity_commands(g.name, g.phases, period, early)
             for g in suite.goals
         }
         """Commands of each sub-command of each goal, one for each step, as multiples of the limits; none for the target goal."""

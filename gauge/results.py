@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .episodes import Record
-from .goals import SUB_COMMANDS, command_name
+from .goals import command_name, count_sub_commands
 from .intervals import CONFIDENCE, ChanceRules, Evidence
 from .level_curve import bracketing_levels, fitted_curve
 from .plan import EnvironmentResult
@@ -190,9 +190,9 @@ def _environment(
         for run, values in zip(row["runs"].values(), runs, strict=True):
             run[column] = _number(values[2])
     for seed, found in of_seed.items():
-        row["runs"][str(seed)]["commands"] = _commands(found, len(columns) - 1)
+        row["runs"][str(seed)]["commands"] = _commands(suite, found, len(columns) - 1)
     if len(weights) > 1:
-        row["runs_by_level"] = {str(at): _runs_at(environment, at, columns) for at in weights}
+        row["runs_by_level"] = {str(at): _runs_at(suite, environment, at, columns) for at in weights}
     row["quality"] = {s: _number(v) for s, v in zip(STATISTICS, plain[columns[-1]], strict=True)}
     row["score"] = _number(statistics["score"][2])
     row["metrics"] = {c: {s: _number(v) for s, v in zip(STATISTICS, plain[c], strict=True)} for c in columns[:-1]}
@@ -203,23 +203,23 @@ def _environment(
     return row, statistics
 
 
-def _runs_at(environment: EnvironmentResult, level: int, columns: Sequence[str]) -> dict[str, Any]:
+def _runs_at(suite: Suite, environment: EnvironmentResult, level: int, columns: Sequence[str]) -> dict[str, Any]:
     """The runs at one of the two levels beside an expected one, as ``runs`` has them in between."""
     runs: dict[str, Any] = {}
     for record in environment.records:
         if record.episode.level == level:
             run = {column: _number(run_statistics(record, index)[2]) for index, column in enumerate(columns)}
-            runs[str(record.episode.seed)] = run | {"commands": _commands([(1.0, record)], len(columns) - 1)}
+            runs[str(record.episode.seed)] = run | {"commands": _commands(suite, [(1.0, record)], len(columns) - 1)}
     return runs
 
 
-def _commands(found: Sequence[tuple[float, Record]], column: int) -> dict[str, float]:
+def _commands(suite: Suite, found: Sequence[tuple[float, Record]], column: int) -> dict[str, float]:
     """Mean@50 of a column in each sub-command of a run, from its records at one or two levels and their weights."""
     values: dict[str, float] = {}
     for weight, record in found:
         played = command_statistics(record, column)
         for goal, name in enumerate(record.episode.goals):
-            for part in range(len(SUB_COMMANDS[name])):
+            for part in range(count_sub_commands(suite, name)):
                 command = command_name(name, part)
                 value = float(played[goal, part][2]) if (goal, part) in played else 0.0
                 values[command] = values.get(command, 0.0) + weight * value

@@ -15,13 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .episodes import Episode, Record
-from .goals import SUB_COMMANDS, TARGET, Schedule
+from .goals import SUB_COMMANDS, TARGET, Schedule, count_sub_commands
 from .suite import Suite
 
 
-def count_segments(episode: Episode) -> int:
-    """Number of segments of an episode that can be played side by side at first."""
-    return sum(len(SUB_COMMANDS[goal]) for goal in episode.goals)
+def count_segments(episode: Episode, suite: Suite | None = None) -> int:
+    """Number of segments of an episode that can be played side by side at first; without the suite, goals of its own count as
+    one each.
+    """
+    if suite is not None:
+        return sum(count_sub_commands(suite, goal) for goal in episode.goals)
+    return sum(len(SUB_COMMANDS[goal]) if goal in SUB_COMMANDS else 1 for goal in episode.goals)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -26,6 +26,7 @@ from ..files.parsing import (
     read_text,
     shown,
 )
+from .commands import Phase
 
 SUITE_FOLDER = Path(__file__).parent / "suites"
 
@@ -40,6 +41,8 @@ Friction = Annotated[float, Field(gt=0.0, le=10.0)]
 Payload = Annotated[float, Field(ge=-5.0, le=50.0)]
 """Mass added to the base [kg]."""
 GoalName = Literal["diagonal_velocity", "max_velocity", "target_pos_velocity"]
+"""The paper's goals, whose commands are written in ``goals.py``: the reference's clock and its rounding errors are part of them."""
+_AIMED = "target_pos_velocity"
 
 
 class SuiteError(ValueError):
@@ -50,9 +53,14 @@ class SuiteError(ValueError):
 class Goal:
     """One kind of motion, made of sub-commands. The robot goes back to the spawn after each of them."""
 
-    name: GoalName
-    phases: tuple[_Time, ...]
-    """Length of each phase of a sub-command [s]; empty for the goal that ends at its target."""
+    name: Name
+    """One of ``GoalName``, whose commands are the paper's, or any other for a goal that is all data."""
+    phases: tuple[_Time, ...] = ()
+    """Length of each phase of a sub-command of the paper's goals [s]; empty for the one that ends at its target."""
+    sub_commands: Annotated[
+        tuple[Annotated[tuple[Phase, ...], Field(min_length=1, max_length=100)], ...], Field(max_length=100)
+    ] = ()
+    """What a goal of one's own commands: its sub-commands, each a row of phases."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +213,7 @@ class Scoring:
 class Push:
     """A sudden lateral push: a force on the base's centre of mass, to the left or right of its heading, chance says which."""
 
-    goal: GoalName
+    goal: Name
     """Velocity goal of whose sub-commands each has a push."""
     after: _Time
     """When it begins, from the first commanded control step on [s]."""
@@ -226,7 +234,7 @@ class Suite:
     """Name of the robot's joint-parameter set."""
     physics: PhysicsOptions
     matrix: Matrix
-    goals: Annotated[tuple[Goal, ...], Field(min_length=1, max_length=3)]
+    goals: Annotated[tuple[Goal, ...], Field(min_length=1, max_length=20)]
     """In the order in which an episode runs them."""
     commands: Commands
     noise: Noise
@@ -243,6 +251,9 @@ class Suite:
     def digest(self) -> str:
         """SHA-256 over every rule, hexadecimal: two suites of one name and different rules differ in it."""
         rules = asdict(self)
+        for goal in rules["goals"]:
+            if not goal["sub_commands"]:
+                del goal["sub_commands"]
         for path, plain in _ADDED.items():  # suites that were published before these existed keep their digest
             *tables, field = path.split(".")
             table = rules[tables[0]] if tables else rules
@@ -338,6 +349,31 @@ def _none_for_false(kind: type, data: dict[str, Any]) -> dict[str, Any]:
     return {key: value(key, given) for key, given in data.items()}
 
 
+def _goal_rules(suite: Suite) -> dict[str, bool]:
+    """Sentences on goals, and whether each rule is kept."""
+    paper, goals = get_args(GoalName), [g.name for g in suite.goals]
+    rules = {
+        f"goals must differ in their first word, which names files; they are {', '.join(goals)}": (
+            len({name.partition("_")[0] for name in goals}) == len(set(goals))
+        )
+    }
+    for goal in suite.goals:
+        own, name = goal.name not in paper, f"the goal '{goal.name}'"
+        largest = max((abs(v) for row in goal.sub_commands for phase in row for v in phase.velocity), default=0.0)
+        rules |= {
+            f"{name} has no commands; give it sub_commands, or choose one of {', '.join(paper)}": (
+                bool(goal.sub_commands) or not own
+            ),
+            f"{name} lacks phases": own or bool(goal.phases) or goal.name == _AIMED,
+            f"{name} has phases or sub_commands that it cannot have; the paper's goals have phases and no sub_commands, one's "
+            "own have sub_commands and no phases": not (goal.phases if own else goal.sub_commands),
+            f"{name} commands {largest:g} times a limit; velocities of a suite are multiples of its limits, -1 to 1": (
+                largest <= 1.0
+            ),
+        }
+    return rules
+
+
 def _check(suite: Suite, source: str) -> None:
     """Refuse what each field alone allows and all of them together do not.
 
@@ -371,10 +407,11 @@ def _check(suite: Suite, source: str) -> None:
         rules[
             f"noise.{name} is {half:g}, which the stream 'reference' does not draw; let it be 0, or the stream 'counter'"
         ] = half == 0.0 or suite.noise.stream == "counter"
+    rules |= _goal_rules(suite)
     if (push := suite.push) is not None:
         rules[f"push.force ({push.force[0]:g} to {push.force[1]:g} N) must rise"] = push.force[0] <= push.force[1]
         rules[f"push.goal ({push.goal}) is none of goals with sub-commands ({', '.join(goals)})"] = any(
-            g.name == push.goal and g.phases for g in suite.goals
+            g.name == push.goal and (g.phases or g.sub_commands) for g in suite.goals
         )
     for name in ("terrains", "frictions", "payloads", "seeds", "search_seeds"):
         values = getattr(matrix, name)

@@ -127,7 +127,7 @@ def play_variant(
         policy=policy,
         robot=robot,
         places=tuple(dict.fromkeys((e.terrain, e.level) for e in episodes)),
-        worlds=min(sum(map(count_segments, waiting)), most),
+        worlds=min(sum(count_segments(e, suite) for e in waiting), most),
         build=partial(variant.worlds, make=make),
         threads=max(threads // count, 1),
     )

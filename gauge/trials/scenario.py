@@ -15,13 +15,13 @@ from ...files.parsing import Name, Text, build, did_you_mean, one_line, parse_to
 from ...terrains.base import Box, Terrain
 from ...terrains.course import Stretch, course_boxes
 from ...terrains.registry import TerrainError, make_terrain
+from ..commands import Phase
 from ..suite import Friction, load_suite
 
 SCENARIO_FOLDER = Path(__file__).parents[1] / "scenarios"
 
 _Place = Annotated[float, Field(ge=-200.0, le=200.0)]
 _Size = Annotated[float, Field(gt=0.0, le=200.0)]
-_Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
 _Seconds = Annotated[float, Field(gt=0.0, le=600.0)]
 _Moment = Annotated[float, Field(ge=0.0, le=600.0)]
 _Newtons = Annotated[float, Field(ge=0.0, le=10_000.0)]
@@ -80,12 +80,9 @@ class Start:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Phase:
-    """What is commanded for a time."""
+class Leg(Phase):
+    """What is commanded for a time, or up to a place."""
 
-    seconds: _Seconds
-    velocity: tuple[_Speed, _Speed, _Speed]
-    """Forward, lateral [m/s] and yaw [rad/s] speed."""
     until_x: _Place | None = None
     """The phase ends early once the base is beyond this x [m]."""
     steer: bool = False
@@ -159,7 +156,7 @@ class Scenario:
     """Whether the motors' torque falls with their speed, as a real one's does."""
     ground: Ground = field(default_factory=Ground)
     start: Start = field(default_factory=Start)
-    commands: Annotated[tuple[Phase, ...], Field(min_length=1, max_length=1000)]
+    commands: Annotated[tuple[Leg, ...], Field(min_length=1, max_length=1000)]
     """One after another, from the start on."""
     forces: Annotated[tuple[Force, ...], Field(max_length=100)] = ()
     success: Success = field(default_factory=Success)

@@ -29,7 +29,7 @@ class Timeline:
         """
         phases = scenario.commands
         self._velocities = [phase.velocity for phase in phases]
-        self._lengths = [max(round(phase.seconds / period), 1) for phase in phases]
+        self._lengths = [phase.steps(period) for phase in phases]
         self._limits = [float("inf") if phase.until_x is None else phase.until_x for phase in phases]
         self._steer = [phase.steer for phase in phases]
         self._line = line

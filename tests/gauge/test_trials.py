@@ -9,13 +9,13 @@ import torch
 from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.consistency.statistics import wilson_interval
 from gaitgauge.gauge.trials.running import Trial, draws, run_scenario
-from gaitgauge.gauge.trials.scenario import Failure, Force, Ground, Phase, Scenario, Start, Success
+from gaitgauge.gauge.trials.scenario import Failure, Force, Ground, Leg, Scenario, Start, Success
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.terrains.course import Stretch
 from scripted_gauge import GO2, ScriptedPolicy
 
-STAND = Phase(seconds=0.2, velocity=(0.0, 0.0, 0.0))
-AHEAD = Phase(seconds=4.0, velocity=(1.0, 0.0, 0.0))
+STAND = Leg(seconds=0.2, velocity=(0.0, 0.0, 0.0))
+AHEAD = Leg(seconds=4.0, velocity=(1.0, 0.0, 0.0))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -28,7 +28,7 @@ def coarse(tmp_path_factory):
     scenario.suite = str(path)
 
 
-def scenario(*commands: Phase, **settings: object) -> Scenario:
+def scenario(*commands: Leg, **settings: object) -> Scenario:
     given = {"suite": scenario.suite} | {
         "start": Start(spread=(0.0, 0.0, 0.0)),
         "success": Success(survive=True),
@@ -66,7 +66,7 @@ def _fake(name: str, scene: object, *, device: str, threads: int, script: FakeSc
 
 def test_speeds_and_times_of_a_robot_that_accelerates_evenly():
     """2 m/s² from rest after 0.2 s of standing, up to 4 m/s."""
-    run = Phase(seconds=5.0, velocity=(4.0, 0.0, 0.0), until_x=12.0)
+    run = Leg(seconds=5.0, velocity=(4.0, 0.0, 0.0), until_x=12.0)
     [trial], _ = play(scenario(STAND, run, STAND, success=Success(speed=3.9, beyond=11.0)), gain=2.0)
     assert trial.outcome == "success"
     # the mean over 0.1 s lags by 0.04 s behind the speed at a step's end, which is 3.9 m/s after 1.95 s
