@@ -7,11 +7,13 @@ from typing import Annotated
 
 import typer
 
+from .command_help import Program
 from .commands import experiments, judging, learning, looking, policies
 from .errors import output_failures
 
 app = typer.Typer(
     name="gaitgauge",
+    cls=Program,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -6,23 +6,45 @@ from typing import Annotated
 
 import typer
 
+from . import completion
+
 PolicyArgument = Annotated[
     str,
     typer.Argument(
-        help="A policy file (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.", metavar="POLICY"
+        help="A policy file (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
+        metavar="POLICY",
+        autocompletion=completion.policies,
     ),
 ]
 TrustOption = Annotated[
     bool,
     typer.Option("--trust", help="Run the program that a policy file of the project's own format carries inside."),
 ]
-SuiteOption = Annotated[str, typer.Option(help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.")]
-BackendOption = Annotated[str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.")]
-DeviceOption = Annotated[str | None, typer.Option(help="cpu or cuda; the default is what the engine is made for.")]
-RobotOption = Annotated[
-    str | None, typer.Option(help="Robot name, or a robot.toml. Default: the robot that the policy is for.")
+SuiteOption = Annotated[
+    str,
+    typer.Option(
+        help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.", autocompletion=completion.suites
+    ),
 ]
-TerrainsOption = Annotated[list[str] | None, typer.Option(help="Terrain; repeatable. Default: the suite's.")]
+BackendOption = Annotated[
+    str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.", autocompletion=completion.backends)
+]
+DeviceOption = Annotated[
+    str | None,
+    typer.Option(
+        help="cpu or cuda; the default is what the engine is made for.", autocompletion=completion.of("cpu", "cuda")
+    ),
+]
+RobotOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Robot name, or a robot.toml. Default: the robot that the policy is for.", autocompletion=completion.robots
+    ),
+]
+TerrainsOption = Annotated[
+    list[str] | None,
+    typer.Option(help="Terrain; repeatable. Default: the suite's.", autocompletion=completion.terrains),
+]
 LevelOption = Annotated[
     int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")
 ]

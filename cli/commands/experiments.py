@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .. import completion
 from ..errors import report_errors
 from ..options import DeviceOption, RobotOption, SuiteOption, ThreadsOption, TrustOption
 
@@ -17,10 +18,17 @@ PoliciesArgument = Annotated[
     typer.Argument(
         help="One or more policy files (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
         metavar="POLICY...",
+        autocompletion=completion.policies,
     ),
 ]
 EngineOption = Annotated[
-    str, typer.Option("--backend", "--engine", help="Physics engine, see 'gaitgauge list backends'.")
+    str,
+    typer.Option(
+        "--backend",
+        "--engine",
+        help="Physics engine, see 'gaitgauge list backends'.",
+        autocompletion=completion.backends,
+    ),
 ]
 
 
@@ -30,7 +38,10 @@ def trial(
     policies: PoliciesArgument,
     scenario: Annotated[
         list[str] | None,
-        typer.Option(help="Scenario (see 'gaitgauge list scenarios'), a .toml file, or all; repeatable. Default: all."),
+        typer.Option(
+            help="Scenario (see 'gaitgauge list scenarios'), a .toml file, or all; repeatable. Default: all.",
+            autocompletion=completion.scenarios,
+        ),
     ] = None,
     repeats: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Robots in each scenario. Default: the scenario's own.")
@@ -44,7 +55,12 @@ def trial(
     json_output: Annotated[bool, typer.Option("--json", help="Print trials.json instead of a table.")] = False,
     trust: TrustOption = False,
 ) -> None:
-    """Send policies through field trials (pulls, stairs, drops, a sprint …) and count how many robots come through."""
+    """Send policies through field trials (pulls, stairs, drops, a sprint …) and count how many robots come through.
+
+    Examples:
+      gaitgauge trial pretrained --repeats 20
+      gaitgauge trial latest walk.onnx --scenario all
+    """
     from ..trial import run_trial
 
     run_trial(

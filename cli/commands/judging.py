@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .. import completion
 from ..errors import report_errors
 from ..options import (
     BackendOption,
@@ -32,7 +33,8 @@ def evaluate(
     pipeline: Annotated[
         str,
         typer.Option(
-            help="base: one environment and seed; multi: one level, all frictions and seeds; level: find the highest level; stress: all."
+            help="base: one environment and seed; multi: one level, all frictions and seeds; level: find the highest level; stress: all.",
+            autocompletion=completion.of("base", "multi", "level", "stress"),
         ),
     ] = "stress",
     suite: SuiteOption = "gaitgauge-1",
@@ -54,7 +56,13 @@ def evaluate(
     json_output: Annotated[bool, typer.Option("--json", help="Print results.json instead of tables.")] = False,
     trust: TrustOption = False,
 ) -> None:
-    """Gauge a policy: terrains, levels, frictions, payloads, noise and latency, down to one score with its interval."""
+    """Gauge a policy: terrains, levels, frictions, payloads, noise and latency, down to one score with its interval.
+
+    Examples:
+      gaitgauge evaluate pretrained --suite demo
+      gaitgauge evaluate latest --terrain stairs_fd --terrain stairs_bd --threads 8
+      gaitgauge evaluate walk.onnx --pipeline multi --level 5 --friction 0.6
+    """
     from ..evaluate import run_evaluation
 
     run_evaluation(
@@ -85,10 +93,15 @@ def compare(
         typer.Argument(
             help="Two or more of: policies, as for evaluate; results folders; results.json files and score cards.",
             metavar="A B...",
+            autocompletion=completion.policies,
         ),
     ],
     pipeline: Annotated[
-        str, typer.Option(help="How policies are evaluated: stress, or multi at one --level.")
+        str,
+        typer.Option(
+            help="How policies are evaluated: stress, or multi at one --level.",
+            autocompletion=completion.of("stress", "multi"),
+        ),
     ] = "stress",
     suite: SuiteOption = "gaitgauge-1",
     backend: BackendOption = "mujoco",
@@ -110,7 +123,13 @@ def compare(
     ] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print comparison.json instead of tables.")] = False,
 ) -> None:
-    """Say which differences between policies are real. Policies are evaluated first; what has been played is not played again."""
+    """Say which differences between policies are real. Policies are evaluated first; what has been played is not played again.
+
+    Examples:
+      gaitgauge compare pretrained latest
+      gaitgauge compare old.gauge.pt new.gauge.pt --pipeline multi --level 3
+      gaitgauge compare results/a results/b
+    """
     from ..compare import run_comparison
 
     run_comparison(
@@ -150,7 +169,12 @@ def verify(
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
     trust: TrustOption = False,
 ) -> None:
-    """Play a score card again and say whether it holds on this machine; exit code 1 where it does not."""
+    """Play a score card again and say whether it holds on this machine; exit code 1 where it does not.
+
+    Examples:
+      gaitgauge verify results/walk --quick
+      gaitgauge verify card.json --policy walk.gauge.pt
+    """
     from ..verify import run_verification
 
     run_verification(
@@ -172,7 +196,11 @@ def board(
     folder: Annotated[Path, typer.Argument(help="Folder of score cards (*.json) or of evaluations.", metavar="FOLDER")],
     out: Annotated[Path | None, typer.Option(help="The page. Default: board.html in the folder.")] = None,
 ) -> None:
-    """Make a leaderboard page of a folder of score cards."""
+    """Make a leaderboard page of a folder of score cards.
+
+    Examples:
+      gaitgauge board cards --out board.html
+    """
     from ..board import run_board
 
     run_board(folder=folder, out=out)
@@ -187,13 +215,21 @@ def validate(
             help="The measured table, then one for each simulator (CSV; docs/validate.md).", metavar="REAL SIM..."
         ),
     ] = None,
-    example: Annotated[str | None, typer.Option(help="Tables that ship with the project: paper.")] = None,
+    example: Annotated[
+        str | None,
+        typer.Option(help="Tables that ship with the project: paper.", autocompletion=completion.of("paper")),
+    ] = None,
     ranks_only: Annotated[
         bool, typer.Option("--ranks-only", help="Values are on different scales: compare the order of policies alone.")
     ] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Hold predictions of simulators against measurements of a robot: errors by motion and metric, and ranks of policies."""
+    """Hold predictions of simulators against measurements of a robot: errors by motion and metric, and ranks of policies.
+
+    Examples:
+      gaitgauge validate --example paper
+      gaitgauge validate real.csv mujoco.csv newton.csv
+    """
     from ..validate import run_validation
 
     run_validation(tables=tables or [], example_name=example, ranks_only=ranks_only, json_output=json_output)
@@ -207,16 +243,21 @@ def consistency(
         typer.Argument(
             help="One or more policy files (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
             metavar="POLICY...",
+            autocompletion=completion.policies,
         ),
     ],
     backends: Annotated[
         str,
         typer.Option(
-            help="Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005)."
+            help="Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005).",
+            autocompletion=completion.backends,
         ),
     ] = "mujoco,mujoco-warp,newton",
     reference: Annotated[
-        str | None, typer.Option(help="Engine that the others are compared with. Default: the first.")
+        str | None,
+        typer.Option(
+            help="Engine that the others are compared with. Default: the first.", autocompletion=completion.backends
+        ),
     ] = None,
     device: Annotated[
         str | None, typer.Option(help="cpu or cuda, for the engines that can use a GPU. Default: a GPU.")
@@ -249,7 +290,12 @@ def consistency(
     json_output: Annotated[bool, typer.Option("--json", help="Print consistency.json instead of tables.")] = False,
     trust: TrustOption = False,
 ) -> None:
-    """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why."""
+    """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why.
+
+    Examples:
+      gaitgauge consistency pretrained --backends mujoco,mujoco-warp --device cpu --seeds 2
+      gaitgauge consistency latest --terrain flat --backends mujoco,mujoco@timestep=0.005
+    """
     from ..consistency import run_consistency
 
     run_consistency(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .. import completion
 from ..errors import report_errors
 
 app = typer.Typer()
@@ -15,7 +16,12 @@ app = typer.Typer()
 @app.command()
 @report_errors
 def train(
-    task: Annotated[str, typer.Argument(help="What to learn, see 'gaitgauge list tasks'.", metavar="TASK")],
+    task: Annotated[
+        str,
+        typer.Argument(
+            help="What to learn, see 'gaitgauge list tasks'.", metavar="TASK", autocompletion=completion.tasks
+        ),
+    ],
     overrides: Annotated[
         list[str] | None,
         typer.Argument(
@@ -24,7 +30,11 @@ def train(
         ),
     ] = None,
     backend: Annotated[
-        str | None, typer.Option(help="Physics engine, see 'gaitgauge list backends'. Default: mujoco-warp.")
+        str | None,
+        typer.Option(
+            help="Physics engine, see 'gaitgauge list backends'. Default: mujoco-warp.",
+            autocompletion=completion.backends,
+        ),
     ] = None,
     device: Annotated[
         str | None, typer.Option(help="cpu, cuda or cuda:N; the default is what the engine is made for.")
@@ -34,7 +44,10 @@ def train(
     ] = None,
     robot: Annotated[
         str | None,
-        typer.Option(help="Robot name, or a robot.toml; the task is scaled by its size. Default: the task's."),
+        typer.Option(
+            help="Robot name, or a robot.toml; the task is scaled by its size. Default: the task's.",
+            autocompletion=completion.robots,
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of everything random. Default: the task's.")] = None,
     iterations: Annotated[
@@ -44,7 +57,12 @@ def train(
         str | None, typer.Option(help="Stop after this wall-clock time, building included: seconds, 9m, 2h or 1h30m.")
     ] = None,
     resume: Annotated[
-        str | None, typer.Option(help="Continue: latest, a run directory or a model_*.pt.", metavar="latest|PATH")
+        str | None,
+        typer.Option(
+            help="Continue: latest, a run directory or a model_*.pt.",
+            metavar="latest|PATH",
+            autocompletion=completion.checkpoints,
+        ),
     ] = None,
     trust: Annotated[
         bool,
@@ -56,7 +74,9 @@ def train(
     init_from: Annotated[
         str | None,
         typer.Option(
-            help="Begin a new run with these networks: a checkpoint or a policy file.", metavar="PATH|pretrained"
+            help="Begin a new run with these networks: a checkpoint or a policy file.",
+            metavar="PATH|pretrained",
+            autocompletion=completion.policies,
         ),
     ] = None,
     run_name: Annotated[str | None, typer.Option(help="Appended to the date in the run directory's name.")] = None,
@@ -70,7 +90,11 @@ def train(
     threads: Annotated[int, typer.Option(min=1, help="CPU threads of an engine that runs on the CPU.")] = 1,
     logger: Annotated[
         str | None,
-        typer.Option(help="tensorboard, or wandb or neptune beside it. Default: the task's.", metavar="NAME"),
+        typer.Option(
+            help="tensorboard, or wandb or neptune beside it. Default: the task's.",
+            metavar="NAME",
+            autocompletion=completion.of("tensorboard", "wandb", "neptune"),
+        ),
     ] = None,
     video_every: Annotated[
         int | None, typer.Option(min=1, help="Iterations between two videos, made in a side process. Default: none.")
@@ -85,12 +109,21 @@ def train(
     score_every: Annotated[
         int | None, typer.Option(min=1, help="Iterations between two scores. Default: the task's.")
     ] = None,
-    score_suite: Annotated[str, typer.Option(help="Suite of the scores, or a suite's .toml file.")] = "quick",
+    score_suite: Annotated[
+        str, typer.Option(help="Suite of the scores, or a suite's .toml file.", autocompletion=completion.suites)
+    ] = "quick",
     score_threads: Annotated[
         int | None, typer.Option(min=1, help="CPU threads of the side process. Default: half of the machine.")
     ] = None,
 ) -> None:
-    """Train a policy; Ctrl-C or SIGTERM writes a checkpoint and says how to go on."""
+    """Train a policy; Ctrl-C or SIGTERM writes a checkpoint and says how to go on.
+
+    Examples:
+      gaitgauge train go2-moe-cts
+      gaitgauge train go2-flat --num-envs 2048 --time 1h30m
+      gaitgauge train go2-moe-cts --init-from pretrained environment.push.linear=0.6
+      gaitgauge train go2-moe-cts --resume latest
+    """
     if list_settings:
         from ..settings import print_settings
 

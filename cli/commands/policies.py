@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .. import completion
 from ..errors import report_errors
 from ..options import BackendOption, DeviceOption, RobotOption, TrustOption
 
@@ -19,23 +20,38 @@ def export(
     policy: Annotated[
         str,
         typer.Argument(
-            help="A checkpoint of the project's own, a run directory, or latest, best, pretrained.", metavar="POLICY"
+            help="A checkpoint of the project's own, a run directory, or latest, best, pretrained.",
+            metavar="POLICY",
+            autocompletion=completion.policies,
         ),
     ],
     out: Annotated[
         Path | None, typer.Option(help="Output folder. Default: 'exported' in the run directory, or here.")
     ] = None,
-    form: Annotated[str, typer.Option("--format", help="torchscript, onnx, deploy or all.")] = "all",
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            help="torchscript, onnx, deploy or all.",
+            autocompletion=completion.of("torchscript", "onnx", "deploy", "all"),
+        ),
+    ] = "all",
     layout: Annotated[
         str,
         typer.Option(
-            help="plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'."
+            help="plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'.",
+            autocompletion=completion.of("plain", "unitree"),
         ),
     ] = "plain",
     trust: TrustOption = False,
     robot: RobotOption = None,
 ) -> None:
-    """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it."""
+    """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it.
+
+    Examples:
+      gaitgauge export latest --out exported
+      gaitgauge export pretrained --layout unitree --out unitree
+    """
     from ..export import run_export
 
     run_export(policy, out=out, form=form, layout=layout, trust=trust, robot_name=robot)
@@ -49,13 +65,19 @@ def play(
         typer.Argument(
             help="Policy files, run directories, or latest, best, pretrained; up to four, side by side.",
             metavar="POLICY...",
+            autocompletion=completion.policies,
         ),
     ],
-    terrain: Annotated[str, typer.Option(help="Terrain, see 'gaitgauge list terrains'.")] = "flat",
+    terrain: Annotated[
+        str, typer.Option(help="Terrain, see 'gaitgauge list terrains'.", autocompletion=completion.terrains)
+    ] = "flat",
     level: Annotated[int | None, typer.Option(help="Level of the terrain, 1 to 10. Default: 5.")] = None,
     viewer: Annotated[
         str | None,
-        typer.Option(help="native: a window; viser: in a browser; video. Default: a window where there is a display."),
+        typer.Option(
+            help="native: a window; viser: in a browser; video. Default: a window where there is a display.",
+            autocompletion=completion.of("native", "viser", "video"),
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "--video", help="Write a video (.mp4); needs no display.")
@@ -83,7 +105,13 @@ def play(
     trust: TrustOption = False,
     robot: RobotOption = None,
 ) -> None:
-    """Watch policies walk: in MuJoCo's viewer, in a browser, or in a video file without a display."""
+    """Watch policies walk: in MuJoCo's viewer, in a browser, or in a video file without a display.
+
+    Examples:
+      gaitgauge play pretrained --terrain stairs_fd --level 6
+      gaitgauge play latest --viewer viser --command 1 0 0
+      gaitgauge play old.gauge.pt new.gauge.pt --out walk.mp4
+    """
     from ..play import PlayRequest, run_play
 
     run_play(
@@ -113,7 +141,11 @@ def play(
 @report_errors
 def import_command(
     source: Annotated[
-        str, typer.Argument(help="TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint.")
+        str,
+        typer.Argument(
+            help="TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint.",
+            autocompletion=completion.policies,
+        ),
     ],
     destination: Annotated[Path, typer.Argument(help="File to write, by custom NAME.gauge.pt.")],
     force: Annotated[bool, typer.Option("--force", help="Replace the destination if it exists.")] = False,
@@ -128,9 +160,16 @@ def import_command(
     contract: Annotated[
         Path | None, typer.Option(help="A contract.toml that says how a TorchScript or ONNX file is to be run.")
     ] = None,
-    robot: Annotated[str | None, typer.Option(help="Robot name, or a robot.toml. Default: go2.")] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Robot name, or a robot.toml. Default: go2.", autocompletion=completion.robots)
+    ] = None,
 ) -> None:
-    """Turn a foreign policy into the project's own file, with its contract."""
+    """Turn a foreign policy into the project's own file, with its contract.
+
+    Examples:
+      gaitgauge import policy.onnx walk.gauge.pt
+      gaitgauge import policy.pt walk.gauge.pt --contract contract.toml
+    """
     from ..inspect import import_file
 
     import_file(
