@@ -80,7 +80,7 @@ def test_long_helps_are_grouped():
 
 
 def test_what_can_be_listed_is_completed():
-    assert looking.LISTS == tuple(LISTS)
+    assert tuple(LISTS) == looking.LISTS
 
 
 # ---- completion -----------------------------------------------------------------------------------------------------
