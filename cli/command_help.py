@@ -13,7 +13,7 @@ from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "What is played": (
-        "pipeline", "suite", "scenario", "terrain", "level", "friction", "payload", "seed", "seeds", "repeats", "robot",
+        "pipeline", "suite", "scenario", "terrain", "level", "friction", "payload", "seed", "seeds", "repeats", "robots", "robot",
         "command", "seconds", "quick", "factor", "attribution", "margin",
     ),
     "Where it runs": ("backend", "backends", "reference", "device", "threads", "num_envs", "capture", "fuse", "cluster"),
@@ -27,7 +27,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 """Groups of options, by the names of their parameters: a name means the same in every command."""
 COMMAND_GROUPS: Mapping[str, tuple[str, ...]] = {
     "Judge": ("evaluate", "compare", "verify", "board"),
-    "Study": ("consistency", "validate", "trial", "sweep"),
+    "Study": ("consistency", "validate", "trial", "latent", "sweep"),
     "Learn": ("train",),
     "Use": ("play", "export", "import"),
     "Look": ("list", "doctor", "robot", "warmup"),

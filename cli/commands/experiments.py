@@ -82,7 +82,10 @@ def trial(
 @report_errors
 def latent(
     policies: PoliciesArgument,
-    terrain: Annotated[list[str] | None, typer.Option(help="Terrain; repeatable. Default: the gauge's seven.")] = None,
+    terrain: Annotated[
+        list[str] | None,
+        typer.Option(help="Terrain; repeatable. Default: the gauge's seven.", autocompletion=completion.terrains),
+    ] = None,
     level: Annotated[int, typer.Option(min=1, help="Level of the terrains that have levels.")] = 5,
     friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.8,
     suite: SuiteOption = "gaitgauge-1",
@@ -99,7 +102,12 @@ def latent(
     json_output: Annotated[bool, typer.Option("--json", help="Print latent.json instead of tables.")] = False,
     trust: TrustOption = False,
 ) -> None:
-    """Look into policies: how well terrains and commands separate in the encoder's latent and in the experts' weights."""
+    """Look into policies: how well terrains and commands separate in the encoder's latent and in the experts' weights.
+
+    Examples:
+      gaitgauge latent pretrained
+      gaitgauge latent latest --terrain flat --terrain wave --seconds 3
+    """
     from ..latent import run_latent
 
     run_latent(
