@@ -40,6 +40,10 @@ def _deploy(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
     return {path: 0.0}
 
 
+def _without_deploy(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
+    return _torchscript(policy, folder, robot) | _onnx(policy, folder, robot)
+
+
 FORMATS: dict[str, Callable[[Policy, Path, Robot], dict[Path, float]]] = {
     "all": export_policy,
     "torchscript": _torchscript,
@@ -93,6 +97,12 @@ def run_export(
     console = Terminal()
     console.say(f"policy {path}, contract {policy.contract.hash[:12]}")
     export = export_unitree if layout == "unitree" else FORMATS[form]
+    if export is export_policy and robot.sdk_joint_names is None:
+        export = _without_deploy
+        console.say(
+            f"no deploy.yaml: it numbers joints as the maker's SDK does, which robot '{robot.name}' does not say "
+            "(sdk_joint_names in its robot.toml)"
+        )
     for written, largest in export(policy, folder, robot).items():
         actions = f"actions differ by at most {largest:.1e}" if largest else "actions are the same"
         check = "reads back the same" if written.suffix == ".yaml" else actions

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from .command_help import Program
-from .commands import experiments, judging, learning, looking, policies
+from .commands import experiments, judging, learning, looking, policies, robots
 from .errors import output_failures
 
 app = typer.Typer(
@@ -18,7 +18,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (judging, experiments, learning, policies, looking):
+for group in (judging, experiments, learning, policies, robots, looking):
     app.add_typer(group.app)
 
 

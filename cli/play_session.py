@@ -16,6 +16,7 @@ from ..gauge.suite import Suite
 from ..policy.base import Policy
 from ..policy.observation import ObservationBuilder
 from ..robots import Robot
+from ..robots.geometry import model_joint_order
 from ..robots.rotation import from_yaw, yaw_of
 from ..terrains.base import Terrain
 from .errors import UserError
@@ -107,7 +108,8 @@ class PlaySession:
         Raises:
             BackendError: the engine cannot do this.
             ContractError: the policy is not for this robot.
-            UserError: the policy's control period is no multiple of the physics step.
+            UserError: the policy's control period is no multiple of the physics step, or the robot lacks the suite's joint
+                parameters.
         """
         suite = settings.suite
         physics = suite.physics
@@ -123,6 +125,12 @@ class PlaySession:
         """Largest commands that the policy was made for."""
         self._own_limits = clip(suite.command_limits(terrain.family), self.limits)
         self._speed = min(suite.commands.target_speed.get(terrain.family, 0.5 * self._own_limits[0]), self.limits[0])
+        if suite.parameters not in robot.parameters:
+            raise UserError(
+                f"robot '{robot.name}' lacks the joint parameters '{suite.parameters}', with which it is played; it has "
+                f"{', '.join(robot.parameters)} (robot.toml)"
+            )
+        self._model_order = model_joint_order(robot)
         scene = Scene(
             robot=robot,
             parameters=robot.parameters[suite.parameters],
@@ -251,7 +259,7 @@ class PlaySession:
     def position(self) -> NDArray[np.float64]:
         """Position of the free joint and of the robot's joints, as MuJoCo orders them: (7 + J,)."""
         state = self.state
-        parts = (state.base_position_w[0], state.base_quaternion_w[0], state.joint_position[0])
+        parts = (state.base_position_w[0], state.base_quaternion_w[0], state.joint_position[0, self._model_order])
         return torch.cat([p.double() for p in parts]).cpu().numpy()
 
     def autopilot(self) -> Command:

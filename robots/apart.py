@@ -18,16 +18,20 @@ COMPUTING_SECONDS = 10
 """Longest that compiling and checking a robot may compute."""
 _WAITING_SECONDS = 6 * COMPUTING_SECONDS
 """Longest that is waited for that, on a machine that has other things to do."""
-_LONGEST_SENTENCE = 10_000
-_SOUND = b"sound"
+_LONGEST_TEXT = 1_000_000
+_SOUND = b"\0"
+"""Before what a work returned; no sentence begins so."""
 
 
-def run_apart(work: Callable[[], None], mjcf: Path) -> None:
+def run_apart(work: Callable[[], str | None], mjcf: Path) -> str:
     """Do something with a robot's model where it can do no harm.
 
     Args:
-        work: raises ``RobotError`` for what is wrong; else its outcome is lost.
+        work: raises ``RobotError`` for what is wrong, or returns a text.
         mjcf: the model; folders of the files that it names can be read.
+
+    Returns:
+        The text.
 
     Raises:
         RobotError: as ``work``, or it takes too much time or memory, or MuJoCo crashes.
@@ -43,14 +47,14 @@ def run_apart(work: Callable[[], None], mjcf: Path) -> None:
         verdict = b""
         try:
             if ours.poll(_WAITING_SECONDS):
-                verdict = ours.recv_bytes(_LONGEST_SENTENCE)
+                verdict = ours.recv_bytes(_LONGEST_TEXT)
         except (OSError, EOFError):
             process.join(2.0)  # it has ended, or is about to
         finally:
             process.kill()
             process.join(5.0)
-    if verdict == _SOUND:
-        return
+    if verdict.startswith(_SOUND):
+        return verdict.removeprefix(_SOUND).decode()
     raise RobotError(verdict.decode("utf-8", "replace") or f"'{one_line(mjcf)}' {_how_it_ended(process.exitcode)}")
 
 
@@ -65,13 +69,12 @@ def _how_it_ended(code: int | None) -> str:
     return f"was not compiled and checked within {_WAITING_SECONDS} s; make its model smaller"
 
 
-def _run(work: Callable[[], None], connection: Connection, folders: list[Path], owner: int) -> None:
+def _run(work: Callable[[], str | None], connection: Connection, folders: list[Path], owner: int) -> None:
     """The process's whole life."""
     enclose(connection.fileno(), owner, folders)
     allow_seconds(COMPUTING_SECONDS)
     try:
-        work()
-        verdict = _SOUND
+        verdict = _SOUND + (work() or "").encode("utf-8", "replace")
     except RobotError as error:
         verdict = str(error).encode("utf-8", "backslashreplace")
     except MemoryError:
@@ -80,5 +83,5 @@ def _run(work: Callable[[], None], connection: Connection, folders: list[Path], 
         )
     except Exception as error:  # noqa: BLE001  (whatever it is, the owner has to hear of it)
         verdict = f"the robot cannot be checked: {type(error).__name__}: {one_line(error)}".encode(errors="replace")
-    connection.send_bytes(verdict[:_LONGEST_SENTENCE])
+    connection.send_bytes(verdict[:_LONGEST_TEXT])
     os._exit(0)  # nothing of what the owner would do at its end

@@ -78,7 +78,7 @@ def body_plan(robot: Robot) -> BodyPlan:
     feet = [model.geom(name).id for name in robot.foot_geoms]
     legs, abduction, lengths = [], [], []
     for name, foot in zip(robot.foot_names, feet, strict=True):
-        chain = _chain(model, int(model.geom_bodyid[foot]), base)
+        chain = joint_chain(model, int(model.geom_bodyid[foot]), base)
         if not chain or any(j not in order for j in chain):
             raise RobotError(f"robot '{robot.name}': the foot '{name}' is not moved by joints of joint_names")
         legs.append(tuple(order[j] for j in chain))
@@ -95,13 +95,13 @@ def body_plan(robot: Robot) -> BodyPlan:
             )
         )
     sideways_ids = {model.joint(robot.joint_names[i]).id for i in abduction}
-    bodies = [_chain(model, model.body(name).id, base) for name in robot.collision_bodies]
+    bodies = [joint_chain(model, model.body(name).id, base) for name in robot.collision_bodies]
     return BodyPlan(
         legs=tuple(legs),
         abduction=tuple(abduction),
         limb_bodies=tuple(i for i, chain in enumerate(bodies) if set(chain) - sideways_ids),
         foot_position=data.geom_xpos[feet].copy(),
-        standing_height=max(-_lowest_point(model, data, foot) for foot in feet),
+        standing_height=max(-lowest_point(model, data, foot) for foot in feet),
         leg_length=float(np.mean(lengths)),
         mass=float(model.body_mass.sum()),
     )
@@ -165,7 +165,7 @@ def default_pose(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
-def _chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
+def joint_chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
     """Joints that move a body against the base, from the base outwards."""
     joints: list[int] = []
     while body not in (base, 0):
@@ -180,7 +180,7 @@ def _sideways(data: mujoco.MjData, joint: int) -> bool:
     return int(np.abs(data.xaxis[joint]).argmax()) == 0
 
 
-def _lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     """Height of the lowest point of a geom, of its box for what is no sphere [m]."""
     import mujoco
 

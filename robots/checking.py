@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..files.parsing import did_you_mean, one_line
@@ -51,50 +52,52 @@ def check_robot(robot: Robot, *, foreign: bool = False) -> None:
 
 def _inspect(robot: Robot) -> None:
     """Compile and check, here."""
+    checks = ModelChecks(robot)
+    for name in ModelChecks.ORDER:
+        getattr(checks, name)()
+
+
+def compiled(mjcf: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """A MuJoCo model's file.
+
+    Raises:
+        RobotError: MuJoCo cannot compile it.
+    """
     import mujoco
 
     try:
-        spec = mujoco.MjSpec.from_file(str(robot.mjcf))
-        model = spec.compile()
+        spec = mujoco.MjSpec.from_file(str(mjcf))
+        return spec, spec.compile()
     except (ValueError, RuntimeError, TypeError, MemoryError, OSError, mujoco.FatalError) as error:
-        raise RobotError(
-            f"'{one_line(robot.mjcf)}' is not a model that MuJoCo can compile: {one_line(error)}"
-        ) from error
-    check = _Check(robot, model)
-    check.size()
-    check.base()
-    check.weight()
-    check.joints()
-    check.motors()
-    check.feet()
-    check.bodies_and_sites()
-    check.standing_pose(spec)
+        raise RobotError(f"'{one_line(mjcf)}' is not a model that MuJoCo can compile: {one_line(error)}") from error
 
 
-class _Check:
-    """The single checks, each of which raises ``RobotError``."""
+class ModelChecks:
+    """The single checks. Each says in a sentence what it found, or raises ``RobotError``."""
 
-    def __init__(self, robot: Robot, model: mujoco.MjModel) -> None:
+    ORDER = ("size", "base", "weight", "joints", "motors", "feet", "bodies_and_sites", "standing_pose")
+
+    def __init__(self, robot: Robot) -> None:
         import mujoco
 
         self.mujoco = mujoco
         self.robot = robot
-        self.model = model
+        self.spec, self.model = compiled(robot.mjcf)
 
-    def error(self, problem: str) -> RobotError:
+    def _error(self, problem: str) -> RobotError:
         return RobotError(f"robot '{self.robot.name}': {one_line(problem, 400)}")
 
-    def require(self, names: Iterable[str], key: str, kind: str) -> list[int]:
+    def _require(self, names: Iterable[str], key: str, kind: str) -> list[int]:
         """Ids of named model objects (``joint``, ``body``, ``geom``, ``site``); those of ``key`` must all exist."""
         object_type = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-        known = self.names(object_type)
+        known = self._names(object_type)
         for name in names:
             if name not in known:
                 hint = did_you_mean(name, known)
-                raise self.error(f"{key} names '{name}' but {self.robot.mjcf.name} has no {kind} of that name{hint}")
+                raise self._error(f"{key} names '{name}' but {self.robot.mjcf.name} has no {kind} of that name{hint}")
         return [self.mujoco.mj_name2id(self.model, object_type, name) for name in names]
 
-    def names(self, object_type: mujoco.mjtObj) -> list[str]:
+    def _names(self, object_type: mujoco.mjtObj) -> list[str]:
         count = {
             self.mujoco.mjtObj.mjOBJ_JOINT: self.model.njnt,
             self.mujoco.mjtObj.mjOBJ_BODY: self.model.nbody,
@@ -104,30 +107,33 @@ class _Check:
         found = (self.mujoco.mj_id2name(self.model, object_type, i) for i in range(count))
         return [name for name in found if name is not None]
 
-    def size(self) -> None:
+    def size(self) -> str:
         """A few lines of XML can stand for a million parts, each of which every world would simulate."""
         model = self.model
         counts = {"bodies": model.nbody, "geoms": model.ngeom, "sites": model.nsite, "degrees of freedom": model.nv}
         for kind, count in counts.items():
             if count > _MOST_PARTS:
-                raise self.error(f"{self.robot.mjcf.name} has {count:,} {kind}; at most {_MOST_PARTS:,} are simulated")
+                raise self._error(f"{self.robot.mjcf.name} has {count:,} {kind}; at most {_MOST_PARTS:,} are simulated")
+        return f"MuJoCo compiles {self.robot.mjcf.name}: {model.nbody - 1} bodies, {model.ngeom} geoms, {model.nv} degrees of freedom"
 
-    def base(self) -> None:
+    def base(self) -> str:
+        """The base is free, and nothing is in the file beside the robot."""
         model, robot = self.model, self.robot
-        (base,) = self.require([robot.base_body], "base_body", "body")
+        (base,) = self._require([robot.base_body], "base_body", "body")
         free = [j for j in range(model.njnt) if model.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_FREE]
         if [model.jnt_bodyid[j] for j in free] != [base]:
-            raise self.error(f"{robot.mjcf.name} must have one free joint, on the base_body '{robot.base_body}'")
+            raise self._error(f"{robot.mjcf.name} must have one free joint, on the base_body '{robot.base_body}'")
         if any(model.geom_bodyid == 0) or any(model.site_bodyid == 0):
-            raise self.error(f"{robot.mjcf.name} has geoms or sites in its worldbody; it must hold the robot alone")
+            raise self._error(f"{robot.mjcf.name} has geoms or sites in its worldbody; it must hold the robot alone")
         outside = [i for i in range(1, model.nbody) if model.body_rootid[i] != base]
         if outside:
             name = self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_BODY, outside[0]) or f"body {outside[0]}"
-            raise self.error(
+            raise self._error(
                 f"{robot.mjcf.name} has the body '{name}' outside '{robot.base_body}'; it must hold the robot alone"
             )
+        return f"'{robot.base_body}' is free, and there is nothing beside the robot"
 
-    def weight(self) -> None:
+    def weight(self) -> str:
         """Nothing but the ground may carry the robot."""
         model, option, file = self.model, self.model.opt, self.robot.mjcf.name
         free = slice(0, 6)  # the base's joint comes first: it is the root of the only tree
@@ -151,38 +157,42 @@ class _Check:
         }
         for problem, kept in rules.items():
             if not kept:
-                raise self.error(f"{file} {problem}; take that out")
+                raise self._error(f"{file} {problem}; take that out")
+        return f"nothing but the ground carries its {model.body_mass.sum():.3f} kg"
 
     def _body_of(self, equality: int, thing: int) -> int:
         """The body at one end of an equality; 0 is the world."""
         site = int(self.model.eq_objtype[equality]) == int(self.mujoco.mjtObj.mjOBJ_SITE)
         return int(self.model.site_bodyid[thing]) if site else int(thing)
 
-    def joints(self) -> None:
+    def joints(self) -> str:
+        """Joints are hinges, all named, with the default pose within their ranges."""
         model, robot = self.model, self.robot
-        ids = self.require(robot.joint_names, "joint_names", "joint")
+        ids = self._require(robot.joint_names, "joint_names", "joint")
         for name, joint in zip(robot.joint_names, ids, strict=True):
             if model.jnt_type[joint] != self.mujoco.mjtJoint.mjJNT_HINGE:
-                raise self.error(f"joint_names names '{name}', which is not a hinge in {robot.mjcf.name}")
+                raise self._error(f"joint_names names '{name}', which is not a hinge in {robot.mjcf.name}")
         others = [
             self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j}"
             for j in range(model.njnt)
             if model.jnt_type[j] != self.mujoco.mjtJoint.mjJNT_FREE and j not in ids
         ]
         if others:
-            raise self.error(f"{robot.mjcf.name} has the joint '{others[0]}', which joint_names lacks; add it there")
+            raise self._error(f"{robot.mjcf.name} has the joint '{others[0]}', which joint_names lacks; add it there")
         for name, joint, angle in zip(robot.joint_names, ids, robot.default_joint_position, strict=True):
             low, high = model.jnt_range[joint]
             if model.jnt_limited[joint] and not low <= angle <= high:
-                raise self.error(
+                raise self._error(
                     f"default_joint_position of '{name}' is {angle:g} rad, outside its range {low:g} to {high:g} rad"
                 )
+        return f"{len(ids)} hinges, all named, with the default pose within their ranges"
 
-    def motors(self) -> None:
+    def motors(self) -> str:
+        """A model with motors has one on each joint."""
         model, robot = self.model, self.robot
         if not model.nu:
-            return  # engines bring their own
-        ids = self.require(robot.joint_names, "joint_names", "joint")
+            return "the model has no motors; the engines bring their own"
+        ids = self._require(robot.joint_names, "joint_names", "joint")
         driven = [
             int(model.actuator_trnid[a, 0])
             for a in range(model.nu)
@@ -190,50 +200,63 @@ class _Check:
         ]
         for name, joint in zip(robot.joint_names, ids, strict=True):
             if driven.count(joint) != 1:
-                raise self.error(f"{robot.mjcf.name} has {driven.count(joint)} actuators on '{name}'; it must have one")
+                raise self._error(
+                    f"{robot.mjcf.name} has {driven.count(joint)} actuators on '{name}'; it must have one"
+                )
         if model.nu != len(ids):
-            raise self.error(
+            raise self._error(
                 f"{robot.mjcf.name} has {model.nu} actuators for {len(ids)} joints; it must have one for each"
             )
+        return "one motor for each joint"
 
-    def feet(self) -> None:
+    def feet(self) -> str:
+        """Feet have shapes that meet the ground."""
         model, robot = self.model, self.robot
-        for geom in self.require(robot.foot_geoms, "foot_shapes" if robot.foot_shapes else "foot_names", "geom"):
-            if not self.solid(geom):
+        for geom in self._require(robot.foot_geoms, "foot_shapes" if robot.foot_shapes else "foot_names", "geom"):
+            if not self._solid(geom):
                 name = model.geom(geom).name
-                raise self.error(f"the foot geom '{name}' does not meet the ground; give it contype or conaffinity 1")
+                raise self._error(f"the foot geom '{name}' does not meet the ground; give it contype or conaffinity 1")
+        return f"{len(robot.foot_names)} feet that meet the ground: {', '.join(robot.foot_names)}"
 
-    def solid(self, geom: int) -> bool:
+    def _solid(self, geom: int) -> bool:
         """Whether a geom meets the ground, whose contype and conaffinity are 1."""
         return bool((self.model.geom_contype[geom] | self.model.geom_conaffinity[geom]) & 1)
 
-    def bodies_and_sites(self) -> None:
-        (base,) = self.require([self.robot.base_body], "base_body", "body")
+    def bodies_and_sites(self) -> str:
+        """Bodies, trunk shapes and the gyroscope's site are where they must be."""
+        (base,) = self._require([self.robot.base_body], "base_body", "body")
         model = self.model
-        bodies = self.require(self.robot.collision_bodies, "collision_bodies", "body")
+        bodies = self._require(self.robot.collision_bodies, "collision_bodies", "body")
         if base not in bodies:
-            raise self.error(f"collision_bodies lacks the base_body '{self.robot.base_body}'; add it")
+            raise self._error(f"collision_bodies lacks the base_body '{self.robot.base_body}'; add it")
         for name, body in zip(self.robot.collision_bodies, bodies, strict=True):
             first = model.body_geomadr[body]
-            if not any(self.solid(g) for g in range(first, first + model.body_geomnum[body])):
-                raise self.error(
+            if not any(self._solid(g) for g in range(first, first + model.body_geomnum[body])):
+                raise self._error(
                     f"no geom of the body '{name}' (collision_bodies) meets the ground; give one contype 1"
                 )
-        shapes = self.require(self.robot.trunk_shapes, "trunk_shapes", "geom")
+        shapes = self._require(self.robot.trunk_shapes, "trunk_shapes", "geom")
         for name, geom in zip(self.robot.trunk_shapes, shapes, strict=True):
             if model.geom_bodyid[geom] != base:
-                raise self.error(f"trunk_shapes names '{name}', which is not on the base_body '{self.robot.base_body}'")
-            if not self.solid(geom):
-                raise self.error(f"the trunk shape '{name}' does not meet the ground; give it contype or conaffinity 1")
+                raise self._error(
+                    f"trunk_shapes names '{name}', which is not on the base_body '{self.robot.base_body}'"
+                )
+            if not self._solid(geom):
+                raise self._error(
+                    f"the trunk shape '{name}' does not meet the ground; give it contype or conaffinity 1"
+                )
+        found = f"{len(bodies)} bodies and {len(shapes)} trunk shapes meet the ground"
         if self.robot.imu_site is None:
-            return
-        (imu,) = self.require([self.robot.imu_site], "imu_site", "site")
+            return f"{found}; no site of a gyroscope is named"
+        (imu,) = self._require([self.robot.imu_site], "imu_site", "site")
         if self.model.site_bodyid[imu] != base:
-            raise self.error(f"imu_site '{self.robot.imu_site}' must be on the base_body '{self.robot.base_body}'")
+            raise self._error(f"imu_site '{self.robot.imu_site}' must be on the base_body '{self.robot.base_body}'")
+        return f"{found}; the gyroscope sits at '{self.robot.imu_site}'"
 
-    def standing_pose(self, spec: mujoco.MjSpec) -> None:
+    def standing_pose(self) -> str:
         """Put the robot on a floor at ``stand_height``: nothing may be in it."""
         robot, height = self.robot, self.robot.stand_height
+        spec = self.spec
         spec.worldbody.add_geom(
             type=self.mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1, margin=0.0
         )
@@ -251,7 +274,8 @@ class _Check:
             if part is None:
                 body = int(model.geom_bodyid[geom])
                 part, kind = self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_BODY, body) or str(body), "body"
-            raise self.error(
+            raise self._error(
                 f"at stand_height {height:g} m the {kind} '{part}' is {-deepest.dist:.3f} m below the ground; "
                 f"raise it to {height - deepest.dist:.3f} m or more"
             )
+        return f"at stand_height {height:g} m nothing of it is below the ground"

@@ -20,6 +20,15 @@ def joint_ranges(robot: Robot) -> NDArray[np.float64]:
     return np.where(model.jnt_limited[ids, None], model.jnt_range[ids], [-np.inf, np.inf])
 
 
+def model_joint_order(robot: Robot) -> list[int]:
+    """The robot's joints in the order in which the model has them behind the free joint: indices into ``joint_names``."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    address = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
+    return sorted(range(robot.num_joints), key=address.__getitem__)
+
+
 def stance_span(robot: Robot) -> float:
     """Largest horizontal distance between two feet in the default pose [m]: the diagonal stance span."""
     _, data = default_pose(robot)

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -14,6 +15,7 @@ from gaitgauge.cli.play_session import beyond
 from gaitgauge.cli.worlds import labels
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.robots import load_robot
+from gaitgauge.robots.geometry import model_joint_order
 from gaitgauge.terrains.registry import make_terrain
 
 ROBOT = load_robot("go2")
@@ -111,6 +113,19 @@ def test_measured_speed_is_in_the_robots_heading_and_friction_acts(session):
     assert (forward, lateral) == (pytest.approx(1.2 * share, abs=0.1), pytest.approx(-0.3 * share, abs=0.1))
     played.set_friction(0.25)
     assert played.readout().friction == 0.25
+
+
+def test_joints_are_drawn_where_they_are_whatever_the_order_of_the_description(session):
+    """The order of a description need not be that of the model's file, in which a pose is drawn."""
+    shuffled = ROBOT.joint_names[::-1]
+    pose = tuple(ROBOT.default_joint_position[ROBOT.joint_names.index(n)] for n in shuffled)
+    assert model_joint_order(ROBOT) == list(range(12))
+    assert model_joint_order(replace(ROBOT, joint_names=shuffled, default_joint_position=pose)) == list(
+        range(11, -1, -1)
+    )
+    played = session()
+    played._model_order = list(range(11, -1, -1))
+    np.testing.assert_array_equal(played.position()[7:], played.state.joint_position[0].flip(0).numpy())
 
 
 # ---- scenery --------------------------------------------------------------------------------------------------------

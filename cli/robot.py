@@ -1,0 +1,150 @@
+"""``gaitgauge robot``: a first description of a robot of one's own, and every check of it as a sentence."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.text import Text
+
+from ..files.writing import write_atomically
+from ..robots import Robot, RobotError, load_robot
+from ..robots.drafting import draft_robot
+from ..robots.examining import Finding, examine
+from ..robots.loading import ROBOT_FILE, load_robot_file
+from .console import Terminal
+from .errors import UserError
+from .picture import Picture, choose_renderer
+
+if TYPE_CHECKING:
+    from .picture import Quality
+
+_EVERYTHING = "everything"
+
+
+def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -> None:
+    """Write a first description, and print what was guessed. What cannot be described leaves nothing behind.
+
+    Raises:
+        UserError: there is a description already.
+        RobotError: the model is no legged robot, or a file cannot be written.
+    """
+    folder = out or model.parent
+    description = folder / ROBOT_FILE
+    if description.exists() and not force:
+        raise UserError(f"'{description}' already exists; give another folder (--out), or replace it with --force")
+    draft = draft_robot(model, name)
+    own = folder / f"{model.stem}-named.xml"
+    made = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RobotError(f"cannot create folder '{folder}': {error.strerror}; choose another --out") from error
+    written: list[Path] = []
+    try:
+        if draft.model:
+            write_atomically(own, draft.model, RobotError)
+            written.append(own)
+        mjcf = own.name if draft.model else os.path.relpath(model.resolve(), folder.resolve())
+        write_atomically(description, draft.text(mjcf), RobotError)
+        written.append(description)
+        robot = load_robot_file(description)
+    except RobotError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        if made:
+            folder.rmdir()
+        raise
+    console = Terminal()
+    console.say(f"wrote {description}: {robot.title}, {len(robot.foot_names)} legs, {robot.num_joints} joints")
+    if draft.model:
+        console.say(f"wrote {own}: the model with names for shapes that the description has to name")
+    console.say("guessed, so look at it:")
+    for guess in draft.guesses:
+        console.say(f"  {guess}")
+    console.say(f"next:\n  gaitgauge robot check {description}")
+
+
+def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_output: bool) -> bool:
+    """Print what every check finds, and draw the standing pose; False where something is wrong that everything needs.
+
+    Raises:
+        UserError: the picture's name does not end in .png, or it is asked for and cannot be drawn.
+    """
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise UserError(f"--picture is '{picture}'; give a file that ends in .png")
+    quality, silent = None, ""
+    if draw:
+        try:
+            quality = choose_renderer()  # before MuJoCo is imported
+        except UserError as error:
+            if picture is not None:
+                raise
+            silent = f"no picture: {error}"
+    robot: Robot | None = None
+    try:
+        robot = load_robot(Path(asked) if os.path.isdir(asked) else asked, check=False)
+        described = f"{robot.title}: the description is complete and its values are possible"
+        findings = [
+            Finding(check="description", passed=True, sentence=described, needed_for=_EVERYTHING),
+            *examine(robot),
+        ]
+    except RobotError as error:
+        findings = [Finding(check="description", passed=False, sentence=str(error), needed_for=_EVERYTHING)]
+    sound = all(f.passed for f in findings if f.needed_for == _EVERYTHING)
+    drawn = None
+    if sound and robot is not None and quality is not None:
+        drawn = picture or Path(f"{robot.name}-standing.png")
+        _draw(robot, quality, drawn)
+    if json_output:
+        rows = [asdict(f) for f in findings]
+        print(json.dumps({"robot": asked, "sound": sound, "checks": rows, "picture": drawn and str(drawn)}, indent=1))
+        return sound
+    _print(findings)
+    console = Terminal()
+    if drawn is not None:
+        console.say(f"picture {drawn}")
+    elif silent:
+        console.say(silent)
+    console.say("the robot is sound" if sound else "the robot cannot be used yet")
+    return sound
+
+
+def _print(findings: Sequence[Finding]) -> None:
+    console = Terminal()
+    for finding in findings:
+        needed = finding.needed_for == _EVERYTHING
+        word, style = ("pass", "green") if finding.passed else ("FAIL", "bold red") if needed else ("note", "yellow")
+        more = "" if finding.passed or needed else f" ({finding.needed_for} needs it)"
+        console.say(Text.assemble((word, style), f"  {finding.check}: {finding.sentence}{more}"))
+
+
+def _draw(robot: Robot, quality: Quality, path: Path) -> None:
+    """Write a picture of the standing pose.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    import imageio.v3
+    import numpy as np
+
+    from ..robots.body_plan import body_plan, default_pose
+    from ..terrains.registry import make_terrain
+    from .scenery import visual_model
+
+    _, data = default_pose(robot)
+    position = data.qpos[: 7 + robot.num_joints].copy()
+    position[2] = body_plan(robot).standing_height
+    picture = Picture(visual_model(robot, make_terrain("flat"), quality), size=quality.size, heading=0.0)
+    try:
+        imageio.v3.imwrite(path, np.ascontiguousarray(picture.draw(position, 0.0)))
+    except OSError as error:
+        raise UserError(
+            f"the picture '{path}' cannot be written: {error.strerror or error}; choose another --picture"
+        ) from error
+    finally:
+        picture.close()

@@ -1,0 +1,175 @@
+"""Writes a first ``robot.toml`` for any MuJoCo model of a legged robot: what the model says is read, the rest guessed and said."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..files.parsing import build, one_line, parse_json
+from .apart import run_apart
+from .checking import compiled
+from .loading import RobotError
+from .surveying import GRAVITY, Survey
+
+_CLEARANCE = 0.02
+"""Height above the ground at which an episode is to start [m]."""
+_GUESSED = "guessed"
+_LINE = 100
+"""Longest line of a list [characters]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A line of the description."""
+
+    key: str
+    """Name; with a dot before it that of its table."""
+    value: Any
+    remark: str = ""
+    """Where the value comes from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draft:
+    """A first description of a robot."""
+
+    name: str
+    entries: tuple[Entry, ...]
+    model: str
+    """The model as MJCF, with names for what the description has to name; empty where the file itself has them."""
+
+    @property
+    def guesses(self) -> list[str]:
+        """What was guessed, as sentences."""
+        return [
+            f"{e.key} = {' '.join(_toml(e.value).split())} ({e.remark})"
+            for e in self.entries
+            if e.remark.startswith(_GUESSED)
+        ]
+
+    def text(self, mjcf: str) -> str:
+        """The ``robot.toml``, whose model lies at ``mjcf`` relative to it."""
+        lines = [
+            f"# A first description of {self.name}, made from its model: go through what is guessed. SI units and radians.",
+            "# A value per joint is one number for all joints, a list in the order of `joint_names`, or a table whose keys",
+            "# are joint names or their endings. docs/your-robot.md explains every key.",
+            "",
+        ]
+        table = ""
+        for entry in self.entries:
+            group, _, key = entry.key.rpartition(".")
+            if group != table:
+                lines += ["", f"[{group}]"]
+                table = group
+            if entry.remark:
+                lines.append(f"# {entry.remark}")
+            lines.append(f"{key} = {_toml(mjcf if key == 'mjcf' else entry.value)}")
+        return "\n".join(lines) + "\n"
+
+
+def draft_robot(model: Path, name: str | None = None) -> Draft:
+    """Read a model, in a process of its own, and guess what it does not say.
+
+    Args:
+        model: MJCF of the robot alone.
+        name: of the robot; None for the model's.
+
+    Raises:
+        RobotError: MuJoCo cannot compile it, or it is no legged robot on a free base.
+    """
+    if not model.is_file():
+        raise RobotError(f"there is no model '{one_line(model)}'; give the MJCF file of the robot")
+    return build(
+        Draft,
+        parse_json(run_apart(partial(_draft, model, name), model), "the draft", RobotError),
+        "the draft",
+        RobotError,
+    )
+
+
+def _draft(path: Path, name: str | None) -> str:
+    spec, model = compiled(path)
+    survey = Survey(path, spec, model)
+    title = name or (spec.modelname if spec.modelname not in ("", "MuJoCo Model") else path.stem)
+    pose, how = survey.default_pose()
+    joints = list(dict.fromkeys([j for leg in survey.legs for j in leg.joints] + survey.hinges))
+    survey.place(pose)
+    length = float(np.mean([survey.leg_length(leg) for leg in survey.legs]))
+    fast = min(2.0, round(math.sqrt(GRAVITY * length), 1))
+    height = math.ceil(1000 * (survey.depth() + _CLEARANCE)) / 1000
+    sites = [model.site(s).name for s in range(model.nsite) if model.site_bodyid[s] == survey.base]
+    imu = next((site for site in sites if "imu" in site.lower()), None)
+    entries = [
+        Entry(key="name", value=re.sub(r"[^a-z0-9_-]+", "-", title.lower()).strip("-_") or "robot"),
+        Entry(key="title", value=title),
+        Entry(key="mjcf", value=path.name),
+        Entry(
+            key="joint_names",
+            value=[model.joint(j).name for j in joints],
+            remark=f"{_GUESSED} order: leg by leg, the front left one first, from the base outwards",
+        ),
+        Entry(key="default_joint_position", value=[round(pose[j], 4) for j in joints], remark=how),
+        Entry(key="base_body", value=survey.body_name(survey.base)),
+        Entry(
+            key="foot_names",
+            value=[survey.geom_name(leg.foot, "foot") for leg in survey.legs],
+            remark=f"{_GUESSED}: the shape at the end of each leg, legs in the same order",
+        ),
+        Entry(key="collision_bodies", value=survey.colliding_bodies()),
+        Entry(
+            key="trunk_shapes",
+            value=[survey.geom_name(survey.trunk(), "trunk")],
+            remark=f"{_GUESSED}: the largest shape of the base; others count as head and sensors",
+        ),
+        *([Entry(key="imu_site", value=imu)] if imu else []),
+        Entry(
+            key="stand_height",
+            value=height,
+            remark=f"{_GUESSED}: {_CLEARANCE:g} m above where the feet touch the ground in the default pose",
+        ),
+        Entry(
+            key="command_limits",
+            value=[fast, round(fast / 2, 2), fast],
+            remark=f"{_GUESSED} from legs of {length:.3f} m: forward, sideways [m/s], turning [rad/s]",
+        ),
+        Entry(
+            key="action_scale", value=0.25, remark=f"{_GUESSED}: how far an output of 1 moves a joint's target [rad]"
+        ),
+        Entry(key="default_parameters", value="gauge"),
+    ]
+    for key, (value, remark) in survey.motors(joints, length).items():
+        entries.append(Entry(key=f"parameters.gauge.{key}", value=value, remark=remark))
+    text = ""
+    if survey.renamed:
+        folder = path.parent.resolve()
+        for kind in ("meshdir", "texturedir"):
+            setattr(spec, kind, os.path.join(folder, getattr(spec, kind)))
+        text = spec.to_xml()
+    return json.dumps(asdict(Draft(name=entries[0].value, entries=tuple(entries), model=text)))
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML; equal numbers of a list become one."""
+    if isinstance(value, list):
+        if len(value) > 3 and len(set(value)) == 1 and not isinstance(value[0], str):
+            return _toml(value[0])
+        items = [_toml(v) for v in value]
+        if sum(map(len, items)) < _LINE:
+            return "[" + ", ".join(items) + "]"
+        lines = [""]
+        for item in items:
+            if lines[-1] and len(lines[-1]) + len(item) > _LINE:
+                lines.append("")
+            lines[-1] += f"{' ' if lines[-1] else '    '}{item},"
+        return "\n".join(["[", *lines, "]"])
+    if isinstance(value, float):
+        return repr(value)
+    return json.dumps(value, ensure_ascii=False)

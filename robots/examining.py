@@ -1,0 +1,164 @@
+"""Looks a robot over for its owner: every check, as a sentence, whether it holds or not; and how it stands with its gains."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+
+import numpy as np
+
+from ..files.parsing import build, parse_json
+from .apart import run_apart
+from .base import Robot
+from .body_plan import body_plan, mirror_image
+from .checking import ModelChecks
+from .geometry import joint_ranges
+from .loading import RobotError
+
+STANDING_SECONDS = 2.0
+"""How long the robot is left standing [s]."""
+_TIMESTEP = 0.002
+_MOST_TILT = 0.3
+"""Tilt beyond which a robot does not stand [rad]."""
+_LOWEST = 0.7
+"""Share of its standing height below which a robot does not stand."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What came of one check."""
+
+    check: str
+    """Its name."""
+    passed: bool
+    sentence: str
+    """What was found, or what is wrong and what to change."""
+    needed_for: str
+    """What does not work where it fails: ``everything``, or a part of the project."""
+
+
+def examine(robot: Robot) -> list[Finding]:
+    """Check a robot's model, in a process of its own, and say what every check found.
+
+    A check that needs what an earlier one found missing is left out.
+    """
+    try:
+        text = run_apart(partial(_findings, robot), robot.mjcf)
+    except RobotError as error:
+        return [Finding(check="model", passed=False, sentence=str(error), needed_for="everything")]
+    return [build(Finding, row, "a finding", RobotError) for row in parse_json(text, "the findings", RobotError)]
+
+
+def _findings(robot: Robot) -> str:
+    found: list[Finding] = []
+
+    def note(check: str, look: Callable[[], str], needed_for: str = "everything") -> None:
+        try:
+            finding = Finding(check=check, passed=True, sentence=look(), needed_for=needed_for)
+        except RobotError as error:
+            sentence = str(error).removeprefix(f"robot '{robot.name}': ")
+            finding = Finding(check=check, passed=False, sentence=sentence, needed_for=needed_for)
+        found.append(finding)
+
+    checks = ModelChecks(robot)
+    for name in ModelChecks.ORDER:
+        note(name.replace("_", " "), getattr(checks, name))
+    if all(f.passed for f in found):
+        note("legs", partial(_legs, robot))
+        note("standing", partial(stand, robot))
+        note("mirror image", partial(_mirror, robot), "training with symmetry")
+        note("joint ranges", partial(_ranges, robot), "the metric dof_limits and the reward joint_limits")
+        note("parameters", partial(_parameters, robot), "the suites that ship with the project")
+        note("SDK order", partial(_sdk, robot), "export of a deploy.yaml")
+    return json.dumps([asdict(finding) for finding in found])
+
+
+def _legs(robot: Robot) -> str:
+    plan = body_plan(robot)
+    sideways = f"{len(plan.abduction)} of them with a joint that swings it sideways"
+    return (
+        f"{len(plan.legs)} legs of {plan.leg_length:.3f} m, {sideways}; the base stands {plan.standing_height:.3f} m high in the "
+        "default pose"
+    )
+
+
+def stand(robot: Robot) -> str:
+    """Let a robot stand in its default pose with the gains of its default parameters, and say how it stands.
+
+    Raises:
+        RobotError: it falls, sinks or flies apart.
+    """
+    import mujoco
+
+    plan, motors = body_plan(robot), robot.parameters[robot.default_parameters]
+    spec = mujoco.MjSpec.from_file(str(robot.mjcf))
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    spec.option.timestep = _TIMESTEP
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1)
+    for geom in spec.geoms:  # as in the suites: legs pass through each other
+        if geom.type != mujoco.mjtGeom.mjGEOM_PLANE and (geom.contype or geom.conaffinity):
+            geom.contype, geom.conaffinity = 0, 1
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    joints = [model.joint(name).id for name in robot.joint_names]
+    at_q, at_v = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    model.dof_armature[at_v] = motors.armature
+    model.dof_damping[at_v] = motors.joint_damping
+    model.dof_frictionloss[at_v] = motors.friction_loss
+    mujoco.mj_setConst(model, data)
+    pose, limit = np.array(robot.default_joint_position), np.array(motors.torque_limit)
+    data.qpos[:7] = (0.0, 0.0, plan.standing_height, 1.0, 0.0, 0.0, 0.0)
+    data.qpos[at_q] = pose
+    for _ in range(round(STANDING_SECONDS / _TIMESTEP)):
+        torque = np.multiply(motors.stiffness, pose - data.qpos[at_q]) - np.multiply(motors.damping, data.qvel[at_v])
+        data.qfrc_applied[at_v] = np.clip(torque, -limit, limit)
+        mujoco.mj_step(model, data)
+        if not np.isfinite(data.qpos).all() or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+            raise RobotError(
+                f"robot '{robot.name}': it flies apart within {data.time:.2f} s of standing; lower stiffness and damping of "
+                f"parameters.{robot.default_parameters}, or give its joints armature"
+            )
+    largest = float(np.max(np.abs(data.qfrc_applied[at_v]) / np.maximum(limit, 1e-9)))
+    height, (_, x, y, _) = float(data.qpos[2]), data.qpos[3:7]
+    tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
+    how = f"after {STANDING_SECONDS:g} s its base is {height:.3f} m high and leans by {tilt:.2f} rad"
+    if tilt > _MOST_TILT or height < _LOWEST * plan.standing_height:
+        raise RobotError(
+            f"robot '{robot.name}': it does not stand: {how}; raise the stiffness and torque_limit of "
+            f"parameters.{robot.default_parameters}, or mend default_joint_position"
+        )
+    return f"stands in its default pose: {how}, with up to {100 * largest:.0f} % of a motor's torque"
+
+
+def _mirror(robot: Robot) -> str:
+    image = mirror_image(robot)
+    pairs = sorted({tuple(sorted((i, j))) for i, j in enumerate(image.foot)})
+    names = ", ".join(" and ".join(dict.fromkeys(robot.foot_names[i] for i in pair)) for pair in pairs)
+    return f"left and right are mirror images: {names}"
+
+
+def _ranges(robot: Robot) -> str:
+    free = [
+        n for n, bounds in zip(robot.joint_names, joint_ranges(robot), strict=True) if not np.isfinite(bounds).all()
+    ]
+    if free:
+        raise RobotError(f"{len(free)} joints have no range in the model ('{free[0]}' …); give them one")
+    return "every joint has a range"
+
+
+def _parameters(robot: Robot) -> str:
+    if "gauge" not in robot.parameters:
+        raise RobotError(
+            f"there is no parameter set 'gauge', which suites ask for; it has {', '.join(robot.parameters)}"
+        )
+    return f"parameter sets: {', '.join(robot.parameters)}"
+
+
+def _sdk(robot: Robot) -> str:
+    if robot.sdk_joint_names is None:
+        raise RobotError("the order of the maker's SDK is not known; give sdk_joint_names")
+    return "the order of the maker's SDK is known"

@@ -1,0 +1,143 @@
+"""A robot of one's own: from a model to a description, a check, and a score."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from gaitgauge.robots import load_robot
+from gaitgauge.robots.examining import examine
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "robots"))
+
+from unseen_robot import LEGS, write_unseen
+
+WITHOUT_DISPLAY = "--no-picture"
+
+
+@pytest.fixture
+def model(tmp_path):
+    return write_unseen(tmp_path)
+
+
+def test_new_and_check(run, model):
+    made = run("robot", "new", model, "--out", "mine")
+    assert made.exit_code == 0, made.stderr
+    assert "wrote mine/robot.toml: unseen, 4 legs, 12 joints" in made.stdout
+    assert "parameters.gauge.stiffness = 32.0 (guessed from weight and leg length)" in made.stdout
+    assert "gaitgauge robot check mine/robot.toml" in made.stdout
+    robot = load_robot(Path("mine"))
+    assert robot.mjcf.resolve() == model.resolve()
+    assert robot.foot_names == tuple(f"sole of {leg}" for leg in ("fore_left", "fore_right", "hind_left", "hind_right"))
+    assert set(robot.collision_bodies) == {"corpus", *(f"{p}.{leg[0]}" for p in ("femur", "tibia") for leg in LEGS)}
+    checked = run("robot", "check", "mine", "--json", WITHOUT_DISPLAY)
+    assert checked.exit_code == 0
+    found = json.loads(checked.stdout)
+    assert found["sound"] and found["picture"] is None
+    rows = {row["check"]: row for row in found["checks"]}
+    assert rows["standing"]["sentence"].startswith("stands in its default pose: after 2 s its base is 0.4")
+    assert [name for name, row in rows.items() if not row["passed"]] == ["SDK order"]
+    assert rows["SDK order"]["needed_for"] == "export of a deploy.yaml"
+
+
+def test_a_description_is_not_replaced_unasked(refused, run, model):
+    assert run("robot", "new", model).exit_code == 0  # beside the model
+    assert refused("robot", "new", model).startswith(f"'{model.parent}/robot.toml' already exists; give another folder")
+    assert run("robot", "new", model, "--force", "--name", "Old Rover").exit_code == 0
+    assert load_robot(model.parent).name == "old-rover"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("<freejoint/>", ""), "has 0 free joints; give its base, 'corpus', a <freejoint/>"),
+        (
+            ("<worldbody>", '<worldbody><geom name="floor" type="plane" size="1 1 1"/>'),
+            "has a geom 'floor' in its worldbody",
+        ),
+        (('name="shell"', 'contype="0" conaffinity="0" name="shell"'), "has no shape on its base 'corpus'"),
+        (
+            ('<joint name="spread.fore_left"', '<joint type="slide" name="x"/><joint name="spread.fore_left"'),
+            "'x', which is no hinge",
+        ),
+        (("</mujoco>", ""), "is not XML"),
+    ],
+)
+def test_a_failed_try_leaves_nothing_that_refuses_the_second(refused, run, model, change, message):
+    whole = model.read_text()
+    assert change[0] in whole
+    model.write_text(whole.replace(*change))
+    assert message in refused("robot", "new", model, "--out", "mine")
+    assert not Path("mine").exists()
+    model.write_text(whole)
+    assert run("robot", "new", model, "--out", "mine").exit_code == 0
+
+
+def test_shapes_without_names_are_given_some(run, model):
+    model.write_text(model.read_text().replace('name="shell" ', "").replace('name="sole of hind_left" ', ""))
+    made = run("robot", "new", model, "--out", "mine")
+    assert made.exit_code == 0, made.stderr
+    robot = load_robot("mine/robot.toml")
+    assert robot.mjcf == Path("mine/unseen-named.xml").resolve()
+    assert robot.trunk_shapes == ("corpus_trunk",)
+    assert robot.foot_names[2] == "tibia.hind_left_foot"
+    assert all(f.passed for f in examine(robot) if f.needed_for == "everything")
+
+
+def test_a_keyframe_is_the_pose(run, model):
+    angles = " ".join(f"0 {-leg[1] * leg[4] * 0.4:g} {leg[1] * leg[5] * 0.8:g}" for leg in LEGS)
+    key = f'<keyframe><key name="home" qpos="0 0 0.5 1 0 0 0 {angles}"/></keyframe></mujoco>'
+    model.write_text(model.read_text().replace("</mujoco>", key))
+    assert run("robot", "new", model, "--out", "mine").exit_code == 0
+    robot = load_robot("mine/robot.toml")
+    pose = dict(zip(robot.joint_names, robot.default_joint_position, strict=True))
+    assert {abs(angle) for name, angle in pose.items() if name.startswith("bend")} == {0.8}
+    assert "of the model's keyframe 'home'" in Path("mine/robot.toml").read_text()
+
+
+def test_what_is_wrong_is_said_and_ends_with_1(run, model):
+    run("robot", "new", model, "--out", "mine")
+    path = Path("mine/robot.toml")
+    text = path.read_text()
+    path.write_text(text.replace("stiffness = 32.0", "stiffness = 1.0"))
+    weak = run("robot", "check", "mine", WITHOUT_DISPLAY)
+    assert weak.exit_code == 1
+    assert "FAIL  standing: it does not stand: after 2 s its base is" in weak.stdout
+    assert "the robot cannot be used yet" in weak.stdout
+    path.write_text(text.replace("base_body", "base_bodi"))
+    unread = run("robot", "check", "mine", WITHOUT_DISPLAY)
+    assert unread.exit_code == 1
+    assert "FAIL  description: robot file 'mine/robot.toml': " in unread.stdout and "base_bodi" in unread.stdout
+
+
+def test_the_picture_is_a_png(refused):
+    assert (
+        refused("robot", "check", "go2", "--picture", "x.jpg") == "--picture is 'x.jpg'; give a file that ends in .png"
+    )
+
+
+@pytest.mark.slow
+def test_an_unseen_robot_goes_from_its_model_to_a_score_in_five_commands(run, model):
+    """And nobody has to say again which robot it is, even when its files are gone."""
+    description = "robots/unseen/robot.toml"
+    small = ("--backend", "mujoco", "--device", "cpu", "--num-envs", 4, "--iterations", 2, "--no-score")
+    for words in (
+        ("robot", "new", model, "--out", "robots/unseen"),
+        ("robot", "check", description, WITHOUT_DISPLAY),
+        ("train", "go2-flat", "--robot", description, *small),
+        ("evaluate", "latest", "--suite", "demo", "--terrain", "flat", "--out", "results/unseen"),
+        ("export", "latest"),
+    ):
+        done = run(*words)
+        assert done.exit_code == 0, f"{words}: {done.output}"
+    results = json.loads(Path("results/unseen/results.json").read_text())
+    assert results["robot"] == "unseen" and 0.0 <= results["score"] <= 1.0
+    remembered = results["policy"]["provenance"]["robot"]
+    assert remembered["source"] == str(Path(description).absolute()) and "files" not in remembered
+    (folder,) = Path("logs/rsl_rl/unseen_flat").iterdir()
+    assert (folder / "exported" / "policy.onnx").is_file() and not (folder / "exported" / "deploy.yaml").exists()
+    Path(description).unlink()
+    again = run("evaluate", "latest", "--suite", "demo", "--terrain", "flat", "--out", "results/again")
+    assert again.exit_code == 0, again.output
+    assert "the robot is the copy that the policy carries" in again.stderr
+    assert json.loads(Path("results/again/results.json").read_text())["score"] == results["score"]
