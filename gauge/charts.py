@@ -32,6 +32,7 @@ _WIDE = 25.0
 """Width of a cell that holds a number."""
 _LEGEND = 130.0
 """Least width of a map, that of its axes' names."""
+_CURVE_WIDTH, _CURVE_HEIGHT, _CURVE_LEFT, _CURVE_RIGHT = 480.0, 260.0, 46.0, 10.0
 _HEAT_LEFT, _HEAT_TOP, _HEAT_BOTTOM = 34.0, 4.0, 34.0
 
 
@@ -257,6 +258,52 @@ def searches(rows: Sequence[Row]) -> list[dict[str, Any]]:
             }
         )
     return charts
+
+
+def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]]) -> dict[str, Any]:
+    """Quantities over something that grows, several lines for each label, on axes that begin at zero or below.
+
+    Args:
+        series: by label, for each line the x and y of its points; values that are not finite are left out.
+
+    Returns:
+        ``size``, ``frame``, ``x_ticks``, ``y_ticks`` and ``lines``, each with its ``label``, the label's ``turn`` and ``points``.
+    """
+    lines = [
+        (label, turn, [(x, y) for x, y in zip(*line, strict=True) if math.isfinite(x) and math.isfinite(y)])
+        for turn, (label, own) in enumerate(series.items())
+        for line in own
+    ]
+    points = [point for *_, line in lines for point in line] or [(1.0, 1.0)]
+    end = max(x for x, _ in points) or 1.0
+    low, high = min(0.0, *(y for _, y in points)), max(0.0, *(y for _, y in points))
+    high = high if high > low else low + 1.0
+    left, right = _CURVE_LEFT, _CURVE_WIDTH - _CURVE_RIGHT
+    upper, lower = _PANEL_TOP, _CURVE_HEIGHT - _PANEL_BOTTOM
+
+    def x_of(value: float) -> float:
+        return _linear(value, (0.0, end), (left, right))
+
+    def y_of(value: float) -> float:
+        return _linear(value, (low, high), (lower, upper))
+
+    return {
+        "size": (_CURVE_WIDTH, _CURVE_HEIGHT),
+        "frame": (left, right, upper, lower),
+        "x_ticks": [{"x": x_of(v), "label": number(v)} for v in _round_values(0.0, end)],
+        "y_ticks": [{"y": y_of(v), "label": number(v)} for v in _round_values(low, high)],
+        "lines": [
+            {"label": label, "turn": turn, "points": [(x_of(x), y_of(y)) for x, y in line]}
+            for label, turn, line in lines
+        ],
+    }
+
+
+def _round_values(low: float, high: float) -> list[float]:
+    """Four to eleven multiples of 1, 2 or 5 times a power of ten within a range."""
+    power = 10.0 ** math.floor(math.log10((high - low) / 4.0))
+    step = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= (high - low) / 4.0 * (1.0 + 1e-9))
+    return [float(f"{i * step:.6g}") for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
 
 
 def _by_terrain(rows: Sequence[Row], quantity: str) -> dict[str, list[Row]]:

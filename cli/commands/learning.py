@@ -1,4 +1,4 @@
-"""The command that learns: train."""
+"""The commands that learn: train and sweep."""
 
 from __future__ import annotations
 
@@ -155,3 +155,25 @@ def train(
         score_every=score_every,
         score_threads=score_threads,
     )
+
+
+@app.command()
+@report_errors
+def sweep(
+    file: Annotated[
+        Path, typer.Argument(help="A list of trainings (.toml), such as benchmarks/sweeps/*.toml.", metavar="FILE")
+    ],
+    out: Annotated[Path | None, typer.Option(help="Output folder. Default: results/sweep-<name>.")] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads of the gauge. Default: half of the cores.")
+    ] = None,
+    time: Annotated[str | None, typer.Option(help="Stop after this wall-clock time: seconds, 9m, 2h or 1h30m.")] = None,
+    report: Annotated[
+        bool, typer.Option("--report", help="Train and gauge nothing: tables and curves of what there is.")
+    ] = False,
+    json_output: Annotated[bool, typer.Option("--json", help="Print sweep.json instead of a table.")] = False,
+) -> None:
+    """Train a list of tasks, settings and seeds on the GPUs there are, gauge each, and compare; goes on where it stopped."""
+    from ..sweep import run_sweep
+
+    run_sweep(file=file, out=out, threads=threads, time=time, report=report, json_output=json_output)

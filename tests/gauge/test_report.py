@@ -378,3 +378,17 @@ def test_unknown_metrics_and_terrains_go_by_their_names(stress):
     page = Page(render(results))
     assert "heart rate" in page.text
     assert "gravel pit" in page.text
+
+
+def test_curves_have_round_ticks_and_leave_out_what_is_not_finite():
+    """Of a frame from (46, 8) to (470, 222)."""
+    data = charts.curves({"a": [([0.0, 4.0], [-1.0, 3.0])], "b": [([1.0, 2.0, 3.0], [1.0, math.nan, 2.0])]})
+    assert data["frame"] == (46.0, 470.0, 8.0, 222.0)
+    assert [line["points"] for line in data["lines"]] == [
+        [(46.0, 222.0), (470.0, 8.0)],
+        [(152.0, 115.0), (364.0, 61.5)],
+    ]
+    assert [(line["label"], line["turn"]) for line in data["lines"]] == [("a", 0), ("b", 1)]
+    assert [t["label"] for t in data["x_ticks"]] == ["0", "1", "2", "3", "4"]
+    assert [t["label"] for t in data["y_ticks"]] == ["−1", "0", "1", "2", "3"]
+    assert charts.curves({"none": []})["lines"] == []

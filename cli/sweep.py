@@ -1,0 +1,87 @@
+"""``gaitgauge sweep``: what starts, ends and fails, then the table of entries and what is real of their differences."""
+
+from __future__ import annotations
+
+import json
+import os
+import time as clock
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from ..files.writing import lock_folder
+from ..training.sweep.file import SweepError, load_sweep
+from ..training.sweep.folding import fold_sweep
+from ..training.sweep.jobs import Jobs
+from ..training.sweep.runs import plan_runs
+from .console import Terminal, make_table, shell_command
+from .errors import complain
+from .train import parse_duration
+
+
+def run_sweep(
+    *, file: Path, out: Path | None, threads: int | None, time: str | None, report: bool, json_output: bool
+) -> None:
+    """Run what is left of a sweep, and print its table; exit code 1 where an entry could not be done, 128 + signal where stopped."""
+    began = clock.monotonic()
+    sweep = load_sweep(file)
+    folder = (out or Path("results") / f"sweep-{sweep.name}").absolute()
+    deadline = None if time is None else began + parse_duration(time)
+    errors = Terminal(stderr=True)
+    if folder.exists() and not folder.is_dir():
+        raise SweepError(f"'{folder}' is a file; give another folder with --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = lock_folder(folder, SweepError)
+    try:
+        runs, refused = plan_runs(sweep, folder)
+        if not runs:
+            raise SweepError(next(iter(refused.values())))
+        for name, sentence in refused.items():
+            complain(f"gaitgauge: entry '{name}' cannot start: {sentence}")
+        jobs = Jobs(sweep, threads=threads or max((os.cpu_count() or 2) // 2, 1), deadline=deadline, say=errors.say)
+        outcome = jobs.work([] if report else runs)
+        found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
+    finally:
+        lock.release()
+    if json_output:
+        print(json.dumps(found, indent=1))
+    else:
+        print_sweep(Terminal(), found)
+        for name in ("sweep.html", "comparison.html", "curves.csv"):
+            if (folder / name).is_file():
+                print(f"{name.partition('.')[0]:11}{folder / name}")
+    if outcome.unfinished:
+        errors.say(f"{len(outcome.unfinished)} of {len(runs)} runs are not done; go on with:\n  {shell_command()}")
+    if outcome.stopped is not None:
+        raise typer.Exit(128 + outcome.stopped)
+    if refused or outcome.failures:
+        raise typer.Exit(1)
+
+
+def print_sweep(console: Terminal, found: Mapping[str, Any]) -> None:
+    """A table of the entries, and the comparison's sentences."""
+    groups = list(dict.fromkeys(g for e in found["entries"] if e["best"] for g in e["best"]["groups"] or {}))
+    columns = ("entry", "score", "95 % interval", *groups, "level", "seed", "mean of seeds")
+    table = make_table(f"{found['title']} ({found['suite']})", *columns, numbers=True)
+    for entry in found["entries"]:
+        best = entry["best"]
+        if best is None:
+            table.add_row(entry["entry"], entry["reason"] and "failed")
+            continue
+        low_high = "" if best["score_interval"] is None else "{:.4f} to {:.4f}".format(*best["score_interval"])
+        values = [f"{best['groups'][g]:.4f}" if g in (best["groups"] or {}) else "" for g in groups]
+        spread = "" if entry["deviation"] is None else f" ± {entry['deviation']:.4f}"
+        table.add_row(
+            entry["entry"],
+            f"{best['score']:.4f}",
+            low_high,
+            *values,
+            "" if best["level"] is None else f"{best['level']:.2f}",
+            str(best["seed"]),
+            f"{entry['mean']:.4f}{spread}",
+        )
+    console.print(table)
+    for sentence in found["sentences"]:
+        console.say(sentence)

@@ -1,0 +1,87 @@
+"""``gaitgauge sweep``: one sentence for what is wrong, and a whole sweep of small trainings."""
+
+import json
+
+import pytest
+import torch
+from small_run import SMALL
+
+SUITE = """
+extends = "gaitgauge-1"
+name = "tiny"
+title = "a few seconds"
+goals = [{ name = "max_velocity", phases = [0.2, 0.1] }, { name = "target_pos_velocity", phases = [] }]
+
+[matrix]
+terrains = ["flat", "slope_fd"]
+frictions = [0.6]
+payloads = [0.0]
+seeds = [0, 1]
+search_seeds = [100, 101]
+
+[commands]
+target_time = { slope = 0.3, wave = 0.3, stairs = 0.3, obstacle = 0.3 }
+
+[settling]
+longest = 0.2
+"""
+
+
+def sweep(**entries: str) -> str:
+    settings = json.dumps([*SMALL, "environment.num_envs=8", "training.run.iterations=2"])
+    text = f'name = "toy"\ntitle = "A toy"\nbackend = "fake"\nsuite = "tiny.toml"\ntraining_suite = "none"\nsettings = {settings}\n'
+    return text + "".join(f'[[entry]]\nname = "{name}"\n{entry}\n' for name, entry in entries.items())
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    (tmp_path / "tiny.toml").write_text(SUITE)
+    return tmp_path
+
+
+def test_a_file_that_is_not_there(refused):
+    assert "'none.toml' does not exist" in refused("sweep", "none.toml")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_machine_without_a_gpu(refused, tiny):
+    (tiny / "sweep.toml").write_text(sweep(one='task = "go2-cts"\nbackend = "mujoco-warp"'))
+    assert "wants a GPU and this machine has none" in refused("sweep", "sweep.toml")
+
+
+def test_a_suite_that_is_not_there(refused, tmp_path):
+    (tmp_path / "sweep.toml").write_text(sweep(one='task = "go2-cts"').replace("tiny.toml", "robogauge-1.2"))
+    assert "robogauge-1.2" in refused("sweep", "sweep.toml")
+
+
+def test_two_sweeps_in_one_folder(refused, tiny, monkeypatch):
+    from gaitgauge.files import writing
+
+    monkeypatch.setattr(writing, "_PATIENCE", 0.1)
+    (tiny / "sweep.toml").write_text(sweep(one='task = "go2-cts"'))
+    (tiny / "out").mkdir()
+    lock = writing.lock_folder(tiny / "out", ValueError)
+    assert "another process is writing" in refused("sweep", "sweep.toml", "--out", "out")
+    lock.release()
+
+
+@pytest.mark.slow
+def test_a_whole_sweep(run, tiny):
+    """Two methods and an entry that cannot start; called again, there is nothing left to do."""
+    text = sweep(CTS='task = "go2-cts"', HIM='task = "go2-him"', wrong='task = "go2-hym"')
+    (tiny / "sweep.toml").write_text(text)
+    result = run("sweep", "sweep.toml", "--out", "out", "--threads", 1)
+    assert result.exit_code == 1, result.output
+    (sentence,) = [line for line in result.stderr.splitlines() if line.startswith("gaitgauge: ")]
+    assert "entry 'wrong' cannot start: unknown task 'go2-hym'" in sentence
+    found = json.loads((tiny / "out" / "sweep.json").read_text())
+    assert [(r["entry"], r["state"]) for r in found["runs"]] == [("CTS", "gauged"), ("HIM", "gauged")]
+    assert len(found["sentences"]) >= 2 and "CTS" in found["sentences"][0] and "HIM" in found["sentences"][0]
+    assert {f.name for f in (tiny / "out").iterdir()} >= {
+        "sweep.html",
+        "curves.csv",
+        "comparison.html",
+        "comparison.tex",
+    }
+    again = run("sweep", "sweep.toml", "--out", "out", "--json")
+    assert again.exit_code == 1 and "is trained" not in again.stderr and json.loads(again.stdout) == found

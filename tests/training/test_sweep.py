@@ -1,0 +1,244 @@
+"""Sweeps: their files, which runs they have, processes in their places, and what is told at the end."""
+
+import json
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from gaitgauge.training.sweep.curves import by_figure, curves_csv
+from gaitgauge.training.sweep.file import Sweep, SweepEntry, SweepError, load_sweep
+from gaitgauge.training.sweep.folding import fold_sweep
+from gaitgauge.training.sweep.jobs import Jobs, visible_gpus
+from gaitgauge.training.sweep.runs import SweepRun, plan_runs
+from gaitgauge.training.tasks import find_task
+
+ROOT = Path(__file__).parents[2]
+ENTRY = SweepEntry(name="one", task="go2-cts")
+SWEEP = Sweep(name="toy", title="A toy", entry=(ENTRY,), backend="fake", training_suite="none")
+
+BEST = replace(SWEEP, training_suite="quick", checkpoint="best")
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "sweep.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("name = 3\ntitle = 'b'\nentry = []", "name is 3; it must be a text"),
+        ("name = 'a'\ntitle = 'b'", "lacks entry"),
+        ("name = 'a'\ntitle = 'b'\nentry = []", "no entries; add a table"),
+        ("name = 'a'\ntitle = 'b'\n[[entry]]\nname = 'c'", r"entry\[0\] lacks task"),
+        ("name = '../a'\ntitle = 'b'\n[[entry]]\nname = 'c'\ntask = 'd'", "letters, digits"),
+        ("name = 'a'\ntitle = 'b'\nseed = [1]\n[[entry]]\nname = 'c'\ntask = 'd'", "unknown field 'seed'.*'seeds'"),
+        ("name = 'a'\ntitle = 'b'\nseeds = [1, 1]\n[[entry]]\nname = 'c'\ntask = 'd'", r"seeds \[1, 1\]; give"),
+        ("name = 'a'\ntitle = 'b'\ncheckpoint = 'first'\n[[entry]]\nname = 'c'\ntask = 'd'", "'last' or 'best'"),
+        (
+            "name = 'a'\ntitle = 'b'\ncheckpoint = 'best'\ntraining_suite = 'none'\n[[entry]]\nname = 'c'\ntask = 'd'",
+            "which training_suite chooses",
+        ),
+        (
+            "name = 'a'\ntitle = 'b'" + "\n[[entry]]\nname = 'C'\ntask = 'd'\n[[entry]]\nname = 'c'\ntask = 'd'",
+            "several",
+        ),
+        ("name =", "not valid TOML"),
+    ],
+)
+def test_files_that_are_wrong(tmp_path, text, sentence):
+    with pytest.raises(SweepError, match=sentence):
+        load_sweep(write(tmp_path, text))
+
+
+def test_a_sweep_that_is_not_there(tmp_path):
+    with pytest.raises(SweepError, match="does not exist"):
+        load_sweep(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks" / "sweeps").glob("*.toml")), ids=lambda p: p.stem)
+def test_the_paper_s_tables_are_sweeps_whose_entries_fit(path):
+    sweep = load_sweep(path)
+    assert len(sweep.entry) >= 4 and len(sweep.seeds) >= 2
+    for entry in sweep.entry:
+        task = find_task(entry.task, (*sweep.settings, *entry.settings))
+        run = task.training.run
+        assert run.iterations * run.steps_per_iteration * task.environment.num_envs >= 600e6
+
+
+def test_the_guide_s_sweep_fits(tmp_path):
+    (text,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "methods.md").read_text(), re.S)
+    sweep = load_sweep(write(tmp_path, text))
+    for entry in sweep.entry:
+        find_task(entry.task, (*sweep.settings, *entry.settings))
+
+
+def test_entries_that_cannot_start_leave_the_others(tmp_path):
+    entries = (
+        ENTRY,
+        SweepEntry(name="misspelt", task="go2-ctss"),
+        SweepEntry(name="setting", task="go2-cts", settings=("training.algorithm.epoch=3",)),
+        SweepEntry(name="engine", task="go2-cts", backend="physx"),
+        replace(ENTRY, name="two", seeds=(7,)),
+    )
+    runs, refused = plan_runs(replace(SWEEP, entry=entries, seeds=(3, 4)), tmp_path)
+    assert [run.label for run in runs] == ["one, seed 3", "two, seed 7", "one, seed 4"]
+    assert list(refused) == ["misspelt", "setting", "engine"]
+    for sentence, named in zip(refused.values(), ("go2-cts", "training.algorithm.epochs", "'physx'"), strict=True):
+        assert named in sentence and "\n" not in sentence
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_without_a_gpu_only_engines_of_the_cpu_start(tmp_path):
+    sweep = replace(SWEEP, backend="mujoco-warp", entry=(ENTRY, replace(ENTRY, name="cpu", backend="mujoco")))
+    runs, refused = plan_runs(sweep, tmp_path)
+    assert [run.label for run in runs] == ["cpu, seed 0"] and not runs[0].on_gpu
+    assert "this machine has none" in refused["one"]
+    assert plan_runs(replace(sweep, entry=(replace(ENTRY, device="cpu"),)), tmp_path / "other")[1] == {}
+
+
+def test_a_folder_of_other_settings_is_refused(tmp_path):
+    plan_runs(SWEEP, tmp_path)
+    assert plan_runs(SWEEP, tmp_path)[1] == {}
+    changed = replace(SWEEP, settings=("training.algorithm.epochs=3",))
+    assert "holds a training with another settings" in plan_runs(changed, tmp_path)[1]["one"]
+
+
+def test_a_training_begins_or_goes_on(tmp_path):
+    (run,), _ = plan_runs(replace(SWEEP, settings=("environment.num_envs=8",)), tmp_path)
+    begins = run.training_command(SWEEP, seconds=None, score_threads=2)
+    assert begins[3:7] == ["train", "go2-cts", "environment.num_envs=8", "--no-score"]
+    assert begins[begins.index("--seed") + 1] == "0" and "--resume" not in begins
+    directory = run.folder / "logs" / "go2_cts" / "2026-01-01_00-00-00"
+    directory.mkdir(parents=True)
+    assert run.directory is None, "there is no checkpoint yet"
+    (directory / "model_5.pt").touch()
+    (directory / "run.json").write_text(json.dumps({"outcome": "finished", "iteration": run.iterations - 1}))
+    assert not run.trained, "a shorter one was finished"
+    goes_on = run.training_command(replace(SWEEP, training_suite="quick"), seconds=90.2, score_threads=2)
+    assert goes_on[3:] == [
+        *("train", "go2-cts", "--resume", str(directory)),
+        *("--score-suite", "quick", "--score-threads", "2", "--time", "90s", "--device", "cpu"),
+    ]
+    (directory / "best.pt").touch()
+    assert run.policy(SWEEP).name == "model_5.pt" and run.policy(BEST).name == "best.pt"
+
+
+class Scripted(SweepRun):
+    """A run whose training and gauging are small programs."""
+
+    def training_command(self, sweep, *, seconds, score_threads):
+        program = f"""
+import json, os, sys, time, pathlib
+folder = pathlib.Path({str(self.folder)!r})
+with open(folder.parents[2] / "order", "a") as file: file.write(f"{self.label} on {{os.environ['CUDA_VISIBLE_DEVICES']}}\\n")
+time.sleep({0.3 if "slow" in self.entry.name else 0.0})
+if {self.entry.name!r} == "broken":
+    sys.exit("gaitgauge: the physics has diverged")
+run = folder / "logs" / "x" / "2026"
+run.mkdir(parents=True)
+(run / "model_3.pt").touch()
+(run / "run.json").write_text(json.dumps(dict(outcome="finished", iteration={self.iterations})))
+"""
+        return [sys.executable, "-S", "-c", program]
+
+    def gauging_command(self, sweep, *, threads):
+        target = self.results(sweep)
+        program = (
+            f"import pathlib; p = pathlib.Path({str(target)!r}); p.mkdir(parents=True); (p / 'results.json').touch()"
+        )
+        return [sys.executable, "-S", "-c", program]
+
+
+def scripted(folder: Path, name: str, *, seed: int = 0, on_gpu: bool = True) -> Scripted:
+    return Scripted(
+        entry=SweepEntry(name=name, task="go2-cts"),
+        seed=seed,
+        settings=(),
+        backend="fake",
+        on_gpu=on_gpu,
+        iterations=3,
+        folder=folder / "runs" / name / f"seed-{seed}",
+    )
+
+
+def work(runs, *, gpus=("3", "5"), deadline=None):
+    said = []
+    outcome = Jobs(SWEEP, threads=1, deadline=deadline, say=said.append, gpus=gpus).work(runs)
+    return outcome, said
+
+
+def test_each_gpu_has_one_training_and_a_failure_stops_nothing(tmp_path):
+    runs = [scripted(tmp_path, name) for name in ("broken", "slow", "third")]
+    runs.append(scripted(tmp_path, "processor", on_gpu=False))
+    outcome, said = work(runs)
+    order = (tmp_path / "order").read_text().splitlines()
+    assert sorted(line.rpartition(" on ")[2] for line in order) == ["", "3", "3", "5"], "the short ones share a GPU"
+    assert list(outcome.failures) == ["broken, seed 0"] and outcome.stopped is None and outcome.unfinished == []
+    assert outcome.failures["broken, seed 0"].startswith("the physics has diverged (see '")
+    assert all(run.trained and run.gauged(SWEEP) for run in runs[1:])
+    assert sum("has been gauged" in sentence for sentence in said) == 3
+    # Called again, only what failed is tried again.
+    (tmp_path / "order").unlink()
+    assert list(work(runs)[0].failures) == ["broken, seed 0"]
+    assert (tmp_path / "order").read_text().startswith("broken, seed 0")
+
+
+def test_what_is_at_work_when_time_is_up_is_gone_on_with(tmp_path):
+    runs = [scripted(tmp_path, "slow"), scripted(tmp_path, "late")]
+    outcome, _ = work(runs, gpus=("0",), deadline=time.monotonic() + 0.15)
+    assert outcome.unfinished == ["slow, seed 0", "late, seed 0"] and outcome.failures == {}
+    assert work(runs, gpus=("0",))[0].unfinished == []
+
+
+def test_a_signal_ends_what_is_at_work(tmp_path):
+    runs = [scripted(tmp_path, "slow"), scripted(tmp_path, "late")]
+    timer = threading.Timer(0.15, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
+    outcome, said = work(runs, gpus=("0",))
+    timer.join()
+    assert outcome.stopped == signal.SIGTERM and len(outcome.unfinished) == 2
+    assert "SIGTERM received" in said[-1] and not any("late" in sentence for sentence in said)
+
+
+def test_gpus_are_those_that_may_be_seen(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,GPU-1a")
+    assert visible_gpus() == ["4", "GPU-1a"]
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    assert visible_gpus() == ["0", "1"]
+
+
+def test_tables_tell_what_is_missing(tmp_path):
+    """Nothing has been trained: rows and a page all the same."""
+    sweep = replace(SWEEP, entry=(ENTRY, replace(ENTRY, name="<b>")), title="A & B")
+    runs, refused = plan_runs(replace(sweep, entry=(ENTRY,)), tmp_path)
+    found = fold_sweep(sweep, runs, {"<b>": "no such task"}, {"one, seed 0": "it broke"}, tmp_path)
+    assert [(r["state"], r["reason"]) for r in found["runs"]] == [("failed", "it broke")]
+    assert [(e["entry"], e["reason"], e["best"]) for e in found["entries"]] == [
+        ("one", "it broke", None),
+        ("<b>", "no such task", None),
+    ]
+    page = (tmp_path / "sweep.html").read_text()
+    assert "&lt;b&gt;" in page and "A &amp; B" in page and "no score yet" in page and refused == {}
+    assert json.loads((tmp_path / "sweep.json").read_text()) == found
+
+
+def test_curves_keep_their_entries():
+    curves = {("a", 0): {"mean reward": ([1.0, 2.0], [0.5, 0.75])}, ("b", 1): {"mean reward": ([1.0], [0.25])}}
+    assert curves_csv(curves).splitlines()[1:] == [
+        "a,0,mean reward,1,0.5",
+        "a,0,mean reward,2,0.75",
+        "b,1,mean reward,1,0.25",
+    ]
+    assert by_figure(curves, ["b", "a", "c"]) == {
+        "mean reward": {"b": [([1.0], [0.25])], "a": [([1.0, 2.0], [0.5, 0.75])], "c": []}
+    }

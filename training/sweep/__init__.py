@@ -1,0 +1,1 @@
+"""Several trainings that belong together: run on the GPUs there are, gauged, compared."""

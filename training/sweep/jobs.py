@@ -1,0 +1,182 @@
+"""Trainings and gaugings as processes, each in a place of its own: one training on a GPU, one on the CPU, one gauging beside them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from ...files.parsing import one_line
+from ..checkpoint import CheckpointError
+from ..stopping import StopSignals
+from .file import Sweep
+from .runs import SweepRun
+
+_POLL = 0.1
+"""Time between two looks at the processes [s]."""
+_PATIENCE = 120.0
+"""Longest wait for processes that were asked to stop [s]: an iteration and its checkpoint."""
+_NO_GPU: Mapping[str, str] = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOutcome:
+    """How the processes of a sweep ended."""
+
+    failures: Mapping[str, str]
+    """One sentence for each run that failed, by label."""
+    unfinished: Sequence[str]
+    """Labels of the runs that a later call goes on with."""
+    stopped: int | None
+    """The signal that stopped it."""
+
+
+@dataclass(kw_only=True)
+class _Job:
+    run: SweepRun
+    gauges: bool
+    place: str
+    process: subprocess.Popen[bytes]
+    log: Path
+
+
+def visible_gpus() -> list[str]:
+    """The GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
+    count = torch.cuda.device_count()
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return named.split(",")[:count] if named else [str(number) for number in range(count)]
+
+
+class Jobs:
+    """Takes runs from where they are to their results."""
+
+    def __init__(
+        self,
+        sweep: Sweep,
+        *,
+        threads: int,
+        deadline: float | None,
+        say: Callable[[str], None],
+        gpus: Sequence[str] | None = None,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            sweep: how the runs are judged.
+            threads: CPU threads of a gauging.
+            deadline: value of ``time.monotonic()`` at which to stop, None for no limit.
+            say: called with a sentence now and then.
+            gpus: as ``visible_gpus``, which is the default.
+        """
+        self._sweep, self._threads, self._deadline, self._say = sweep, threads, deadline, say
+        gpus = visible_gpus() if gpus is None else gpus
+        self._places = {f"GPU {gpu}": {"CUDA_VISIBLE_DEVICES": gpu, "OMP_NUM_THREADS": "1"} for gpu in gpus}
+        self._score_threads = max(threads // max(len(gpus), 1), 1)
+        self._to_train: deque[SweepRun] = deque()
+        self._to_gauge: deque[SweepRun] = deque()
+        self._live: list[_Job] = []
+        self._failures: dict[str, str] = {}
+
+    def work(self, runs: Sequence[SweepRun]) -> SweepOutcome:
+        """Train and gauge, until all is done, the time is up or a signal asks to stop; then trainings have written checkpoints."""
+        for run in runs:
+            self._sort(run)
+        with StopSignals(self._say) as signals:
+            while signals.received is None and not self._late and (self._live or self._start()):
+                self._start()
+                self._collect()
+                time.sleep(_POLL)
+            self._stop()
+        unfinished = [r.label for r in runs if r.label not in self._failures and not self._done(r)]
+        return SweepOutcome(failures=dict(self._failures), unfinished=unfinished, stopped=signals.received)
+
+    @property
+    def _late(self) -> bool:
+        return self._deadline is not None and time.monotonic() >= self._deadline
+
+    def _done(self, run: SweepRun) -> bool:
+        return run.trained and run.gauged(self._sweep)
+
+    def _sort(self, run: SweepRun) -> None:
+        """Put a run where it goes on."""
+        try:
+            if not run.trained:
+                self._to_train.append(run)
+            elif not run.gauged(self._sweep):
+                self._to_gauge.append(run)
+        except CheckpointError as error:
+            self._failures[run.label] = str(error)
+
+    def _start(self) -> bool:
+        """Start what there is a place for; whether anything is at work."""
+        taken = {job.place for job in self._live}
+        for run in list(self._to_train):
+            free = [p for p in (self._places if run.on_gpu else ("the CPU",)) if p not in taken]
+            if free:
+                taken.add(free[0])
+                self._to_train.remove(run)
+                seconds = None if self._deadline is None else self._deadline - time.monotonic()
+                command = run.training_command(self._sweep, seconds=seconds, score_threads=self._score_threads)
+                how = "goes on" if run.directory else "is trained"
+                self._launch(run, command, free[0], run.log, f"{run.label} {how} on {free[0]}; its log is {run.log}")
+        if self._to_gauge and "gauge" not in taken:
+            run = self._to_gauge.popleft()
+            command = run.gauging_command(self._sweep, threads=self._threads)
+            self._launch(
+                run, command, "gauge", run.folder / "gauge.log", f"{run.label} is gauged on {self._sweep.suite}"
+            )
+        return bool(self._live)
+
+    def _launch(self, run: SweepRun, command: Sequence[str], place: str, log: Path, sentence: str) -> None:
+        environment = {**os.environ, **self._places.get(place, _NO_GPU)}
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("ab") as output:
+            # A session of its own: Ctrl-C in the terminal is for the sweep, which hands it on.
+            process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=environment,
+                start_new_session=True,
+            )
+        self._live.append(_Job(run=run, gauges=place == "gauge", place=place, process=process, log=log))
+        self._say(sentence)
+
+    def _collect(self) -> None:
+        """Take what has ended and sort it on."""
+        for job in [j for j in self._live if j.process.poll() is not None]:
+            self._live.remove(job)
+            run, code = job.run, job.process.returncode
+            if code:
+                self._failures[run.label] = f"{_last_line(job.log) or f'exit code {code}'} (see '{job.log}')"
+                self._say(f"{run.label} failed: {self._failures[run.label]}")
+            elif job.gauges or run.trained:
+                self._say(f"{run.label} has been {'gauged' if job.gauges else 'trained'}")
+                self._sort(run)
+
+    def _stop(self) -> None:
+        """Ask what is at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk."""
+        for job in self._live:
+            job.process.send_signal(signal.SIGTERM)
+        until = time.monotonic() + _PATIENCE
+        for job in self._live:
+            try:
+                job.process.wait(max(until - time.monotonic(), 0.1))
+            except subprocess.TimeoutExpired:
+                job.process.kill()
+                job.process.wait()
+        self._live = []
+
+
+def _last_line(log: Path) -> str:
+    """The last sentence of a log."""
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return one_line(lines[-1].removeprefix("gaitgauge: ")) if lines else ""

@@ -1,0 +1,163 @@
+"""The runs of a sweep: what each is to be, how far it is, and the commands that take it further."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...backends.base import BackendError
+from ...files.parsing import read_results
+from ...files.writing import json_text, write_atomically
+from ...gauge.suite import SuiteError, load_suite
+from ..checkpoint import CheckpointError
+from ..configuration import ConfigurationError
+from ..launch import TrainRequest, prepare
+from ..overrides import TaskError
+from ..run_directory import latest_checkpoint, read_run_json
+from .file import NO_SUITE, Sweep, SweepEntry, SweepError
+
+_PROGRAM = (sys.executable, "-m", f"{__name__.partition('.')[0]}.cli.main")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepRun:
+    """One training: an entry with one seed."""
+
+    entry: SweepEntry
+    seed: int
+    settings: tuple[str, ...]
+    """Of sweep and entry."""
+    backend: str
+    on_gpu: bool
+    """Whether its engine runs on a GPU."""
+    iterations: int
+    """Updates of the whole run."""
+    folder: Path
+    """Where its run directory and its gauging go."""
+
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        return f"{self.entry.name}, seed {self.seed}"
+
+    @property
+    def log(self) -> Path:
+        """What its training printed."""
+        return self.folder / "train.log"
+
+    @property
+    def directory(self) -> Path | None:
+        """Its run directory, the latest with a checkpoint; None before the first checkpoint."""
+        found = [run for run in self.folder.glob("logs/*/*") if latest_checkpoint(run)]
+        return max(found, key=lambda run: run.name) if found else None
+
+    @property
+    def trained(self) -> bool:
+        """Whether all of its iterations are done.
+
+        Raises:
+            CheckpointError: its description is damaged.
+        """
+        run = self.directory
+        noted = read_run_json(run) if run else {}
+        return noted.get("outcome") == "finished" and noted.get("iteration", 0) >= self.iterations
+
+    def policy(self, sweep: Sweep) -> Path | None:
+        """What of it is gauged; None before it is trained."""
+        run = self.directory
+        if run is None:
+            return None
+        best = run / "best.pt"
+        return best if sweep.checkpoint == "best" and best.is_file() else latest_checkpoint(run)
+
+    def results(self, sweep: Sweep) -> Path | None:
+        """Where the gauging of its policy goes; None before it is trained."""
+        policy = self.policy(sweep)
+        return self.folder / "gauge" / policy.stem if policy else None
+
+    def gauged(self, sweep: Sweep) -> bool:
+        """Whether its policy has been gauged."""
+        results = self.results(sweep)
+        return results is not None and (results / "results.json").is_file()
+
+    def training_command(self, sweep: Sweep, *, seconds: float | None, score_threads: int) -> list[str]:
+        """Begins the training or goes on with it; ``seconds`` is its wall-clock limit [s]."""
+        options = ["--no-score"]
+        if sweep.training_suite != NO_SUITE:
+            options = ["--score-suite", sweep.training_suite, "--score-threads", str(score_threads)]
+        options += [] if seconds is None else ["--time", f"{max(seconds, 1.0):.0f}s"]
+        options += [] if self.on_gpu else ["--device", "cpu"]
+        if (run := self.directory) is not None:
+            return [*_PROGRAM, "train", self.entry.task, "--resume", str(run), *options]
+        options += ["--backend", self.backend, "--seed", str(self.seed), "--log-root", str(self.folder / "logs")]
+        return [*_PROGRAM, "train", self.entry.task, *self.settings, *options]
+
+    def gauging_command(self, sweep: Sweep, *, threads: int) -> list[str]:
+        """Gauges its policy, or goes on with that."""
+        policy, results = self.policy(sweep), self.results(sweep)
+        assert policy is not None and results is not None
+        options = ["--suite", sweep.suite, "--threads", str(threads), "--out", str(results), "--json"]
+        return [*_PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
+
+    def claim(self) -> None:
+        """Note in its folder what it is trained with, or check that it is the same as before.
+
+        Raises:
+            SweepError: the folder holds a training with other settings.
+        """
+        mine: Mapping[str, Any] = {
+            "task": self.entry.task,
+            "settings": list(self.settings),
+            "seed": self.seed,
+            "backend": self.backend,
+        }
+        note = self.folder / "entry.json"
+        if not note.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(note, json_text(dict(mine)), SweepError)
+        elif (found := read_results(note, "sweep's note", SweepError)) != mine:
+            changed = next(name for name in mine if found.get(name) != mine[name])
+            raise SweepError(
+                f"'{self.folder}' holds a training with another {changed}; give another folder with --out, or take this one "
+                "away"
+            )
+
+
+def plan_runs(sweep: Sweep, folder: Path) -> tuple[list[SweepRun], dict[str, str]]:
+    """The runs of a sweep, those of the first seed first, and of each entry that cannot start one sentence on why.
+
+    Raises:
+        SuiteError: no such suite.
+    """
+    for suite in {sweep.suite, sweep.training_suite} - {NO_SUITE}:
+        load_suite(suite)
+    runs: list[tuple[int, SweepRun]] = []
+    refused: dict[str, str] = {}
+    for entry in sweep.entry:
+        settings, backend = (*sweep.settings, *entry.settings), entry.backend or sweep.backend
+        request = TrainRequest(
+            task=entry.task, overrides=settings, backend=backend, device=entry.device, score_suite=None
+        )
+        try:
+            plan = prepare(request)
+            own = []
+            for turn, seed in enumerate(sweep.seeds if entry.seeds is None else entry.seeds):
+                run = SweepRun(
+                    entry=entry,
+                    seed=seed,
+                    settings=settings,
+                    backend=backend,
+                    on_gpu=plan.device.startswith("cuda"),
+                    iterations=plan.task.training.run.iterations,
+                    folder=folder / "runs" / entry.name / f"seed-{seed}",
+                )
+                run.claim()
+                own.append((turn, run))
+        except (TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError, SweepError) as error:
+            refused[entry.name] = str(error)
+            continue
+        runs += own
+    return [run for _, run in sorted(runs, key=lambda item: item[0])], refused
