@@ -90,7 +90,7 @@ def load_results(path: str | Path) -> Results:
         for table in (found.terrains, found.metrics):
             if not all(isinstance(row, Mapping) for row in table.values()):
                 raise ResultsError(f"'{file}' was edited or is damaged: a terrain or metric is no table")
-        _ = found.score, found.interval, found.suite  # what is asked for later is there
+        _ = found.score, found.interval, found.suite, found.complete  # what is asked for later is there
     return found
 
 

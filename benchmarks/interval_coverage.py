@@ -22,11 +22,12 @@ from typing import Any
 
 import numpy as np
 from gaitgauge.files.writing import write_atomically
-from gaitgauge.gauge.comparison import chance_rules_of, compare
+from gaitgauge.gauge.comparison import ComparisonError, compare
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.intervals import Chance, ChanceRules, Evidence
 from gaitgauge.gauge.level_chance import bisect
 from gaitgauge.gauge.level_curve import expected_levels, follow
+from gaitgauge.gauge.result_check import chance_rules_of
 from gaitgauge.gauge.results import SCHEMA, environment_weights
 from gaitgauge.gauge.store import StoreError
 from numpy.typing import NDArray
@@ -320,7 +321,7 @@ def judge(recorded: Sequence[Results]) -> dict[str, Figures]:
         held = (ends[:, 0] <= values.mean()) & (values.mean() <= ends[:, 1])
         return values.mean(), 1.96 * values.std(ddof=1), float(np.median(np.ptp(ends, axis=1) / 2)), held.mean()
 
-    evidence = [Evidence(r["environments"], chance_rules_of(r)) for r in recorded]
+    evidence = [Evidence(r["environments"], chance_rules_of(r, "results", ComparisonError)) for r in recorded]
     terrains = [row["terrain"] for row in recorded[0]["environments"]]
     even = environment_weights(terrains)
 
@@ -347,7 +348,8 @@ def fixed_levels(recorded: Sequence[Results]) -> int:
     mean, held = np.mean([r["score"] for r in recorded]), 0
     for results in recorded:
         rows = [{k: v for k, v in row.items() if k != "trials"} for row in results["environments"]]
-        chance = Evidence(rows, chance_rules_of(results)).chance(environment_weights([r["terrain"] for r in rows]))
+        rules = chance_rules_of(results, "results", ComparisonError)
+        chance = Evidence(rows, rules).chance(environment_weights([r["terrain"] for r in rows]))
         low, high = chance.interval(results["score"]) or (0.0, 1.0)
         held += low <= mean <= high
     return held

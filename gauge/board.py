@@ -9,6 +9,7 @@ from typing import Any
 
 import jinja2
 
+from ..files.parsing import edited, one_line
 from ..files.writing import write_atomically
 from ..policy.contract import PRIVILEGED_TERMS
 from .coverage import COMPLETE, coverage_of
@@ -31,7 +32,9 @@ def write_board(folder: Path, page: Path) -> Path:
     if not files:
         raise CardError(f"'{folder}' holds no score cards; put results.json files or folders of evaluations there")
     cards = {str(file.relative_to(folder)): load_card(file) for file in files}
-    write_atomically(page, render_board(board_data(cards, folder)), CardError)
+    with edited(f"a card in '{one_line(folder)}'", CardError, jinja2.TemplateError):
+        text = render_board(board_data(cards, folder))
+    write_atomically(page, text, CardError)
     return page
 
 

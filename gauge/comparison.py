@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path, PurePath
@@ -19,7 +19,8 @@ import numpy as np
 from ..files.parsing import edited, one_line, read_results, shown
 from .coverage import COMPLETE, coverage_of
 from .episodes import QUALITY
-from .intervals import CONFIDENCE, Array, Chance, ChanceRules, Evidence
+from .intervals import CONFIDENCE, Array, Chance, Evidence
+from .result_check import chance_rules_of, check_result
 from .results import ONE_SEED, SCHEMA, environment_weights
 
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
@@ -143,7 +144,7 @@ def _compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None)
     evidence = []
     for at, found in enumerate(results):
         same_order = sorted(found["environments"], key=lambda row: order[_key(row)])
-        evidence.append(Evidence(same_order, chance_rules_of(found), name=str(at)))
+        evidence.append(Evidence(same_order, chance_rules_of(found, "results", ComparisonError), name=str(at)))
     paired = len({(tuple(r["chance"]["seeds"]), len(r["chance"]["search_seeds"])) for r in results}) == 1
     raw: list[tuple[str, str, int, int, tuple[float, float], Chance]] = []
     for first, second in combinations(range(len(results)), 2):
@@ -216,13 +217,8 @@ def load_result(path: Path) -> dict[str, Any]:
             f"'{file}' has schema {shown(schema)}, a comparison needs {SCHEMA}, which holds trials and runs; "
             "run its evaluation again with --resume"
         )
+    check_result(found, f"results '{one_line(file)}'", ComparisonError)
     return found
-
-
-def chance_rules_of(results: Mapping[str, Any]) -> ChanceRules:
-    """The rules of chance that some results carry."""
-    found = {f.name: results["chance"][f.name] for f in fields(ChanceRules) if f.name in results["chance"]}
-    return ChanceRules(**found | {k: tuple(found[k]) for k in ("seeds", "search_seeds")})
 
 
 def _check(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import jinja2
 
-from ..files.writing import write_atomically
+from ..files.parsing import edited
+from ..files.writing import write_atomically, write_failure
 from .charts import terrain_label
 from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p
 from .consistency import charts
@@ -25,14 +26,21 @@ def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
 
     Returns:
         Path by kind: ``json``, ``csv``, ``tex``, ``html``.
+
+    Raises:
+        ComparisonError: they cannot be written, or the results hold what no evaluation writes.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    contents = {
-        "json": json.dumps(found.plain(), indent=1, allow_nan=False) + "\n",
-        "csv": as_csv(found),
-        "tex": as_latex(found),
-        "html": as_page(found),
-    }
+    with edited("one of the results", ComparisonError, jinja2.TemplateError):
+        contents = {
+            "json": json.dumps(found.plain(), indent=1, allow_nan=False) + "\n",
+            "csv": as_csv(found),
+            "tex": as_latex(found),
+            "html": as_page(found),
+        }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ComparisonError(write_failure(folder, error)) from error
     paths = {kind: folder / f"comparison.{kind}" for kind in contents}
     for kind, text in contents.items():
         write_atomically(paths[kind], text, ComparisonError)

@@ -12,18 +12,21 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy import special
 
+from ..files.parsing import NotNegative, Seed, Share
 from .episodes import QUALITY
 from .level_chance import bisected_levels, redraw_levels, shared_luck, success_curves
 from .level_curve import expected_levels
 
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]
+_Seeds = Annotated[tuple[Seed, ...], Field(max_length=10_000)]
 
 CONFIDENCE = 0.95
 _QUALITY_STEP = 0.85
@@ -113,20 +116,20 @@ def welch(variances: Array, freedoms: Array) -> float:
 class ChanceRules:
     """What a suite says that decides about chance."""
 
-    level_weight: float
-    quality_weight: float
-    pass_rate: float
-    levels: int
-    seeds: tuple[int, ...]
+    level_weight: NotNegative
+    quality_weight: NotNegative
+    pass_rate: Share
+    levels: Annotated[int, Field(ge=1, le=1000)]
+    seeds: _Seeds
     """Of the quality episodes."""
-    search_seeds: tuple[int, ...]
+    search_seeds: _Seeds
     shared_noise: bool
     """Whether the environments of a seed share its random numbers."""
-    resamples: int
+    resamples: Annotated[int, Field(ge=1, le=100_000)]
     """Replicates of the level searches."""
-    level: str = "bisection"
+    level: Literal["bisection", "curve"] = "bisection"
     """How a level is found, as the suite has it; absent from results that are older than the choice."""
-    bracket_seeds: int = 2
+    bracket_seeds: Annotated[int, Field(ge=1, le=1000)] = 2
     """Seeds that look for the crossing of a curve."""
 
 

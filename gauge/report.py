@@ -9,7 +9,7 @@ from typing import Any
 
 import jinja2
 
-from ..files.parsing import edited, read_results
+from ..files.parsing import edited, read_results, shown
 from ..files.writing import write_atomically
 from . import charts
 from .charts import FLAT, Row, number, terrain_label
@@ -74,7 +74,9 @@ def render(results: Mapping[str, Any]) -> str:
     """
     if not isinstance(results, Mapping) or results.get("schema") != SCHEMA:
         found = results.get("schema") if isinstance(results, Mapping) else None
-        raise StoreError(f"the results have schema {found!r}, this version reads {SCHEMA}; evaluate the policy again")
+        raise StoreError(
+            f"the results have schema {shown(found)}, this version reads {SCHEMA}; evaluate the policy again"
+        )
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,

@@ -106,7 +106,7 @@ def read_measurements(path: Path) -> Measurements:
         policy, motion = row.get("policy") or _LONE, row["motion"]
         if None in row or not motion:
             raise ValidationError(f"line {number} of {one_line(path)} does not have the columns of the first line")
-        values = [_number(row[name], f"{name} in line {number} of {one_line(path)}") for name in names]
+        values = [_number(row[name], f"{one_line(name, 80)} in line {number} of {one_line(path)}") for name in names]
         sums.setdefault(policy, {}).setdefault(motion, []).append(values)
         if "command" in row and commands.setdefault(motion, row["command"]) != row["command"]:
             raise ValidationError(f"line {number} of {one_line(path)} gives motion {shown(motion)} another command")
@@ -152,7 +152,7 @@ def aggregate_errors(real: Table, predicted: Table, commands: Mapping[str, str] 
             if missing:
                 hint = did_you_mean(motion, table) if motion not in table else ""
                 raise ValidationError(
-                    f"the {source} values lack {missing[0]} of motion '{motion}'{hint}; both sides need the same motions"
+                    f"the {source} values lack {one_line(missing[0], 80)} of motion {shown(motion)}{hint}; both sides need the same motions"
                 )
     rows = {
         command: {m: _mean([abs(predicted[o][m] - real[o][m]) for o in motions]) for m in metrics}
@@ -232,9 +232,15 @@ def validate(real: Measurements, simulators: Sequence[Measurements], *, ranks_on
             for side in (real, simulator):
                 if policy not in side.values:
                     raise ValidationError(
-                        f"'{side.name}' has no rows of policy '{policy}'{did_you_mean(policy, side.values)}; "
+                        f"'{one_line(side.name)}' has no rows of policy {shown(policy)}{did_you_mean(policy, side.values)}; "
                         "both sides need the same policies"
                     )
+        for of in real.values.values():
+            if odd := set(of) ^ set(next(iter(real.values.values()))):
+                raise ValidationError(
+                    f"'{one_line(real.name)}' has motion {shown(min(odd))} for some policies alone; "
+                    "every policy needs the same motions"
+                )
         name = simulator.name
         while name in found:
             name += "'"

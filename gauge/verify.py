@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from ..files.parsing import edited
 from ..robots import robot_names
 from ..robots.loading import robot_digest
-from .comparison import chance_rules_of, load_result
+from .comparison import load_result
 from .evaluate import Prepared, Request, Status, evaluate, file_digest, prepare
 from .intervals import Evidence
 from .pipelines import Environment
+from .result_check import chance_rules_of
 from .results import environment_weights
 from .suite import Suite, load_suite
 
@@ -77,7 +79,7 @@ def prepare_replay(
             backend=card["backend"],
             robot=card["robot"] if card["robot"] in robot_names() else None,  # else the policy carries it
             device=device,
-            seeds=tuple(card["chance"]["seeds"]),
+            seeds=chance_rules_of(card, "the card", CardError).seeds,
             threads=threads,
             trust=trust,
         )
@@ -119,6 +121,11 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
         ``score``, ``interval`` and ``band`` of the card and the ``replayed`` score over what was played, and ``levels``: for each
         environment whose level differs its terrain, friction, payload, ``card`` and ``here``.
     """
+    with edited("the card", CardError):
+        return _judge(card, replay)
+
+
+def _judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
     by_key = {_key(row): row for row in card["environments"]}
     pairs = [(by_key[_key(row)], row) for row in replay["environments"]]
     equal = all(old.get(key) == new.get(key) for old, new in pairs for key in _OUTCOME)
@@ -128,7 +135,7 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
         olds = [old for old, _ in pairs]
         weights = environment_weights([row["terrain"] for row in olds])
         score = round(float(weights @ np.array([row["score"] for row in olds])), 6)
-        interval = Evidence(olds, chance_rules_of(card)).chance(weights).interval(score)
+        interval = Evidence(olds, chance_rules_of(card, "the card", CardError)).chance(weights).interval(score)
     band = tolerance_band(score, interval)
     within = band is not None and here is not None and band[0] <= here <= band[1]
     return {
@@ -164,16 +171,9 @@ def load_card(path: Path) -> dict[str, Any]:
     """Read a score card: a ``results.json`` or a copy of it, or its folder.
 
     Raises:
-        ComparisonError: there is none, or it is damaged or too old.
-        CardError: a field is missing.
+        ComparisonError: there is none, it is damaged or too old, or a field is missing.
     """
-    card = load_result(path)
-    missing = [
-        k for k in ("suite", "score", "chance", "policy", "pipeline", "backend", "robot", "provenance") if k not in card
-    ]
-    if missing:
-        raise CardError(f"'{path}' is no score card: it has no '{missing[0]}'; give the results.json of an evaluation")
-    return card
+    return load_result(path)
 
 
 def _sample(rows: Sequence[Row], suite: Suite) -> list[Row]:

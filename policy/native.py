@@ -222,7 +222,9 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
         if len(arguments_text) > _LONGEST_ARGUMENTS:
             raise PolicyError(f"'{source}' has network arguments of over {_LONGEST_ARGUMENTS:,} characters")
         arguments = json.loads(arguments_text)
-    except (json.JSONDecodeError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
+        if isinstance(error, PolicyError):
+            raise
         raise PolicyError(f"'{source}' has malformed network arguments: {first_line(error)}") from error
     architecture = str(spec.get("architecture"))
     stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=state_dict)

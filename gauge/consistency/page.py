@@ -8,7 +8,7 @@ from typing import Any
 
 import jinja2
 
-from ...files.parsing import edited, read_results
+from ...files.parsing import edited, read_results, shown
 from ...files.writing import write_atomically
 from ..charts import number, terrain_label
 from ..report import TEMPLATES, metric_label
@@ -70,7 +70,9 @@ def render(results: Mapping[str, Any]) -> str:
         StoreError: results of another schema.
     """
     if results.get("schema") != SCHEMA:
-        raise StoreError(f"the study has schema {results.get('schema')!r}, this version reads {SCHEMA}; run it again")
+        raise StoreError(
+            f"the study has schema {shown(results.get('schema'))}, this version reads {SCHEMA}; run it again"
+        )
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,

@@ -71,4 +71,4 @@ def _sidecar(content: bytes, folder: Path) -> None:
 
 
 register("policy-deploy", _deploy, words=(b"&a [*a]", b"*a", b"!!python/object:os.system", b"<<: ", b"? "), text=True)
-register("policy-contract", _sidecar, text=True)
+register("policy-contract", _sidecar, json=True)

@@ -125,5 +125,5 @@ register(
     text=True,
 )
 register("episode", _episode, seeds=[_archive()])
-register("episode-head", _head, seeds=[HEAD], text=True)
-register("run-request", _request, seeds=[json.dumps(REQUEST).encode()], text=True)
+register("episode-head", _head, seeds=[HEAD], json=True)
+register("run-request", _request, seeds=[json.dumps(REQUEST).encode()], json=True)

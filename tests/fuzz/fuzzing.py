@@ -7,6 +7,9 @@ a file written outside the case's own folder. To add a parser, call ``register``
 
 from __future__ import annotations
 
+import copy
+import json
+import math
 import os
 import resource
 import signal
@@ -39,6 +42,8 @@ class Parser:
     """Contents that it takes."""
     words: tuple[bytes, ...]
     """What is put in between."""
+    json: bool = False
+    """Whether contents are JSON, of which values are replaced as well as bytes."""
 
 
 @dataclass(kw_only=True)
@@ -70,6 +75,7 @@ def register(
     seeds: Sequence[bytes] | None = None,
     words: Sequence[bytes] = (),
     text: bool = False,
+    json: bool = False,
 ) -> None:
     """Add a parser.
 
@@ -79,16 +85,20 @@ def register(
         seeds: None for the files in ``seeds/<name>``.
         words: of the format, to put in between.
         text: whether the format is a text.
+        json: whether it is JSON.
     """
     found = seeds if seeds is not None else [f.read_bytes() for f in sorted((SEEDS / name).iterdir())]
     assert found, f"parser '{name}' has no seeds"
-    PARSERS[name] = Parser(name=name, feed=feed, seeds=tuple(found), words=(*words, *(_TEXTS if text else _BYTES)))
+    words = (*words, *(_TEXTS if text or json else _BYTES))
+    PARSERS[name] = Parser(name=name, feed=feed, seeds=tuple(found), words=words, json=json)
 
 
 @st.composite
 def contents(draw: Any, parser: Parser) -> bytes:
     """A seed of the parser, changed in up to eight places."""
     data = bytearray(draw(st.sampled_from(parser.seeds)))
+    if parser.json and draw(st.booleans()):
+        return draw(_trees(bytes(data)))
     for _ in range(draw(st.integers(1, 8))):
         at = int(draw(st.floats(0, 1, exclude_max=True)) * len(data))
         length = draw(st.sampled_from((1, 1, 2, 4, 16, 256)))
@@ -110,6 +120,51 @@ def contents(draw: Any, parser: Parser) -> bytes:
             case "cut":
                 del data[at:]
     return bytes(data)
+
+
+_ODD: tuple[Any, ...] = (
+    None,
+    True,
+    -1,
+    0,
+    1,
+    2**31,
+    10**9,
+    10**30,
+    -0.5,
+    1e300,
+    math.nan,
+    math.inf,
+    "",
+    "x",
+    "../../x",
+    "[/x]",
+)
+_ODD += ("\x1b[31m", "\ud800", "9" * 400, [], [[]], {}, {"": {}}, [None] * 3, [0] * 3000, "x" * 100_000)
+
+
+@st.composite
+def _trees(draw: Any, seed: bytes) -> bytes:
+    """A JSON text of which up to four values, wherever they stand, are others, gone, or put into lists."""
+    tree = json.loads(seed)
+    for _ in range(draw(st.integers(1, 4))):
+        table, key = None, None
+        node = tree
+        while isinstance(node, dict | list) and node and (table is None or draw(st.integers(0, 3))):
+            table, key = node, draw(st.sampled_from(sorted(node) if isinstance(node, dict) else range(len(node))))
+            node = table[key]
+        if table is None:
+            return json.dumps(draw(st.sampled_from(_ODD))).encode()
+        match draw(st.sampled_from(("set", "set", "set", "delete", "list", "rename"))):
+            case "set":
+                table[key] = copy.deepcopy(draw(st.sampled_from(_ODD)))
+            case "delete":
+                del table[key]
+            case "list":
+                table[key] = [node, copy.deepcopy(node)]
+            case "rename" if isinstance(table, dict):
+                table[draw(st.sampled_from(("x", "", "\x1b[31m", "../x", "1e9")))] = table.pop(key)
+    return json.dumps(tree).encode()
 
 
 def check(parser: Parser, content: bytes) -> None:

@@ -3,8 +3,9 @@
 from copy import deepcopy
 
 import pytest
+from gaitgauge.gauge.comparison import ComparisonError
 from gaitgauge.gauge.evaluate import file_digest
-from gaitgauge.gauge.verify import CardError, judge, load_card
+from gaitgauge.gauge.verify import judge, load_card
 from test_report import sample
 
 
@@ -71,5 +72,5 @@ def test_the_hash_of_a_policys_file_is_what_other_programs_print(tmp_path):
 def test_results_of_something_else_are_no_card(tmp_path):
     path = tmp_path / "half.json"
     path.write_text('{"schema": 2, "environments": [], "suite": {}}')
-    with pytest.raises(CardError, match="it has no 'score'"):
+    with pytest.raises(ComparisonError, match=r"half\.json': it lacks score, backend, robot, pipeline"):
         load_card(path)

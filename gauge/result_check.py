@@ -1,0 +1,106 @@
+"""What readers of a ``results.json`` take for granted, checked where somebody else may have written or edited it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from ..files.parsing import Kind, Name, Text, build, shown
+from .intervals import ChanceRules
+
+MOST_ROWS = 10_000
+"""Environments of one result."""
+MOST_REPLICATES = 20_000_000
+"""Environments times replicates of the level searches, which are done again when results are compared."""
+_Words = Annotated[str, Field(max_length=4096)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Result:
+    score: float | None
+    score_interval: tuple[float, float] | None = None
+    level: float | None = None
+    backend: Text
+    robot: Name
+    pipeline: Text
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Suite:
+    name: Name
+    version: Name
+    digest: Text
+    title: _Words = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Policy:
+    path: _Words
+    file_sha256: Text
+    observations: Annotated[tuple[Text, ...], Field(max_length=1000)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Coverage:
+    kind: Literal["complete", "part", "custom", "unknown"]
+    text: _Words
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row:
+    terrain: Text
+    friction: Annotated[float, Field(gt=0.0, le=10.0)]
+    payload: Annotated[float, Field(ge=-5.0, le=50.0)]
+    level: Annotated[int, Field(ge=0, le=1000)] | None = None
+    score: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Provenance:
+    digests: Mapping[str, Text] = field(default_factory=dict)
+
+
+def check_result(data: Mapping[str, Any], source: str, error: type[Exception]) -> None:
+    """Check names, numbers and their ranges in the content of a ``results.json``; what is not named here is left as it is.
+
+    Raises:
+        error: something is missing, of another type, or out of range.
+    """
+    take(_Result, data, source, error)
+    for key, kind in {"suite": _Suite, "policy": _Policy, "provenance": _Provenance, "coverage": _Coverage}.items():
+        if key != "coverage" or data.get(key) is not None:  # older results do not state theirs
+            take(kind, data.get(key), f"{source}: {key}", error)
+    rows = data.get("environments")
+    if not isinstance(rows, list) or len(rows) > MOST_ROWS:
+        raise error(f"{source}: environments is {shown(rows)}; it must be a list of at most {MOST_ROWS:,}")
+    for at, row in enumerate(rows):
+        take(_Row, row, f"{source}: environments[{at}]", error)
+
+
+def chance_rules_of(data: Mapping[str, Any], source: str, error: type[Exception]) -> ChanceRules:
+    """The rules of chance that some results carry.
+
+    Raises:
+        error: one is missing or out of range, or all replicates together are too many.
+    """
+    rules = take(ChanceRules, data.get("chance"), f"{source}: chance", error)
+    if len(data["environments"]) * rules.resamples > MOST_REPLICATES:
+        raise error(
+            f"{source}: {len(data['environments'])} environments with {rules.resamples:,} replicates are more than is computed; "
+            f"{MOST_REPLICATES:,} replicates in all are allowed"
+        )
+    return rules
+
+
+def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
+    """A dataclass from the entries of a table that bear its fields' names.
+
+    Raises:
+        error: as ``build``.
+    """
+    if not isinstance(data, Mapping):
+        raise error(f"{source} is {shown(data)}; it must be a table")
+    return build(kind, {f.name: data[f.name] for f in fields(kind) if f.name in data}, source, error)  # type: ignore[arg-type]

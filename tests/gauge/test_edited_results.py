@@ -1,0 +1,98 @@
+"""``results.json`` and score cards that somebody edited: each is one sentence for every reader."""
+
+import copy
+import json
+from pathlib import Path
+
+import pytest
+from gaitgauge.api import ResultsError, load_results
+from gaitgauge.gauge.board import write_board
+from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
+from gaitgauge.gauge.result_check import MOST_ROWS, chance_rules_of
+from gaitgauge.gauge.validation import Measurements, ValidationError, validate
+from gaitgauge.gauge.verify import CardError, load_card
+
+SEED = Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json"
+TRUE = json.loads(SEED.read_text())
+
+
+@pytest.fixture
+def edited(tmp_path):
+    """Writes results with one value replaced."""
+
+    def write(*path: str | int, value: object) -> Path:
+        table = found = copy.deepcopy(TRUE)
+        for key in path[:-1]:
+            table = table[key]
+        table[path[-1]] = value
+        file = tmp_path / "results.json"
+        file.write_text(json.dumps(found))
+        return file
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        (("suite", "name"), "../../x", "suite: name is"),
+        (("suite", "digest"), [1], "suite: digest is"),
+        (("policy", "path"), 3, "policy: path is 3"),
+        (("policy", "observations"), 3, "policy: observations is 3"),
+        (("backend",), ["x"], "backend is"),
+        (("robot",), "../robot.toml", "robot is"),
+        (("score",), "high", "score is 'high'"),
+        (("score_interval",), [0.1], "score_interval"),
+        (("coverage",), 3, "coverage is 3"),
+        (("coverage", "kind"), "best", "coverage: kind is 'best'"),
+        (("environments",), [{}] * (MOST_ROWS + 1), "environments is"),
+        (("environments", 0), 3, r"environments\[0\] is 3"),
+        (("environments", 0, "friction"), -1, "friction is -1"),
+        (("environments", 1, "level"), 10**9, "level is 1000000000"),
+        (("provenance", "digests"), 3, "provenance: digests is 3"),
+    ],
+)
+def test_every_reader_of_cards_names_the_value(edited, tmp_path, path, value, named):
+    file = edited(*path, value=value)
+    for read in (load_result, load_card, lambda card: write_board(card.parent, tmp_path / "board.html")):
+        with pytest.raises(ComparisonError, match=named) as caught:
+            read(file)
+        assert str(caught.value).isprintable() and "results.json" in str(caught.value)
+    assert not (tmp_path / "board.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "named"),
+    [("resamples", 10**9, "resamples is"), ("levels", 10**9, "levels is"), ("seeds", "all", "seeds is")],
+)
+def test_rules_of_chance_that_would_take_all_memory(edited, key, value, named):
+    file = edited("chance", key, value=value)
+    with pytest.raises(ComparisonError, match=named):
+        compare([load_result(file), TRUE], ["one", "two"])
+    with pytest.raises(CardError, match=named):
+        chance_rules_of(load_card(file), "the card", CardError)
+
+
+def test_many_rows_with_many_replicates_are_too_many(edited):
+    many = load_result(edited("environments", value=TRUE["environments"][:1] * 1000))
+    many["chance"]["resamples"] = 100_000
+    with pytest.raises(ComparisonError, match="1000 environments with 100,000 replicates"):
+        compare([many, many], ["one", "two"])
+
+
+def test_scores_that_no_evaluation_writes_are_not_compared(edited):
+    file = edited("environments", 0, "runs", value={"0": {"quality": float("inf")}})
+    with pytest.raises(ComparisonError):
+        compare([load_result(file), TRUE], ["one", "two"])
+
+
+def test_the_library_reads_coverage_with_care(edited):
+    with pytest.raises(ResultsError, match="was edited or is damaged"):
+        load_results(edited("coverage", value=["complete"]))
+
+
+def test_policies_measured_in_other_motions_do_not_compare():
+    table = Measurements(name="real\x1b", values={"a": {"x": {"m": 1.0}}, "b": {"y\x1b": {"m": 1.0}}})
+    with pytest.raises(ValidationError, match="every policy needs the same motions") as caught:
+        validate(table, [table])
+    assert str(caught.value).isprintable()
