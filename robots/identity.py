@@ -28,7 +28,8 @@ from .registry import load_robot, robot_names
 
 LARGEST_COPY = 400_000
 """Largest copy of a robot in a policy [characters]; a model with more than this in its meshes is remembered by its path."""
-_LARGEST_FILE = 20_000_000
+_LARGEST_UNPACKED = 50_000_000
+"""Size of the files of a copy once they are unpacked [bytes]."""
 _Digest = Annotated[str, Field(min_length=64, max_length=64)]
 
 
@@ -123,15 +124,17 @@ def _unpacked(known: RobotIdentity) -> Robot:
     source = f"the copy of the robot '{known.name}' that the policy carries"
     folder = Path(tempfile.mkdtemp(prefix="gaitgauge-robot-")).resolve()
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    left = _LARGEST_UNPACKED
     try:
         for name, text in known.files.items():
             path = PurePosixPath(name)
             if path.is_absolute() or ".." in path.parts or not path.parts:
                 raise RobotError(f"{source} has a file '{one_line(name)}' outside its folder")
             unpack = zlib.decompressobj()
-            data = unpack.decompress(base64.b64decode(text, validate=True), _LARGEST_FILE)
-            if unpack.unconsumed_tail:
-                raise RobotError(f"{source} has a file '{one_line(name)}' of more than {_LARGEST_FILE // 10**6} MB")
+            data = unpack.decompress(base64.b64decode(text, validate=True), left + 1)
+            left -= len(data)
+            if unpack.unconsumed_tail or left < 0:
+                raise RobotError(f"{source} unpacks to more than {_LARGEST_UNPACKED // 10**6} MB")
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_bytes(data)
     except (OSError, ValueError, zlib.error) as error:

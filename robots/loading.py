@@ -99,9 +99,15 @@ def model_files(mjcf: Path) -> list[Path]:
     A name that leads nowhere is left out; MuJoCo refuses such a model.
 
     Raises:
-        RobotError: a file of the model is not XML or defines entities, or all of them are too many or too large.
-        OSError: a file cannot be read.
+        RobotError: a file cannot be read, is not XML or defines entities, or all of them are too many or too large.
     """
+    try:
+        return _model_files(mjcf)
+    except OSError as error:
+        raise RobotError(f"'{one_line(error.filename)}' cannot be read: {error.strerror}") from error
+
+
+def _model_files(mjcf: Path) -> list[Path]:
     found, described, size = {mjcf: None}, {mjcf}, 0
     pending = [mjcf]
     while pending:

@@ -20,7 +20,7 @@ from gaitgauge.gauge.report import write_report
 from gaitgauge.gauge.validation import read_measurements, validate
 from gaitgauge.gauge.verify import judge, load_card
 from gaitgauge.policy.adapters import described_contract
-from gaitgauge.policy.contract import go2_contract
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.fence.archive import packed, read_archive
 from gaitgauge.policy.native import StoredNetwork
 from gaitgauge.policy.networks import MlpNetwork
@@ -77,7 +77,7 @@ def _entries() -> bytes:
     training = {"version": 1, "task": "go2-flat", "num_envs": 8, "world_size": 1, "progress": 0.5}
     training |= {"best_score": None, "best_iteration": None, "settings": {"backend": "fake"}, "log": {"returns": [1.0]}}
     made = io.BytesIO()
-    torch.save(checkpoint_entries(go2_contract(ROBOT), mlp, {"iter": 1, "training": training}), made)
+    torch.save(checkpoint_entries(standard_contract(ROBOT), mlp, {"iter": 1, "training": training}), made)
     return made.getvalue()
 
 

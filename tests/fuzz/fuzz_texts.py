@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import io
 import json
+import tempfile
 from pathlib import Path
 
 import numpy as np
 from fuzzing import register
 from gaitgauge.backends.base import PhysicsOptions
+from gaitgauge.files.parsing import parse_json
 from gaitgauge.gauge.consistency.variants import parse_variant
 from gaitgauge.gauge.episodes import Episode, Record, RecordError
 from gaitgauge.gauge.store import RunFolder
 from gaitgauge.gauge.suite import SUITE_FOLDER, load_suite
-from gaitgauge.robots import load_robot
+from gaitgauge.robots import RobotError, load_robot
+from gaitgauge.robots.identity import identify, recall
 from gaitgauge.training.tasks import find_task
 
 GO2 = load_robot("go2").mjcf.parent
@@ -60,6 +63,15 @@ def _settings(content: bytes, folder: Path) -> None:
 
 def _variant(content: bytes, folder: Path) -> None:
     parse_variant(content.decode("utf-8", "surrogateescape")).physics(PhysicsOptions())
+
+
+def _carried(content: bytes, folder: Path) -> None:
+    """A robot that a policy carries is unpacked into a folder of its own."""
+    before, tempfile.tempdir = tempfile.tempdir, str(folder)
+    try:
+        recall(parse_json(content, "it", RobotError))
+    finally:
+        tempfile.tempdir = before
 
 
 EPISODE = Episode(
@@ -110,6 +122,8 @@ def _archive() -> bytes:
     return archive.getvalue()
 
 
+_GONE = identify(load_robot("go2"), "/nowhere/robot.toml")
+CARRIED = json.dumps(_GONE, default=str).encode()
 _SUITE = (SUITE_FOLDER / "robogauge-1.1.toml").read_bytes().replace(b'"robogauge-1.1"', b'"mine"')
 _SHORT = b'extends = "gaitgauge-1"\nname = "mine"\n[matrix]\nfrictions = [0.6]\n[metrics]\ninterval = 50\n'
 _SETTINGS = b"environment.push.linear=0.6\ntraining.run.iterations=50\nenvironment.terrain.tiles.flat.share=0.3\n"
@@ -127,3 +141,4 @@ register(
 register("episode", _episode, seeds=[_archive()])
 register("episode-head", _head, seeds=[HEAD], json=True)
 register("run-request", _request, seeds=[json.dumps(REQUEST).encode()], json=True)
+register("robot-carried", _carried, seeds=[CARRIED], json=True)

@@ -1,7 +1,9 @@
 """What a policy remembers of its robot, and what becomes of it where the robot is gone or has changed."""
 
+import base64
 import json
 import shutil
+import zlib
 from dataclasses import replace
 
 import pytest
@@ -54,11 +56,19 @@ def test_a_robot_of_many_files_is_carried_whole(unseen, tmp_path):
     assert robot_digest(recall(entry)[0]) == entry["digest"]
 
 
+BOMB = base64.b64encode(zlib.compress(bytes(20_000_000))).decode()
+LAUGHS = base64.b64encode(zlib.compress(b"<!DOCTYPE m [<!ENTITY a 'ha'>]><mujoco model='&a;'/>")).decode()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda e: e | {"files": {"../x.xml": next(iter(e["files"].values()))}}, "outside its folder"),
         (lambda e: e | {"files": {"unseen.xml": "no base64"}}, "cannot be unpacked"),
+        (lambda e: e | {"files": dict.fromkeys("abc", BOMB)}, "unpacks to more than 50 MB"),
+        (lambda e: e | {"files": {"a\0b": "", **e["files"]}}, "without control characters"),
+        (lambda e: e | {"files": {"unseen.xml": LAUGHS}}, "defines XML entities"),
+        (lambda e: e | {"description": e["description"] | {"mjcf": "none.xml"}}, "none.xml' cannot be read"),
         (lambda e: e | {"digest": "0" * 64}, "is damaged: its digest"),
         (lambda e: e | {"digest": "short"}, "the robot that the policy remembers.*digest"),
         (lambda e: e | {"files": None}, "which is not there; say where it is with --robot"),
