@@ -58,6 +58,7 @@ class Film:
             pix_fmt_in="rgb24",
             pix_fmt_out=pixels,
             macro_block_size=2,
+            ffmpeg_log_level="error",
             output_params=options,
         )
         self._writer.send(None)
