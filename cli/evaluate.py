@@ -38,9 +38,10 @@ def run_evaluation(
     out: Path | None,
     resume: bool,
     json_output: bool,
+    clip: bool = True,
     **choices: Any,
 ) -> None:
-    """Evaluate, show progress, print the tables and where the files are."""
+    """Evaluate, show progress, film the robot, print the tables and where the files are."""
     request = Request(
         policy=policy,
         pipeline=pipeline,
@@ -63,6 +64,18 @@ def run_evaluation(
         console.say(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}")
         raise typer.Exit(130) from None
     report = write_report(folder)
+    if clip:
+        from .clip import make_clip
+
+        options = [
+            policy,
+            *(["--trust"] if request.trust else []),
+            *(["--robot", request.robot] if request.robot else []),
+        ]
+        if sentence := make_clip(folder, results, options):
+            console.say(sentence)
+        else:
+            report = write_report(folder)
     if json_output:
         print(json.dumps(results, indent=1))
         return

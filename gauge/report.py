@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
@@ -12,8 +13,10 @@ import jinja2
 from ..files.parsing import edited, read_results, shown
 from ..files.writing import write_atomically
 from . import charts
+from .breakdown import breakdown
 from .charts import FLAT, Row, number, terrain_label
 from .coverage import coverage_of, notes, score_label, suite_label
+from .references import references_for
 from .results import SCHEMA
 from .store import StoreError
 
@@ -34,6 +37,10 @@ METRIC_LABELS: Mapping[str, tuple[str, str]] = {
 }
 """Long and short label; other metrics go by their name."""
 
+CLIP = "clip.webp"
+"""A film of the robot beside the results; it becomes part of the page."""
+_LARGEST_CLIP = 4_000_000
+"""[bytes]"""
 _SHOWN = 6
 """Environments that a warning names before it says how many more there are."""
 _LONGEST = 400
@@ -58,7 +65,7 @@ def write_report(folder: Path) -> Path:
     try:
         results = read_results(source, "results", StoreError)
         with edited(str(source), StoreError, jinja2.TemplateError):
-            text = render(results)
+            text = render(results, _clip(folder))
     except StoreError as error:
         raise StoreError(f"{error}; run gaitgauge evaluate again with --resume") from error
     page = folder / "report.html"
@@ -66,8 +73,18 @@ def write_report(folder: Path) -> Path:
     return page
 
 
-def render(results: Mapping[str, Any]) -> str:
+def _clip(folder: Path) -> bytes | None:
+    """The film that lies in a folder of results, None where there is none that fits into a page."""
+    path = folder / CLIP
+    return path.read_bytes() if path.is_file() and path.stat().st_size <= _LARGEST_CLIP else None
+
+
+def render(results: Mapping[str, Any], clip: bytes | None = None) -> str:
     """The page of some results, as HTML text. Whatever they contain is shown as text and never becomes markup.
+
+    Args:
+        results: content of ``results.json``.
+        clip: a WebP film of the robot.
 
     Raises:
         StoreError: results of another schema.
@@ -86,7 +103,9 @@ def render(results: Mapping[str, Any]) -> str:
     )
     environment.filters |= {"fixed": _fixed, "number": number, "terrain": terrain_label, "metric": metric_label}
     environment.filters |= {"short_metric": lambda name: metric_label(name, short=True), "grouped": _grouped}
-    return environment.get_template("report.html.j2").render(report_data(results))
+    return environment.get_template("report.html.j2").render(
+        **report_data(results), clip=None if clip is None else base64.b64encode(clip).decode()
+    )
 
 
 def metric_label(name: str, *, short: bool = False) -> str:
@@ -142,6 +161,11 @@ def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
         "score_figures": _figures(rows, "score", both) if evaluated else [],
         "metrics": {name: {**row, "strip": charts.strip(row)} for name, row in results["metrics"].items()},
         "metric_matrix": metric_matrix(rows),
+        "breakdown": breakdown(rows),
+        "references": [
+            {"of": r, "strip": charts.strip({"mean50": r.score, "interval": r.interval})}
+            for r in references_for(results)
+        ],
         "searches": charts.searches(rows),
         "rows": [_row(r) for r in rows],
         "events": any(r.get(flag) for r in rows for flag in _FLAGS),

@@ -57,7 +57,7 @@ class Scorer:
         out = self._folder / path.stem
         # A resumed run may come by the same iteration again, with other weights.
         shutil.rmtree(out, ignore_errors=True)
-        options = ["--suite", self._asked, "--json", "--threads", str(self._threads), "--out", str(out)]
+        options = ["--suite", self._asked, "--json", "--no-clip", "--threads", str(self._threads), "--out", str(out)]
         self._side.submit(
             Job(
                 command=[sys.executable, "-m", f"{_PACKAGE}.cli.main", "evaluate", str(path), *options],

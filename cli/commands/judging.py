@@ -53,6 +53,9 @@ def evaluate(
         Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-<pipeline>.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the output folder.")] = False,
+    clip: Annotated[
+        bool, typer.Option("--clip/--no-clip", help="Film the robot for the report, where this machine can draw.")
+    ] = True,
     json_output: Annotated[bool, typer.Option("--json", help="Print results.json instead of tables.")] = False,
     trust: TrustOption = False,
 ) -> None:
@@ -80,6 +83,7 @@ def evaluate(
         threads=threads,
         out=out,
         resume=resume,
+        clip=clip,
         json_output=json_output,
         trust=trust,
     )

@@ -16,6 +16,12 @@ from typer.testing import CliRunner, Result
 sys.path.insert(0, str(Path(__file__).parent))
 
 
+@pytest.fixture(autouse=True)
+def no_films(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evaluations film nobody: it takes seconds, and not every machine can draw."""
+    monkeypatch.setattr("gaitgauge.cli.clip.make_clip", lambda folder, results, options: None)
+
+
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     """Runs a command line in an empty folder."""

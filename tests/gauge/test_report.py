@@ -19,7 +19,7 @@ from gaitgauge.gauge.coverage import coverage
 from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.pipelines import make_environments
 from gaitgauge.gauge.plan import PlanRules, environment_result, plan
-from gaitgauge.gauge.report import STATISTIC_LABELS, metric_matrix, render, report_data, warnings, write_report
+from gaitgauge.gauge.report import CLIP, STATISTIC_LABELS, metric_matrix, render, report_data, warnings, write_report
 from gaitgauge.gauge.results import fold, health
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
@@ -184,6 +184,34 @@ def test_page_asks_for_nothing_from_outside(stress):
         assert not {"src", "href", "srcset", "action", "data", "xlink:href"} & attributes.keys()
     assert not re.search(r"@import|url\(|fetch\(|XMLHttpRequest", text)
     assert "default-src 'none'" in text
+
+
+def test_film_is_part_of_the_page_and_nothing_else_is_loaded(tmp_path, stress):
+    (tmp_path / "results.json").write_text(json.dumps(stress))
+    (tmp_path / CLIP).write_bytes(b"RIFFfilm")
+    text = write_report(tmp_path).read_text()
+    assert [a["src"] for t, a in Page(text).tags if "src" in a] == ["data:image/webp;base64,UklGRmZpbG0="]
+    assert "img-src data:" in text
+    assert "img-src" not in render(stress)
+    (tmp_path / CLIP).write_bytes(bytes(5_000_000))
+    assert "img-src" not in write_report(tmp_path).read_text()
+
+
+def test_every_number_has_its_name_where_a_phone_hides_the_tables_heads(stress):
+    """At 390 pixels the table of metrics showed no numbers."""
+    tables = re.findall(r'<table class="[^"]*stack[^"]*">(.*?)</table>', render(stress), re.S)
+    assert len(tables) == 3
+    for table in tables:
+        for line in re.findall(r"<tr>(.*?)</tr>", table.split("</thead>")[1], re.S):
+            _, *cells = re.findall(r"<t[dh]\b[^>]*>", line)
+            assert cells and all("data-label=" in cell or 'class="strip"' in cell for cell in cells), line
+
+
+def test_directions_commands_and_references_are_shown(stress):
+    page = Page(render(stress))
+    for words in ("turning left", "there and back: forward and right", "0.6739", "arXiv 2602.00678"):
+        assert words in page.text
+    assert "others, on the same suite" not in Page(render(sample("base", **PIPELINES["base"]))).text
 
 
 @pytest.mark.parametrize("place", ["path", "command", "terrain", "host", "provenance", "version", "suite"])

@@ -1,0 +1,57 @@
+"""Quality by direction and command, and the scores of known policies beside a score."""
+
+import pytest
+from gaitgauge.gauge.breakdown import breakdown, command_label
+from gaitgauge.gauge.references import reference_table, references_for
+from gaitgauge.gauge.suite import load_suite
+
+
+def row(terrain, *runs):
+    return {"terrain": terrain, "runs": {str(seed): {"quality": 0.5, "commands": run} for seed, run in enumerate(runs)}}
+
+
+def test_means_over_seeds_and_environments_then_over_terrains():
+    rows = [
+        row("flat", {"max_velocity +x": 0.8, "max_velocity -y": 0.6}, {"max_velocity +x": 0.6}),
+        row("flat", {"max_velocity +x": 0.4, "diagonal_velocity +x-y": 0.2}),
+        row("wave", {"max_velocity +x": 0.1}),
+        {"terrain": "wave"},  # nothing was played
+    ]
+    found = breakdown(rows)
+    assert found["command"]["full speed, then stop: forward"] == {
+        "mean": pytest.approx((0.6 + 0.1) / 2),
+        "flat": pytest.approx(0.6),
+        "wave": pytest.approx(0.1),
+    }
+    forward, right = found["direction"]["forward"], found["direction"]["right"]
+    assert forward["flat"] == pytest.approx((0.8 + 0.6 + 0.4 + 0.2) / 4)
+    assert right == {"mean": pytest.approx(0.4), "flat": pytest.approx(0.4)}
+    assert list(found["direction"]) == ["forward", "right"]
+    assert breakdown([{"terrain": "flat", "runs": {"0": {"commands": {}}}}, {"terrain": "wave"}]) == {}
+
+
+def test_labels_of_commands():
+    assert command_label("diagonal_velocity -x+y") == "there and back: backward and left"
+    assert command_label("max_velocity -yaw") == "full speed, then stop: turning right"
+    assert command_label("target_pos_velocity") == "to the target"
+    assert command_label("own_goal +z") == "own goal +z"
+
+
+def results(suite="robogauge-1.1", version="1.1.0", kind="complete", score=0.6, sha="ab"):
+    return {
+        "suite": {"name": suite, "version": version},
+        "coverage": {"kind": kind, "text": kind},
+        "score": score,
+        "policy": {"file_sha256": sha},
+    }
+
+
+def test_references_are_of_the_same_suite_and_beside_whole_runs_alone():
+    scores = [r.score for r in references_for(results())]
+    assert scores == [0.6739, 0.6729, 0.6713, 0.5149]
+    ours = next(r for r in reference_table().reference if r.file_sha256)
+    assert [r.score for r in references_for(results(sha=ours.file_sha256))] == [0.6739, 0.6713, 0.5149]
+    for other in ({"suite": "quick"}, {"version": "2.0.0"}, {"kind": "part"}, {"score": None}):
+        assert not references_for(results(**other))
+    for reference in reference_table().reference:
+        assert load_suite(reference.suite).version == reference.version, "the suite has moved on"
