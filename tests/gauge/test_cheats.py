@@ -92,12 +92,24 @@ def test_a_policy_that_knows_what_no_robot_knows_has_no_plain_score(folder):
     assert not table["ranked"] and table["others"][0]["observations"] == "privileged"
 
 
+WHOLE = """
+extends = "gaitgauge-1"
+name = "whole"
+
+[matrix]
+terrains = ["flat", "slope_bd", "wave", "obstacle"]
+frictions = [0.6]
+payloads = [0.0]
+search_seeds = [100, 101]
+"""
+"""Whole goals on terrain that one might slide, roll or bounce along."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHEATS)
 def test_a_cheat_has_at_most_a_quarter_on_flat_ground_and_nothing_elsewhere(folder, policy, name):
-    """All of the suite's terrains, at friction 0.6."""
-    request = Request(policy=str(policy(name)), suite="gaitgauge-1", frictions=(0.6,), payloads=(0.0,), threads=2)
-    found = evaluate(request, folder / f"whole-{name}")
+    suite = folder / "whole.toml"
+    suite.write_text(WHOLE)
+    found = evaluate(Request(policy=str(policy(name)), suite=str(suite), threads=2), folder / f"whole-{name}")
     assert found["terrains"].pop("flat")["score"] < 0.25
     assert {row["score"] for row in found["terrains"].values()} == {0.0}
-    assert found["score"] < 0.04
