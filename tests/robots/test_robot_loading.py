@@ -242,7 +242,7 @@ def test_missing_and_unreadable_files(tmp_path):
 def test_unknown_name_offers_close_ones():
     with pytest.raises(RobotError, match=r"unknown robot 'g02'; did you mean 'go2'\?"):
         load_robot("g02")
-    with pytest.raises(RobotError, match=r"unknown robot 'elephant' \(installed: go2"):
+    with pytest.raises(RobotError, match=r"unknown robot 'elephant' \(installed: anymal_c, go1, go2"):
         load_robot("elephant")
 
 
@@ -338,7 +338,7 @@ def install_plugin(monkeypatch):
 
 def test_plugin_callable(install_plugin):
     install_plugin("plugged", "robot_plugin:plugin_robot")
-    assert robot_names() == ["go2", "plugged"]
+    assert robot_names() == ["anymal_c", "go1", "go2", "plugged"]
     assert load_robot("plugged") == plugin_robot()
 
 
@@ -350,7 +350,7 @@ def test_plugin_path(install_plugin, write_hopper, monkeypatch):
 
 def test_plugin_does_not_replace_an_own_robot(install_plugin):
     install_plugin("go2", "robot_plugin:plugin_robot")
-    assert robot_names() == ["go2"]
+    assert robot_names() == ["anymal_c", "go1", "go2"]
     assert load_robot("go2") == GO2
 
 
