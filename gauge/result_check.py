@@ -41,6 +41,7 @@ class _Policy:
     path: _Words
     file_sha256: Text
     observations: Annotated[tuple[Text, ...], Field(max_length=1000)] | None = None
+    kind_of_observations: Literal["measurable", "privileged"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,7 @@ class _Row:
     terrain: Text
     friction: Annotated[float, Field(gt=0.0, le=10.0)]
     payload: Annotated[float, Field(ge=-5.0, le=50.0)]
-    level: Annotated[int, Field(ge=0, le=1000)] | None = None
+    level: Annotated[float, Field(ge=0, le=1000)] | None = None
     score: float | None = None
 
 

@@ -32,6 +32,12 @@ def edited(tmp_path):
     return write
 
 
+def test_an_expected_level_is_no_edited_one(edited):
+    """A card of gaitgauge-1 was refused for levels that are no whole numbers."""
+    at = next(at for at, row in enumerate(TRUE["environments"]) if row["level"])
+    assert load_card(edited("environments", at, "level", value=5.166667))["environments"][at]["level"] == 5.166667
+
+
 @pytest.mark.parametrize(
     ("path", "value", "named"),
     [
