@@ -10,8 +10,9 @@ import trimesh
 import viser
 
 from ..terrains.base import Terrain
+from .picture import show
 from .play_session import PlaySession
-from .scenery import COLLISION_GROUP, show, visual_model
+from .scenery import COLLISION_GROUP, visual_model
 
 _BESIDE = 1.6
 """Distance between robots whose ground is the same at both places [m]."""

@@ -11,8 +11,9 @@ from .console import Terminal
 from .errors import UserError
 from .gamepad import Gamepad
 from .overlay import summary, table
+from .picture import show
 from .play_session import Command, PlaySession, Readout, clip
-from .scenery import COLLISION_GROUP, show, visual_model
+from .scenery import COLLISION_GROUP, visual_model
 
 # GLFW's numbers of keys that the viewer does not use itself.
 _UP, _DOWN, _LEFT, _RIGHT = 265, 264, 263, 262

@@ -6,10 +6,14 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .errors import UserError
+
+if TYPE_CHECKING:
+    import mujoco
 
 RENDERERS = ("egl", "osmesa")
 """Ways to draw without a display, the faster first; the value of MUJOCO_GL."""
@@ -99,19 +103,37 @@ def choose_renderer() -> Quality:
     )
 
 
+class Follower:
+    """The point at which a camera looks that follows a robot smoothly."""
+
+    ABOVE = 0.06
+    """How far above the base it is, which leaves room for words above the robot [m]."""
+    LAG = 0.25
+    """Time constant [s]."""
+
+    def __init__(self) -> None:
+        """Look at nothing yet."""
+        self._at: np.ndarray | None = None
+
+    def follow(self, position: np.ndarray, seconds: float) -> np.ndarray:
+        """Where to look at a pose (7 + J,), ``seconds`` after the one before; (3,) [m]."""
+        target = position[:3] + np.array([0.0, 0.0, self.ABOVE])
+        # A robot that was put back to the start is not followed on its way there.
+        if self._at is None or np.linalg.norm(target - self._at) > 1.5:
+            self._at = target
+        self._at = self._at + (target - self._at) * min(1.0, seconds / self.LAG)
+        return self._at
+
+
 class Picture:
-    """Draws a robot on its ground from a camera that follows it smoothly."""
+    """Draws a robot on its ground."""
 
     AZIMUTH = 55.0
     """Direction in which the camera looks, against the robot's first heading [deg]."""
     ELEVATION = -16.0
     DISTANCE = 1.9
-    ABOVE = 0.06
-    """How far above the base it looks, which leaves room for words above the robot [m]."""
-    LAG = 0.25
-    """Time constant of the camera [s]."""
 
-    def __init__(self, model: object, *, size: tuple[int, int], heading: float) -> None:
+    def __init__(self, model: mujoco.MjModel, *, size: tuple[int, int], heading: float) -> None:
         """Prepare the renderer.
 
         Args:
@@ -121,7 +143,6 @@ class Picture:
         """
         import mujoco
 
-        assert isinstance(model, mujoco.MjModel)
         self._model, self._data = model, mujoco.MjData(model)
         self._renderer = mujoco.Renderer(model, size[1], size[0])
         self._camera = mujoco.MjvCamera()
@@ -130,22 +151,26 @@ class Picture:
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 1
         self._options.sitegroup[:] = 0
-        self._looks_at: np.ndarray | None = None
 
-    def draw(self, position: np.ndarray, seconds: float) -> np.ndarray:
-        """The picture of a pose (7 + J,), ``seconds`` after the one before; (height, width, 3) uint8."""
-        from .scenery import show
-
+    def draw(self, position: np.ndarray, looks_at: np.ndarray) -> np.ndarray:
+        """The picture of a pose (7 + J,) from a camera that looks at a point (3,) [m]; (height, width, 3) uint8."""
         show(self._model, self._data, position)
-        target = position[:3] + np.array([0.0, 0.0, self.ABOVE])
-        # A robot that was put back to the start is not followed on its way there.
-        if self._looks_at is None or np.linalg.norm(target - self._looks_at) > 1.5:
-            self._looks_at = target
-        self._looks_at = self._looks_at + (target - self._looks_at) * min(1.0, seconds / self.LAG)
-        self._camera.lookat[:] = self._looks_at
+        self._camera.lookat[:] = looks_at
         self._renderer.update_scene(self._data, self._camera, self._options)
         return self._renderer.render()
 
     def close(self) -> None:
         """Free the renderer."""
         self._renderer.close()
+
+
+def show(model: mujoco.MjModel, data: mujoco.MjData, position: np.ndarray) -> None:
+    """Put the model into a pose, (7 + J,), and move the sun along."""
+    import mujoco
+
+    data.qpos[: len(position)] = position
+    sun = model.light("sun").id
+    model.light_pos[sun] = (*position[:2] - np.array([1.4, 1.8]), position[2] + 4.0)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)

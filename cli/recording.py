@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from .drawing import Shot, Tile, draw, processes_for
 from .overlay import annotate
-from .picture import Picture, Quality
-from .play_session import Command, PlaySession
+from .picture import Follower, Quality
+from .play_session import Command, PlaySession, Readout
 from .scenery import visual_model
 from .video import Film
 
@@ -54,36 +55,46 @@ def record(wanted: Recording, quality: Quality, progress: Callable[[float], None
     sessions = wanted.sessions
     several = len(sessions) > 1
     tile = quality.tile if several else quality.size
+    small = CLIP_TILE if several else CLIP_SIZE
+    size, small = (tile[0] * len(sessions), tile[1]), (small[0] * len(sessions), small[1])
     frames = max(1, round(wanted.seconds / FRAME_TIME))
+    every = 1 if wanted.video else _CLIP_EVERY
+    tiles = [
+        Tile(
+            model=visual_model(session.robot, session.terrain, quality),
+            heading=session.terrain.spawns["level_search"].yaw,
+        )
+        for session in sessions
+    ]
     with ExitStack() as stack:
-        pictures = [_picture(session, quality, tile) for session in sessions]
-        for picture in pictures:
-            stack.callback(picture.close)
-        width = tile[0] * len(sessions)
-        video = wanted.video and stack.enter_context(Film(wanted.video, fps=1.0 / FRAME_TIME, size=(width, tile[1])))
-        small = CLIP_TILE if several else CLIP_SIZE
-        small = (small[0] * len(sessions), small[1])
+        video = wanted.video and stack.enter_context(Film(wanted.video, fps=1.0 / FRAME_TIME, size=size))
         slower = 1.0 / (FRAME_TIME * _CLIP_EVERY)
         clip = wanted.clip and stack.enter_context(Film(wanted.clip, fps=slower, size=small))
-        drawn_at = -FRAME_TIME
-        for frame in range(frames):
-            for session in sessions:
-                while session.time < (frame + 1) * FRAME_TIME - 1e-9:  # policies may have periods of their own
-                    session.step(wanted.command or session.autopilot())
-            in_clip = clip and frame % _CLIP_EVERY == 0
-            if video or in_clip:
-                since, drawn_at = frame * FRAME_TIME - drawn_at, frame * FRAME_TIME
-                tiles = [p.draw(s.position(), since) for p, s in zip(pictures, sessions, strict=True)]
-                drawn = np.concatenate(tiles, axis=1)
-                readouts = [s.readout() for s in sessions]
-                if video:
-                    video.add(annotate(drawn, readouts))
-                if clip and in_clip:
-                    reduced = Image.fromarray(drawn).resize(small, Image.Resampling.BOX)
-                    clip.add(annotate(np.asarray(reduced), readouts))
+        processes = processes_for(frames // every * len(sessions), quality)
+        drawn = stack.enter_context(
+            closing(draw(tiles, tile, _shots(sessions, frames, every, wanted.command), processes))
+        )
+        for picture, (frame, readouts) in drawn:
+            if video:
+                video.add(annotate(picture, readouts))
+            if clip and frame % _CLIP_EVERY == 0:
+                reduced = Image.fromarray(picture).resize(small, Image.Resampling.BOX)
+                clip.add(annotate(np.asarray(reduced), readouts))
             progress((frame + 1) / frames)
 
 
-def _picture(session: PlaySession, quality: Quality, tile: tuple[int, int]) -> Picture:
-    model = visual_model(session.robot, session.terrain, quality)
-    return Picture(model, size=tile, heading=session.terrain.spawns["level_search"].yaw)
+def _shots(
+    sessions: Sequence[PlaySession], frames: int, every: int, command: Command | None
+) -> Iterator[Shot[tuple[int, list[Readout]]]]:
+    """Play, and say what is to be drawn: every so many frames."""
+    followers = [Follower() for _ in sessions]
+    for frame in range(frames):
+        for session in sessions:
+            while session.time < (frame + 1) * FRAME_TIME - 1e-9:  # policies may have periods of their own
+                session.step(command or session.autopilot())
+        if frame % every == 0:
+            poses = []
+            for session, follower in zip(sessions, followers, strict=True):
+                position = session.position()
+                poses.append((position, follower.follow(position, FRAME_TIME * every)))
+            yield Shot(poses=poses, note=(frame, [session.readout() for session in sessions]))

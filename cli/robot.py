@@ -141,7 +141,7 @@ def _draw(robot: Robot, quality: Quality, path: Path) -> None:
     position[2] = body_plan(robot).standing_height
     picture = Picture(visual_model(robot, make_terrain("flat"), quality), size=quality.size, heading=0.0)
     try:
-        imageio.v3.imwrite(path, np.ascontiguousarray(picture.draw(position, 0.0)))
+        imageio.v3.imwrite(path, np.ascontiguousarray(picture.draw(position, position[:3])))
     except OSError as error:
         raise UserError(
             f"the picture '{path}' cannot be written: {error.strerror or error}; choose another --picture"

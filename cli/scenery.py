@@ -161,13 +161,3 @@ def drawn_heights(heights: FloatArray, most_nodes: int) -> FloatArray:
     fewer = zoom(heights, factors, order=1)
     back = zoom(fewer, [n / m for n, m in zip(heights.shape, fewer.shape, strict=True)], order=1)
     return np.asarray(fewer) if np.abs(back - heights).max() <= _SAME_GROUND else heights
-
-
-def show(model: mujoco.MjModel, data: mujoco.MjData, position: np.ndarray) -> None:
-    """Put the model into a pose, (7 + J,), and move the sun along."""
-    data.qpos[: len(position)] = position
-    sun = model.light("sun").id
-    model.light_pos[sun] = (*position[:2] - np.array([1.4, 1.8]), position[2] + 4.0)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_camlight(model, data)

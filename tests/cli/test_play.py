@@ -11,6 +11,7 @@ import pytest
 import torch
 from gaitgauge.backends import ResetState
 from gaitgauge.cli import scenery
+from gaitgauge.cli.picture import show
 from gaitgauge.cli.play_session import beyond
 from gaitgauge.cli.worlds import labels
 from gaitgauge.gauge.suite import load_suite
@@ -138,7 +139,7 @@ def test_what_is_drawn_stands_where_the_physics_has_it(session, terrain, level):
         played.step((0.0, 0.0, 0.0))
     model = scenery.visual_model(ROBOT, played.terrain)
     data = mujoco.MjData(model)
-    scenery.show(model, data, played.position())
+    show(model, data, played.position())
     feet = np.array([data.site(name).xpos for name in ROBOT.foot_names])
     np.testing.assert_allclose(feet, played.state.foot_position_w[0].numpy(), atol=2e-3)
 

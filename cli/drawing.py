@@ -1,0 +1,133 @@
+"""Draws the pictures of a film: here where a GPU does it, in several processes where the processor does, since no picture needs
+another one.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections import deque
+from collections.abc import Generator, Iterable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+import numpy as np
+
+from .errors import UserError
+from .picture import PLAIN, Picture, Quality
+
+if TYPE_CHECKING:
+    import mujoco
+
+Note = TypeVar("Note")
+
+_MOST = 4
+"""Processes at most."""
+_WORTH = 50
+"""Pictures for which it is worth to start another process."""
+_AHEAD = 3
+"""Pictures that are asked for ahead of time, for each process."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tile:
+    """One robot of a picture."""
+
+    model: mujoco.MjModel
+    """What ``scenery.visual_model`` made."""
+    heading: float
+    """Of the robot at the start [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot(Generic[Note]):
+    """One picture that is to be drawn."""
+
+    poses: Sequence[tuple[np.ndarray, np.ndarray]]
+    """Pose (7 + J,) of each robot, and the point (3,) at which its camera looks."""
+    note: Note
+    """Comes back with the picture."""
+
+
+def processes_for(pictures: int, quality: Quality) -> int:
+    """How many processes draw; 0: this one."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    wanted = min(_MOST, cores, pictures // _WORTH)
+    return wanted if quality is PLAIN and wanted > 1 else 0
+
+
+def draw(
+    tiles: Sequence[Tile], size: tuple[int, int], shots: Iterable[Shot[Note]], processes: int
+) -> Generator[tuple[np.ndarray, Note], None, None]:
+    """Pictures of shots, in their order.
+
+    Args:
+        tiles: the robots, from left to right.
+        size: width and height of each tile [pixels].
+        shots: are taken as they are needed.
+        processes: what ``processes_for`` says.
+
+    Yields:
+        (height, width of all tiles, 3) uint8, and the shot's note.
+
+    Raises:
+        UserError: a process that draws was ended from outside.
+    """
+    if not processes:
+        artist = _Artist(tiles, size)
+        try:
+            for shot in shots:
+                yield artist.draw(shot.poses), shot.note
+        finally:
+            artist.close()
+        return
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's threads would only be in the way of the other processes
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (tiles, size))
+    waiting: deque[tuple[Future[np.ndarray], Note]] = deque()
+    try:
+        for shot in shots:
+            waiting.append((pool.submit(_draw, shot.poses), shot.note))
+            if len(waiting) > _AHEAD * processes:
+                future, note = waiting.popleft()
+                yield future.result(), note
+        for future, note in waiting:
+            yield future.result(), note
+    except BrokenProcessPool as error:
+        raise UserError(
+            "a process that draws was ended, perhaps for want of memory; ask for a shorter video"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+class _Artist:
+    """All tiles of one process."""
+
+    def __init__(self, tiles: Sequence[Tile], size: tuple[int, int]) -> None:
+        self._pictures = [Picture(tile.model, size=size, heading=tile.heading) for tile in tiles]
+
+    def draw(self, poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        drawn = [picture.draw(*pose) for picture, pose in zip(self._pictures, poses, strict=True)]
+        return drawn[0] if len(drawn) == 1 else np.concatenate(drawn, axis=1)
+
+    def close(self) -> None:
+        for picture in self._pictures:
+            picture.close()
+
+
+_artist: _Artist | None = None
+"""Of this process, where it only draws."""
+
+
+def _begin(tiles: Sequence[Tile], size: tuple[int, int]) -> None:
+    global _artist
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's matter
+    _artist = _Artist(tiles, size)
+
+
+def _draw(poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    assert _artist is not None
+    return _artist.draw(poses)

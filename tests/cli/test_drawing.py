@@ -1,0 +1,108 @@
+"""Pictures of a film in their order, whoever draws them."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from gaitgauge.cli import drawing
+from gaitgauge.cli.drawing import Shot, Tile, draw, processes_for
+from gaitgauge.cli.errors import UserError
+from gaitgauge.cli.picture import PLAIN, RICH, Follower, choose_renderer
+
+TILES = [Tile(model=None, heading=0.0), Tile(model=None, heading=1.0)]
+
+
+def shots(count):
+    for i in range(count):
+        yield Shot(poses=[(np.full(19, float(i)), np.zeros(3)), (np.full(19, float(i + 100)), np.zeros(3))], note=i)
+
+
+def test_tiles_stand_side_by_side_and_pictures_are_drawn_as_they_are_needed(monkeypatch):
+    closed, taken = [], []
+
+    class Flat:
+        def __init__(self, model, *, size, heading):
+            self.size = size
+
+        def draw(self, position, looks_at):
+            return np.full((self.size[1], self.size[0], 3), int(position[0]), dtype=np.uint8)
+
+        def close(self):
+            closed.append(self)
+
+    monkeypatch.setattr(drawing, "Picture", Flat)
+    for picture, note in draw(TILES, (4, 3), (taken.append(s.note) or s for s in shots(5)), processes=0):
+        assert taken == list(range(note + 1))
+        assert picture.shape == (3, 8, 3)
+        assert (picture[:, :4] == note).all() and (picture[:, 4:] == note + 100).all()
+    assert note == 4
+    assert len(closed) == 2
+
+
+def test_processes_are_started_where_they_are_worth_it(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(2)), raising=False)
+    assert [processes_for(n, PLAIN) for n in (20, 99, 100, 5000)] == [0, 0, 2, 2]
+    assert processes_for(5000, RICH) == 0, "a GPU draws for one process as fast as for several"
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(64)), raising=False)
+    assert processes_for(5000, PLAIN) == 4
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
+    assert processes_for(5000, PLAIN) == 0
+
+
+def test_camera_follows_a_walk_and_does_not_fly_back_to_the_start():
+    follower, position = Follower(), np.zeros(19)
+    assert follower.follow(position, 0.04).tolist() == [0.0, 0.0, 0.06]
+    position[0] = 1.0
+    assert follower.follow(position, 0.05)[0] == pytest.approx(0.05 / 0.25)
+    position[0] = -5.0
+    assert follower.follow(position, 0.04)[0] == -5.0
+
+
+@pytest.mark.slow
+def test_several_processes_draw_what_one_draws_and_one_that_dies_is_a_sentence(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.delenv("LP_NUM_THREADS", raising=False)
+    try:
+        choose_renderer()
+    except UserError as error:
+        pytest.skip(str(error))
+    # In a process of its own: MuJoCo chooses the renderer when it is imported.
+    done = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "a process that draws was ended" in done.stdout
+
+
+_SCRIPT = """
+import multiprocessing, os, signal
+import numpy as np
+from gaitgauge.cli.drawing import Shot, Tile, draw
+from gaitgauge.cli.errors import UserError
+from gaitgauge.cli.picture import PLAIN
+from gaitgauge.cli.scenery import visual_model
+from gaitgauge.robots import load_robot
+from gaitgauge.terrains.registry import make_terrain
+
+tiles = [Tile(model=visual_model(load_robot("go2"), make_terrain("flat"), PLAIN), heading=0.0)]
+
+def shots(count):
+    for i in range(count):
+        position = np.array([0.1 * i, 0.0, 0.3, 1.0, *[0.0] * 15])
+        yield Shot(poses=[(position, position[:3])], note=i)
+
+one = list(draw(tiles, (160, 90), shots(9), 0))
+two = list(draw(tiles, (160, 90), shots(9), 2))
+assert [note for _, note in two] == list(range(9))
+for (a, _), (b, _) in zip(one, two):
+    assert np.abs(a.astype(int) - b).mean() < 0.5
+assert np.abs(one[0][0].astype(int) - one[8][0]).mean() > 1.0
+
+pictures = draw(tiles, (160, 90), shots(500), 2)
+next(pictures)
+for child in multiprocessing.active_children():
+    os.kill(child.pid, signal.SIGKILL)
+try:
+    list(pictures)
+except UserError as error:
+    print(error)
+"""
