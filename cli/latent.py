@@ -11,14 +11,12 @@ from typing import Any
 
 import typer
 
-from ..gauge.latent.figures import label
+from ..gauge.latent.figures import SPACES, label
 from ..gauge.latent.study import PAIRS, LatentRequest, study_latents
 from .console import Terminal, make_table
 from .errors import UserError
 from .policies import policy_file
 from .progress import ProgressDisplay
-
-_SPACES = {"latent": "latent", "experts": "experts' weights", "input": "the network's input"}
 
 
 def run_latent(
@@ -61,7 +59,7 @@ def print_latents(console: Terminal, results: Mapping[str, Any]) -> None:
         table = make_table(f"{pair} told apart: {words}", *columns, numbers=True)
         table.columns[1].justify = "left"
         for entry in results["policies"]:
-            for space, name in _SPACES.items():
+            for space, name in SPACES.items():
                 if (found := entry[pair].get(space)) is not None:
                     numbers = (found["silhouette"], found["probe"], found["chance"], *found["recall"].values())
                     table.add_row(entry["label"], name, *(f"{n:.2f}" for n in numbers))

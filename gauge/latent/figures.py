@@ -15,6 +15,15 @@ from ..report import TEMPLATES
 from .collecting import Notes
 
 FIGURES = ("terrains", "commands", "experts")
+SPACES = {
+    "latent": "latent",
+    "latent_mean": "latent, means of 1 s",
+    "experts": "experts' weights",
+    "experts_mean": "experts' weights, means of 1 s",
+    "input": "network's input",
+    "input_mean": "network's input, means of 1 s",
+}
+"""In what classes are told apart, in the order in which tables list it."""
 LABELS = {
     "slope_fd": "slope up",
     "slope_bd": "slope down",
@@ -56,7 +65,7 @@ def render_figure(name: str, results: Mapping[str, Any], points: Points) -> str 
         x += panel["width"] + _GAP + (_LEFT if name != "experts" else 0.0)
     at, line = _LEFT, 0
     for item in legend:
-        width = 22.0 + 7.0 * len(item["text"])
+        width = 28.0 + 7.0 * len(item["text"])
         if at + width > max(x, 360.0) and at > _LEFT:
             at, line = _LEFT, line + 1
         item["x"], item["line"] = round(at, 1), line
@@ -80,7 +89,7 @@ def render_page(results: Mapping[str, Any], pictures: Mapping[str, str]) -> str:
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
     # the figures' templates have escaped what is in them
     figures = {name: markupsafe.Markup(text) for name, text in pictures.items()}
-    return _environment().get_template("latent.html.j2").render(results=results, figures=figures)
+    return _environment().get_template("latent.html.j2").render(results=results, figures=figures, spaces=SPACES)
 
 
 def _environment() -> jinja2.Environment:

@@ -29,6 +29,8 @@ from .separation import Separation, principal_components, separation
 
 PAIRS = {"terrains": "forward on every terrain", "commands": "every command on all terrains"}
 """What is told apart, as in the paper's two figures."""
+STRIDES = 10
+"""Notes that a mean is taken over: a second, in which a robot takes two to three strides."""
 
 
 class LatentError(ValueError):
@@ -173,6 +175,7 @@ def look(
     classes = {"terrains": notes.terrain, "commands": notes.command}
     names = {"terrains": [t.name for t in walks.terrains], "commands": list(COMMANDS)}
     spaces = {"latent": notes.latent, "experts": notes.weights, "input": notes.history}
+    blocks = _blocks(notes, STRIDES)
     entry: dict[str, Any] = {
         **describe(label, loaded),
         "walkers": notes.walkers,
@@ -189,8 +192,13 @@ def look(
             )
         found: dict[str, Any] = {}
         for space, values in spaces.items():
-            if values is not None and len(names[pair]) > 1:
-                found[space] = _plain(separation(values[rows], classes[pair][rows], notes.robot[rows]), names[pair])
+            if values is None or len(names[pair]) < 2:
+                continue
+            found[space] = _plain(separation(values[rows], classes[pair][rows], notes.robot[rows]), names[pair])
+            whole = blocks[rows[blocks[:, 0]]]
+            kinds, robots = classes[pair][whole[:, 0]], notes.robot[whole[:, 0]]
+            if len(set(kinds)) == len(names[pair]) and len(set(robots)) > 1:
+                found[f"{space}_mean"] = _plain(separation(values[whole].mean(axis=1), kinds, robots), names[pair])
         if notes.latent is not None:
             spread, shares = principal_components(notes.latent[rows])
             found["explained"] = [float(s) for s in shares]
@@ -199,6 +207,16 @@ def look(
         entry[pair] = found
     entry["experts"] = None if notes.weights is None else _experts(notes, names, chosen, classes)
     return entry, places
+
+
+def _blocks(notes: Notes, count: int) -> NDArray[np.int64]:
+    """Rows of ``count`` notes that follow each other of one robot, (B, count); what is left of a robot's notes is in none."""
+    order = np.lexsort((notes.time, notes.robot, notes.command, notes.terrain))
+    keys = np.stack((notes.terrain, notes.command, notes.robot))[:, order]
+    begins = np.flatnonzero(np.append(True, (np.diff(keys) != 0).any(axis=0)))
+    parts = np.split(order, begins[1:])
+    found = [part[: len(part) // count * count].reshape(-1, count) for part in parts]
+    return np.concatenate(found)
 
 
 def _plain(found: Separation, names: Sequence[str]) -> dict[str, Any]:

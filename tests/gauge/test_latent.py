@@ -7,9 +7,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
-from gaitgauge.gauge.latent.collecting import COMMANDS, Walks, collect
+from gaitgauge.gauge.latent.collecting import COMMANDS, Notes, Walks, collect
 from gaitgauge.gauge.latent.separation import principal_components, separation, silhouette
-from gaitgauge.gauge.latent.study import LatentError, LatentRequest, study_latents
+from gaitgauge.gauge.latent.study import LatentError, LatentRequest, _blocks, study_latents
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
@@ -89,6 +89,28 @@ def test_what_robots_noted_belongs_to_where_they_were(walks):
     assert np.allclose(told, expected, atol=1e-6)
     again = collect(policy, robot, walks)
     assert np.array_equal(notes.latent, again.latent)
+
+
+def test_means_are_of_notes_of_one_robot_that_follow_each_other():
+    # at each moment robots 0 and 1 of terrain 0, then robot 0 of terrain 1, which falls after three of five
+    rows = [(0, 0, m) for m in range(5)] + [(0, 1, m) for m in range(5)] + [(1, 0, m) for m in range(3)]
+    terrain, robot, moment = np.array(sorted(rows, key=lambda row: row[2])).T
+    nothing = np.zeros(len(rows), dtype=np.int64)
+    notes = Notes(
+        latent=None,
+        weights=None,
+        history=np.zeros((len(rows), 1)),
+        terrain=terrain,
+        command=nothing,
+        robot=robot,
+        time=0.1 * moment,
+        falls=1,
+        walkers=3,
+    )
+    found = [[(terrain[i], robot[i], moment[i]) for i in block] for block in _blocks(notes, 2)]
+    robots = [(0, 0), (0, 1), (1, 0)]
+    expected = [[(*r, 2 * b), (*r, 2 * b + 1)] for r in robots for b in range(1 if r == (1, 0) else 2)]
+    assert found == expected
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,9 @@
 """Scenario files: those that ship, and those that could not be played or decided."""
 
 import pytest
+from gaitgauge.gauge.trials.page import view
 from gaitgauge.gauge.trials.scenario import ScenarioError, load_scenario, scenario_names
+from gaitgauge.gauge.trials.trialling import profile
 
 OWN = """
 name = "own"
@@ -109,3 +111,24 @@ def test_what_cannot_be_played_or_decided_is_refused_in_one_sentence(tmp_path, o
     with pytest.raises(ValueError, match=sentence) as caught:
         load(tmp_path, text)
     assert str(caught.value).isprintable()
+
+
+def test_the_ground_is_drawn_from_the_side_by_its_corners():
+    stairs = load_scenario("stairs-at-speed")
+    line = profile(stairs.terrain(), 0.0, 0.0, 5.5)
+    assert line[0] == (-2.0, 0.0) and line[-1][1] == 0.0 and len(line) < 45
+    assert max(z for _, z in line) == pytest.approx(0.6)
+    assert profile(load_scenario("sprint").terrain(), 0.0, 0.0, None) == []
+
+
+def test_ways_are_seen_from_the_side_where_the_ground_has_a_shape_and_from_above_elsewhere():
+    path = [(0.0, 0.5, 0.3, 0.0), (2.0, -0.5, 0.5, 0.0), (float("nan"), 0.0, 0.0, 0.0)]
+    result = {"rows": [{"path": path, "outcome": "fell", "seed": 3, "seconds": 1.0}]}
+    above = view({"profile": []}, result)
+    [way] = above["paths"]
+    assert not above["side"] and len(way["points"]) == 2 and way["title"] == "seed 3: fell after 1.0 s"
+    assert way["points"][1][1] > way["points"][0][1]  # to the right is downwards
+    side = view({"profile": [(-1.0, 0.0), (3.0, 0.0)]}, result)
+    assert side["side"] and side["paths"][0]["points"][1][1] < side["paths"][0]["points"][0][1]
+    (left, _), (right, _) = side["ground"]
+    assert right - left == pytest.approx(side["size"][0] - 2 * 34.0)
