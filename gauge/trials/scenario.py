@@ -226,6 +226,11 @@ def load_scenario(name: str) -> Scenario:
     data = parse_toml(read_text(path, "scenario file", ScenarioError), source, ScenarioError)
     scenario = build(Scenario, data, source, ScenarioError)
     _check(scenario, source)
+    if path.resolve().parent != SCENARIO_FOLDER.resolve() and scenario.name in scenario_names():
+        raise ScenarioError(
+            f"{source} is called '{scenario.name}' as a scenario that ships with the project; give it a 'name' of its own, so that "
+            "results are not taken for that one's"
+        )
     return scenario
 
 

@@ -68,6 +68,7 @@ def test_unknown_names_are_refused_with_those_that_are_near():
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
+        ('name = "own"', 'name = "sprint"', "is called 'sprint' as a scenario that ships"),
         ("survive = true", "survive = false", "nothing says what success is, so it can never be decided"),
         ("[success]\nsurvive = true", "", "nothing says what success is"),
         ("survive = true", "beyond = 3.0", "commands lead no further than to 2 m, so success can never be decided"),
