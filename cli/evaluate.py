@@ -17,6 +17,7 @@ from ..backends.registry import choose_device
 from ..gauge.coverage import COMPLETE, coverage_of, notes, score_label, suite_label
 from ..gauge.evaluate import Request, Status, evaluate, prepare
 from ..gauge.report import write_report
+from ..gauge.results import ALL
 from ..gauge.suite import Suite
 from ..policy.adapters import assumptions
 from ..policy.contract import PolicyContract
@@ -93,7 +94,8 @@ def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -
         return None
     at_once = _AT_ONCE + suite.settling.longest
     with (folder / "episodes.csv").open(encoding="utf-8", newline="") as file:
-        counts = [(int(row["falls"]), int(row["control_steps"])) for row in csv.DictReader(file)]
+        whole = [row for row in csv.DictReader(file) if row["command"] == ALL]
+    counts = [(int(row["falls"]), int(row["control_steps"])) for row in whole]
     fell = [falls > 0 and steps * contract.control_period <= falls * at_once for falls, steps in counts]
     if 2 * sum(fell) <= len(fell):
         return None

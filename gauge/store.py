@@ -64,11 +64,18 @@ class RunFolder:
         record.save(self._episodes)
 
     def discard_all_but(self, counted: Collection[Episode]) -> None:
-        """Remove the records of speculative episodes that results do not count."""
+        """Remove the records of speculative episodes that results do not count.
+
+        Raises:
+            StoreError: one cannot be removed.
+        """
         names = {episode.key for episode in counted}
         for path in self._episodes.glob("*.npz"):
             if path.stem not in names:
-                path.unlink()
+                try:
+                    path.unlink()
+                except OSError as error:
+                    raise StoreError(write_failure(path, error)) from error
 
 
 def _present_request(folder: Path, wanted: Mapping[str, Any], *, resume: bool) -> Any:

@@ -8,6 +8,7 @@ from pathlib import Path
 import onnx
 from google.protobuf.message import DecodeError
 
+from ...files.parsing import shown
 from ..base import PolicyError
 from .archive import LARGEST_FILE
 from .operators import ONNX_CONTRIBUTED, ONNX_OPERATORS
@@ -142,8 +143,10 @@ def _beside(location: str, folder: Path, source: str) -> Path:
             )
         if not path.is_file():
             raise PolicyError(f"'{source}' lacks its weights: there is no file '{location}' beside it")
-    except (OSError, RuntimeError) as error:
-        raise PolicyError(f"'{source}' lacks its weights: '{location}' cannot be read") from error
+    except (OSError, RuntimeError, ValueError) as error:  # a name that leads in circles, holds a null character …
+        if isinstance(error, PolicyError):
+            raise
+        raise PolicyError(f"'{source}' lacks its weights: {shown(location)} cannot be read") from error
     return path
 
 

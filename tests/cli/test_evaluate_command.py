@@ -106,8 +106,8 @@ def test_assumptions_are_repeated_where_the_robot_falls_at_once(tmp_path, contra
     at_once = round((longest + 0.5) / period)
 
     def said(contract, *rows):
-        lines = [f"{falls},{steps}" for falls, steps in rows]
-        (tmp_path / "episodes.csv").write_text("\n".join(["falls,control_steps", *lines]))
+        lines = [line for falls, steps in rows for line in (f"all,{falls},{steps}", "max_velocity +x,,")]
+        (tmp_path / "episodes.csv").write_text("\n".join(["command,falls,control_steps", *lines]))
         return doubtful_assumptions(contract, suite, tmp_path)
 
     falling, walking = (1, at_once), (0, 4000)

@@ -376,7 +376,8 @@ def test_weights_outside_the_folder(tmp_path):
     folder.mkdir()
     (tmp_path / "secret").write_bytes(bytes(45 * 12 * 4))
     (folder / "link").symlink_to(tmp_path / "secret")
-    for location in ("../secret", str(tmp_path / "secret"), "link", "", "none"):
+    (folder / "loop").symlink_to(folder / "loop")
+    for location in ("../secret", str(tmp_path / "secret"), "link", "", "none", "a\0b", "x" * 300, "loop", "/dev/zero"):
         refused(graph_file(folder / "policy.onnx", PRODUCT, weights=[outside(location)]), "folder|lacks")
     (folder / "w").write_bytes(bytes(45 * 12 * 4))
     graph_file(folder / "policy.onnx", PRODUCT, weights=[outside("w")])
