@@ -68,14 +68,20 @@ def test_no_command_opens_the_file(run, refused, tmp_path, contract, kind, insid
         "import": [path, tmp_path / "made.gauge.pt"],
         "evaluate": [path, "--suite", "demo"],
         "export": [path],
-        "play": [path, "--viewer", "video", "--seconds", "0.1"],
+        "play": [path, "--viewer", "viser", "--port", "18080"],
+        "consistency": [path, "--backends", "mujoco,mujoco@iterations=50", "--suite", "demo"],
+        "latent": [path],
     }
     for command, arguments in commands.items():
         for trust in ([], ["--trust"]):
             message = refused(command, *arguments, *trust)
             assert ("--trust" if inside and not trust else "torch.from_file") in message, command
             assert not victim.exists(), command
-    refused("train", "go2-flat", "--init-from", path)
+    for trust in ([], ["--trust"]):  # weights alone are taken, whatever is trusted
+        message = refused("train", "go2-flat", "--backend", "fake", "--device", "cpu", "--init-from", path, *trust)
+        assert ("carries a program (torchscript), not weights" if inside else "more than tensors") in message
+        assert not victim.exists()
+    refused("compare", path, path)
     run_folder = tmp_path / "logs" / "rsl_rl" / "go2_flat" / "2026-01-01_00-00-00"
     run_folder.mkdir(parents=True)
     (run_folder / "model_1.pt").write_bytes(path.read_bytes())
