@@ -1,6 +1,7 @@
 """Speed of learning without an environment: rollout bookkeeping and updates on random data.
 
     python benchmarks/learning_speed.py --num-envs 8192 --device cuda:0
+    python benchmarks/learning_speed.py --task go2-him --variants "tf32, compiled, CUDA graphs, alternate"
 
 Prints, for each variant of the algorithm's settings, the time of a rollout's forward passes, of one update, and the
 environment steps a second that learning alone would allow.
@@ -11,19 +12,23 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.robots import load_robot
-from gaitgauge.training.algorithms.cts import CTS
+from gaitgauge.training.algorithms.methods import METHODS
 from gaitgauge.training.algorithms.symmetry import build_mirror
-from gaitgauge.training.configuration import AlgorithmConfiguration, RunConfiguration, TrainingConfiguration
+from gaitgauge.training.configuration import TrainingConfiguration
 from gaitgauge.training.environment_configuration import ObservationConfiguration
+from gaitgauge.training.tasks import find_task
 from tensordict import TensorDict
 
 WIDTHS = {"policy": 45, "history": 225, "privileged": 263}
+PUBLISHED: dict[str, Any] = {"symmetry": "none", "precision": "tf32"}
+"""What a variant has where it names nothing else."""
 PLAIN: dict[str, Any] = {"cuda_graphs": False, "compile_mode": "none"}
 VARIANTS: dict[str, dict[str, Any]] = {
     "float32": PLAIN | {"precision": "float32"},
@@ -51,17 +56,22 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def measure(settings: dict[str, Any], *, num_envs: int, steps: int, repeat: int, device: str) -> dict[str, float]:
+def measure(configuration: TrainingConfiguration, *, num_envs: int, repeat: int, device: str) -> dict[str, float]:
     """Seconds of a rollout and of an update, means over ``repeat`` iterations after as many to warm up."""
     torch.manual_seed(0)
-    configuration = TrainingConfiguration(
-        algorithm=AlgorithmConfiguration(**settings), run=RunConfiguration(steps_per_iteration=steps)
-    )
+    steps = configuration.run.steps_per_iteration
     robot = load_robot("go2")
     mirror = build_mirror(ObservationConfiguration(), contract=standard_contract(robot), robot=robot)
     groups = {name: torch.randn(num_envs, width, device=device) for name, width in WIDTHS.items()}
     observations = TensorDict(groups, batch_size=[num_envs])
-    algorithm = CTS.build(observations, configuration, num_actions=robot.num_joints, mirror=mirror, device=device)
+    algorithm = METHODS[configuration.algorithm.method].build(
+        observations,
+        configuration,
+        num_actions=robot.num_joints,
+        command_entries=(6, 7, 8),
+        mirror=mirror,
+        device=device,
+    )
     rewards, dones = torch.randn(num_envs, device=device), torch.zeros(num_envs, dtype=torch.bool, device=device)
     on_gpu = torch.device(device).type == "cuda"
     times = {"rollout": 0.0, "update": 0.0}
@@ -88,6 +98,7 @@ def measure(settings: dict[str, Any], *, num_envs: int, steps: int, repeat: int,
 def main() -> None:
     """Measure all variants that the device can run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--task", default="go2-moe-cts", help="whose method and networks are measured")
     parser.add_argument("--num-envs", type=int, default=8192)
     parser.add_argument("--steps", type=int, default=24)
     parser.add_argument("--repeat", type=int, default=5)
@@ -103,9 +114,13 @@ def main() -> None:
             continue
         if torch.device(options.device).type == "cuda":
             torch.cuda.reset_peak_memory_stats()
-        result = measure(
-            settings, num_envs=options.num_envs, steps=options.steps, repeat=options.repeat, device=options.device
+        training = find_task(options.task).training
+        configuration = replace(
+            training,
+            algorithm=replace(training.algorithm, **(PUBLISHED | settings)),
+            run=replace(training.run, steps_per_iteration=options.steps),
         )
+        result = measure(configuration, num_envs=options.num_envs, repeat=options.repeat, device=options.device)
         speed = options.num_envs * options.steps / (result["rollout"] + result["update"])
         results[name] = result | {"steps_per_second": speed}
         print(

@@ -6,8 +6,8 @@ from gaitgauge.policy.base import Policy, PolicySession, RowwiseSession
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.export import export_onnx, export_torchscript
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.native import NativePolicy, StoredNetwork, save_policy
+from gaitgauge.policy.networks import ARCHITECTURES, MlpNetwork
 from gaitgauge.policy.rebuilt import RebuiltPolicy
 from gaitgauge.policy.steady import steady_session
 from gaitgauge.robots import load_robot
@@ -46,6 +46,16 @@ def test_rows_do_not_matter(tiny, count):
 
 def test_the_shipped_policy_runs_batched():
     session, _ = steady_session(load_policy("pretrained", ROBOT), 24)
+    assert session.batched and not isinstance(session, RowwiseSession)
+
+
+@pytest.mark.parametrize("architecture", ["ac_moe", "mcp", "him", "dreamwaq"])
+def test_rows_of_the_other_methods_networks_do_not_matter(architecture):
+    torch.manual_seed(0)
+    arguments = {"primitives_blind_to": [6, 7, 8]} if architecture == "mcp" else {}
+    state = ARCHITECTURES[architecture](**arguments).state_dict()
+    stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=state)
+    session, _ = steady_session(NativePolicy(standard_contract(ROBOT), stored, path=architecture), 24)
     assert session.batched and not isinstance(session, RowwiseSession)
 
 

