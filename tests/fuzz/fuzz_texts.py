@@ -1,4 +1,4 @@
-"""Suites, robots and their models, settings, variants, episode files, run folders."""
+"""Suites, sweeps, robots and their models, settings, variants, episode files, run folders."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from gaitgauge.gauge.store import RunFolder
 from gaitgauge.gauge.suite import SUITE_FOLDER, load_suite
 from gaitgauge.robots import RobotError, load_robot
 from gaitgauge.robots.identity import identify, recall
+from gaitgauge.training.sweep.file import load_sweep
 from gaitgauge.training.tasks import find_task
 
 GO2 = load_robot("go2").mjcf.parent
@@ -43,6 +44,12 @@ def _suite(content: bytes, folder: Path) -> None:
     path = folder / "mine.toml"
     path.write_bytes(content)
     load_suite(str(path))
+
+
+def _sweep(content: bytes, folder: Path) -> None:
+    path = folder / "mine.toml"
+    path.write_bytes(content)
+    load_sweep(path)
 
 
 def _robot(content: bytes, folder: Path) -> None:
@@ -128,6 +135,9 @@ _SUITE = (SUITE_FOLDER / "robogauge-1.1.toml").read_bytes().replace(b'"robogauge
 _SHORT = b'extends = "gaitgauge-1"\nname = "mine"\n[matrix]\nfrictions = [0.6]\n[metrics]\ninterval = 50\n'
 _SETTINGS = b"environment.push.linear=0.6\ntraining.run.iterations=50\nenvironment.terrain.tiles.flat.share=0.3\n"
 register("suite", _suite, seeds=[_SUITE, _SHORT], words=_TOML, text=True)
+_SWEEP = b"""name = "a"\ntitle = "b"\nseeds = [0, 1]\nsettings = ["training.run.iterations=5"]\ncheckpoint = "best"
+[[entry]]\nname = "c"\ntask = "go2-him"\nseeds = [7]\nbackend = "mujoco"\ndevice = "cpu"\n"""
+register("sweep", _sweep, seeds=[_SWEEP], words=_TOML, text=True)
 register("robot", _robot, seeds=[(GO2 / "robot.toml").read_bytes()], words=_TOML, text=True)
 register("robot-model", _model, seeds=[(GO2 / "go2.xml").read_bytes()], words=_XML, text=True)
 register("settings", _settings, seeds=[_SETTINGS], words=(b"=", b".", b"none", b"inf", b"1,2", b"\n"), text=True)
