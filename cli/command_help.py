@@ -56,7 +56,7 @@ def _prepare(command: Any) -> None:
     text, _, examples = (command.help or "").partition(_EXAMPLES)
     command.help = escape(text)
     if examples:
-        command.epilog = "[bold]Examples:[/]\n" + escape(examples.rstrip())
+        command.epilog = "Examples:\n" + escape(examples.rstrip())
     options = [p for p in command.params if isinstance(p, TyperOption) and p.name != "help"]
     for parameter in command.params:
         if isinstance(parameter, TyperOption | TyperArgument) and parameter.help:

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,18 +47,21 @@ class Finding:
     """What to do, where it is not ok."""
 
 
-def examine() -> bool:
-    """Print a table of all checks.
+def examine(*, json_output: bool = False) -> bool:
+    """Print a table of all checks, or JSON.
 
     Returns:
         False if there is a problem.
     """
-    console = Terminal()
+    console = Terminal(stderr=json_output)
     table = make_table("gaitgauge doctor", "check", "status", "found", "what to do")
     findings = []
     with console.status("checking …"):
         for check in CHECKS:
             findings += list(check())
+    if json_output:
+        print(json.dumps([asdict(each) for each in findings], indent=1))
+        return all(each.status != PROBLEM for each in findings)
     for each in findings:
         table.add_row(each.what, Text(each.status, _STYLES[each.status]), each.found, each.advice)
     console.print(table)

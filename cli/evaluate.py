@@ -88,10 +88,9 @@ def run_evaluation(
 
 
 def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -> str | None:
-    """What was taken for granted of the policy, where in most episodes the robot fell within a second of standing."""
-    taken = assumptions(contract)
-    if taken is None:
-        return None
+    """What to do, and what was taken for granted of the policy, where in most episodes the robot fell within a second of
+    standing.
+    """
     at_once = _AT_ONCE + suite.settling.longest
     with (folder / "episodes.csv").open(encoding="utf-8", newline="") as file:
         whole = [row for row in csv.DictReader(file) if row["command"] == ALL]
@@ -99,7 +98,11 @@ def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -
     fell = [falls > 0 and steps * contract.control_period <= falls * at_once for falls, steps in counts]
     if 2 * sum(fell) <= len(fell):
         return None
-    return f"the robot fell at once in {sum(fell)} of {len(fell)} episodes. The policy does not say how it is to be run; {taken}"
+    taken = assumptions(contract)
+    return (
+        f"the robot fell at once in {sum(fell)} of {len(fell)} episodes: 'gaitgauge doctor POLICY' tries what may be wrong"
+        + (f". The policy does not say how it is to be run; {taken}" if taken else "")
+    )
 
 
 def shower(display: ProgressDisplay) -> Callable[[Status], None]:

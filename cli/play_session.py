@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ from ..backends.base import PhysicsState, Randomization, ResetState, Scene
 from ..backends.registry import make_backend
 from ..gauge.goals import target_command, target_offset
 from ..gauge.suite import Suite
+from ..policy.adapters import assumptions
 from ..policy.base import Policy
 from ..policy.observation import ObservationBuilder
 from ..robots import Robot
@@ -30,6 +33,8 @@ _SETTLE = 0.4
 """Time after a reset in which the robot is told to stand [s]."""
 _FALLEN_TILT = 1.4
 """Tilt of the base at which the robot starts again [rad]."""
+_AT_ONCE = 1.0
+"""Time after that within which a fall says that the policy is run wrongly [s]."""
 _LONG_DOWN = 1.0
 """How long a fallen robot is shown [s]."""
 
@@ -65,6 +70,14 @@ class Readout:
     """How often it lay on the ground."""
     arrivals: int
     """How often it was at the target."""
+
+
+@cache  # once for each policy
+def _doubt(policy: Policy) -> None:
+    """Say that a policy may be run otherwise than it was made for."""
+    sentence = "'%s': the robot falls at once; 'gaitgauge doctor POLICY' tries what may be wrong%s"
+    taken = assumptions(policy.contract)
+    logging.getLogger(__name__).warning(sentence, policy.path, f"; {taken}" if taken else "")
 
 
 def clip(command: Command, limits: Command) -> Command:
@@ -235,6 +248,8 @@ class PlaySession:
             self._down += self.period
             if self._down >= _LONG_DOWN or bool(self.state.diverged[0]):
                 self.falls += 1
+                if self.since_reset - self._down < _SETTLE + _AT_ONCE:
+                    _doubt(self.policy)
                 self.reset()
             return
         self._down = 0.0

@@ -57,7 +57,8 @@ def load_policy(
             accepted, and the Go2 stands in.
         trust: run a program that a file of the project's own format carries inside; it is fenced in either way.
         log_root: where ``latest`` and ``best`` look: ``<log_root>/<experiment>/<run>/``.
-        contract_file: a ``contract.toml`` that says how a TorchScript or ONNX file is to be run; it goes before all else.
+        contract_file: a ``contract.toml`` that says how a file without a contract of its own is to be run; it goes before
+            all else.
 
     Raises:
         PolicyError: no such file or name, a damaged or foreign file, or a network that does not fit its contract.
@@ -135,12 +136,10 @@ def _load(
     kind = file_kind(data, source)
     if kind in ("torchscript", "onnx"):
         return _foreign(ForeignFile(kind=kind, data=data), path, source, robot, contract=contract)
-    if contract is not None:
-        raise PolicyError(
-            f"'{source}' is neither TorchScript nor ONNX, and has its contract inside; leave out --contract"
-        )
     entries = load_entries(data, source=source)
     if is_policy(entries):
+        if contract is not None:
+            raise PolicyError(f"'{source}' has its contract inside; leave out --contract, or import its source again")
         stored = read_policy(entries, source=source)
         if isinstance(stored.network, StoredNetwork):
             return NativePolicy(stored.contract, stored.network, path=source)
@@ -153,7 +152,8 @@ def _load(
     found = checkpoint_network(entries, robot, path=path)
     if found is None:
         raise PolicyError(f"'{source}' is a torch.save file, but neither a gaitgauge policy nor an rsl_rl checkpoint")
-    return NativePolicy(*found, path=source)
+    assumed, network = found
+    return NativePolicy(contract or assumed, network, path=source)
 
 
 def _foreign(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from .. import completion
 from ..errors import report_errors
+from ..options import RobotOption, ThreadsOption, TrustOption
 
 app = typer.Typer()
 
@@ -39,13 +41,50 @@ def list_command(
 
 @app.command()
 @report_errors
-def doctor() -> None:
-    """Check packages, engines, GPU and rendering of this machine, and say what to do about each problem.
+def doctor(
+    policy: Annotated[
+        str | None,
+        typer.Argument(
+            help="A policy to examine, as for play. Default: this machine is examined.",
+            metavar="POLICY",
+            autocompletion=completion.policies,
+        ),
+    ] = None,
+    contract: Annotated[
+        Path | None, typer.Option(help="A contract.toml that says how the policy is to be run.", metavar="PATH")
+    ] = None,
+    robot: RobotOption = None,
+    seconds: Annotated[float, typer.Option(min=0.5, max=20.0, help="How long each description is played [s].")] = 2.0,
+    threads: ThreadsOption = None,
+    out: Annotated[Path | None, typer.Option(help="Write the contract.toml that fits best.")] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    trust: TrustOption = False,
+) -> None:
+    """Say what is wrong: with this machine, or with how a policy is run; exit code 1 where something is.
+
+    Of a policy it plays the description and every likely other one: joint order, scales, signs, history, gains, pose.
 
     Examples:
       gaitgauge doctor
+      gaitgauge doctor policy.onnx
+      gaitgauge doctor policy.onnx --contract contract.toml --out mended.toml
     """
-    from ..doctor import examine
+    if policy is None:
+        from ..doctor import examine
 
-    if not examine():
+        well = examine(json_output=json_output)
+    else:
+        from ..diagnosis import examine_policy
+
+        well = examine_policy(
+            policy,
+            contract=contract,
+            robot=robot,
+            seconds=seconds,
+            threads=threads,
+            out=out,
+            json_output=json_output,
+            trust=trust,
+        )
+    if not well:
         raise typer.Exit(1)

@@ -1,0 +1,114 @@
+"""``gaitgauge doctor POLICY``: what looks wrong with how a policy is run."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..files.writing import write_atomically
+from ..gauge.diagnosis import Diagnosis, Outcome, diagnose
+from ..policy.adapters import assumptions
+from ..policy.alternatives import toml_lines
+from ..policy.its_robot import robot_for
+from ..policy.loading import load_policy
+from ..robots import load_robot
+from .console import Terminal, make_table
+from .errors import UserError
+from .policies import policy_file
+
+_SHOWN = 8
+"""Changes that the table shows."""
+
+
+def examine_policy(
+    choice: str,
+    *,
+    contract: Path | None,
+    robot: str | None,
+    seconds: float,
+    threads: int | None,
+    out: Path | None,
+    json_output: bool,
+    trust: bool,
+) -> bool:
+    """Play a policy as described and otherwise, print what looks wrong and how to mend it.
+
+    Args:
+        choice: the policy, as for ``play``.
+        contract: a ``contract.toml`` that describes it.
+        robot: name or path of the robot; None for the one that the policy is for.
+        seconds: how long each description is played.
+        threads: CPU threads, None for all.
+        out: where the whole ``contract.toml`` of the best description is written.
+        json_output: print JSON instead of a table.
+        trust: run the program that the file carries inside.
+
+    Returns:
+        Whether nothing looks wrong.
+    """
+    asked = None if robot is None else load_robot(robot)
+    policy = load_policy(policy_file(choice), asked, trust=trust, contract_file=contract)
+    body = robot_for(policy.contract, robot)
+    progress = Terminal(stderr=True)
+    with progress.status("playing the policy as described and otherwise …"):
+        found = diagnose(policy, body, seconds=seconds, threads=threads or os.cpu_count() or 1)
+    lines = toml_lines(found.best.contract, policy.contract)
+    if out is not None:
+        lines_of_file = [f"# {found.verdict()}", *toml_lines(found.best.contract)]
+        write_atomically(out, "\n".join(lines_of_file) + "\n", UserError)
+    if json_output:
+        print(json.dumps(_as_data(found, lines, assumptions(policy.contract)), indent=1))
+        return found.sound
+    console = Terminal()
+    console.print(_table(choice, found))
+    console.say(found.verdict())
+    if lines:
+        console.say("lines of contract.toml to change:")
+        for line in lines:
+            console.say(f"  {line}")
+        if out is None:
+            console.say(
+                "--out contract.toml writes the whole file; then: gaitgauge import POLICY NAME.gauge.pt --contract contract.toml"
+            )
+    if out is not None:
+        console.say(f"wrote {out}")
+    return found.sound
+
+
+def _table(choice: str, found: Diagnosis) -> Any:
+    rows: Sequence[tuple[str, Outcome]] = [
+        ("as described", found.described),
+        *((f"{o.kind}: {o.text}", o) for o in found.others[:_SHOWN]),
+        *((f"… and {o.kind}: {o.text}", o) for o in found.mistakes[1:]),
+    ]
+    table = make_table(choice, "contract", "score", "stays up", "does as told", "smooth", numbers=True)
+    for text, outcome in rows:
+        values = (outcome.score, outcome.survival, outcome.tracking, outcome.smoothness)
+        table.add_row(text, *(f"{v:.2f}" for v in values))
+    return table
+
+
+def _as_data(found: Diagnosis, lines: Sequence[str], assumed: str | None) -> dict[str, Any]:
+    def row(outcome: Outcome) -> dict[str, Any]:
+        return {
+            "kind": outcome.kind,
+            "text": outcome.text,
+            "score": outcome.score,
+            "survival": outcome.survival,
+            "tracking": outcome.tracking,
+            "smoothness": outcome.smoothness,
+        }
+
+    return {
+        "sound": found.sound,
+        "verdict": found.verdict(),
+        "assumed": assumed,
+        "described": row(found.described),
+        "mistakes": [row(o) for o in found.mistakes],
+        "others": [row(o) for o in found.others],
+        "contract_lines": list(lines),
+        "contract": found.best.contract.to_dict(),
+    }

@@ -1,0 +1,62 @@
+"""``gaitgauge doctor``, with and without a policy."""
+
+import json
+import tomllib
+from dataclasses import replace
+
+import pytest
+from gaitgauge.cli import doctor
+from gaitgauge.gauge import diagnosis
+from gaitgauge.policy.alternatives import alternatives
+from gaitgauge.policy.contract import PolicyContract
+from gaitgauge.policy.loading import load_policy
+from gaitgauge.policy.native import save_policy
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Only the sign of actions is tried."""
+    monkeypatch.setattr(
+        diagnosis, "alternatives", lambda c, robot: [a for a in alternatives(c, robot) if a.kind == "sign of actions"]
+    )
+
+
+@pytest.fixture
+def backwards(tmp_path):
+    """A policy that walks, with the sign of its actions turned round."""
+    good = load_policy("pretrained")
+    path = tmp_path / "backwards.gauge.pt"
+    wrong = replace(good.contract, action_scale=tuple(-v for v in good.contract.action_scale))
+    save_policy(path, wrong, good.stored)
+    return path
+
+
+@pytest.mark.usefixtures("few")
+def test_it_names_the_mistake_and_the_lines_to_change(run, backwards, tmp_path):
+    result = run("doctor", backwards, "--seconds", 1, "--threads", 1, "--out", tmp_path / "contract.toml")
+    assert result.exit_code == 1, result.output
+    assert "the sign of actions looks wrong" in result.output
+    assert "action_scale = [0.25, 0.25" in result.output
+    data = tomllib.loads((tmp_path / "contract.toml").read_text())
+    assert PolicyContract.from_dict(data).hash == load_policy("pretrained").contract.hash
+
+
+@pytest.mark.usefixtures("few")
+def test_json_holds_it_all(run):
+    result = run("doctor", "pretrained", "--seconds", 1, "--threads", 1, "--json")
+    assert result.exit_code == 0, result.output
+    data = json.loads(result.stdout)
+    assert data["sound"]
+    assert data["contract_lines"] == []
+    assert [o["kind"] for o in data["others"]] == ["sign of actions"]
+
+
+def test_a_file_that_is_no_policy_is_refused(refused, tmp_path):
+    assert "there is no policy file" in refused("doctor", tmp_path / "nothing.pt")
+
+
+def test_the_machine_is_told_as_json(run, monkeypatch):
+    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_python,))
+    (found,) = json.loads(run("doctor", "--json").stdout)
+    assert found["what"] == "Python"
+    assert found["status"] == "ok"
