@@ -173,7 +173,12 @@ def sweep(
     ] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print sweep.json instead of a table.")] = False,
 ) -> None:
-    """Train a list of tasks, settings and seeds on the GPUs there are, gauge each, and compare; goes on where it stopped."""
+    """Train a list of tasks, settings and seeds on the GPUs there are, gauge each, and compare; goes on where it stopped.
+
+    Examples:
+      gaitgauge sweep benchmarks/sweeps/methods.toml
+      gaitgauge sweep trainings.toml --report
+    """
     from ..sweep import run_sweep
 
     run_sweep(file=file, out=out, threads=threads, time=time, report=report, json_output=json_output)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .. import completion
 from ..errors import report_errors
 
 app = typer.Typer()
@@ -22,7 +23,11 @@ def new(
     name: Annotated[str | None, typer.Option(help="Name of the robot. Default: the model's.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a robot.toml that is there.")] = False,
 ) -> None:
-    """Write a first robot.toml from a MuJoCo model, and say what was guessed."""
+    """Write a first robot.toml from a MuJoCo model, and say what was guessed.
+
+    Examples:
+      gaitgauge robot new mine/mine.xml
+    """
     from ..robot import new_robot
 
     new_robot(model, out=out, name=name, force=force)
@@ -31,14 +36,24 @@ def new(
 @robot.command()
 @report_errors
 def check(
-    robot: Annotated[str, typer.Argument(help="A robot.toml, its folder, or a robot's name.", metavar="PATH")],
+    robot: Annotated[
+        str,
+        typer.Argument(
+            help="A robot.toml, its folder, or a robot's name.", metavar="PATH", autocompletion=completion.robots
+        ),
+    ],
     picture: Annotated[
         Path | None, typer.Option(help="Picture of the standing pose (.png). Default: NAME-standing.png.")
     ] = None,
     no_picture: Annotated[bool, typer.Option("--no-picture", help="Draw nothing.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
 ) -> None:
-    """Check a robot's description and model, and let it stand; exit code 1 where something is wrong."""
+    """Check a robot's description and model, and let it stand; exit code 1 where something is wrong.
+
+    Examples:
+      gaitgauge robot check mine/robot.toml
+      gaitgauge robot check go2 --no-picture
+    """
     from ..robot import check_robot_files
 
     if not check_robot_files(robot, picture=picture, draw=not no_picture, json_output=json_output):
