@@ -115,6 +115,5 @@ def test_assumptions_are_repeated_where_the_robot_falls_at_once(tmp_path, contra
     assert "taken for granted (5 frames" in said(guessed, falling)
     assert said(guessed, falling, walking) is None
     assert said(guessed, (1, 4000)) is None  # it fell late
-    assert said(guessed, ("", 500)) is None  # a row of a single command
     assert "gaitgauge doctor" in said(contract, falling)
     assert "taken for granted" not in said(contract, falling)  # nothing was guessed
