@@ -18,8 +18,11 @@ from .loading import RobotError
 if TYPE_CHECKING:
     import mujoco
 
-_BEND = 0.88
-"""Distance from hip to foot of a standing leg over that of a stretched one."""
+_BEND = 0.8
+"""Distance from hip to foot of a standing leg over that of a stretched one: 0.73 for the Go2, 0.85 for ANYmal C."""
+_BEHIND = 0.1
+"""How far a standing foot is behind its hip, or before it where the knee is, over leg length: under the robot's weight knees give
+way, and the hips move towards them."""
 _WIDEST = 2.8
 """Angle beyond which no pose is looked for [rad]."""
 _STIFFNESS, _TORQUE, _DAMPING, _ARMATURE = 0.3, 0.4, 1.0 / 40.0, 1.5e-4
@@ -139,7 +142,7 @@ class Survey:
         angles = self._within(dict.fromkeys(self.hinges, 0.0))
         for leg in self.legs:
             angles |= self._bent(leg, angles)
-        return angles, "guessed: knees bent, feet below the hips"
+        return angles, "guessed: knees bent, feet below the hips, a little behind them where knees are behind"
 
     def _within(self, angles: dict[int, float]) -> dict[int, float]:
         bounds = {j: self._bounds(j) for j in angles}
@@ -168,9 +171,12 @@ class Survey:
         for side in (range(stretched + 1), range(stretched, len(grid))):
             nearest = min(side, key=lambda i: abs(lengths[i] - wanted))
             bent = float(grid[nearest])
-            swing, apart = self._below(hip, partial(self._reach, leg, {**pose, knee: bent}))
-            self._reach(leg, {**pose, knee: bent}, swing)
-            in_front = bool(self.data.xanchor[knee][0] > self.data.xanchor[hip][0])
+            for in_front, aside in ((False, -_BEHIND), (True, _BEHIND)):
+                reach = partial(self._reach, leg, {**pose, knee: bent})
+                swing, apart = self._below(hip, reach, aside * lengths[stretched])
+                reach(swing)
+                if in_front == bool(self.data.xanchor[knee][0] > self.data.xanchor[hip][0]):
+                    break
             wrong = apart + abs(lengths[nearest] - wanted)
             found.append((round(wrong, 2), in_front, {knee: bent, hip: swing}))
         # a leg that cannot bend so, or a foot that cannot come below its hip, is worse than a knee in front
@@ -182,13 +188,13 @@ class Survey:
         self.place({**pose, hip: swing})
         return self.data.geom_xpos[leg.foot] - self.data.xanchor[hip]
 
-    def _below(self, hip: int, reach: Callable[[float], NDArray[np.float64]]) -> tuple[float, float]:
-        """The angle of a hip with which the foot is below it, and how far beside it is [m]."""
+    def _below(self, hip: int, reach: Callable[[float], NDArray[np.float64]], aside: float) -> tuple[float, float]:
+        """The angle of a hip with which the foot is below it and so far before it [m], and how far it is from there [m]."""
         low, high = self._bounds(hip)
         found = (0.5 * (low + high), np.inf)
         for _ in range(3):  # finer each time
             feet = [(float(angle), reach(float(angle))) for angle in np.linspace(low, high, 101)]
-            below = [(angle, abs(float(foot[0]))) for angle, foot in feet if foot[2] < 0.0]
+            below = [(angle, abs(float(foot[0]) - aside)) for angle, foot in feet if foot[2] < 0.0]
             found = min([found, *below], key=lambda each: each[1])
             step = (high - low) / 50
             low, high = max(found[0] - step, low), min(found[0] + step, high)

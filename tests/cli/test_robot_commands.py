@@ -35,7 +35,7 @@ def test_new_and_check(run, model):
     found = json.loads(checked.stdout)
     assert found["sound"] and found["picture"] is None
     rows = {row["check"]: row for row in found["checks"]}
-    assert rows["standing"]["sentence"].startswith("stands in its default pose: after 2 s its base is 0.4")
+    assert rows["standing"]["sentence"].startswith("stands in its default pose: after 2 s its base is 0.38")
     assert [name for name, row in rows.items() if not row["passed"]] == ["SDK order"]
     assert rows["SDK order"]["needed_for"] == "export of a deploy.yaml"
 
