@@ -21,6 +21,7 @@ def import_differences(found: mujoco.MjModel, expected: mujoco.MjModel, order: N
     wrong: list[str] = []
     for name in BODY_AND_JOINT_FIELDS:
         _compare(name, getattr(found, name), getattr(expected, name), wrong)
+    _compare("body_inertia", _inertia(found), _inertia(expected), wrong)
     for name in GEOM_FIELDS:
         _compare(name, getattr(found, name)[order], getattr(expected, name), wrong)
     # the sizes that a round shape does not use are filled differently
@@ -35,7 +36,6 @@ def import_differences(found: mujoco.MjModel, expected: mujoco.MjModel, order: N
 
 BODY_AND_JOINT_FIELDS = (
     "body_mass",
-    "body_inertia",
     "body_ipos",
     "body_pos",
     "jnt_pos",
@@ -71,6 +71,17 @@ _USED_SIZES = {
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): 2,
 }
+
+
+def _inertia(model: mujoco.MjModel) -> NDArray[np.float64]:
+    """Inertia of every body about its centre of mass, along its own axes [kg·m²], (B, 3, 3): principal axes may be named in any
+    order.
+    """
+    turn = np.zeros((model.nbody, 9))
+    for row, quaternion in zip(turn, model.body_iquat, strict=True):
+        mujoco.mju_quat2Mat(row, quaternion)
+    axes = turn.reshape(-1, 3, 3)
+    return axes @ (model.body_inertia[:, :, None] * axes.transpose(0, 2, 1))
 
 
 def _compare(name: str, found: NDArray, expected: NDArray, wrong: list[str]) -> None:
