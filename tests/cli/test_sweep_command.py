@@ -85,3 +85,7 @@ def test_a_whole_sweep(run, tiny):
     }
     again = run("sweep", "sweep.toml", "--out", "out", "--json")
     assert again.exit_code == 1 and "is trained" not in again.stderr and json.loads(again.stdout) == found
+    (tiny / "out" / "sweep.html").unlink()
+    told = run("sweep", "sweep.toml", "--out", "out", "--report")
+    assert told.exit_code == 1 and "sweep.html" in told.stdout and "HIM" in told.stdout
+    assert json.loads((tiny / "out" / "sweep.json").read_text()) == found

@@ -24,11 +24,14 @@ class Twins(Processes):
         return number
 
 
-@pytest.mark.parametrize("symmetry", ["none", "alternate"])
-def test_a_step_in_two_halves_is_the_same_step(symmetry):
+@pytest.mark.parametrize(
+    ("method", "symmetry"), [("cts", "none"), ("cts", "alternate"), ("ac_moe", "alternate"), ("dreamwaq", "alternate")]
+)
+def test_a_step_in_two_halves_is_the_same_step(method, symmetry):
     def learned(processes):
         seed_everything(0)
-        configuration = toy_configuration(algorithm={"symmetry": symmetry})
+        algorithm = {"symmetry": symmetry, "method": method}
+        configuration = toy_configuration(encoder="moe" if method == "cts" else "mlp", algorithm=algorithm)
         runner = TrainingRunner(
             ToyEnv(), configuration, contract=toy_contract(), task="toy", mirror=toy_mirror(), processes=processes
         )

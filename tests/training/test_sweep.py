@@ -125,7 +125,7 @@ def test_a_training_begins_or_goes_on(tmp_path):
     assert not run.trained, "a shorter one was finished"
     goes_on = run.training_command(replace(SWEEP, training_suite="quick"), seconds=90.2, score_threads=2)
     assert goes_on[3:] == [
-        *("train", "go2-cts", "--resume", str(directory)),
+        *("train", "go2-cts", "environment.num_envs=8", "--resume", str(directory)),
         *("--score-suite", "quick", "--score-threads", "2", "--time", "90s", "--device", "cpu"),
     ]
     (directory / "best.pt").touch()

@@ -91,7 +91,8 @@ class SweepRun:
         options += [] if seconds is None else ["--time", f"{max(seconds, 1.0):.0f}s"]
         options += [] if self.on_gpu else ["--device", "cpu"]
         if (run := self.directory) is not None:
-            return [*_PROGRAM, "train", self.entry.task, "--resume", str(run), *options]
+            # The settings are those of the checkpoint; given again, functions that they name need no --trust.
+            return [*_PROGRAM, "train", self.entry.task, *self.settings, "--resume", str(run), *options]
         options += ["--backend", self.backend, "--seed", str(self.seed), "--log-root", str(self.folder / "logs")]
         return [*_PROGRAM, "train", self.entry.task, *self.settings, *options]
 
