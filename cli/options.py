@@ -16,6 +16,9 @@ PolicyArgument = Annotated[
         autocompletion=completion.policies,
     ),
 ]
+LARGEST_SEED = 2**63 - 2**32
+"""Commands count on from a seed."""
+
 TrustOption = Annotated[
     bool,
     typer.Option("--trust", help="Run the program that a policy file of the project's own format carries inside."),

@@ -9,7 +9,7 @@ import typer
 
 from .. import completion
 from ..errors import report_errors
-from ..options import DeviceOption, RobotOption, SuiteOption, ThreadsOption, TrustOption
+from ..options import LARGEST_SEED, DeviceOption, RobotOption, SuiteOption, ThreadsOption, TrustOption
 
 app = typer.Typer()
 
@@ -46,7 +46,9 @@ def trial(
     repeats: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Robots in each scenario. Default: the scenario's own.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first robot; the others' follow it.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first robot; the others' follow it.")
+    ] = 0,
     backend: EngineOption = "mujoco",
     device: DeviceOption = None,
     robot: RobotOption = None,
@@ -94,7 +96,9 @@ def latent(
         int,
         typer.Option(min=2, max=1000, help="Robots for each terrain and command; the probe is tried on each in turn."),
     ] = 4,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first robots; the others' follow it.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first robots; the others' follow it.")
+    ] = 0,
     backend: EngineOption = "mujoco",
     robot: RobotOption = None,
     threads: ThreadsOption = None,

@@ -9,7 +9,7 @@ import typer
 
 from .. import completion
 from ..errors import report_errors
-from ..options import BackendOption, DeviceOption, RobotOption, TrustOption
+from ..options import LARGEST_SEED, BackendOption, DeviceOption, RobotOption, TrustOption
 
 app = typer.Typer()
 
@@ -94,7 +94,7 @@ def play(
         ),
     ] = None,
     friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.6,
-    seed: Annotated[int, typer.Option(help="Of the heading at each start.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the heading at each start.")] = 0,
     backend: BackendOption = "mujoco",
     device: DeviceOption = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,

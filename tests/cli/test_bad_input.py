@@ -156,6 +156,8 @@ def test_other_robot_and_other_period(refused, tmp_path, contract, stored):
         (("--friction", "nan"), ("nan", "--friction")),
         (("--payload", -100), ("-100", "--payload")),
         (("--payload", "nan"), ("nan", "--payload")),
+        (("--seed", -1), ("-1", "--seed")),
+        (("--seed", 10**300), ("1000", "--seed")),
         (("--suite", "gaitgauge-2"), ("'gaitgauge-2'", "'gaitgauge-1'")),
         (("--suite", "nowhere.toml"), ("'nowhere.toml'",)),
         (("--pipeline", "strss"), ("'strss'", "stress")),

@@ -15,6 +15,7 @@ from gaitgauge.gauge.consistency.variants import parse_variant
 from gaitgauge.gauge.episodes import Episode, Record, RecordError
 from gaitgauge.gauge.store import RunFolder
 from gaitgauge.gauge.suite import SUITE_FOLDER, load_suite
+from gaitgauge.gauge.trials.scenario import SCENARIO_FOLDER, load_scenario
 from gaitgauge.robots import RobotError, load_robot
 from gaitgauge.robots.identity import identify, recall
 from gaitgauge.training.sweep.file import load_sweep
@@ -46,8 +47,14 @@ def _suite(content: bytes, folder: Path) -> None:
     load_suite(str(path))
 
 
-def _sweep(content: bytes, folder: Path) -> None:
+def _scenario(content: bytes, folder: Path) -> None:
     path = folder / "mine.toml"
+    path.write_bytes(content)
+    load_scenario(str(path))
+
+
+def _sweep(content: bytes, folder: Path) -> None:
+    path = folder / "sweep.toml"
     path.write_bytes(content)
     load_sweep(path)
 
@@ -129,6 +136,10 @@ def _archive() -> bytes:
     return archive.getvalue()
 
 
+SCENARIOS = [
+    (SCENARIO_FOLDER / f"{name}.toml").read_bytes().replace(b'name = "', b'name = "my-', 1)
+    for name in ("drop-60cm", "sprint")
+]
 _GONE = identify(load_robot("go2"), "/nowhere/robot.toml")
 CARRIED = json.dumps(_GONE, default=str).encode()
 _SUITE = (SUITE_FOLDER / "robogauge-1.1.toml").read_bytes().replace(b'"robogauge-1.1"', b'"mine"')
@@ -152,3 +163,4 @@ register("episode", _episode, seeds=[_archive()])
 register("episode-head", _head, seeds=[HEAD], json=True)
 register("run-request", _request, seeds=[json.dumps(REQUEST).encode()], json=True)
 register("robot-carried", _carried, seeds=[CARRIED], json=True)
+register("scenario", _scenario, seeds=SCENARIOS, words=_TOML, text=True)

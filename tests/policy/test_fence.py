@@ -239,7 +239,7 @@ class Raising(Plain):
         (Quantized, "quantize"),
         (Text, "str"),
         (Huge, "memory|allocate"),
-        (Deep, "memory|alloc|crashed|took over"),
+        pytest.param(Deep, "memory|alloc|crashed|took over", marks=pytest.mark.slow),
         (Raising, "leg"),
     ],
 )
@@ -283,7 +283,7 @@ class LaterEndless(Plain):
         return self.layer(observation)
 
 
-@pytest.mark.parametrize("module", [Endless, EndlessLoading])
+@pytest.mark.parametrize("module", [Endless, pytest.param(EndlessLoading, marks=pytest.mark.slow)])
 def test_a_program_without_an_end_is_ended(tmp_path, monkeypatch, module):
     monkeypatch.setattr(fence_child, "STEP_SECONDS", 1)
     path = tmp_path / "policy.pt"
@@ -291,6 +291,7 @@ def test_a_program_without_an_end_is_ended(tmp_path, monkeypatch, module):
     refused(path, "took over 1 s")
 
 
+@pytest.mark.slow
 def test_a_program_that_finds_no_end_later_is_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(fence_child, "STEP_SECONDS", 1)
     path = tmp_path / "policy.pt"
@@ -311,7 +312,11 @@ def test_ctrl_c_ends_a_program_without_an_end(tmp_path):
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()
-        time.sleep(2.0)
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        until = time.monotonic() + (30.0 if children.exists() else 2.0)
+        while time.monotonic() < until and not (children.exists() and children.read_text()):
+            time.sleep(0.02)
+        time.sleep(0.3)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=8.0)
     assert b"KeyboardInterrupt" in errors
