@@ -36,6 +36,7 @@ def run_evaluation(
     backend: str,
     device: str | None,
     threads: int | None,
+    cluster: str | None,
     out: Path | None,
     resume: bool,
     json_output: bool,
@@ -49,7 +50,8 @@ def run_evaluation(
         suite=suite,
         backend=backend,
         device=choose_device(backend, device),
-        threads=threads or os.cpu_count() or 1,
+        threads=threads or (None if cluster else os.cpu_count() or 1),
+        cluster=cluster,
         **choices,
     )
     prepared = prepare(request)  # all that can be wrong with the request is said before anything is written

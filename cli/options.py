@@ -63,3 +63,11 @@ SeedsOption = Annotated[
 ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")
 ]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Ray cluster whose CPUs play, all that are free or as many as --threads: auto, HOST:PORT or ray://HOST:PORT. "
+        "Results do not depend on it.",
+        metavar="ADDRESS",
+    ),
+]

@@ -16,6 +16,7 @@ from typing import Any
 
 PACKAGES = ("gaitgauge", "mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib", "onnxruntime")
 _GROUPS = "gaitgauge."
+_JUDGING = ("backends", "files", "gauge", "policy", "robots", "terrains")
 _ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -61,6 +62,12 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
+
+
+@cache
+def source_digest() -> str:
+    """SHA-256, hexadecimal, over the source of all packages that a score depends on."""
+    return digest(path for package in _JUDGING for path in sorted((_ROOT / package).rglob("*.py")))
 
 
 @cache

@@ -4,18 +4,18 @@ The records are the state. After each of them its plan is asked again; what a pl
 room, level tests first, because others wait for them. One rule says which episodes are played speculatively, before a plan
 requires them: as long as fewer than ``Speculation.at_work`` episodes are at work and a worker has room, the most probable one
 starts (level tests before quality), if it is probable enough. What no plan may require any more is cancelled; a speculative
-episode that has ended is a record like any other, which a plan counts or not.
+episode that has ended is a record like any other, which a plan counts or not. Where a worker is lost, what it had waits again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .episodes import Episode, Record
 from .plan import Plan, Records
 from .segments import count_segments
-from .workers import Drop, Failed, Finished, Play, Progress, Stop, Transport
+from .workers import Drop, Failed, Finished, Lost, Play, Progress, Stop, Transport
 
 Planner = Callable[[Records], Plan]
 """The plan of one environment, after the records that exist."""
@@ -78,6 +78,9 @@ def play(
                 keep(message.record)
                 dispatcher.finish(message.record)
                 continue
+            if isinstance(message, Lost):
+                dispatcher.lose(worker)
+                continue
             dispatcher.hear(worker, message)
             if watch is not None:
                 watch(dispatcher)
@@ -101,6 +104,7 @@ class Dispatcher:
         self._progress = [Progress() for _ in range(workers.count)]
         self._room = [workers.worlds] * workers.count
         self._sent = [0] * workers.count  # ``Play`` messages
+        self._lost: list[Progress] = []  # the last that was heard of workers that are gone
         self._plan_of: dict[Episode, int] = {}
         self._worker_of: dict[Episode, int] = {}
         for number in range(len(planners)):
@@ -125,6 +129,13 @@ class Dispatcher:
         if progress.played == self._sent[worker]:
             self._room[worker] = progress.room
 
+    def lose(self, worker: int) -> None:
+        """A worker is gone: its episodes wait again. It is there again when something is heard of it."""
+        self._lost.append(replace(self._progress[worker], active={}))
+        self._progress[worker] = Progress(stopped=True)
+        self._room[worker] = self._sent[worker] = 0
+        self._worker_of = {episode: other for episode, other in self._worker_of.items() if other != worker}
+
     def active(self) -> dict[Episode, int]:
         """Episodes at work, and the control steps played of each."""
         return {episode: age for progress in self._progress for episode, age in progress.active.items()}
@@ -132,12 +143,12 @@ class Dispatcher:
     @property
     def physics_steps(self) -> int:
         """Physics steps so far, added up over worlds."""
-        return sum(progress.physics_steps for progress in self._progress)
+        return sum(progress.physics_steps for progress in (*self._progress, *self._lost))
 
     @property
     def engine_seconds(self) -> float | None:
         """Time spent inside the engine's stepping, added up over workers [s]; None where the engine does not measure it."""
-        seconds = [p.engine_seconds for p in self._progress if p.engine_seconds is not None]
+        seconds = [p.engine_seconds for p in (*self._progress, *self._lost) if p.engine_seconds is not None]
         return sum(seconds) if seconds else None
 
     # ---- what workers are told ------------------------------------------------------------------------------------
@@ -169,24 +180,30 @@ class Dispatcher:
 
     def stop(self) -> None:
         """Stop the workers and hear what they did."""
-        for worker in range(self._workers.count):
+        at_work = set(self._by_room())
+        for worker in at_work:
             self._workers.send(worker, Stop())
-        while not all(progress.stopped for progress in self._progress):
+        while at_work:
             for worker, message in self._workers.receive():
                 if isinstance(message, Failed):
                     raise message.error
-                if isinstance(message, Progress):
+                if isinstance(message, Lost):
+                    self.lose(worker)
+                elif isinstance(message, Progress) and worker in at_work:  # else it has just taken another's place
                     self._progress[worker] = message
+                if self._progress[worker].stopped:
+                    at_work.discard(worker)
 
     def _by_room(self) -> list[int]:
-        """Workers, those with most room first."""
-        return sorted(range(self._workers.count), key=lambda worker: -self._room[worker])
+        """Workers that are there, those with most room first."""
+        there = [worker for worker, progress in enumerate(self._progress) if not progress.stopped]
+        return sorted(there, key=lambda worker: -self._room[worker])
 
     def _share_tests(self, waiting: Sequence[Episode]) -> None:
         """Each worker gets its part of all tests at work and waiting, or a few together; they go before all that it has."""
-        tests = self._tests()
-        part = max(-(-(sum(tests) + len(waiting)) // self._workers.count), _TOGETHER)
-        for worker in self._by_room():
+        tests, there = self._tests(), self._by_room()
+        part = max(-(-(sum(tests) + len(waiting)) // max(len(there), 1)), _TOGETHER)
+        for worker in there:
             most = max(min(part, self._workers.worlds) - tests[worker], 0)
             self._push(worker, waiting[:most])
             waiting = waiting[most:]
@@ -195,7 +212,9 @@ class Dispatcher:
         """Workers with room get one after the other; none with tests, on which others wait, while another has no tests."""
         tests = self._tests()
         for episode in waiting:
-            open_to = [w for w in self._by_room() if self._room[w] > 0 and (all(tests) or not tests[w])]
+            there = self._by_room()
+            all_have_tests = all(tests[w] for w in there)
+            open_to = [w for w in there if self._room[w] > 0 and (all_have_tests or not tests[w])]
             if not open_to:
                 return
             self._push(open_to[0], [episode])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any
 import torch
 
 from ..backends.base import PhysicsBackend
+from ..backends.mujoco import MujocoBackend
 from ..backends.registry import find_backend, make_backend
 from ..files.parsing import shown
 from ..files.provenance import plugins, provenance, versions
@@ -32,6 +33,7 @@ from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
 from ..robots.loading import robot_digest
 from ..terrains.registry import make_terrain, terrain_names
+from .cluster import Cluster, ClusterError, ClusterWorkers, check_address
 from .coverage import coverage
 from .dispatcher import Dispatcher, Speculation, play
 from .episodes import QUALITY, Episode
@@ -71,10 +73,12 @@ class Request:
     frictions: tuple[float, ...] = ()
     payloads: tuple[float, ...] = ()
     seeds: tuple[int, ...] = ()
-    threads: int = 1
-    """CPU threads; they change the time, never the results."""
+    threads: int | None = 1
+    """CPU threads; they change the time, never the results. None with ``cluster`` for all that are free there."""
     trust: bool = False
     """Run the program that a policy file of the project's own format carries inside."""
+    cluster: str | None = None
+    """Address of a Ray cluster that plays, in as many workers as ``threads``; None for this machine. It changes the time alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,10 +118,17 @@ def prepare(request: Request) -> Prepared:
     """Check a request and load what it names.
 
     Raises:
-        SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError: one sentence on what is wrong.
+        SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, ClusterError: one sentence on what is wrong.
     """
     suite = load_suite(request.suite)
     find_backend(request.backend, request.device)
+    if request.cluster is not None:
+        check_address(request.cluster)
+        if request.backend != MujocoBackend.name:
+            raise ClusterError(
+                f"a cluster plays with backend '{MujocoBackend.name}' on CPUs, not with '{request.backend}'; leave out --cluster "
+                "or --backend"
+            )
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:
         if not 0.0 < friction <= 10.0:
@@ -254,7 +265,7 @@ def evaluate(
         The content of ``results.json``.
 
     Raises:
-        SuiteError, RobotError, PolicyError, ContractError, BackendError, StoreError, RecordError: one sentence.
+        SuiteError, RobotError, PolicyError, ContractError, BackendError, ClusterError, StoreError, RecordError: one sentence.
     """
     began = time.perf_counter()
     prepared = request if isinstance(request, Prepared) else prepare(request)
@@ -263,9 +274,12 @@ def evaluate(
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
     planners = [partial(plan, environment, rules=rules) for environment in prepared.environments]
     on_progress = _watcher(prepared, watch, began)
-    with RunFolder(folder, identity(prepared), resume=resume) as store:
-        job, count, speculation = _workers(prepared, [planner(store.records) for planner in planners], make)
-        with closing(start_workers(job, count)) as workers:
+    with ExitStack() as stack:
+        cluster = None if request.cluster is None else stack.enter_context(closing(Cluster(request.cluster)))
+        store = stack.enter_context(RunFolder(folder, identity(prepared), resume=resume))
+        plans = [planner(store.records) for planner in planners]
+        job, count, speculation = _workers(prepared, plans, make, cluster)
+        with closing(cluster.workers(job, count) if cluster else start_workers(job, count)) as workers:
             effort = play(planners, store.records, store.put, workers, speculation=speculation, watch=on_progress)
         outcomes = [environment_result(environment, store.records, rules) for environment in prepared.environments]
         counted = [record for outcome in outcomes for record in (*outcome.trials, *outcome.records)]
@@ -293,7 +307,7 @@ def evaluate(
         results["provenance"] = provenance(
             command=command,
             device=request.device,
-            threads=request.threads,
+            threads=request.threads or count,
             digests={
                 "policy": policy_digest(prepared.policy),
                 "robot": robot_digest(prepared.robot),
@@ -304,6 +318,8 @@ def evaluate(
             processes=count,
             set_aside=[path.name for path in store.damaged],
         )
+        if isinstance(workers, ClusterWorkers):
+            results["provenance"]["cluster"] = {"address": request.cluster, "processors": sorted(workers.processors)}
         if effort.engine_seconds is not None:
             results["provenance"]["engine_seconds"] = round(effort.engine_seconds, 2)
         write_atomically(folder / "episodes.csv", rows_csv(counted), StoreError)
@@ -313,7 +329,7 @@ def evaluate(
 
 
 def _workers(
-    prepared: Prepared, plans: Sequence[Plan], make: Callable[..., PhysicsBackend]
+    prepared: Prepared, plans: Sequence[Plan], make: Callable[..., PhysicsBackend], cluster: Cluster | None
 ) -> tuple[Job, int, Speculation]:
     """What to play with, how many workers play, and what they play speculatively."""
     request, suite = prepared.request, prepared.suite
@@ -324,7 +340,11 @@ def _workers(
     ]
     required = [episode for found in plans for episode in found.required]
     on_gpu = torch.device(request.device).type != "cpu"
-    count = local_workers(request.backend, request.device, threads=request.threads, most=len(required))
+    threads, most = request.threads or 1, len(required)
+    if cluster is not None:
+        count = max(min(request.threads or cluster.cpus, cluster.cpus, most), 1)
+    else:
+        count = local_workers(request.backend, request.device, threads=threads, most=most)
     if on_gpu:
         # a GPU plays nearly every level of every search at once: a few long batches instead of many short ones
         speculation = Speculation(at_work=_GPU_WORLDS, test_probability=0.02, quality_probability=0.5)
@@ -346,7 +366,7 @@ def _workers(
         places=tuple(dict.fromkeys(places)),
         worlds=worlds,
         build=partial(make, request.backend, device=request.device),
-        threads=max(request.threads // count, 1),
+        threads=1 if cluster is not None else max(threads // count, 1),
     )
     return job, count, speculation
 

@@ -2,8 +2,8 @@
 
 To a worker go ``Play``, ``Drop`` and ``Stop``; from it come ``Finished`` with a record, ``Progress`` and ``Failed`` with an
 error. A worker answers to nothing: it plays what it has, and says in its progress how much more it could begin at once.
-``InProcess`` is one worker in this process, for a GPU or a single thread; ``LocalProcesses`` are several, with one pipe each. A
-cluster is another class with the methods of ``Transport``.
+``InProcess`` is one worker in this process, for a GPU or a single thread; ``LocalProcesses`` are several, with one pipe each;
+``cluster.ClusterWorkers`` are actors on other machines, which may be lost and come back.
 
 The control loop of a rollout is one Python thread that waits for its engine and lets the engine wait for it: two processes of
 one thread each keep two cores busy where one with two threads does not.
@@ -31,7 +31,8 @@ from ..backends.base import BackendError, PhysicsBackend, Scene
 from ..backends.mujoco import MujocoBackend
 from ..policy.base import Policy
 from ..policy.fenced import FencedPolicy
-from ..policy.loading import load_policy
+from ..policy.loading import restore_policy
+from ..policy.native import FilePolicy
 from ..robots import Robot
 from ..terrains.registry import make_terrain
 from .episodes import Episode, Record
@@ -39,7 +40,7 @@ from .motors import joint_parameters
 from .rollout import Rollout
 from .suite import Suite
 
-_PROGRESS_INTERVAL = 0.2
+PROGRESS_INTERVAL = 0.2
 """Time between a worker's reports on how far it is [s]."""
 # a forked worker has all modules and the policy at once; elsewhere system libraries do not bear being forked
 if sys.platform == "linux":
@@ -102,6 +103,11 @@ class Failed:
     error: Exception
 
 
+@dataclass(frozen=True)
+class Lost:
+    """The worker is gone with all that it had and was sent. If another one takes its place, that one's progress says so."""
+
+
 class Transport(Protocol):
     """Workers, and the way to them. They are numbered from 0 and have started once the transport is made."""
 
@@ -113,11 +119,11 @@ class Transport(Protocol):
     def send(self, worker: int, message: Play | Drop | Stop) -> None:
         """Send a message to a worker."""
 
-    def receive(self) -> Sequence[tuple[int, Finished | Progress | Failed]]:
+    def receive(self) -> Sequence[tuple[int, Finished | Progress | Failed | Lost]]:
         """Wait for messages; returns those that are there, each with the worker's number, a worker's own in their order.
 
         Raises:
-            BackendError: a worker is gone.
+            BackendError, ClusterError: a worker is gone, or all of them where they may come and go.
         """
 
     def close(self) -> None:
@@ -170,17 +176,20 @@ class Job:
 
     def in_another_process(self) -> Job:
         """The job in a worker's process: a policy that is at work in a process of its own gets another one there."""
-        if not isinstance(self.policy, FencedPolicy):
+        policy = self.policy
+        if not isinstance(policy, FencedPolicy):
             return self
-        return replace(self, policy=load_policy(self.policy.path, self.robot, trust=True))  # it was trusted before
+        return replace(self, policy=restore_policy(policy.stored, policy.contract, policy.path, self.robot))
 
     def __getstate__(self) -> dict[str, Any]:
-        """A policy does not travel to a process that was not forked: its name does."""
-        return {**vars(self), "policy": self.policy.path}
+        """To a process that was not forked a policy travels as what was in its file."""
+        policy = self.policy
+        assert isinstance(policy, FilePolicy)
+        return {**vars(self), "policy": (policy.stored, policy.contract, policy.path)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Load the policy by its name."""
-        vars(self).update(state | {"policy": load_policy(state["policy"], state["robot"], trust=True)})
+        """Make the policy again."""
+        vars(self).update(state | {"policy": restore_policy(*state["policy"], state["robot"])})
 
 
 class Worker:
@@ -333,7 +342,7 @@ def _run_worker(job: Job, pipe: Connection, inherited: Sequence[Connection]) -> 
         except (EOFError, ConnectionError):
             return  # the parent is gone
         except Exception as error:  # noqa: BLE001  (whatever it is, the parent has to hear of it)
-            pipe.send(Failed(_portable(error)))
+            pipe.send(Failed(portable(error)))
     except (EOFError, ConnectionError):
         return
 
@@ -345,7 +354,7 @@ def _serve(worker: Worker, pipe: Connection) -> None:
         now = time.monotonic()
         if now >= next_report or rollout.room > max(told, 0):
             progress = worker.progress()
-            next_report, told = now + _PROGRESS_INTERVAL, progress.room
+            next_report, told = now + PROGRESS_INTERVAL, progress.room
             pipe.send(progress)
         while rollout.idle or pipe.poll():
             message = pipe.recv()
@@ -358,7 +367,7 @@ def _serve(worker: Worker, pipe: Connection) -> None:
             pipe.send(Finished(record))
 
 
-def _portable(error: Exception) -> Exception:
+def portable(error: Exception) -> Exception:
     """The error itself if it survives the way to the parent, else one with the same words."""
     try:
         pickle.loads(pickle.dumps(error))

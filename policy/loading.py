@@ -76,6 +76,19 @@ def load_policy(
     return policy
 
 
+def restore_policy(
+    stored: StoredNetwork | ForeignFile, contract: PolicyContract, path: str, robot: Robot
+) -> FilePolicy:
+    """A policy that was loaded elsewhere, out of what a ``FilePolicy`` has; a program in it was trusted there.
+
+    Raises:
+        PolicyError: the network does not fit its contract, or a program cannot be run here.
+    """
+    if isinstance(stored, StoredNetwork):
+        return NativePolicy(contract, stored, path=path)
+    return rebuilt(_foreign(stored, Path(path), path, robot, contract=contract))
+
+
 @cache  # once, and not again in each process that is forked from this one
 def _say(path: str, sentence: str) -> None:
     logging.getLogger(__name__).warning("'%s' does not say how it is to be run; %s", path, sentence)

@@ -23,7 +23,7 @@ from pydantic import Field
 from ..files.parsing import Name, Text, build, one_line
 from .base import Robot
 from .checking import check_robot
-from .loading import RobotError, model_files, robot_digest
+from .loading import LARGEST_MODEL, RobotError, model_files, robot_digest
 from .registry import load_robot, robot_names
 
 LARGEST_COPY = 400_000
@@ -62,18 +62,33 @@ def identify(robot: Robot, source: str) -> dict[str, Any]:
     if source in robot_names():
         return entry
     entry["source"] = os.path.abspath(os.path.expanduser(source))
+    return entry | _copy(robot, LARGEST_COPY)
+
+
+def packed(robot: Robot) -> RobotIdentity:
+    """A robot with all its files, for a machine that may have none of them; ``unpacked`` makes it a robot there.
+
+    Raises:
+        RobotError: a file of the model cannot be read.
+    """
+    copy = _copy(robot, LARGEST_MODEL)
+    return RobotIdentity(name=robot.name, digest=robot_digest(robot), **copy)
+
+
+def _copy(robot: Robot, largest: int) -> dict[str, Any]:
+    """Description and files as in ``RobotIdentity``; nothing if they are larger than so many characters."""
     paths = [path.resolve() for path in model_files(robot.mjcf)]
     folder = Path(os.path.commonpath([path.parent for path in paths]))
-    files = {}
+    files: dict[str, str] = {}
     for path in paths:
         try:
             data = path.read_bytes()
         except OSError as error:
             raise RobotError(f"'{one_line(path)}' cannot be read: {error.strerror}") from error
         files[path.relative_to(folder).as_posix()] = base64.b64encode(zlib.compress(data, 9)).decode()
-        if sum(map(len, files.values())) > LARGEST_COPY:
-            return entry
-    return entry | {"description": asdict(robot) | {"mjcf": next(iter(files))}, "files": files}
+        if sum(map(len, files.values())) > largest:
+            return {}
+    return {"description": asdict(robot) | {"mjcf": next(iter(files))}, "files": files}
 
 
 def recall(remembered: Any) -> tuple[Robot, str | None]:
@@ -100,7 +115,11 @@ def recall(remembered: Any) -> tuple[Robot, str | None]:
             f"the policy is for the robot '{known.name}' of '{one_line(known.source)}', which is not there; say where it is "
             "with --robot"
         )
-    return _unpacked(known), f"'{one_line(known.source)}' is not there; the robot is the copy that the policy carries"
+    folder = Path(tempfile.mkdtemp(prefix="gaitgauge-robot-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return unpacked(
+        known, folder
+    ), f"'{one_line(known.source)}' is not there; the robot is the copy that the policy carries"
 
 
 def changed(robot: Robot, digest: str, what: str) -> str | None:
@@ -114,16 +133,15 @@ def changed(robot: Robot, digest: str, what: str) -> str | None:
     )
 
 
-def _unpacked(known: RobotIdentity) -> Robot:
-    """Write a robot's files into a folder that is gone when the program ends.
+def unpacked(known: RobotIdentity, folder: Path) -> Robot:
+    """Write a robot's files into an empty folder, where they have to stay while the robot is read.
 
     Raises:
         RobotError: they are damaged, lead out of the folder, or are not what the digest says.
     """
     assert known.files is not None and known.description is not None
     source = f"the copy of the robot '{known.name}' that the policy carries"
-    folder = Path(tempfile.mkdtemp(prefix="gaitgauge-robot-")).resolve()
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder = folder.resolve()
     left = _LARGEST_UNPACKED
     try:
         for name, text in known.files.items():

@@ -11,6 +11,7 @@ from .. import completion
 from ..errors import report_errors
 from ..options import (
     BackendOption,
+    ClusterOption,
     DeviceOption,
     FrictionsOption,
     LevelOption,
@@ -49,6 +50,7 @@ def evaluate(
     ] = None,
     seed: SeedsOption = None,
     threads: ThreadsOption = None,
+    cluster: ClusterOption = None,
     out: Annotated[
         Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-<pipeline>.")
     ] = None,
@@ -81,6 +83,7 @@ def evaluate(
         payloads=tuple(payload or ()),
         seeds=tuple(seed or ()),
         threads=threads,
+        cluster=cluster,
         out=out,
         resume=resume,
         clip=clip,

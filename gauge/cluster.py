@@ -1,0 +1,400 @@
+"""Workers on a Ray cluster: a transport whose workers are actors, one for each CPU.
+
+Everything that decides about results travels to the nodes as data: suite, policy and robot. A node needs gaitgauge itself, in
+the same versions and with the same source as here, or it is refused. A worker whose node or process dies is replaced wherever
+the cluster has a CPU, now or later; until then the others play what it had. Ray is imported where it is used.
+
+An actor does nothing between two calls. A call brings it messages and lets it play until there is something to tell, for
+``PROGRESS_INTERVAL`` at most; then comes the next one, unless it has nothing to play.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import logging
+import pickle
+import re
+import socket
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..files.parsing import one_line, shown
+from ..files.provenance import plugins, processor, source_digest, versions
+from ..robots.identity import packed, unpacked
+from .workers import (
+    PROGRESS_INTERVAL,
+    Drop,
+    Failed,
+    Finished,
+    Job,
+    Lost,
+    Play,
+    Progress,
+    Stop,
+    Worker,
+    portable,
+)
+
+_ADDRESS = re.compile(r"auto|(ray://)?(?P<host>[\w.-]+|\[[\da-fA-F:]+\]):(?P<port>\d{1,5})")
+_CONNECTING = 5.0
+"""Longest wait for the cluster's port to answer [s]."""
+_ARRIVING = 60.0
+"""Longest wait for all workers before those that are there begin [s]."""
+_LISTENING = 2.0
+"""Time without a word from any worker after which the nodes are looked at [s]."""
+_MOST_LOSSES = 3
+"""How often in a row a worker is replaced that never finished an episode: then it is not the nodes' fault."""
+_KEPT = "what had finished is kept: go on with --resume"
+
+Message = Finished | Progress | Failed
+
+
+class ClusterError(RuntimeError):
+    """A cluster cannot be used, or not any more; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Arrived:
+    """A worker's first message."""
+
+    processor: str
+    """Its node's CPU."""
+
+
+def check_address(address: str) -> None:
+    """Refuse what is no address of a Ray cluster, and a machine without Ray.
+
+    Raises:
+        ClusterError: one sentence.
+    """
+    _ray()
+    if _ADDRESS.fullmatch(address) is None:
+        raise ClusterError(
+            f"{shown(address)} is no address of a Ray cluster; give auto for the one of this machine, HOST:PORT (--cluster "
+            "10.0.0.1:6379) or ray://HOST:PORT"
+        )
+
+
+def fingerprint() -> dict[str, str]:
+    """What has to be the same on all nodes."""
+    return {**versions(), **plugins(), "source of gaitgauge": source_digest()}
+
+
+class Cluster:
+    """A connection to a running Ray cluster."""
+
+    def __init__(self, address: str) -> None:
+        """Connect.
+
+        Raises:
+            ClusterError: Ray is not installed, nothing answers at the address, or no CPU is free.
+        """
+        check_address(address)
+        self.address, self._ray = address, _ray()
+        found = _ADDRESS.fullmatch(address)
+        try:
+            if found is not None and found["host"]:
+                # Ray itself tries for a minute and then ends the process
+                socket.create_connection((found["host"].strip("[]"), int(found["port"])), timeout=_CONNECTING).close()
+            self._ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (OSError, ValueError, RuntimeError, OverflowError) as error:
+            raise ClusterError(
+                f"no Ray cluster can be used at {address} ({_first_sentence(error)}); start one with 'ray start --head', run "
+                "this on one of its nodes or give its ray:// address (--cluster)"
+            ) from error
+        self.cpus = self._free_cpus()
+        """CPUs that were free, at least 1."""
+        if self.cpus < 1:
+            there = self._ray.cluster_resources().get("CPU", 0.0)
+            self.close()
+            raise ClusterError(
+                f"the Ray cluster at {address} has no free CPU (of {there:g}); add nodes with 'ray start --address', or wait "
+                "until others have finished"
+            )
+
+    def _free_cpus(self) -> int:
+        """CPUs that are free; those of a run that has just ended may take some seconds to be."""
+        until = time.monotonic() + _CONNECTING
+        while (free := int(self._ray.available_resources().get("CPU", 0.0))) < 1 and time.monotonic() < until:
+            time.sleep(0.5)
+        return free
+
+    def workers(self, job: Job, count: int) -> ClusterWorkers:
+        """Start so many workers."""
+        return ClusterWorkers(self._ray, job, count)
+
+    def close(self) -> None:
+        """Disconnect; what still runs there for this program ends."""
+        self._ray.shutdown()
+
+
+@dataclass(kw_only=True)
+class _Seat:
+    """One worker, seen from here."""
+
+    actor: Any
+    call: Any = None
+    """The call that it is at; None while it has nothing to do."""
+    outbox: list[Play | Drop | Stop] = field(default_factory=list)
+    """What the next call brings it."""
+    there: bool = False
+    """Whether it has answered yet."""
+    losses: int = 0
+    """Workers before it in this seat that were lost since one last finished an episode."""
+
+
+class ClusterWorkers:
+    """Workers on the nodes of a cluster; see ``workers.Transport``."""
+
+    def __init__(self, ray: Any, job: Job, count: int) -> None:
+        """Start workers and wait for them; those that take long are ``Lost`` until they come.
+
+        Raises:
+            ClusterError: no node is left.
+            RobotError: a file of the robot's model cannot be read.
+        """
+        self.count, self.worlds = count, job.worlds
+        self.processors: set[str] = set()
+        """CPUs of the nodes that have played."""
+        self._ray = ray
+        self._make = ray.remote(num_cpus=1, max_restarts=0)(_actor_class())
+        self._shipment = ray.put(pickle.dumps((job, packed(job.robot))))
+        self._seats = [_Seat(actor=None) for _ in range(count)]
+        self._heard: list[tuple[int, Message | Lost]] = []
+        for number in range(count):
+            self._start(number, losses=0)
+        until = time.monotonic() + _ARRIVING
+        while not all(s.there for s in self._seats) and (time.monotonic() < until or not self._anyone):
+            self._listen()
+        self._heard = [(n, Lost()) for n, seat in enumerate(self._seats) if not seat.there] + self._heard
+
+    @property
+    def _anyone(self) -> bool:
+        return any(seat.there for seat in self._seats)
+
+    def send(self, worker: int, message: Play | Drop | Stop) -> None:
+        """See ``Transport.send``."""
+        seat = self._seats[worker]
+        seat.outbox.append(message)
+        if seat.call is None:
+            self._call(seat)
+
+    def receive(self) -> list[tuple[int, Message | Lost]]:
+        """See ``Transport.receive``.
+
+        Raises:
+            ClusterError: no node is left, a worker dies again and again, or a node does not have what this machine has.
+        """
+        while not self._heard:
+            self._listen()
+        heard, self._heard = self._heard, []
+        return heard
+
+    def close(self) -> None:
+        """See ``Transport.close``."""
+        for seat in self._seats:
+            self._ray.kill(seat.actor)
+
+    # ---- workers come and go --------------------------------------------------------------------------------------
+
+    def _start(self, number: int, *, losses: int) -> None:
+        """Have Ray start a worker wherever a CPU is free, as soon as one is."""
+        seat = self._seats[number] = _Seat(actor=self._make.remote(fingerprint(), self._shipment), losses=losses)
+        self._call(seat)
+
+    def _call(self, seat: _Seat) -> None:
+        """Bring a worker its messages and let it play on."""
+        messages, seat.outbox = seat.outbox, []
+        seat.call = seat.actor.exchange.remote(messages)
+
+    def _listen(self) -> None:
+        """Take what workers say within ``_LISTENING``."""
+        ray, calls = self._ray, {seat.call: n for n, seat in enumerate(self._seats) if seat.call is not None}
+        done, _ = ray.wait(list(calls), timeout=_LISTENING)
+        if not done:
+            self._look_at_nodes()
+            return
+        for call in ray.wait(list(calls), num_returns=len(calls), timeout=0)[0]:
+            self._take(calls[call])
+
+    def _take(self, number: int) -> None:
+        """Take the answer to a call that is over."""
+        seat = self._seats[number]
+        call, seat.call = seat.call, None
+        try:
+            answer = self._ray.get(call)
+        except self._ray.exceptions.RayTaskError:
+            raise  # a mistake of this program's
+        except self._ray.exceptions.RayError as error:
+            self._replace(number, error)
+            return
+        if isinstance(answer, str):
+            raise ClusterError(answer)
+        idle = False
+        for message in pickle.loads(answer):
+            if isinstance(message, Arrived):
+                self._welcome(message)
+                continue
+            self._heard.append((number, message))
+            seat.losses = 0 if isinstance(message, Finished) else seat.losses
+            idle = isinstance(message, Failed) or (
+                isinstance(message, Progress) and (message.stopped or message.room == self.worlds)
+            )
+        seat.there = True
+        if seat.outbox or not idle:
+            self._call(seat)
+
+    def _welcome(self, arrived: Arrived) -> None:
+        """Say it if nodes may differ in the last bits."""
+        before = len(self.processors)
+        self.processors.add(arrived.processor)
+        if before and len(self.processors) == 2 > before:
+            logging.getLogger(__name__).warning(
+                "the cluster's nodes have different processors (%s): in the last bits results may not be those of one machine",
+                ", ".join(sorted(self.processors)),
+            )
+
+    def _replace(self, number: int, error: Exception) -> None:
+        """A worker is gone."""
+        seat = self._seats[number]
+        if seat.there:
+            self._heard.append((number, Lost()))
+        self._ray.kill(seat.actor)  # it may only have been out of reach
+        if seat.losses + 1 > _MOST_LOSSES:
+            raise ClusterError(
+                f"a worker on the Ray cluster died {seat.losses + 1} times in a row ({_first_sentence(error)}); {_KEPT}, with "
+                "fewer --threads if memory ran out"
+            )
+        self._start(number, losses=seat.losses + 1)
+
+    def _look_at_nodes(self) -> None:
+        """See whether anybody can still come.
+
+        Raises:
+            ClusterError: no.
+        """
+        if self._anyone:
+            return
+        if not any(node["Alive"] and node["Resources"].get("CPU", 0.0) >= 1.0 for node in self._ray.nodes()):
+            raise ClusterError(
+                f"no node of the Ray cluster is left; {_KEPT} once it has nodes again, or without --cluster"
+            )
+
+
+# ---- on a node --------------------------------------------------------------------------------------------------------
+
+
+def _actor_class() -> type:
+    """The class of the actors. It travels to the nodes as it stands here, and finds out what they have."""
+
+    class GaitgaugeWorker:
+        def __init__(self, wanted: dict[str, str], shipment: bytes) -> None:
+            self.wanted, self.shipment = wanted, shipment
+            self.worker: Any = None
+
+        def exchange(self, messages: Any) -> Any:
+            """Messages of a worker, pickled; or a sentence on why this node is of no use."""
+            if self.worker is None:
+                import ray
+
+                node = ray.util.get_node_ip_address()
+                try:
+                    from gaitgauge.gauge.cluster import NodeWorker
+                except ImportError as error:
+                    return f"node {node} of the Ray cluster lacks this gaitgauge ({error}); install it on all nodes"
+                self.worker = NodeWorker(node, self.wanted, self.shipment)
+            return self.worker.exchange(messages)
+
+    return GaitgaugeWorker
+
+
+class NodeWorker:
+    """A worker in an actor's process."""
+
+    def __init__(self, node: str, wanted: dict[str, str], shipment: bytes) -> None:
+        """Keep what is needed to begin.
+
+        Args:
+            node: the node's name, for messages.
+            wanted: ``fingerprint`` of the machine that asks.
+            shipment: what to play with.
+        """
+        self._node, self._wanted, self._shipment = node, wanted, shipment
+        self._worker: Worker | None = None
+
+    def exchange(self, messages: Sequence[Play | Drop | Stop]) -> bytes | str:
+        """Take messages, play until there is something to tell, and tell it (pickled), or why this node is refused."""
+        told: list[Any] = []
+        try:
+            if self._worker is None:
+                if reason := self._difference():
+                    return reason
+                self._worker = self._begin()
+                told.append(Arrived(processor()))
+            told += self._play(self._worker, messages)
+        except Exception as error:  # noqa: BLE001  (whatever it is, who asked has to hear of it)
+            told.append(Failed(portable(error)))
+        return pickle.dumps(told)
+
+    def _difference(self) -> str | None:
+        """What this node has not as it is wanted."""
+        mine = fingerprint()
+        for name in sorted(mine.keys() | self._wanted.keys()):
+            here, there = (found.get(name, "not there")[:40] for found in (mine, self._wanted))
+            if here != there:
+                return (
+                    f"node {self._node} of the Ray cluster has another {one_line(name, 80)} ({one_line(here)}) than this machine "
+                    f"({one_line(there)}), so that results would mix; install the same on all nodes"
+                )
+        return None
+
+    def _begin(self) -> Worker:
+        torch.set_num_threads(1)
+        job, robot = pickle.loads(self._shipment)
+        with tempfile.TemporaryDirectory(
+            prefix="gaitgauge-robot-"
+        ) as folder:  # its engine has read all when it is made
+            worker = Worker(replace(job, robot=unpacked(robot, Path(folder))))
+        gc.freeze()
+        return worker
+
+    def _play(self, worker: Worker, messages: Sequence[Play | Drop | Stop]) -> list[Message]:
+        """Play; told is a record at once, and so is room that was not there before."""
+        for message in messages:
+            worker.take(message)
+        rollout, until = worker.rollout, time.monotonic() + PROGRESS_INTERVAL
+        room = max(rollout.room, 0)
+        records: list[Message] = []
+        while not (records or worker.stopped or rollout.idle or rollout.room > room or time.monotonic() >= until):
+            records += [Finished(record) for record in rollout.advance()]
+        return [*records, worker.progress()]
+
+
+# ---- Ray --------------------------------------------------------------------------------------------------------------
+
+
+def _ray() -> Any:
+    """Ray's module.
+
+    Raises:
+        ClusterError: it is not installed.
+    """
+    try:
+        return importlib.import_module("ray")
+    except ImportError as error:
+        raise ClusterError(
+            "--cluster needs Ray, which is not installed; install it with pip install 'gaitgauge[cluster]'"
+        ) from error
+
+
+def _first_sentence(error: BaseException) -> str:
+    """The beginning of an error's message."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return one_line(lines[0].partition(". ")[0].rstrip("."), 160) if lines else type(error).__name__
