@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,8 @@ def run_evaluation(
     folder = out or Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
     console = Terminal(stderr=True)
     try:
-        with ProgressDisplay(console, "gauging") as display:
+        # Ray prints what it has to say of nodes to standard output
+        with redirect_stdout(sys.stderr), ProgressDisplay(console, "gauging") as display:
             results = evaluate(
                 prepared, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=shower(display)
             )

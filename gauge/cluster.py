@@ -13,6 +13,7 @@ from __future__ import annotations
 import gc
 import importlib
 import logging
+import os
 import pickle
 import re
 import socket
@@ -48,7 +49,9 @@ _CONNECTING = 5.0
 _ARRIVING = 60.0
 """Longest wait for all workers before those that are there begin [s]."""
 _LISTENING = 2.0
-"""Time without a word from any worker after which the nodes are looked at [s]."""
+"""Time between two looks at the nodes [s]."""
+_HEADLESS = 30.0
+"""Longest time for which the head node may be out of reach [s]; after 60 s Ray ends this process without a word."""
 _MOST_LOSSES = 3
 """How often in a row a worker is replaced that never finished an episode: then it is not the nodes' fault."""
 _KEPT = "what had finished is kept: go on with --resume"
@@ -97,14 +100,14 @@ class Cluster:
             ClusterError: Ray is not installed, nothing answers at the address, or no CPU is free.
         """
         check_address(address)
-        self.address, self._ray = address, _ray()
-        found = _ADDRESS.fullmatch(address)
+        self._ray = _ray()
+        os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # what it says of lost nodes is said here
         try:
-            if found is not None and found["host"]:
-                # Ray itself tries for a minute and then ends the process
-                socket.create_connection((found["host"].strip("[]"), int(found["port"])), timeout=_CONNECTING).close()
+            if address != "auto":
+                _knock(address)  # Ray itself would try for a minute
             self._ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-        except (OSError, ValueError, RuntimeError, OverflowError) as error:
+            self._head = address if "://" in address else self._ray.get_runtime_context().gcs_address
+        except (OSError, ValueError, RuntimeError) as error:
             raise ClusterError(
                 f"no Ray cluster can be used at {address} ({_first_sentence(error)}); start one with 'ray start --head', run "
                 "this on one of its nodes or give its ray:// address (--cluster)"
@@ -128,7 +131,7 @@ class Cluster:
 
     def workers(self, job: Job, count: int) -> ClusterWorkers:
         """Start so many workers."""
-        return ClusterWorkers(self._ray, job, count)
+        return ClusterWorkers(self._ray, self._head, job, count)
 
     def close(self) -> None:
         """Disconnect; what still runs there for this program ends."""
@@ -153,8 +156,14 @@ class _Seat:
 class ClusterWorkers:
     """Workers on the nodes of a cluster; see ``workers.Transport``."""
 
-    def __init__(self, ray: Any, job: Job, count: int) -> None:
+    def __init__(self, ray: Any, head: str, job: Job, count: int) -> None:
         """Start workers and wait for them; those that take long are ``Lost`` until they come.
+
+        Args:
+            ray: its module, connected.
+            head: address of the head node.
+            job: what to play with.
+            count: number of workers.
 
         Raises:
             ClusterError: no node is left.
@@ -163,7 +172,8 @@ class ClusterWorkers:
         self.count, self.worlds = count, job.worlds
         self.processors: set[str] = set()
         """CPUs of the nodes that have played."""
-        self._ray = ray
+        self._ray, self._head = ray, head
+        self._next_look = self._reached = time.monotonic()
         self._make = ray.remote(num_cpus=1, max_restarts=0)(_actor_class())
         self._shipment = ray.put(pickle.dumps((job, packed(job.robot))))
         self._seats = [_Seat(actor=None) for _ in range(count)]
@@ -215,13 +225,18 @@ class ClusterWorkers:
         seat.call = seat.actor.exchange.remote(messages)
 
     def _listen(self) -> None:
-        """Take what workers say within ``_LISTENING``."""
+        """Take what workers say within ``_LISTENING``; look at the nodes now and then."""
+        if time.monotonic() >= self._next_look:
+            self._look_at_nodes()
+            self._next_look = time.monotonic() + _LISTENING
+        if all(seat.call is None for seat in self._seats):
+            for seat in self._seats:
+                self._call(seat)
         ray, calls = self._ray, {seat.call: n for n, seat in enumerate(self._seats) if seat.call is not None}
         done, _ = ray.wait(list(calls), timeout=_LISTENING)
-        if not done:
-            self._look_at_nodes()
-            return
-        for call in ray.wait(list(calls), num_returns=len(calls), timeout=0)[0]:
+        if done:
+            done, _ = ray.wait(list(calls), num_returns=len(calls), timeout=0)
+        for call in done:
             self._take(calls[call])
 
     def _take(self, number: int) -> None:
@@ -275,11 +290,23 @@ class ClusterWorkers:
         self._start(number, losses=seat.losses + 1)
 
     def _look_at_nodes(self) -> None:
-        """See whether anybody can still come.
+        """See whether anybody is there or can still come.
 
         Raises:
             ClusterError: no.
         """
+        try:
+            _knock(self._head)
+            self._reached = time.monotonic()
+        except OSError as error:
+            away = time.monotonic() - self._reached
+            if away > _HEADLESS:
+                self._seats = []
+                raise ClusterError(
+                    f"the head node of the Ray cluster ({self._head}) has been out of reach for {away:.0f} s; {_KEPT} once it is "
+                    "there again, or without --cluster"
+                ) from error
+            return
         if self._anyone:
             return
         if not any(node["Alive"] and node["Resources"].get("CPU", 0.0) >= 1.0 for node in self._ray.nodes()):
@@ -392,6 +419,19 @@ def _ray() -> Any:
         raise ClusterError(
             "--cluster needs Ray, which is not installed; install it with pip install 'gaitgauge[cluster]'"
         ) from error
+
+
+def _knock(address: str) -> None:
+    """See whether anybody listens at an address.
+
+    Raises:
+        OSError: nobody, or the port is none.
+    """
+    host, _, port = address.rpartition("://")[2].rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECTING).close()
+    except OverflowError as error:
+        raise OSError(str(error)) from error
 
 
 def _first_sentence(error: BaseException) -> str:

@@ -12,7 +12,7 @@ from gaitgauge.gauge.pipelines import Environment
 from gaitgauge.gauge.plan import Plan, PlanRules, plan, plan_list
 from gaitgauge.gauge.segments import count_segments
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.gauge.workers import Drop, Failed, Finished, Play, Progress, Stop
+from gaitgauge.gauge.workers import Drop, Failed, Finished, Lost, Play, Progress, Stop
 from scripted_gauge import DIAGONAL, MAXIMUM, TARGET, episode
 
 RULES = PlanRules(suite=load_suite("robogauge-1.1"), seeds=(0, 1, 2))
@@ -184,6 +184,72 @@ def test_a_record_that_was_on_its_way_when_its_episode_was_cancelled_is_kept_and
     records, *_ = finish(late)
     assert late.dropped
     assert counted(records) == counted(finish(Workers(1, 500, success))[0])
+
+
+class Mortal(Workers):
+    """Workers that die with all that they have, and perhaps come back; the first one stays."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.dead, self.deaths, self.patience = set(), 0, 2000
+
+    def send(self, worker, message):
+        assert worker not in self.dead
+        super().send(worker, message)
+
+    def receive(self):
+        for worker in [w for w in self.dead if self.order.random() < 0.2]:
+            self.dead.remove(worker)
+            self.have[worker], self.played[worker], self.stopped[worker] = [], 0, False
+        self.patience -= 1
+        assert self.patience > 0, "nothing is at work"
+        busy = any(have and not stopped for have, stopped in zip(self.have, self.stopped, strict=True))
+        heard = super().receive() if busy else [(worker, self.progress(worker)) for worker in range(self.count)]
+        messages = [m for m in heard if m[0] not in self.dead]
+        for worker in range(1, self.count):
+            if worker not in self.dead and self.order.random() < 0.1:
+                self.dead.add(worker)
+                self.deaths += 1
+                self.have[worker], self.stopped[worker] = [], True
+                messages = [*(m for m in messages if m[0] != worker), (worker, Lost())]
+        return messages
+
+
+def test_lost_workers_lose_nothing_and_do_not_show_in_what_counts():
+    chance, deaths = random.Random(6), 0
+    for _ in range(15):
+        success = outcomes(chance)
+        expected, *_ = finish(Workers(1, 24, success, chance))
+        workers = Mortal(4, 24, success, chance)
+        records, kept, dispatcher = finish(workers, speculation=Speculation(at_work=30))
+        assert counted(records) == counted(expected)
+        assert len(kept) == len(records)
+        assert dispatcher.active().keys() <= set(workers.have[0])
+        deaths += workers.deaths
+    assert deaths > 50
+
+
+def test_what_a_lost_worker_has_done_is_counted_and_its_episodes_wait_again():
+    class Dying(Workers):
+        """The second worker is lost at the second report."""
+
+        calls = 0
+
+        def receive(self):
+            self.calls += 1
+            if self.calls == 1:
+                return [(0, self.progress(0)), (1, Progress(played=1, physics_steps=700))]
+            if self.calls == 2:
+                self.have[1], self.stopped[1] = [], True
+                return [(1, Lost())]
+            return [(worker, message) for worker, message in super().receive() if worker == 0]
+
+    walks = [episode(MAXIMUM, seed=seed) for seed in range(6)]
+    workers = Dying(2, 12)
+    records, _, dispatcher = finish(workers, planners=[partial(plan_list, walks)], speculation=Speculation())
+    assert set(records) == set(walks)
+    assert Counter(workers.started) == {e: 1 + (e in walks[1:4:2]) for e in walks}
+    assert dispatcher.physics_steps == 710
 
 
 # ---- who plays what ---------------------------------------------------------------------------------------------------

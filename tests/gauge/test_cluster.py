@@ -1,0 +1,299 @@
+"""Workers on a Ray cluster: what is refused, what travels to a node, and that neither nodes nor their deaths show in results."""
+
+import importlib.util
+import json
+import pickle
+import shutil
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from gaitgauge.backends.registry import make_backend
+from gaitgauge.gauge import cluster
+from gaitgauge.gauge.cluster import Arrived, Cluster, ClusterError, NodeWorker, check_address, fingerprint
+from gaitgauge.gauge.evaluate import Request, evaluate, prepare
+from gaitgauge.gauge.workers import Failed, Finished, Job, Play, Progress, Stop, Worker
+from gaitgauge.policy.loading import PRETRAINED, load_policy
+from gaitgauge.robots import load_robot
+from gaitgauge.robots.identity import packed
+from scripted_gauge import GO2, MAXIMUM, episode, short_suite
+
+needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
+
+# ---- sentences --------------------------------------------------------------------------------------------------------
+
+
+def test_a_machine_without_ray_is_told_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ClusterError, match=r"needs Ray, which is not installed; .*'gaitgauge\[cluster\]'"):
+        prepare(Request(policy="pretrained", cluster="auto"))
+
+
+@pytest.fixture
+def with_ray(monkeypatch):
+    """Something that passes for Ray where nothing of it is asked for."""
+    monkeypatch.setitem(sys.modules, "ray", object())
+
+
+@pytest.mark.parametrize(
+    "address", ["", "local", "10.0.0.1", "10.0.0.1:port", "http://10.0.0.1:6379", "a b:1", "[1:6379"]
+)
+def test_what_is_no_address_is_said(with_ray, address):
+    with pytest.raises(ClusterError, match=r"is no address of a Ray cluster; give auto .*HOST:PORT"):
+        check_address(address)
+
+
+@pytest.mark.parametrize("address", ["auto", "10.0.0.1:6379", "head-node.lab:6379", "[fe80::1]:6379", "ray://h:10001"])
+def test_addresses(with_ray, address):
+    check_address(address)
+
+
+def test_another_engine_is_refused(with_ray):
+    with pytest.raises(ClusterError, match="plays with backend 'mujoco' on CPUs, not with 'fake'"):
+        prepare(Request(policy="pretrained", backend="fake", cluster="auto"))
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:{}", "ray://127.0.0.1:{}", "127.0.0.1:99999"])
+def test_an_address_where_nobody_listens_is_one_sentence(with_ray, address, tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = address.format(free.getsockname()[1])
+    with pytest.raises(
+        ClusterError, match=rf"no Ray cluster can be used at {address} \(.*\); start one with 'ray start"
+    ):
+        evaluate(Request(policy="pretrained", suite="demo", cluster=address), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+# ---- what travels to a node -------------------------------------------------------------------------------------------
+
+
+class Counting(torch.nn.Module):
+    """Counts its steps, so that its own code has to be run."""
+
+    steps: int
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.steps = 0
+        self.layer = torch.nn.Linear(45, 12)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        self.steps += 1
+        return 0.1 * self.layer(x) + 0.01 * float(self.steps % 7)
+
+    @torch.jit.export
+    def reset(self) -> None:
+        self.steps = 0
+
+
+@pytest.fixture
+def elsewhere(tmp_path) -> tuple[Path, Path]:
+    """A TorchScript policy and a robot in files of their own."""
+    torch.manual_seed(0)
+    torch.jit.save(torch.jit.script(Counting().eval()), str(tmp_path / "policy.pt"))
+    shutil.copytree(GO2.mjcf.parent, tmp_path / "robot")
+    return tmp_path / "policy.pt", tmp_path / "robot"
+
+
+def job_of(policy: Path, robot: Path) -> Job:
+    loaded = load_robot(robot)
+    return Job(
+        suite=short_suite("gaitgauge-1"),
+        policy=load_policy(policy, loaded),
+        robot=loaded,
+        places=(("flat", 0),),
+        worlds=8,
+        build=_build,
+    )
+
+
+def _build(scene, *, threads):
+    return make_backend("mujoco", scene, threads=threads)
+
+
+def exchanged(node: NodeWorker, *messages: Play | Stop) -> list:
+    return pickle.loads(node.exchange(messages))
+
+
+def test_a_node_plays_the_same_without_the_files(elsewhere):
+    walk = episode(MAXIMUM, seed=3)
+    job = job_of(*elsewhere)
+    here = Worker(job)
+    here.take(Play([walk]))
+    expected = []
+    while not expected:
+        expected = here.rollout.advance()
+    here.rollout.backend.close()
+
+    shipment = pickle.dumps((job, packed(job.robot)))
+    for path in elsewhere:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    node = NodeWorker("10.0.0.7", fingerprint(), shipment)
+    arrived, idle = exchanged(node)
+    assert isinstance(arrived, Arrived)
+    assert (idle.room, idle.played, idle.stopped) == (8, 0, False)
+    heard = exchanged(node, Play([walk]))
+    while not isinstance(heard[0], Finished):
+        heard = exchanged(node)
+    finished, progress = heard
+    assert finished.record.episode == walk
+    assert finished.record.samples.tobytes() == expected[0].samples.tobytes()
+    assert finished.record.summary() == expected[0].summary()
+    assert (progress.played, progress.room) == (1, 8)
+    (last,) = exchanged(node, Stop())
+    assert isinstance(last, Progress) and last.stopped
+
+
+def test_a_node_with_other_versions_is_refused():
+    other = {**fingerprint(), "mujoco": "3.16.0"}
+    sentence = NodeWorker("10.0.0.7", other, b"").exchange([])
+    assert sentence == (
+        f"node 10.0.0.7 of the Ray cluster has another mujoco ({fingerprint()['mujoco']}) than this machine (3.16.0), so that "
+        "results would mix; install the same on all nodes"
+    )
+    plugin = {**fingerprint(), "gaitgauge.robots:spot": "spot:robot (spot 1.0)"}
+    assert "another gaitgauge.robots:spot (not there)" in NodeWorker("10.0.0.7", plugin, b"").exchange([])
+    assert "another source of gaitgauge" in NodeWorker(
+        "n", {**fingerprint(), "source of gaitgauge": "0"}, b""
+    ).exchange([])
+
+
+def test_what_goes_wrong_on_a_node_is_told():
+    (failed,) = exchanged(NodeWorker("n", fingerprint(), b"nothing"))
+    assert isinstance(failed, Failed) and isinstance(failed.error, pickle.UnpicklingError)
+
+
+def test_the_class_of_the_actors_travels_without_this_module(monkeypatch):
+    node = cluster._actor_class()(fingerprint(), b"nothing")
+    monkeypatch.setitem(
+        sys.modules, "ray", type("Ray", (), {"util": type("U", (), {"get_node_ip_address": lambda: "n"})})
+    )
+    monkeypatch.setitem(sys.modules, "gaitgauge.gauge.cluster", None)
+    assert node.exchange([]).startswith("node n of the Ray cluster lacks this gaitgauge (")
+
+
+# ---- clusters of this machine -----------------------------------------------------------------------------------------
+
+SUITE = """
+extends = "gaitgauge-1"
+name = "small"
+title = "some seconds"
+goals = [{ name = "max_velocity", phases = [1.0, 0.2] }, { name = "target_pos_velocity", phases = [] }]
+
+[matrix]
+terrains = ["flat", "slope_fd"]
+frictions = [0.6, 0.9]
+payloads = [0.0]
+seeds = [0, 1, 2, 3]
+search_seeds = [100, 101]
+
+[commands]
+target_time = { slope = 0.3, wave = 0.3, stairs = 0.3, obstacle = 0.3 }
+
+[settling]
+longest = 0.3
+"""
+STORE = 80 * 2**20
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("suite") / "small.toml"
+    path.write_text(SUITE)
+    return path
+
+
+@pytest.fixture(scope="module")
+def alone(small, tmp_path_factory) -> Path:
+    """The results of one process."""
+    folder = tmp_path_factory.mktemp("alone") / "run"
+    evaluate(Request(policy=str(PRETRAINED), suite=str(small)), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def head():
+    """A cluster whose head plays nothing."""
+    from ray.cluster_utils import Cluster as LocalCluster
+
+    found = LocalCluster(
+        initialize_head=True,
+        head_node_args={"num_cpus": 0, "object_store_memory": STORE, "include_dashboard": False},
+    )
+    yield found
+    found.shutdown()
+
+
+@pytest.fixture
+def nodes(head):
+    """Three nodes of one CPU each, as a list; those that a test has taken out were killed."""
+    there = [head.add_node(num_cpus=1, object_store_memory=STORE) for _ in range(3)]
+    yield there
+    for node in there:
+        head.remove_node(node, allow_graceful=False)
+
+
+def reproducible(folder: Path) -> tuple[dict, bytes]:
+    results = json.loads((folder / "results.json").read_text())
+    del results["provenance"]
+    return results, (folder / "episodes.csv").read_bytes()
+
+
+def kept(folder: Path) -> int:
+    return len(list((folder / "episodes").glob("*.npz")))
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.parametrize("dying", [0, 1])
+def test_three_nodes_equal_one_machine_also_when_one_is_killed(head, nodes, small, alone, tmp_path, dying):
+    folder, killed = tmp_path / "run", []
+
+    def watch(status):
+        if len(killed) < dying and kept(folder) >= 5:
+            head.remove_node(nodes.pop(), allow_graceful=False)
+            killed.append(kept(folder))
+
+    request = Request(policy=str(PRETRAINED), suite=str(small), threads=None, cluster=head.address)
+    results = evaluate(request, folder, watch=watch)
+    assert reproducible(folder) == reproducible(alone)
+    assert len(killed) == dying
+    assert results["provenance"]["processes"] == 3
+    assert results["provenance"]["cluster"]["address"] == head.address
+
+
+@needs_ray
+@pytest.mark.slow
+def test_a_cluster_without_nodes_ends_in_a_sentence_and_the_run_goes_on_elsewhere(head, nodes, small, alone, tmp_path):
+    folder = tmp_path / "run"
+
+    def watch(status):
+        while nodes and kept(folder) >= 3:
+            head.remove_node(nodes.pop(), allow_graceful=False)
+
+    request = Request(policy=str(PRETRAINED), suite=str(small), threads=2, cluster=head.address)
+    with pytest.raises(
+        ClusterError, match=r"no node of the Ray cluster is left; what had finished is kept: go on with --resume"
+    ):
+        evaluate(request, folder, watch=watch)
+    before = {path: path.stat().st_mtime_ns for path in (folder / "episodes").glob("*.npz")}
+    assert len(before) >= 3
+    with pytest.raises(ClusterError, match=r"has no free CPU \(of 0\); add nodes"):
+        Cluster(head.address)
+    nodes.append(head.add_node(num_cpus=1, object_store_memory=STORE))
+    evaluate(request, folder, resume=True)
+    assert reproducible(folder) == reproducible(alone)
+    counted = {path for path in before if path.exists()}
+    assert counted and all(path.stat().st_mtime_ns == before[path] for path in counted)
+
+
+@needs_ray
+@pytest.mark.slow
+def test_a_node_with_another_source_is_refused(head, nodes, small, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "fingerprint", lambda: fingerprint() | {"mujoco": "3.16.0"})
+    request = Request(policy=str(PRETRAINED), suite=str(small), threads=1, cluster=head.address)
+    with pytest.raises(ClusterError, match=r"has another mujoco \(3\.17\..*\) than this machine \(3\.16\.0\)"):
+        evaluate(request, tmp_path / "run")
