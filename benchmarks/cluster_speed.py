@@ -1,0 +1,97 @@
+"""What a Ray cluster brings: one evaluation on this machine and on clusters of nodes with one CPU each, all on this machine.
+
+    python benchmarks/cluster_speed.py [POLICY] [--suite demo] [--terrain flat …] [--nodes 1 2] [--cluster ADDRESS] [--out FILE.json]
+
+Prints for one process, for as many processes as nodes, and for each number of nodes: wall time of the whole evaluation, the time
+inside MuJoCo's stepping added up over workers, the speed-up against one process, and whether results and rows are equal to the
+last bit. Nodes are started before the clock; connecting, starting the workers on them, loading and writing are part of the wall
+time. With ``--cluster`` a cluster that runs already is measured beside them, with all its free CPUs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gaitgauge.gauge.evaluate import Request, evaluate
+
+_STORE = 100 * 2**20
+"""Memory for objects of a node [bytes]."""
+
+
+def measured(options: argparse.Namespace, threads: int | None, cluster: str | None) -> dict[str, Any]:
+    """One evaluation: its figures, and what must be the same in all of them."""
+    request = Request(
+        policy=options.policy, suite=options.suite, terrains=tuple(options.terrain), threads=threads, cluster=cluster
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        results = evaluate(request, Path(folder) / "run")
+        seconds = time.perf_counter() - began
+        rows = (Path(folder) / "run" / "episodes.csv").read_text(encoding="utf-8")
+    provenance = results.pop("provenance")
+    return {
+        "workers": provenance["processes"],
+        "seconds": seconds,
+        "engine_seconds": provenance["engine_seconds"],
+        "score": results["score"],
+        "outcome": json.dumps(results, sort_keys=True) + rows,
+    }
+
+
+def on_nodes(options: argparse.Namespace, nodes: int) -> dict[str, Any]:
+    """One evaluation on a cluster of so many nodes, whose head plays nothing."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(
+        initialize_head=True,
+        head_node_args={"num_cpus": 0, "object_store_memory": _STORE, "include_dashboard": False},
+    )
+    try:
+        for _ in range(nodes):
+            cluster.add_node(num_cpus=1, object_store_memory=_STORE)
+        return measured(options, None, cluster.address)
+    finally:
+        cluster.shutdown()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("policy", nargs="?", default="pretrained")
+    parser.add_argument("--suite", default="demo")
+    parser.add_argument("--terrain", nargs="*", default=[])
+    parser.add_argument("--nodes", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--cluster", help="address of a cluster that runs already")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args(arguments)
+    runs = [("processes", lambda n=n: measured(options, n, None)) for n in sorted({1, *options.nodes})]
+    runs += [("nodes", lambda n=n: on_nodes(options, n)) for n in options.nodes]
+    if options.cluster:
+        runs.append((options.cluster, lambda: measured(options, None, options.cluster)))
+    print("workers  seconds  stepping  speed-up  score   results  where", flush=True)
+    found: list[dict[str, Any]] = []
+    for where, run in runs:
+        found.append(run() | {"where": where})
+        row, first = found[-1], found[0]
+        row["speed_up"] = first["seconds"] / row["seconds"]
+        row["same"] = row["outcome"] == first["outcome"]
+        print(
+            f"{row['workers']:7d}  {row['seconds']:7.1f}  {row['engine_seconds']:8.1f}  {row['speed_up']:8.2f}  "
+            f"{row['score']:.4f}  {'equal  ' if row['same'] else 'OTHER  '}  {where}",
+            flush=True,
+        )
+    if options.out:
+        table = [{k: v for k, v in row.items() if k != "outcome"} for row in found]
+        machine = {"processor": platform.processor(), "host": platform.node()}
+        options.out.write_text(json.dumps({"machine": machine, "rows": table}, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
