@@ -29,6 +29,7 @@ import torch
 from ..files.parsing import one_line, shown
 from ..files.provenance import plugins, processor, source_digest, versions
 from ..robots.identity import packed, unpacked
+from ..robots.loading import LARGEST_MODEL
 from .workers import (
     PROGRESS_INTERVAL,
     Drop,
@@ -388,7 +389,7 @@ class NodeWorker:
         with tempfile.TemporaryDirectory(
             prefix="gaitgauge-robot-"
         ) as folder:  # its engine has read all when it is made
-            worker = Worker(replace(job, robot=unpacked(robot, Path(folder))))
+            worker = Worker(replace(job, robot=unpacked(robot, Path(folder), largest=LARGEST_MODEL)))
         gc.freeze()
         return worker
 

@@ -133,8 +133,13 @@ def changed(robot: Robot, digest: str, what: str) -> str | None:
     )
 
 
-def unpacked(known: RobotIdentity, folder: Path) -> Robot:
+def unpacked(known: RobotIdentity, folder: Path, *, largest: int = _LARGEST_UNPACKED) -> Robot:
     """Write a robot's files into an empty folder, where they have to stay while the robot is read.
+
+    Args:
+        known: the robot, perhaps a stranger's.
+        folder: where its files go.
+        largest: their size once they are unpacked, at most [bytes].
 
     Raises:
         RobotError: they are damaged, lead out of the folder, or are not what the digest says.
@@ -142,7 +147,7 @@ def unpacked(known: RobotIdentity, folder: Path) -> Robot:
     assert known.files is not None and known.description is not None
     source = f"the copy of the robot '{known.name}' that the policy carries"
     folder = folder.resolve()
-    left = _LARGEST_UNPACKED
+    left = largest
     try:
         for name, text in known.files.items():
             path = PurePosixPath(name)
@@ -152,7 +157,7 @@ def unpacked(known: RobotIdentity, folder: Path) -> Robot:
             data = unpack.decompress(base64.b64decode(text, validate=True), left + 1)
             left -= len(data)
             if unpack.unconsumed_tail or left < 0:
-                raise RobotError(f"{source} unpacks to more than {_LARGEST_UNPACKED // 10**6} MB")
+                raise RobotError(f"{source} unpacks to more than {largest // 10**6} MB")
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_bytes(data)
     except (OSError, ValueError, zlib.error) as error:
