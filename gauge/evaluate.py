@@ -30,7 +30,7 @@ from ..policy.digest import policy_digest
 from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import find_policy, load_policy
 from ..policy.native import FilePolicy
-from ..robots import Robot, RobotError, load_robot
+from ..robots import Robot, load_robot
 from ..robots.loading import robot_digest
 from ..terrains.registry import make_terrain, terrain_names
 from .cluster import Cluster, ClusterError, ClusterWorkers, check_address
@@ -41,6 +41,7 @@ from .goals import TARGET, check_terrain, count_sub_commands
 from .motors import gains_note, joint_parameters
 from .pipelines import PIPELINES, Environment, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
+from .policies import check_fit
 from .results import fold, health, rows_csv
 from .segments import count_segments
 from .store import RunFolder, StoreError
@@ -159,16 +160,7 @@ def prepare(request: Request) -> Prepared:
         highest = suite.scoring.levels if environment.level is None else environment.level
         check_terrain(suite, make_terrain(name, highest), searched=environment.searched)
     robot, policy = _robot_and_policy(request)
-    if suite.parameters not in robot.parameters:
-        raise RobotError(
-            f"suite '{suite.name}' needs the joint parameters '{suite.parameters}', which robot '{robot.name}' lacks; "
-            f"it has {', '.join(sorted(robot.parameters))} (robot.toml)"
-        )
-    if abs(policy.contract.control_period - suite.physics.control_period) > 1e-9:
-        raise SuiteError(
-            f"the policy was made for a control period of {policy.contract.control_period:g} s, suite '{suite.name}' runs "
-            f"{suite.physics.control_period:g} s; use a policy of that period"
-        )
+    check_fit(suite, robot, policy.contract)
     return Prepared(
         request=request,
         suite=suite,

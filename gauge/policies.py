@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from ..policy.base import PolicyError
-from ..policy.contract import ContractError
+from ..policy.contract import ContractError, PolicyContract
 from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import find_policy, load_policy
 from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
+from .suite import Suite, SuiteError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +65,25 @@ def load_policies(
         else:
             found[stem if short.count(stem) == 1 else name] = loaded
     return found, refused
+
+
+def check_fit(suite: Suite, robot: Robot, contract: PolicyContract) -> None:
+    """Check that a suite's physics suits a robot and a policy.
+
+    Raises:
+        RobotError: the robot lacks the suite's joint parameters.
+        SuiteError: the policy was made for another control period.
+    """
+    if suite.parameters not in robot.parameters:
+        raise RobotError(
+            f"suite '{suite.name}' needs the joint parameters '{suite.parameters}', which robot '{robot.name}' lacks; "
+            f"it has {', '.join(sorted(robot.parameters))} (robot.toml)"
+        )
+    if abs(contract.control_period - suite.physics.control_period) > 1e-9:
+        raise SuiteError(
+            f"the policy was made for a control period of {contract.control_period:g} s, suite '{suite.name}' runs "
+            f"{suite.physics.control_period:g} s; use a policy of that period"
+        )
 
 
 def describe(label: str, loaded: Loaded) -> dict[str, Any]:

@@ -14,11 +14,12 @@ from ...backends.base import PhysicsBackend, Randomization, Scene
 from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...policy.watching import watched_session
-from ...robots import Robot, RobotError
+from ...robots import Robot
 from ...robots.rotation import from_yaw, tilt
 from ...terrains.base import Terrain
 from ..episodes import Episode
 from ..motors import joint_parameters
+from ..policies import check_fit
 from ..suite import Suite
 from ..walking import Walk
 
@@ -99,15 +100,11 @@ def collect(
 
     Raises:
         BackendError: the engine cannot do it.
-        RobotError: the robot lacks the joint parameters of the suite.
+        RobotError, SuiteError: the suite's physics does not suit the robot or the policy.
         PolicyError: the policy has neither encoder nor experts, or its output is not finite.
         ContractError: it is not for this robot.
     """
-    if walks.suite.parameters not in robot.parameters:
-        raise RobotError(
-            f"suite '{walks.suite.name}' needs the joint parameters '{walks.suite.parameters}', which robot '{robot.name}' "
-            f"lacks; it has {', '.join(sorted(robot.parameters))} (robot.toml)"
-        )
+    check_fit(walks.suite, robot, policy.contract)
     places = [(t, c, r) for t in range(len(walks.terrains)) for c in range(len(COMMANDS)) for r in range(walks.robots)]
     scene = Scene(
         robot=robot,

@@ -103,7 +103,7 @@ def study_latents(
                 loaded.policy, loaded.robot, walks, backend=request.backend, threads=request.threads, make=make
             )
             entry, places = look(label, loaded, notes, walks)
-        except (PolicyError, ContractError, BackendError, RobotError, LatentError) as error:
+        except (PolicyError, ContractError, BackendError, RobotError, SuiteError, LatentError) as error:
             refused.append(Refused(what=label, reason=str(error)))
         else:
             entries.append(entry)

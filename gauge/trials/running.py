@@ -19,13 +19,14 @@ import torch
 from ...backends.base import PhysicsBackend, PhysicsState, Randomization, Scene
 from ...backends.registry import make_backend
 from ...policy.base import Policy
-from ...robots import Robot, RobotError
+from ...robots import Robot
 from ...robots.rotation import from_yaw, rotate_inverse, tilt, yaw_of
 from ..episodes import Episode
 from ..motors import joint_parameters
+from ..policies import check_fit
 from ..suite import load_suite
 from ..walking import Walk
-from .scenario import Force, Scenario, ScenarioError
+from .scenario import Force, Scenario
 from .timeline import Timeline
 
 SMOOTHING = 0.1
@@ -135,7 +136,7 @@ def run_scenario(
         BackendError: the engine cannot do what the scenario asks for.
         ContractError, PolicyError: the policy is not for this robot, or its output is not finite.
         RobotError: the robot lacks the joint parameters of the scenario's suite.
-        ScenarioError: the policy's control period is not that of the scenario's suite.
+        SuiteError: the policy's control period is not that of the scenario's suite.
     """
     scene = make_scene(scenario, robot, policy, len(seeds))
     if torch.device(device).type == "cpu":
@@ -147,17 +148,7 @@ def run_scenario(
 def make_scene(scenario: Scenario, robot: Robot, policy: Policy, count: int) -> Scene:
     """The worlds of ``count`` trials. Raises as ``run_scenario``."""
     suite = load_suite(scenario.suite)
-    if suite.parameters not in robot.parameters:
-        raise RobotError(
-            f"scenario '{scenario.name}' needs the joint parameters '{suite.parameters}', which robot '{robot.name}' lacks; "
-            f"it has {', '.join(sorted(robot.parameters))} (robot.toml)"
-        )
-    period = policy.contract.control_period
-    if abs(period - suite.physics.control_period) > 1e-9:
-        raise ScenarioError(
-            f"the policy was made for a control period of {period:g} s, scenario '{scenario.name}' runs "
-            f"{suite.physics.control_period:g} s; use a policy of that period"
-        )
+    check_fit(suite, robot, policy.contract)
     return Scene(
         robot=robot,
         parameters=joint_parameters(suite, robot, policy.contract),

@@ -107,7 +107,7 @@ def run_trials(
                 threads=request.threads,
                 make=make,
             )
-        except (BackendError, ContractError, PolicyError, RobotError, ScenarioError) as error:
+        except (BackendError, ContractError, PolicyError, RobotError, SuiteError) as error:
             refused.append(Refused(what=f"{label} in {scenario.name}", reason=str(error)))
         else:
             entry["results"].append(summary(label, policies[label].policy.contract, scenario, trials))

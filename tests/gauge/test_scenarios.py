@@ -28,7 +28,7 @@ def load(tmp_path, text: str):
 def test_every_scenario_that_ships_can_be_loaded_and_has_ground():
     for name in scenario_names():
         scenario = load_scenario(name)
-        assert scenario.name == name and scenario.about and scenario.seconds < 100.0
+        assert scenario.name == name and scenario.about and scenario.seconds < 120.0
         assert scenario.terrain().height([scenario.start.x], [0.0]).shape == (1,)
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.consistency.statistics import wilson_interval
+from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.gauge.trials.running import Trial, draws, run_scenario
 from gaitgauge.gauge.trials.scenario import Failure, Force, Ground, Leg, Scenario, Start, Success
 from gaitgauge.policy.loading import load_policy
@@ -172,3 +173,10 @@ def test_what_happens_to_a_robot_depends_on_neither_the_others_nor_threads():
     three = run_scenario(policy, GO2, trial, [0, 1, 2], threads=2)
     alone = run_scenario(policy, GO2, trial, [1])
     assert three[1] == alone[0] and three[0] != three[1]
+
+
+def test_a_policy_of_another_control_period_is_refused():
+    policy = ScriptedPolicy()
+    policy.contract = replace(policy.contract, control_period=0.01)
+    with pytest.raises(SuiteError, match=r"made for a control period of 0\.01 s, suite 'coarse' runs 0\.02 s"):
+        play(scenario(STAND), policy)
