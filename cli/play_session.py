@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..backends.base import PhysicsState, Randomization, ResetState, Scene
 from ..backends.registry import make_backend
 from ..gauge.goals import target_command, target_offset
+from ..gauge.motors import joint_parameters
 from ..gauge.suite import Suite
 from ..policy.adapters import assumptions
 from ..policy.base import Policy
@@ -146,7 +147,7 @@ class PlaySession:
         self._model_order = model_joint_order(robot)
         scene = Scene(
             robot=robot,
-            parameters=robot.parameters[suite.parameters],
+            parameters=joint_parameters(suite, robot, policy.contract),
             terrains=(terrain,),
             terrain_index=(0,),
             physics=physics,

@@ -91,7 +91,9 @@ def session(policy: Path) -> Iterator[Callable[..., PlaySession]]:
     """Makes worlds in which that policy stands."""
     made = []
 
-    def make(terrain: str = "flat", level: int | None = None, friction: float = 0.8) -> PlaySession:
+    def make(
+        terrain: str = "flat", level: int | None = None, friction: float = 0.8, policy: Path = policy
+    ) -> PlaySession:
         maker = WorldMaker(backend="mujoco", device="cpu", seed=0, trust=False)
         made.append(maker.make(str(policy), terrain, level, friction, "standing"))
         return made[-1]

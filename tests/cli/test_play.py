@@ -15,6 +15,7 @@ from gaitgauge.cli.picture import show
 from gaitgauge.cli.play_session import beyond
 from gaitgauge.cli.worlds import labels
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.native import save_policy
 from gaitgauge.robots import load_robot
 from gaitgauge.robots.geometry import model_joint_order
 from gaitgauge.terrains.registry import make_terrain
@@ -96,6 +97,19 @@ def test_commands_reach_as_far_as_the_policys_contract_and_clipping_is_said(sess
     for _ in range(25):
         played.step((4.0, -0.5, -3.0))
     assert played.readout().command == (2.0, -0.5, -2.0)
+
+
+def test_policies_are_played_with_the_gains_that_the_gauge_plays_them_with(session, contract, stored, tmp_path):
+    """Play took the robot's own gains where the suite takes those of the policy's contract."""
+    path = tmp_path / "soft.gauge.pt"
+    soft = replace(contract, stiffness=(5.0,) * ROBOT.num_joints)
+    save_policy(path, soft, stored)
+    heights = []
+    for played in (session(), session(policy=path)):
+        for _ in range(50):
+            played.step((0.0, 0.0, 0.0))
+        heights.append(played.position()[2])
+    assert heights[1] < heights[0] - 0.05, "a robot with a quarter of the stiffness sags"
 
 
 def test_measured_speed_is_in_the_robots_heading_and_friction_acts(session):
