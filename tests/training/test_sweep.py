@@ -14,10 +14,11 @@ import pytest
 import torch
 from gaitgauge.training.sweep.curves import by_figure, curves_csv
 from gaitgauge.training.sweep.file import Sweep, SweepEntry, SweepError, load_sweep
-from gaitgauge.training.sweep.folding import fold_sweep
+from gaitgauge.training.sweep.folding import across_seeds, fold_sweep
 from gaitgauge.training.sweep.jobs import Jobs, visible_gpus
 from gaitgauge.training.sweep.runs import SweepRun, plan_runs
 from gaitgauge.training.tasks import find_task
+from scipy.stats import t as student_t
 
 ROOT = Path(__file__).parents[2]
 ENTRY = SweepEntry(name="one", task="go2-cts")
@@ -242,3 +243,16 @@ def test_curves_keep_their_entries():
     assert by_figure(curves, ["b", "a", "c"]) == {
         "mean reward": {"b": [([1.0], [0.25])], "a": [([1.0, 2.0], [0.5, 0.75])], "c": []}
     }
+
+
+def test_entries_are_compared_over_their_seeds():
+    """By hand: means 2 and 6, variances 1 and 4 of three runs each, so t = 4 / sqrt(5 / 3) with (5/3)² / (1/18 + 8/9) degrees."""
+    found = across_seeds({"a": [0.1, 0.2, 0.3], "alone": [0.5], "b": [0.4, 0.6, 0.8], "c": [0.15, 0.2, 0.25]})
+    assert [(p["first"], p["second"]) for p in found] == [("a", "b"), ("a", "c"), ("b", "c")]
+    expected = 2.0 * student_t.sf(4.0 / (5.0 / 3.0) ** 0.5, (5.0 / 3.0) ** 2 / (1.0 / 18.0 + 8.0 / 9.0))
+    assert found[0]["difference"] == pytest.approx(0.4) and found[0]["p_value"] == pytest.approx(expected)
+    assert found[0]["corrected"] == pytest.approx(min(3.0 * expected, 1.0)) and found[1]["p_value"] == pytest.approx(
+        1.0
+    )
+    assert across_seeds({"a": [0.5, 0.5], "b": [0.6, 0.6]})[0]["p_value"] == 0.0
+    assert across_seeds({"a": [0.5], "b": [0.6, 0.6]}) == []

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import jinja2
+from scipy.stats import ttest_ind
 
 from ...files.writing import json_text, write_atomically
 from ...gauge import charts
-from ...gauge.comparison import ComparisonError, compare, load_result
+from ...gauge.comparison import ComparisonError, compare, format_p, holm, load_result
 from ...gauge.comparison_report import write_comparison
+from ...gauge.intervals import CONFIDENCE
 from ...gauge.report import TEMPLATES
 from ..run_directory import read_run_json
 from .curves import Curve, by_figure, curves_csv, learning_curves
@@ -33,7 +36,7 @@ def fold_sweep(
         folder: where the files go.
 
     Returns:
-        The content of ``sweep.json``: ``runs``, ``entries``, ``sentences`` and what could not be done.
+        The content of ``sweep.json``: ``runs``, ``entries``, their differences ``across_seeds``, and ``sentences``.
 
     Raises:
         SweepError, ComparisonError, CheckpointError: a file is damaged or cannot be written.
@@ -49,6 +52,11 @@ def fold_sweep(
             sentences = found.sentences
         except ComparisonError as error:
             sentences = [f"No comparison: {error}."]
+    scores = {
+        e.name: [r["score"] for r in rows if r["entry"] == e.name and r["score"] is not None] for e in sweep.entry
+    }
+    pairs = across_seeds(scores)
+    sentences += [_seeds_sentence(pairs)] if pairs else []
     data: dict[str, Any] = {
         "schema": 1,
         "name": sweep.name,
@@ -58,6 +66,7 @@ def fold_sweep(
         "entries": [
             _entry(e.name, [r for r in rows if r["entry"] == e.name], refused.get(e.name)) for e in sweep.entry
         ],
+        "across_seeds": pairs,
         "sentences": sentences,
     }
     curves = {(r.entry.name, r.seed): learning_curves(run) for r in runs if (run := r.directory) is not None}
@@ -108,6 +117,36 @@ def _entry(name: str, rows: Sequence[Mapping[str, Any]], refused: str | None) ->
         if best
         else None,
     }
+
+
+def across_seeds(scores: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
+    """Differences of the entries' mean scores over their seeds of training, by Welch's t-test, corrected for many looks by Holm.
+
+    Args:
+        scores: of each entry's runs; an entry with fewer than two says nothing of its spread and is left out.
+
+    Returns:
+        ``first``, ``second``, ``difference`` of the second's mean minus the first's, ``p_value`` and ``corrected`` of each pair.
+    """
+    known = {name: own for name, own in scores.items() if len(own) > 1}
+    pairs = []
+    for (first, one), (second, two) in combinations(known.items(), 2):
+        spread = statistics.variance(one) + statistics.variance(two)
+        difference = statistics.fmean(two) - statistics.fmean(one)
+        p_value = float(ttest_ind(one, two, equal_var=False).pvalue) if spread > 0.0 else float(difference == 0.0)
+        pairs.append({"first": first, "second": second, "difference": round(difference, 6), "p_value": p_value})
+    corrected = holm([pair["p_value"] for pair in pairs])
+    return [pair | {"corrected": p} for pair, p in zip(pairs, corrected, strict=True)]
+
+
+def _seeds_sentence(pairs: Sequence[Mapping[str, Any]]) -> str:
+    """What the seeds of training allow to say about the entries themselves."""
+    real = sorted((p for p in pairs if p["corrected"] < 1.0 - CONFIDENCE), key=lambda p: p["corrected"])
+    found = f"Over the seeds of training, {len(real)} of {len(pairs)} differences are real (Welch's test, Holm's correction)"
+    shown = ", ".join(
+        f"'{p['second']}' and '{p['first']}' {p['difference']:+.4f} (p {format_p(p['corrected'])})" for p in real
+    )
+    return f"{found}: {shown}." if real else f"{found}: with so few runs the methods cannot be told apart."
 
 
 def _page(data: Mapping[str, Any], curves: Mapping[tuple[str, int], Mapping[str, Curve]], *, compared: bool) -> str:
