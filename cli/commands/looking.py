@@ -1,4 +1,4 @@
-"""Commands that look at what there is: list, doctor."""
+"""Commands that look at what there is and make it ready: list, doctor, warmup."""
 
 from __future__ import annotations
 
@@ -86,5 +86,40 @@ def doctor(
             json_output=json_output,
             trust=trust,
         )
-    if not well:
-        raise typer.Exit(1)
+
+
+@app.command()
+@report_errors
+def warmup(
+    arch: Annotated[
+        list[str] | None,
+        typer.Option(help="GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU."),
+    ] = None,
+    backend: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="mujoco-warp or newton; repeatable. Default: mujoco-warp.",
+            autocompletion=completion.warp_backends,
+        ),
+    ] = None,
+    robot: Annotated[str, typer.Option(help="Robot name, or a robot.toml.", autocompletion=completion.robots)] = "go2",
+    cache: Annotated[
+        Path | None, typer.Option(help="Folder of the kernels. Default: Warp's own, or WARP_CACHE_PATH.")
+    ] = None,
+    threads: ThreadsOption = None,
+) -> None:
+    """Compile the GPU kernels of training and evaluating before they are needed, also for a GPU that is not here.
+
+    Examples:
+      gaitgauge warmup
+      gaitgauge warmup --arch sm_90 --cache kernels
+    """
+    from ..warmup import run_warmup
+
+    run_warmup(
+        architectures=tuple(arch or ()),
+        backends=tuple(backend or ("mujoco-warp",)),
+        robot=robot,
+        cache=cache,
+        threads=threads,
+    )

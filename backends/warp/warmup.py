@@ -1,0 +1,144 @@
+"""Compiles the kernels of the engines on Warp before they are needed, also for a GPU that is not here.
+
+With the GPU, an engine is played for some steps, which compiles all. Without, it is played on the CPU while every launch is
+written down, and the kernels that were launched are compiled for the other architecture: into the same folder, under the same
+names as they are looked for later. What an engine launches on a GPU alone is not seen that way and is compiled at the first use.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import warp as wp
+
+from ..base import BackendError, Randomization, ResetState, Scene
+from ..registry import make_backend
+
+_DEFAULT_BLOCK = 256
+"""Threads of a block where a launch names none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compiled:
+    """What was compiled."""
+
+    modules: int
+    """Modules, each once for every block size."""
+    fresh: int
+    """Of them, those that were not there before."""
+    seconds: float
+
+
+def exercise(backend: str, scenes: Iterable[Scene], device: str) -> None:
+    """Play an engine for some steps, so that every kernel that they need is there.
+
+    Raises:
+        BackendError: there is no such engine or device.
+    """
+    for scene in scenes:
+        with closing(make_backend(backend, scene, device=device)) as physics:
+            count = physics.num_worlds
+            options: dict[str, Any] = {"device": physics.device, "dtype": physics.dtype}
+            pose = torch.tensor([scene.robot.default_joint_position], **options).expand(count, -1)
+            place = torch.tensor([[0.0, 0.0, scene.robot.stand_height]], **options).expand(count, 3)
+            upright = torch.tensor([[1.0, 0.0, 0.0, 0.0]], **options).expand(count, 4)
+            start = ResetState(base_position=place, base_quaternion=upright, held_target=pose)
+            half = torch.arange(count, device=physics.device) % 2 == 0
+            physics.randomize(Randomization(friction=torch.full((count,), 0.8, **options)))
+            physics.reset(start)
+            physics.step(pose)
+            physics.step(pose, sample_at=torch.ones(count, dtype=torch.int64, device=physics.device), worlds=half)
+            physics.push(half, linear_velocity_w=torch.zeros(count, 3, **options))
+            physics.reset(start, half)
+            physics.step(pose)
+
+
+def supported_architectures() -> list[int]:
+    """Architectures that the compiler here knows, such as 90 for ``sm_90``; it needs no GPU."""
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.init()
+    return list(wp.get_cuda_supported_archs())
+
+
+def cache_folder() -> str:
+    """Where compiled kernels are kept."""
+    wp.init()
+    return str(wp.config.kernel_cache_dir)
+
+
+@contextmanager
+def recorded_launches() -> Iterator[dict[Any, set[int]]]:
+    """Inside, every launch is noted as well as done: block sizes by module."""
+    seen: dict[Any, set[int]] = {}
+    original = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
+
+    def noting(launch: Callable[..., Any]) -> Callable[..., Any]:
+        def noted(kernel: Any, *args: Any, **options: Any) -> Any:
+            block = options.get("block_dim") or _DEFAULT_BLOCK
+            seen.setdefault(kernel.module, set()).add(int(block))
+            return launch(kernel, *args, **options)
+
+        return noted
+
+    for name, launch in original.items():
+        setattr(wp, name, noting(launch))
+    try:
+        yield seen
+    finally:
+        for name, launch in original.items():
+            setattr(wp, name, launch)
+
+
+def compile_for(architecture: int, launched: dict[Any, set[int]], *, threads: int = 1) -> Compiled:
+    """Compile modules for an architecture into Warp's cache; what is there already is left alone.
+
+    Args:
+        architecture: such as 90 for ``sm_90``.
+        launched: block sizes by module.
+        threads: compilations at a time.
+    """
+    began = time.perf_counter()
+    # a module's default block size is part of it, so one module is compiled by one thread
+    with ThreadPoolExecutor(threads) as pool:
+        results = list(pool.map(lambda item: _compile(architecture, *item), launched.items()))
+    fresh = [each for result in results for each in result]
+    return Compiled(modules=len(fresh), fresh=sum(fresh), seconds=time.perf_counter() - began)
+
+
+def _compile(architecture: int, module: Any, blocks: Iterable[int]) -> list[bool]:
+    """Compile a module once for each block size; whether each was not there before."""
+    usual = module.options["block_dim"]
+    before = set(Path(cache_folder()).glob(f"*/*.sm{architecture}*"))
+    fresh = []
+    for block in sorted(blocks):
+        wp.set_module_options({"block_dim": block}, module=module)
+        try:
+            (path,) = wp.compile_aot_module(module, arch=architecture, use_ptx=False)
+        finally:
+            wp.set_module_options({"block_dim": usual}, module=module)
+        fresh.append(Path(path) not in before)
+    return fresh
+
+
+def check_architecture(text: str) -> int:
+    """The number of an architecture such as ``sm_90`` or ``90``.
+
+    Raises:
+        BackendError: the compiler does not know it.
+    """
+    known = supported_architectures()
+    number = text.removeprefix("sm_")
+    if not number.isdigit() or int(number) not in known:
+        raise BackendError(
+            f"the architecture '{text}' is not known to Warp's compiler; choose from: "
+            + ", ".join(f"sm_{a}" for a in known)
+            + " (--arch)"
+        )
+    return int(number)

@@ -1,0 +1,95 @@
+"""``gaitgauge warmup``: kernels compiled before they are needed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from ..backends.base import TRAINING_PHYSICS, Scene
+from ..gauge.suite import load_suite
+from ..robots import Robot, load_robot
+from ..terrains.gauge_terrains import LEVELS
+from ..terrains.registry import gauge_terrain_names, make_terrain
+from .console import Terminal
+from .errors import UserError
+
+_ENGINES = ("mujoco-warp", "newton")
+_SUITE = "gaitgauge-1"
+
+
+def run_warmup(
+    *, architectures: Sequence[str], backends: Sequence[str], robot: str, cache: Path | None, threads: int | None
+) -> None:
+    """Compile what training and evaluating need.
+
+    Args:
+        architectures: such as ``sm_90``; none for the GPU of this machine.
+        backends: engines on Warp.
+        robot: name or path; its numbers of joints and feet are part of the kernels.
+        cache: folder of the kernels, None for Warp's own.
+        threads: compilations at a time, None for all cores.
+
+    Raises:
+        UserError: no architecture and no GPU, or an engine without kernels.
+    """
+    for name in backends:
+        if name.partition(":")[0] not in _ENGINES:
+            raise UserError(
+                f"the engine '{name}' has no kernels to compile; choose from: {', '.join(_ENGINES)} (--backend)"
+            )
+    if cache is not None:
+        os.environ["WARP_CACHE_PATH"] = str(cache)  # before Warp is imported
+    from ..backends.warp import warmup
+
+    numbers = [warmup.check_architecture(text) for text in architectures]
+    if not numbers and not torch.cuda.is_available():
+        raise UserError("there is no GPU here; say which one the kernels are for, such as --arch sm_90 (H100, H200)")
+    console = Terminal()
+    scenes = _scenes(load_robot(robot))
+    for name in backends:
+        began = time.perf_counter()
+        if not numbers:
+            warmup.exercise(name, scenes, "cuda")
+            console.say(f"{name}: all kernels for this GPU are there ({time.perf_counter() - began:.0f} s)")
+            continue
+        with (
+            console.status(f"{name}: playing on the CPU to see what is launched …"),
+            warmup.recorded_launches() as launched,
+        ):
+            warmup.exercise(name, scenes, "cpu")
+        console.say(
+            f"{name}: {len(launched)} modules are launched (seen on the CPU in {time.perf_counter() - began:.0f} s)"
+        )
+        for number in numbers:
+            with console.status(f"{name}: compiling for sm_{number} …"):
+                done = warmup.compile_for(number, launched, threads=threads or os.cpu_count() or 1)
+            console.say(
+                f"{name}, sm_{number}: {done.fresh} of {done.modules} compiled, the others were there ({done.seconds:.0f} s)"
+            )
+    console.say(f"kernels are in {warmup.cache_folder()}")
+    if cache is not None:
+        console.say(f"programs find them with WARP_CACHE_PATH={cache}")
+    if numbers:
+        console.say("what an engine launches on a GPU alone is not seen from a CPU and is compiled at the first use")
+
+
+def _scenes(robot: Robot) -> list[Scene]:
+    """A few worlds as training and as the gauge have them, on level ground, on boxes and on a height field."""
+    level = LEVELS[len(LEVELS) // 2]
+    names = [n for n in gauge_terrain_names() if n in ("flat", "stairs_fd", "wave")]
+    terrains = tuple(make_terrain(n, None if n == "flat" else level) for n in names)
+    own = robot.parameters[robot.default_parameters]
+    return [
+        Scene(
+            robot=robot,
+            parameters=robot.parameters.get("training", own) if each is TRAINING_PHYSICS else own,
+            terrains=terrains,
+            terrain_index=tuple(range(len(terrains))),
+            physics=each,
+        )
+        for each in (TRAINING_PHYSICS, load_suite(_SUITE).physics)
+    ]

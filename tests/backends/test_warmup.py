@@ -1,0 +1,69 @@
+"""Kernels compiled for a GPU that is not here."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from gaitgauge.backends.base import BackendError
+
+pytest.importorskip("warp")
+
+PROGRAM = """
+import json, sys
+import warp as wp
+from gaitgauge.backends.warp.warmup import cache_folder, compile_for, recorded_launches
+
+@wp.kernel
+def double(values: wp.array(dtype=float)):
+    i = wp.tid()
+    values[i] = 2.0 * values[i]
+
+values = wp.full(4, 1.5, dtype=float, device="cpu")
+with recorded_launches() as launched:
+    wp.launch(double, dim=4, inputs=[values], device="cpu")
+    wp.launch(double, dim=4, inputs=[values], device="cpu", block_dim=64)
+usual = double.module.options["block_dim"]
+names = [double.module.get_module_identifier(block_dim=block) for block in (64, 256)]
+first = compile_for(90, launched)
+second = compile_for(90, launched)
+assert double.module.options["block_dim"] == usual
+print(json.dumps([values.numpy().tolist(), first.modules, first.fresh, second.fresh, names, cache_folder()]))
+"""
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """What the program above did, and the folder that it was told to use."""
+    folder = tmp_path_factory.mktemp("kernels")
+    program = folder / "program.py"  # Warp reads the source of its kernels
+    program.write_text(PROGRAM)
+    environment = os.environ | {"WARP_CACHE_PATH": str(folder / "cache")}
+    done = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1]), folder / "cache"
+
+
+@pytest.mark.slow
+def test_launches_happen_and_are_compiled_once_for_each_block_size(compiled):
+    (values, modules, fresh, again, _, _), _ = compiled
+    assert values == [6.0] * 4
+    assert (modules, fresh, again) == (2, 2, 0)
+
+
+@pytest.mark.slow
+def test_machine_code_lies_where_it_is_looked_for(compiled):
+    (*_, names, cache), folder = compiled
+    assert cache.startswith(str(folder))
+    for name in names:
+        (binary,) = folder.rglob(f"{name}/*.sm90*.cubin")
+        assert binary.read_bytes()[:4] == b"\x7fELF"
+
+
+def test_an_architecture_that_the_compiler_does_not_know_is_refused():
+    from gaitgauge.backends.warp.warmup import check_architecture
+
+    assert check_architecture("sm_90") == check_architecture("90") == 90
+    with pytest.raises(BackendError, match=r"'sm_1' is not known to Warp's compiler; choose from: sm_75"):
+        check_architecture("sm_1")
