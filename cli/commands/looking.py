@@ -86,6 +86,8 @@ def doctor(
             json_output=json_output,
             trust=trust,
         )
+    if not well:
+        raise typer.Exit(1)
 
 
 @app.command()
