@@ -40,6 +40,8 @@ class Tile:
     """What ``scenery.visual_model`` made."""
     heading: float
     """Of the robot at the start [rad]."""
+    leg_length: float
+    """Of the robot [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +109,9 @@ class _Artist:
     """All tiles of one process."""
 
     def __init__(self, tiles: Sequence[Tile], size: tuple[int, int]) -> None:
-        self._pictures = [Picture(tile.model, size=size, heading=tile.heading) for tile in tiles]
+        self._pictures = [
+            Picture(tile.model, size=size, heading=tile.heading, leg_length=tile.leg_length) for tile in tiles
+        ]
 
     def draw(self, poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         drawn = [picture.draw(*pose) for picture, pose in zip(self._pictures, poses, strict=True)]

@@ -131,15 +131,17 @@ class Picture:
     AZIMUTH = 55.0
     """Direction in which the camera looks, against the robot's first heading [deg]."""
     ELEVATION = -16.0
-    DISTANCE = 1.9
+    DISTANCE = 4.46
+    """Of the camera, in lengths of the robot's legs."""
 
-    def __init__(self, model: mujoco.MjModel, *, size: tuple[int, int], heading: float) -> None:
+    def __init__(self, model: mujoco.MjModel, *, size: tuple[int, int], heading: float, leg_length: float) -> None:
         """Prepare the renderer.
 
         Args:
             model: what ``scenery.visual_model`` made.
             size: width and height of the picture [pixels].
             heading: of the robot at the start [rad].
+            leg_length: of the robot [m].
         """
         import mujoco
 
@@ -147,7 +149,7 @@ class Picture:
         self._renderer = mujoco.Renderer(model, size[1], size[0])
         self._camera = mujoco.MjvCamera()
         self._camera.azimuth = np.degrees(heading) + self.AZIMUTH
-        self._camera.elevation, self._camera.distance = self.ELEVATION, self.DISTANCE
+        self._camera.elevation, self._camera.distance = self.ELEVATION, self.DISTANCE * leg_length
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 1
         self._options.sitegroup[:] = 0

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ..robots.body_plan import body_plan
 from .drawing import Shot, Tile, draw, processes_for
 from .overlay import annotate
 from .picture import Follower, Quality
@@ -63,6 +64,7 @@ def record(wanted: Recording, quality: Quality, progress: Callable[[float], None
         Tile(
             model=visual_model(session.robot, session.terrain, quality),
             heading=session.terrain.spawns["level_search"].yaw,
+            leg_length=body_plan(session.robot).leg_length,
         )
         for session in sessions
     ]

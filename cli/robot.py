@@ -138,8 +138,10 @@ def _draw(robot: Robot, quality: Quality, path: Path) -> None:
 
     _, data = default_pose(robot)
     position = data.qpos[: 7 + robot.num_joints].copy()
-    position[2] = body_plan(robot).standing_height
-    picture = Picture(visual_model(robot, make_terrain("flat"), quality), size=quality.size, heading=0.0)
+    plan = body_plan(robot)
+    position[2] = plan.standing_height
+    model = visual_model(robot, make_terrain("flat"), quality)
+    picture = Picture(model, size=quality.size, heading=0.0, leg_length=plan.leg_length)
     try:
         imageio.v3.imwrite(path, np.ascontiguousarray(picture.draw(position, position[:3])))
     except OSError as error:

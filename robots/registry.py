@@ -51,6 +51,11 @@ def is_path(text: str) -> bool:
     return "/" in text or os.sep in text or text.endswith(".toml")
 
 
+def lasting(text: str) -> str:
+    """A robot's name, or the absolute path of its description, which holds from any folder."""
+    return os.path.abspath(os.path.expanduser(text)) if is_path(text) else text
+
+
 def _named(text: str) -> Robot:
     own = _own()
     if text in own:

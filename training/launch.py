@@ -17,8 +17,10 @@ from ..backends.registry import choose_device
 from ..files.parsing import build, shown
 from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
+from ..policy.contract import PolicyContract
+from ..policy.its_robot import robot_for
 from ..policy.loading import find_policy
-from ..robots.registry import is_path
+from ..robots.registry import lasting
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .configuration import ConfigurationError, TrainingConfiguration, to_plain
@@ -136,12 +138,13 @@ def prepare(request: TrainRequest) -> TrainPlan:
         raise ConfigurationError(
             "a resumed run keeps its robot; leave --robot out, or begin a new run with --init-from"
         )
-    own, robot = _own_overrides(request), _absolute(request.robot)
+    own = _own_overrides(request)
+    robot = None if request.robot is None else lasting(request.robot)
     known, task = find_task(request.task), find_task(request.task, own, robot=robot)
     checkpoint, run, notice = None, None, ""
     if request.resume is not None:
         checkpoint = find_checkpoint(
-            request.resume, experiment=task.training.run.experiment, root=request.log_root
+            request.resume, experiment=task.training.run.experiment, task=request.task, root=request.log_root
         ).absolute()
         # A checkpoint carried here without its run directory continues in a new one.
         run = checkpoint.parent if read_run_json(checkpoint.parent).get("task") == request.task else None
@@ -230,6 +233,7 @@ def _kept(checkpoint: Path, name: str) -> tuple[Task, str]:
             f"{source}: an earlier version wrote it, without all of its settings; begin a new run with its networks: "
             f"--init-from {checkpoint}"
         )
+    robot_for(PolicyContract.from_json(entries["contract"]))  # says where it is not what the run began with
     task = replace(
         find_task(name),
         environment=build(EnvironmentConfiguration, stored["environment"], source, CheckpointError),
@@ -261,11 +265,6 @@ def _first_weights(request: TrainRequest, task: Task) -> Path:
     if request.init_from == "pretrained":
         return find_policy(request.init_from)
     return find_checkpoint(request.init_from, experiment=task.training.run.experiment, root=request.log_root)
-
-
-def _absolute(robot: str | None) -> str | None:
-    """A robot's name, or the absolute path of its description, which holds wherever a run is continued."""
-    return os.path.abspath(os.path.expanduser(robot)) if robot is not None and is_path(robot) else robot
 
 
 def _own_overrides(request: TrainRequest) -> list[str]:

@@ -57,15 +57,20 @@ def latest_checkpoint(run: Path) -> Path | None:
     return max(numbered)[1] if numbered else None
 
 
-def find_checkpoint(choice: str, *, experiment: str, root: Path = LOG_ROOT) -> Path:
+def find_checkpoint(choice: str, *, experiment: str, task: str = "", root: Path = LOG_ROOT) -> Path:
     """The checkpoint that ``--resume`` names: ``latest`` (of the experiment), a run directory (its last), or a file.
 
     Raises:
         CheckpointError: there is none.
     """
     if choice == "latest":
-        runs = sorted((r for r in (root / experiment).glob("*") if r.is_dir()), key=lambda r: r.name, reverse=True)
-        for run in runs:
+        # A run for another robot than the task's has an experiment of its own.
+        runs = [
+            r
+            for r in root.glob("*/*")
+            if r.is_dir() and (r.parent.name == experiment or (task and read_run_json(r).get("task") == task))
+        ]
+        for run in sorted(runs, key=lambda r: r.name, reverse=True):
             if found := latest_checkpoint(run):
                 return found
         raise CheckpointError(

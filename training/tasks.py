@@ -297,9 +297,12 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise TaskError(f"unknown task '{name}'; {hint}the tasks are: {', '.join(TASKS)}")
     chosen = list(overrides)
+    named = [o for o in chosen if o.split("=", 1)[0].strip() == "environment.robot"]
+    if named and robot is not None:
+        raise TaskError(f"the robot is given twice, as '{robot}' and with environment.robot=; leave one out")
+    if named:  # the same as --robot
+        robot, chosen = named[-1].split("=", 1)[1].strip(), [o for o in chosen if o not in named]
     if robot is not None:
-        if any(o.split("=", 1)[0].strip() == "environment.robot" for o in chosen):
-            raise TaskError(f"the robot is given twice, as '{robot}' and with environment.robot=; leave one out")
         known = known.for_robot(robot)
     task = known.with_overrides(chosen)
     own_horizon = any(o.split("=", 1)[0].strip() == "environment.schedule.horizon_steps" for o in chosen)

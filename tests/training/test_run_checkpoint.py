@@ -94,6 +94,13 @@ def test_run_directories(tmp_path):
     assert latest_checkpoint(second) is None
     # The newest run has no checkpoint yet.
     assert find_checkpoint("latest", experiment="go2", root=tmp_path) == first / "model_1000.pt"
+    other = tmp_path / "mine" / "2027-01-01_00-00-00"
+    other.mkdir(parents=True)
+    (other / "model_3.pt").touch()
+    (other / "run.json").write_text('{"task": "walk"}')
+    assert find_checkpoint("latest", experiment="go2", root=tmp_path) == first / "model_1000.pt"
+    assert find_checkpoint("latest", experiment="go2", task="run", root=tmp_path) == first / "model_1000.pt"
+    assert find_checkpoint("latest", experiment="go2", task="walk", root=tmp_path) == other / "model_3.pt"
     assert find_checkpoint(str(first), experiment="other", root=tmp_path) == first / "model_1000.pt"
     with pytest.raises(CheckpointError, match=r"There is no checkpoint 'none\.pt'"):
         find_checkpoint("none.pt", experiment="go2", root=tmp_path)

@@ -51,6 +51,10 @@ def test_settings_change_what_is_scaled(heavy):
     assert chosen.training.run.experiment == "mine"
 
 
+def test_the_setting_is_the_same_as_the_option(heavy):
+    assert find_task("go2-flat", [f"environment.robot={heavy}"]) == find_task("go2-flat", robot=heavy)
+
+
 def test_the_tasks_own_robot_changes_nothing():
     assert find_task("go2-sprint", robot="go2") == find_task("go2-sprint")
     assert scaled_environment(find_task("go2-flat").environment, "go2") == find_task("go2-flat").environment
