@@ -12,6 +12,7 @@ from typing import Any
 import typer
 
 from ..files.writing import lock_folder
+from ..gauge.cluster import check_address
 from ..training.sweep.file import SweepError, load_sweep
 from ..training.sweep.folding import fold_sweep
 from ..training.sweep.jobs import Jobs
@@ -22,7 +23,14 @@ from .train import parse_duration
 
 
 def run_sweep(
-    *, file: Path, out: Path | None, threads: int | None, time: str | None, report: bool, json_output: bool
+    *,
+    file: Path,
+    out: Path | None,
+    threads: int | None,
+    cluster: str | None,
+    time: str | None,
+    report: bool,
+    json_output: bool,
 ) -> None:
     """Run what is left of a sweep, and print its table; exit code 1 where an entry could not be done, 128 + signal where stopped."""
     began = clock.monotonic()
@@ -30,6 +38,10 @@ def run_sweep(
     folder = (out or Path("results") / f"sweep-{sweep.name}").absolute()
     deadline = None if time is None else began + parse_duration(time)
     errors = Terminal(stderr=True)
+    gauging = None
+    if cluster is not None:
+        check_address(cluster)
+        gauging = ["--cluster", cluster, *([] if threads is None else ["--threads", str(threads)])]
     if folder.exists() and not folder.is_dir():
         raise SweepError(f"'{folder}' is a file; give another folder with --out")
     folder.mkdir(parents=True, exist_ok=True)
@@ -40,7 +52,8 @@ def run_sweep(
             raise SweepError(next(iter(refused.values())))
         for name, sentence in refused.items():
             complain(f"gaitgauge: entry '{name}' cannot start: {sentence}")
-        jobs = Jobs(sweep, threads=threads or max((os.cpu_count() or 2) // 2, 1), deadline=deadline, say=errors.say)
+        threads = threads or max((os.cpu_count() or 2) // 2, 1)
+        jobs = Jobs(sweep, threads=threads, deadline=deadline, say=errors.say, gauging=gauging)
         outcome = jobs.work([] if report else runs)
         found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
     finally:

@@ -9,6 +9,7 @@ import typer
 
 from .. import completion
 from ..errors import report_errors
+from ..options import ClusterOption
 
 app = typer.Typer()
 
@@ -167,6 +168,7 @@ def sweep(
     threads: Annotated[
         int | None, typer.Option(min=1, help="CPU threads of the gauge. Default: half of the cores.")
     ] = None,
+    cluster: ClusterOption = None,
     time: Annotated[str | None, typer.Option(help="Stop after this wall-clock time: seconds, 9m, 2h or 1h30m.")] = None,
     report: Annotated[
         bool, typer.Option("--report", help="Train and gauge nothing: tables and curves of what there is.")
@@ -181,4 +183,4 @@ def sweep(
     """
     from ..sweep import run_sweep
 
-    run_sweep(file=file, out=out, threads=threads, time=time, report=report, json_output=json_output)
+    run_sweep(file=file, out=out, threads=threads, cluster=cluster, time=time, report=report, json_output=json_output)

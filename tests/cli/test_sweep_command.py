@@ -1,6 +1,7 @@
 """``gaitgauge sweep``: one sentence for what is wrong, and a whole sweep of small trainings."""
 
 import json
+import sys
 
 import pytest
 import torch
@@ -41,6 +42,13 @@ def tiny(tmp_path):
 
 def test_a_file_that_is_not_there(refused):
     assert "'none.toml' does not exist" in refused("sweep", "none.toml")
+
+
+def test_no_cluster(refused, tiny, monkeypatch):
+    (tiny / "sweep.toml").write_text(sweep(one='task = "go2-cts"'))
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert "'gaitgauge[cluster]'" in refused("sweep", "sweep.toml", "--cluster", "auto", "--out", tiny / "out")
+    assert not (tiny / "out").exists()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")

@@ -1,8 +1,9 @@
-"""Training in two processes of one machine, as torchrun starts them; on the CPU."""
+"""Training in two processes, as torchrun starts them on one machine and on two; on the CPU."""
 
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -48,8 +49,10 @@ runner.processes.leave()
 """
 
 
-def start(folder: Path, *command: str) -> subprocess.Popen[str]:
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *command]
+def start(
+    folder: Path, *command: str, torchrun: tuple[str, ...] = ("--standalone", "--nproc-per-node", "2")
+) -> subprocess.Popen[str]:
+    launcher = [sys.executable, "-m", "torch.distributed.run", *torchrun, *command]
     environment = {
         **os.environ,
         "OMP_NUM_THREADS": "1",
@@ -128,6 +131,48 @@ def test_a_run_that_loses_a_process_ends_with_a_checkpoint_and_a_sentence(tmp_pa
     assert resumed.returncode == 0, output
     assert "was written by what was left of several processes, not 2: episodes start anew" in output
     assert (run / f"model_{description['iteration'] + 1}.rank1.pt").is_file()
+
+
+def start_nodes(folder: Path, *command: str) -> list[subprocess.Popen[str]]:
+    """Two agents of torchrun with one process each, as on two machines that share a folder."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    meeting = ("--nnodes", "2", "--nproc-per-node", "1", "--rdzv-backend", "c10d", "--rdzv-id", "walk")
+    meeting += ("--rdzv-endpoint", f"127.0.0.1:{port}")
+    return [start(folder, *command, torchrun=meeting) for _ in range(2)]
+
+
+@pytest.mark.slow
+def test_gradients_are_averaged_over_two_nodes(tmp_path):
+    (tmp_path / "learn.py").write_text(SCRIPT)
+    for node in start_nodes(tmp_path, "learn.py"):
+        output, _ = node.communicate(timeout=300)
+        assert node.returncode == 0, output
+
+
+@pytest.mark.slow
+def test_a_run_on_two_nodes_is_one_run_and_goes_on_without_one_of_them(tmp_path):
+    nodes = start_nodes(tmp_path, *TRAIN, "--iterations", "1000000")
+    deadline = time.monotonic() + 200.0
+    while not list(tmp_path.rglob("model_2.rank1.pt")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    (run,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    (second,) = [node for node in nodes if "1" in [rank(n) for n in children(node.pid)]]
+    for number in [second.pid, *children(second.pid)]:
+        os.kill(number, signal.SIGKILL)
+    (first,) = [node for node in nodes if node is not second]
+    output, _ = first.communicate(timeout=120)
+    second.wait()
+    description = json.loads((run / "run.json").read_text())
+    assert description["outcome"] in ("lost a process", "signal"), output
+    last = description["iteration"]
+    assert last >= 2 and (run / f"model_{last}.pt").is_file()
+    assert "--resume" in output
+    alone = [sys.executable, *TRAIN, "--resume", "latest", "--iterations", str(last + 1)]
+    done = subprocess.run(alone, cwd=tmp_path, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, timeout=300)
+    assert done.returncode == 0
+    assert (run / f"model_{last + 1}.pt").is_file()
 
 
 def children(parent: int) -> list[int]:

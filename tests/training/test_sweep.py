@@ -133,6 +133,18 @@ def test_a_training_begins_or_goes_on(tmp_path):
     assert run.policy(SWEEP).name == "model_5.pt" and run.policy(BEST).name == "best.pt"
 
 
+def test_a_gauging_is_played_where_it_is_told(tmp_path):
+    run = scripted(tmp_path, "entry")
+    results = run.folder / "gauge" / "model_3"
+    (run.folder / "logs" / "x" / "2026").mkdir(parents=True)
+    (run.folder / "logs" / "x" / "2026" / "model_3.pt").touch()
+    command = SweepRun.gauging_command(run, SWEEP, where=["--cluster", "auto", "--threads", "4"])
+    assert command[3:] == [
+        *("evaluate", str(run.policy(SWEEP)), "--suite", SWEEP.suite, "--cluster", "auto", "--threads", "4"),
+        *("--out", str(results), "--json"),
+    ]
+
+
 class Scripted(SweepRun):
     """A run whose training and gauging are small programs."""
 
@@ -151,7 +163,7 @@ run.mkdir(parents=True)
 """
         return [sys.executable, "-S", "-c", program]
 
-    def gauging_command(self, sweep, *, threads):
+    def gauging_command(self, sweep, *, where):
         target = self.results(sweep)
         program = (
             f"import pathlib; p = pathlib.Path({str(target)!r}); p.mkdir(parents=True); (p / 'results.json').touch()"

@@ -65,6 +65,7 @@ class Jobs:
         deadline: float | None,
         say: Callable[[str], None],
         gpus: Sequence[str] | None = None,
+        gauging: Sequence[str] | None = None,
     ) -> None:
         """Prepare.
 
@@ -74,8 +75,10 @@ class Jobs:
             deadline: value of ``time.monotonic()`` at which to stop, None for no limit.
             say: called with a sentence now and then.
             gpus: as ``visible_gpus``, which is the default.
+            gauging: options of ``evaluate`` on who plays a gauging; None for the threads.
         """
-        self._sweep, self._threads, self._deadline, self._say = sweep, threads, deadline, say
+        self._sweep, self._deadline, self._say = sweep, deadline, say
+        self._gauging = ("--threads", str(threads)) if gauging is None else gauging
         gpus = visible_gpus() if gpus is None else gpus
         self._places = {f"GPU {gpu}": {"CUDA_VISIBLE_DEVICES": gpu, "OMP_NUM_THREADS": "1"} for gpu in gpus}
         self._score_threads = max(threads // max(len(gpus), 1), 1)
@@ -128,7 +131,7 @@ class Jobs:
                 self._launch(run, command, free[0], run.log, f"{run.label} {how} on {free[0]}; its log is {run.log}")
         if self._to_gauge and "gauge" not in taken:
             run = self._to_gauge.popleft()
-            command = run.gauging_command(self._sweep, threads=self._threads)
+            command = run.gauging_command(self._sweep, where=self._gauging)
             self._launch(
                 run, command, "gauge", run.folder / "gauge.log", f"{run.label} is gauged on {self._sweep.suite}"
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,11 +96,11 @@ class SweepRun:
         options += ["--backend", self.backend, "--seed", str(self.seed), "--log-root", str(self.folder / "logs")]
         return [*_PROGRAM, "train", self.entry.task, *self.settings, *options]
 
-    def gauging_command(self, sweep: Sweep, *, threads: int) -> list[str]:
-        """Gauges its policy, or goes on with that."""
+    def gauging_command(self, sweep: Sweep, *, where: Sequence[str]) -> list[str]:
+        """Gauges its policy, or goes on with that; ``where`` are the options ``--threads`` and ``--cluster``."""
         policy, results = self.policy(sweep), self.results(sweep)
         assert policy is not None and results is not None
-        options = ["--suite", sweep.suite, "--threads", str(threads), "--out", str(results), "--json"]
+        options = ["--suite", sweep.suite, *where, "--out", str(results), "--json"]
         return [*_PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
 
     def claim(self) -> None:
