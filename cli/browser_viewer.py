@@ -59,27 +59,28 @@ class Panel:
         gui = server.gui
         self._server = server
         with gui.add_folder("ground"):
-            terrains = list(dict.fromkeys([*gauge_terrain_names(), chosen.terrain]))
-            self._terrain: Any = gui.add_dropdown("terrain", terrains, initial_value=chosen.terrain)
+            self._terrains = list(dict.fromkeys([*gauge_terrain_names(), chosen.terrain]))
+            self._terrain: Any = gui.add_dropdown("terrain", self._terrains, initial_value=chosen.terrain)
             middle = WorldMaker.default_level("stairs_fd") or LEVELS[0]
             self._level: Any = gui.add_slider(
                 "level", min=LEVELS[0], max=LEVELS[-1], step=1, initial_value=chosen.level or middle
             )
             least, most = _FRICTIONS
             friction = sessions[0].friction
+            self._frictions = min(least, friction), max(most, friction)
             self._friction: Any = gui.add_slider(
-                "friction", min=min(least, friction), max=max(most, friction), step=0.05, initial_value=friction
+                "friction", min=self._frictions[0], max=self._frictions[1], step=0.05, initial_value=friction
             )
-        names = _policies(chosen.policies)
+        self._names = _policies(chosen.policies)
         self._policies: list[Any] = []
         self._readings: list[Any] = []
         for number, choice in enumerate(chosen.policies, 1):
             with gui.add_folder("policy" if len(chosen.policies) == 1 else f"policy {number}"):
-                self._policies.append(gui.add_dropdown("file", names, initial_value=choice))
+                self._policies.append(gui.add_dropdown("file", self._names, initial_value=choice))
                 self._readings.append(gui.add_markdown(""))
         with gui.add_folder("command"):
             self.auto: Any = gui.add_checkbox("find its own way", initial_value=command is None)
-            limits = _limits(sessions)
+            limits = self._reach = _limits(sessions)
             start = clip(command or (0.0, 0.0, 0.0), limits)
             self._sliders: list[Any] = [
                 gui.add_slider(name, min=-limit, max=limit, step=0.05, initial_value=value)
@@ -99,23 +100,26 @@ class Panel:
 
     @property
     def chosen(self) -> Choice:
-        """What is chosen now."""
-        terrain = self._terrain.value
+        """What is chosen now, of what was offered: whoever reaches the server can send anything, another file among others."""
+        terrain = _offered(self._terrain.value, self._terrains)
         self._level.disabled = terrain == "flat"
-        level = None if terrain == "flat" else int(self._level.value)
-        return Choice(terrain=terrain, level=level, policies=tuple(p.value for p in self._policies))
+        level = None if terrain == "flat" else int(_within(self._level.value, LEVELS[0], LEVELS[-1]))
+        policies = tuple(_offered(menu.value, self._names) for menu in self._policies)
+        return Choice(terrain=terrain, level=level, policies=policies)
 
     @property
     def friction(self) -> float:
         """Of the ground."""
-        return float(self._friction.value)
+        return _within(self._friction.value, *self._frictions)
 
     @property
     def command(self) -> Command | None:
         """What the sliders say, None for the robot's own way."""
         if self.auto.value:
             return None
-        forward, lateral, yaw = (float(slider.value) for slider in self._sliders)
+        forward, lateral, yaw = (
+            _within(slider.value, -limit, limit) for slider, limit in zip(self._sliders, self._reach, strict=True)
+        )
         return forward, lateral, yaw
 
     def tell(self, sessions: Sequence[PlaySession]) -> None:
@@ -127,7 +131,8 @@ class Panel:
 
     def refit(self, sessions: Sequence[PlaySession]) -> None:
         """Let the sliders end where the policies do."""
-        for slider, limit in zip(self._sliders, _limits(sessions), strict=True):
+        self._reach = _limits(sessions)
+        for slider, limit in zip(self._sliders, self._reach, strict=True):
             slider.value = max(-limit, min(limit, slider.value))
             slider.min, slider.max = -limit, limit
 
@@ -140,6 +145,17 @@ class Panel:
             self._level.value = chosen.level
         for menu, policy in zip(self._policies, chosen.policies, strict=True):
             menu.value = policy
+
+
+def _offered(value: object, options: Sequence[str]) -> str:
+    """A value of a menu, the first where it is none of it."""
+    return value if isinstance(value, str) and value in options else options[0]
+
+
+def _within(value: Any, low: float, high: float) -> float:
+    """A value of a slider within its ends; the lower end for what is no number."""
+    number = float(value)
+    return min(number, high) if number >= low else low
 
 
 def _limits(sessions: Sequence[PlaySession]) -> Command:

@@ -1,6 +1,7 @@
 """``gaitgauge play`` in a browser: shapes, who is let in, and what is chosen on the page."""
 
 import socket
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -11,6 +12,7 @@ from gaitgauge.cli.browser_viewer import Choice, Panel, serve
 from gaitgauge.cli.play_session import PlaySession
 from gaitgauge.cli.worlds import WorldMaker
 from gaitgauge.policy.base import PolicyError
+from gaitgauge.terrains.gauge_terrains import LEVELS
 from gaitgauge.terrains.registry import make_terrain
 
 MAKER = WorldMaker(backend="mujoco", device="cpu", seed=0, trust=False)
@@ -134,3 +136,20 @@ def test_missing_policy_is_no_choice(tmp_path, monkeypatch):
 
     monkeypatch.setattr(browser_viewer, "find_policy", find)
     assert browser_viewer._policies(["mine.pt", "pretrained"]) == ["mine.pt", "pretrained"]
+
+
+def test_a_page_that_sends_what_was_not_offered_gets_what_was():
+    """Menus and sliders hold whatever a client sends: files of this machine, numbers that are none."""
+    panel = Panel.__new__(Panel)
+    panel._terrains, panel._names, panel._frictions = ["flat", "wave"], ["mine.pt"], (0.1, 1.5)
+    panel._reach = (1.0, 0.5, 2.0)
+    wave, anything = SimpleNamespace(value="wave"), SimpleNamespace(value="/etc/passwd")
+    panel._terrain, panel._policies = wave, [anything]
+    panel._level = SimpleNamespace(value=1e9, disabled=False)
+    assert panel.chosen == Choice(terrain="wave", level=LEVELS[-1], policies=("mine.pt",))
+    panel._terrain, panel._level.value = SimpleNamespace(value="../x"), float("nan")
+    assert panel.chosen == Choice(terrain="flat", level=None, policies=("mine.pt",))
+    panel._friction, panel.auto = SimpleNamespace(value=float("nan")), SimpleNamespace(value=False)
+    assert panel.friction == 0.1
+    panel._sliders = [SimpleNamespace(value=v) for v in (float("inf"), float("nan"), -0.5)]
+    assert panel.command == (1.0, -0.5, -0.5)
