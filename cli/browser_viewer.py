@@ -217,12 +217,10 @@ class Cameras:
         self._server, self._page = server, page
         self._aim_until: dict[int, float] = {}
         self._middle = page.middle
-        self.new_worlds()
 
     def new_worlds(self) -> None:
-        """Aim all of them again, and those that are still to come."""
+        """Aim all of them again."""
         self._aim_until.clear()
-        self._aim(self._server.initial_camera)
 
     def _aim(self, camera: Any) -> None:
         """Look at the robots, from as far as it takes to see all of them."""
@@ -240,6 +238,7 @@ class Cameras:
         """Take them along with the robots, where that is wanted."""
         middle, now = self._page.middle, time.monotonic()
         moved, self._middle = middle - self._middle, middle
+        self._aim(self._server.initial_camera)  # where browsers begin that come now, and where "reset view" leads
         for number, client in self._server.get_clients().items():
             # A browser that has just come overwrites what it is told with where it was made to look first.
             until = self._aim_until.setdefault(number, now + _AIMING)
