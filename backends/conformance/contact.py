@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...robots.body_plan import body_plan
 from ..base import TRAINING_PHYSICS, BackendError, PhysicsOptions
 from .bench import Bench, Worlds, expect, expect_close
 from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, level_stance
@@ -216,7 +217,10 @@ def hold_to_converged(bench: Bench, physics: PhysicsOptions) -> str:
     changes |= {"torque_limits": False, "torque_speed_limit": False}
     count, steps = 4, round(1.5 / physics.timestep)
     parameters, pose = bench.soft(), np.asarray(bench.robot.default_joint_position)
-    legs = np.repeat([1.0, -1.0, -1.0, 1.0], len(pose) // 4) * np.resize([0.1, -0.35, 0.5], len(pose))
+    plan, legs = body_plan(bench.robot), np.zeros(len(pose))
+    for joints, foot in zip(plan.legs, plan.foot_position, strict=True):
+        for joint in joints:  # legs that are diagonal to each other swing together
+            legs[joint] = np.sign(foot[0] * foot[1]) * {"hip": 0.1, "thigh": -0.35, "calf": 0.5}[plan.part(joint)]
     phase = 2.0 * np.pi * 2.5 * physics.timestep * np.arange(steps)[:, None] + 0.7 * np.arange(count)
     targets = pose + np.sin(phase)[..., None] * legs
     speed = np.c_[np.linspace(-1.0, 1.0, count), np.zeros((count, 2))]
