@@ -51,7 +51,7 @@ class DamageError(AssertionError):
 def start(policy: str, folder: Path, threads: int, *, resume: bool) -> subprocess.Popen[bytes]:
     """An evaluation in a session of its own."""
     command = [sys.executable, "-c", "from gaitgauge.cli.main import main; main()", "evaluate", policy]
-    command += ["--suite", "torture.toml", "--threads", str(threads), "--out", folder.name]
+    command += ["--suite", "torture.toml", "--no-clip", "--threads", str(threads), "--out", folder.name]
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
         run = subprocess.Popen(
             command + (["--resume"] if resume else []),
