@@ -37,7 +37,7 @@ def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -
     description = folder / ROBOT_FILE
     if description.exists() and not force:
         raise UserError(f"'{description}' already exists; give another folder (--out), or replace it with --force")
-    draft = draft_robot(model, name)
+    draft = draft_robot(model, name, folder=folder)
     own = folder / f"{model.stem}-named.xml"
     made = not folder.exists()
     try:

@@ -75,12 +75,13 @@ class Draft:
         return "\n".join(lines) + "\n"
 
 
-def draft_robot(model: Path, name: str | None = None) -> Draft:
+def draft_robot(model: Path, name: str | None = None, *, folder: Path | None = None) -> Draft:
     """Read a model, in a process of its own, and guess what it does not say.
 
     Args:
         model: MJCF of the robot alone.
         name: of the robot; None for the model's.
+        folder: where the description, and a model with names, are to lie; None for the model's folder.
 
     Raises:
         RobotError: MuJoCo cannot compile it, or it is no legged robot on a free base.
@@ -89,13 +90,13 @@ def draft_robot(model: Path, name: str | None = None) -> Draft:
         raise RobotError(f"there is no model '{one_line(model)}'; give the MJCF file of the robot")
     return build(
         Draft,
-        parse_json(run_apart(partial(_draft, model, name), model), "the draft", RobotError),
+        parse_json(run_apart(partial(_draft, model, name, folder or model.parent), model), "the draft", RobotError),
         "the draft",
         RobotError,
     )
 
 
-def _draft(path: Path, name: str | None) -> str:
+def _draft(path: Path, name: str | None, home: Path) -> str:
     spec, model = compiled(path)
     survey = Survey(path, spec, model)
     title = name or (spec.modelname if spec.modelname not in ("", "MuJoCo Model") else path.stem)
@@ -149,10 +150,11 @@ def _draft(path: Path, name: str | None) -> str:
         entries.append(Entry(key=f"parameters.gauge.{key}", value=value, remark=remark))
     text = ""
     if survey.renamed:
-        folder = path.parent.resolve()
         for kind in ("meshdir", "texturedir"):
-            setattr(spec, kind, os.path.join(folder, getattr(spec, kind)))
+            setattr(spec, kind, str(path.parent.resolve() / getattr(spec, kind)))
         text = spec.to_xml()
+        for assets in {spec.meshdir, spec.texturedir}:  # MuJoCo had to find them from here, and will have to from there
+            text = text.replace(f'dir="{assets}', f'dir="{os.path.relpath(assets, home.resolve())}')
     return json.dumps(asdict(Draft(name=entries[0].value, entries=tuple(entries), model=text)))
 
 

@@ -84,6 +84,21 @@ def test_shapes_without_names_are_given_some(run, model):
     assert all(f.passed for f in examine(robot) if f.needed_for == "everything")
 
 
+def test_a_model_with_names_finds_its_meshes(run, model):
+    """The copy lies in another folder than the meshes."""
+    meshes = model.parent / "meshes"
+    meshes.mkdir()
+    (meshes / "part.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    text = model.read_text().replace('angle="radian"', 'angle="radian" meshdir="meshes"').replace('name="shell" ', "")
+    asset = '<asset><mesh name="part" file="part.obj" scale="0.1 0.1 0.1"/></asset><worldbody>'
+    seen = '<freejoint/><geom type="mesh" mesh="part" contype="0" conaffinity="0" mass="0"/>'
+    model.write_text(text.replace("<worldbody>", asset).replace("<freejoint/>", seen))
+    made = run("robot", "new", model, "--out", "robots/mine")
+    assert made.exit_code == 0, made.stderr
+    assert 'meshdir="../../meshes' in Path("robots/mine/unseen-named.xml").read_text()
+    assert all(f.passed for f in examine(load_robot("robots/mine/robot.toml")) if f.needed_for == "everything")
+
+
 def test_a_keyframe_is_the_pose(run, model):
     angles = " ".join(f"0 {-leg[1] * leg[4] * 0.4:g} {leg[1] * leg[5] * 0.8:g}" for leg in LEGS)
     key = f'<keyframe><key name="home" qpos="0 0 0.5 1 0 0 0 {angles}"/></keyframe></mujoco>'
