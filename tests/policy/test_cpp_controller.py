@@ -1,0 +1,95 @@
+"""The C++ example reads what ``export --layout unitree`` writes and acts as the policy does."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import gaitgauge
+import onnxruntime
+import pytest
+from gaitgauge.policy.export import export_unitree
+from gaitgauge.policy.loading import load_policy
+from gaitgauge.robots import load_robot
+
+ROOT = Path(gaitgauge.__path__[0])
+EXAMPLE = ROOT / "examples" / "cpp_controller"
+HEADERS = [
+    Path(p)
+    for p in (
+        os.environ.get("ONNXRUNTIME_INCLUDE", ""),
+        "/usr/include/onnxruntime",
+        "/usr/local/include/onnxruntime",
+        "/usr/include/onnxruntime/core/session",
+    )
+    if p
+]
+
+pytestmark = pytest.mark.slow
+
+
+def run(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(w) for w in words], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def controller(tmp_path_factory) -> Path:
+    """The program, built against the library of the Python package."""
+    for program in ("cmake", "c++"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is not installed")
+    headers = next((p for p in HEADERS if (p / "onnxruntime_cxx_api.h").is_file()), None)
+    if headers is None:
+        pytest.skip("onnxruntime's C++ headers are not here: install libonnxruntime-dev, or set ONNXRUNTIME_INCLUDE")
+    (library,) = (Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*")
+    folder = tmp_path_factory.mktemp("cpp")
+    for name in ("libonnxruntime.so", "libonnxruntime.so.1"):
+        (folder / name).symlink_to(library)
+    settings = [f"-DONNXRUNTIME_INCLUDE={headers}", f"-DONNXRUNTIME_LIBRARY={folder / 'libonnxruntime.so'}"]
+    configured = run("cmake", "-S", EXAMPLE, "-B", folder / "build", *settings)
+    if "yaml-cpp" in configured.stderr:
+        pytest.skip("yaml-cpp is not installed: install libyaml-cpp-dev")
+    assert configured.returncode == 0, configured.stderr
+    built = run("cmake", "--build", folder / "build")
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert "warning:" not in built.stdout + built.stderr
+    return folder / "build" / "controller"
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("bundle")
+    export_unitree(load_policy("pretrained"), folder, load_robot("go2"))
+    recorded = run(sys.executable, EXAMPLE / "record.py", "pretrained", folder, folder / "states.csv")
+    assert recorded.returncode == 0, recorded.stderr
+    return folder
+
+
+def test_it_acts_as_the_policy_does_over_200_steps(controller, bundle):
+    done = run(controller, bundle, bundle / "states.csv")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.startswith("200 steps")
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [("scale: [0.25, 0.25, 0.25]", "scale: [0.2, 0.25, 0.25]"), ("joint_ids_map: [3, 4,", "joint_ids_map: [4, 3,")],
+)
+def test_it_notices_other_settings(controller, bundle, tmp_path, right, wrong):
+    shutil.copytree(bundle, tmp_path / "other")
+    deploy = tmp_path / "other" / "params" / "deploy.yaml"
+    text = deploy.read_text()
+    assert right in text
+    deploy.write_text(text.replace(right, wrong))
+    done = run(controller, tmp_path / "other", bundle / "states.csv")
+    assert done.returncode == 1
+    assert "NOT the same" in done.stdout
+
+
+def test_it_says_what_is_missing(controller, tmp_path):
+    done = run(controller, tmp_path, tmp_path / "states.csv")
+    assert done.returncode == 2
+    assert done.stderr.startswith("controller: ")
