@@ -157,7 +157,7 @@ class Survey:
         swinging = self._swinging(leg)
         if len(swinging) < 2:
             return {}
-        hip, knee = swinging[0], swinging[-1]
+        hip, knee = swinging[:2]
 
         grid = np.linspace(*self._bounds(knee), 181)
         across = self.data.xaxis[hip].copy()
