@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
+import os
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from gaitgauge.files.provenance import processor
 from gaitgauge.gauge.evaluate import Request, evaluate
 
 _STORE = 100 * 2**20
@@ -89,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     if options.out:
         table = [{k: v for k, v in row.items() if k != "outcome"} for row in found]
-        machine = {"processor": platform.processor(), "host": platform.node()}
+        machine = {"processor": processor(), "cpus": os.cpu_count()}
         options.out.write_text(json.dumps({"machine": machine, "rows": table}, indent=1) + "\n", encoding="utf-8")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import sys
@@ -59,8 +60,8 @@ def run_evaluation(
     folder = out or Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
     console = Terminal(stderr=True)
     try:
-        # Ray prints what it has to say of nodes to standard output
-        with redirect_stdout(sys.stderr), ProgressDisplay(console, "gauging") as display:
+        # Ray prints its nodes' logs to standard output; that a worker was lost is one of the notices
+        with redirect_stdout(io.StringIO() if cluster else sys.stdout), ProgressDisplay(console, "gauging") as display:
             results = evaluate(
                 prepared, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=shower(display)
             )

@@ -13,7 +13,6 @@ from __future__ import annotations
 import gc
 import importlib
 import logging
-import os
 import pickle
 import re
 import socket
@@ -102,7 +101,6 @@ class Cluster:
         """
         check_address(address)
         self._ray = _ray()
-        os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # what it says of lost nodes is said here
         try:
             if address != "auto":
                 _knock(address)  # Ray itself would try for a minute
@@ -288,6 +286,9 @@ class ClusterWorkers:
                 f"a worker on the Ray cluster died {seat.losses + 1} times in a row ({_first_sentence(error)}); {_KEPT}, with "
                 "fewer --threads if memory ran out"
             )
+        logging.getLogger(__name__).warning(
+            "a worker on the Ray cluster was lost (%s); what it had is played again", _first_sentence(error)
+        )
         self._start(number, losses=seat.losses + 1)
 
     def _look_at_nodes(self) -> None:

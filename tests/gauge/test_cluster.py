@@ -1,24 +1,32 @@
 """Workers on a Ray cluster: what is refused, what travels to a node, and that neither nodes nor their deaths show in results."""
 
 import importlib.util
+import itertools
 import json
 import pickle
 import shutil
 import socket
 import sys
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge import cluster
 from gaitgauge.gauge.cluster import Arrived, Cluster, ClusterError, NodeWorker, check_address, fingerprint
+from gaitgauge.gauge.dispatcher import Speculation, play
 from gaitgauge.gauge.evaluate import Request, evaluate, prepare
-from gaitgauge.gauge.workers import Failed, Finished, Job, Play, Progress, Stop, Worker
+from gaitgauge.gauge.plan import plan_list
+from gaitgauge.gauge.workers import Failed, Finished, InProcess, Job, Play, Progress, Stop, Worker
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import PRETRAINED, load_policy
+from gaitgauge.policy.native import NativePolicy, StoredNetwork
+from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import load_robot
 from gaitgauge.robots.identity import packed
-from scripted_gauge import GO2, MAXIMUM, episode, short_suite
+from scripted_gauge import GO2, MAXIMUM, Puppet, episode, short_suite
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
 
@@ -173,6 +181,148 @@ def test_the_class_of_the_actors_travels_without_this_module(monkeypatch):
     )
     monkeypatch.setitem(sys.modules, "gaitgauge.gauge.cluster", None)
     assert node.exchange([]).startswith("node n of the Ray cluster lacks this gaitgauge (")
+
+
+# ---- workers come and go, without Ray ---------------------------------------------------------------------------------
+
+
+class RayError(Exception):
+    pass
+
+
+class FakeRay:
+    """Actors in this process. ``fate`` says of an actor's number and call what comes of it: ``""``, ``dies`` or ``waits``."""
+
+    exceptions = SimpleNamespace(RayError=RayError, RayTaskError=type("RayTaskError", (RayError,), {}))
+    util = SimpleNamespace(get_node_ip_address=lambda: "10.0.0.7")
+
+    def __init__(self, fate):
+        self.fate, self.made, self.killed = fate, 0, 0
+
+    def remote(self, **options):
+        assert options == {"num_cpus": 1, "max_restarts": 0}
+        return lambda kind: SimpleNamespace(remote=lambda *arguments: self._actor(kind(*arguments)))
+
+    def _actor(self, real):
+        number, calls = self.made, itertools.count()
+        self.made += 1
+        return SimpleNamespace(
+            exchange=SimpleNamespace(remote=lambda messages: (number, next(calls), lambda: real.exchange(messages)))
+        )
+
+    def put(self, value):
+        return value
+
+    def wait(self, refs, *, num_returns=1, timeout):
+        assert refs
+        ready = [ref for ref in refs if self.fate(*ref[:2]) != "waits"]
+        return ready[:num_returns], []
+
+    def get(self, ref):
+        if self.fate(*ref[:2]) == "dies":
+            raise RayError("The actor died. And more.")
+        return ref[2]()
+
+    def kill(self, actor):
+        self.killed += 1
+
+    def nodes(self):
+        return [{"Alive": True, "Resources": {"CPU": 2.0}}, {"Alive": False, "Resources": {"CPU": 8.0}}]
+
+
+def _puppets(scene, *, threads):
+    return Puppet(scene)
+
+
+@pytest.fixture(scope="module")
+def puppet_job() -> Job:
+    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
+    network = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=MlpNetwork(**arguments).state_dict())
+    policy = NativePolicy(standard_contract(GO2), network, path="small")
+    return Job(
+        suite=short_suite("gaitgauge-1"), policy=policy, robot=GO2, places=(("flat", 0),), worlds=8, build=_puppets
+    )
+
+
+@pytest.fixture
+def fake(monkeypatch, puppet_job):
+    """Starts workers on actors of a given fate."""
+    monkeypatch.setattr(cluster, "_knock", lambda address: None)
+    monkeypatch.setattr(cluster, "_ARRIVING", 0.0)
+
+    def start(fate, count=2):
+        ray = FakeRay(fate)
+        monkeypatch.setitem(sys.modules, "ray", ray)
+        return cluster.ClusterWorkers(ray, "10.0.0.1:6379", puppet_job, count)
+
+    return start
+
+
+WALKS = [episode(MAXIMUM, seed=seed) for seed in range(4)]
+
+
+def played(workers) -> dict:
+    records: dict = {}
+    play([partial(plan_list, WALKS)], records, lambda record: None, workers, speculation=Speculation())
+    workers.close()
+    return {e: (r.summary(), r.samples.tobytes()) for e, r in records.items()}
+
+
+@pytest.fixture(scope="module")
+def expected(puppet_job) -> dict:
+    return played(InProcess(puppet_job))
+
+
+def _lives(actor, call):
+    return ""
+
+
+FATES = {
+    "the first dies at work": lambda actor, call: "dies" if (actor, call) == (0, 2) else "",
+    "the second never comes": lambda actor, call: "waits" if actor == 1 else "",
+    "the first dies and nobody takes its place": lambda actor, call: (
+        "dies" if (actor, call) == (0, 1) else "waits" if actor == 2 else ""
+    ),
+    "both die now and then": lambda actor, call: "dies" if call == 2 + actor and actor < 5 else "",
+}
+
+
+@pytest.mark.parametrize("fate", FATES)
+def test_nothing_is_lost_and_nothing_differs(fake, expected, fate, caplog):
+    workers = fake(FATES[fate])
+    assert played(workers) == expected
+    assert caplog.text.count("was lost (The actor died); what it had is played again") == workers._ray.made - 2
+    assert (workers._ray.made > 2) == ("die" in fate)
+
+
+def test_a_worker_that_dies_again_and_again_ends_the_run(fake):
+    with pytest.raises(
+        ClusterError, match=r"died 4 times in a row \(The actor died\); what had finished is kept: .*--threads"
+    ):
+        fake(lambda actor, call: "dies", count=1)
+
+
+def test_a_head_node_out_of_reach_ends_the_run(fake, monkeypatch):
+    monkeypatch.setattr(cluster, "_LISTENING", 0.0)
+    monkeypatch.setattr(cluster, "_HEADLESS", 0.0)
+    workers = fake(_lives)
+
+    def nobody(address):
+        raise ConnectionRefusedError(address)
+
+    monkeypatch.setattr(cluster, "_knock", nobody)
+    with pytest.raises(ClusterError, match=r"head node of the Ray cluster \(10.0.0.1:6379\) has been out of reach for"):
+        played(workers)
+    workers.close()
+
+
+def test_different_processors_are_said_once(fake, monkeypatch, caplog):
+    kinds = itertools.cycle(["A", "B", "C"])
+    monkeypatch.setattr(cluster, "processor", lambda: next(kinds))
+    monkeypatch.setattr(cluster, "_ARRIVING", 60.0)
+    workers = fake(_lives, count=3)
+    assert workers.processors == {"A", "B", "C"}
+    assert caplog.text.count("different processors (A, B)") == 1
 
 
 # ---- clusters of this machine -----------------------------------------------------------------------------------------
