@@ -165,10 +165,7 @@ def unpacked(known: RobotIdentity, folder: Path, *, largest: int = _LARGEST_UNPA
             raise
         raise RobotError(f"{source} cannot be unpacked: {one_line(error)}") from error
     mjcf = folder / str(known.description.get("mjcf"))
-    own = mjcf.resolve().is_relative_to(folder)
-    stray = [path for path in (model_files(mjcf) if own else [mjcf]) if not path.resolve().is_relative_to(folder)]
-    if stray:
-        raise RobotError(f"{source} names the file '{one_line(stray[0])}', which is none of its own")
+    model_files(mjcf, within=folder)  # refused before any other file is read
     robot = build(Robot, {**known.description, "mjcf": str(mjcf)}, source, RobotError)
     if robot_digest(robot) != known.digest:
         raise RobotError(f"{source} is damaged: its digest is not the one that the policy remembers; give --robot")

@@ -93,25 +93,34 @@ def robot_digest(robot: Robot) -> str:
         raise RobotError(f"'{one_line(error.filename)}' cannot be read: {error.strerror}") from error
 
 
-def model_files(mjcf: Path) -> list[Path]:
+def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
     """A MuJoCo model's file and those that it names: included models, meshes, textures, height fields, skins.
 
     A name that leads nowhere is left out; MuJoCo refuses such a model.
 
+    Args:
+        mjcf: the model's file.
+        within: folder in which all must lie, links followed; None for anywhere.
+
     Raises:
-        RobotError: a file cannot be read, is not XML or defines entities, or all of them are too many or too large.
+        RobotError: a file cannot be read, is a pipe or a device, lies elsewhere, is not XML or defines entities, or all of them
+            are too many or too large.
     """
     try:
-        return _model_files(mjcf)
+        return _model_files(mjcf, within)
     except OSError as error:
         raise RobotError(f"'{one_line(error.filename)}' cannot be read: {error.strerror}") from error
 
 
-def _model_files(mjcf: Path) -> list[Path]:
+def _model_files(mjcf: Path, within: Path | None) -> list[Path]:
     found, described, size = {mjcf: None}, {mjcf}, 0
     pending = [mjcf]
     while pending:
         file = pending.pop(0)
+        if within is not None and not file.resolve().is_relative_to(within):
+            raise RobotError(f"the model names the file '{one_line(file)}', which is none of its own")
+        if not os.path.isfile(file) and os.path.exists(file):  # MuJoCo would wait for it, or read it without end
+            raise RobotError(f"'{one_line(file)}' is not a regular file")
         size += file.stat().st_size
         if size > LARGEST_MODEL or len(found) > MOST_FILES:
             raise RobotError(
@@ -132,7 +141,7 @@ def _model_files(mjcf: Path) -> list[Path]:
         for tag, attributes in elements:
             names = [value for key, value in attributes.items() if key.startswith("file")]
             for path in (folder / name for name in names for folder in folders):
-                if path not in found and os.path.isfile(path):
+                if path not in found and os.path.exists(path) and not os.path.isdir(path):
                     found[path] = None
                     pending.append(path)
                     if tag in ("include", "model"):  # MuJoCo reads these as XML, whatever their ending

@@ -57,7 +57,7 @@ LAUGHS = '<!ENTITY a0 "ha">' + "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' 
         (above('<asset><hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/></asset>'), "go2.xml"),
         (above('<asset><texture type="2d" name="t" builtin="flat" width="60000" height="60000"/></asset>'), "allocate"),
         (above('<asset><mesh name="m" builtin="plate" params="20000 20000"/></asset>'), "go2.xml"),
-        (above('<asset><mesh name="m" file="/dev/zero"/></asset>'), "go2.xml"),
+        (above('<asset><mesh name="m" file="/dev/zero"/></asset>'), "'/dev/zero' is not a regular file"),
         (on_base(f'<replicate count="2500">{GEOM}</replicate>'), "geoms; at most 2,000 are simulated"),
         ("<mujoco>" + "<body>" * 100_000 + "</body>" * 100_000 + "</mujoco>", "go2.xml"),
         (TEXT + f"<!--{'x' * 4_000_000}-->", "larger than 4 MB"),
@@ -93,6 +93,12 @@ def test_a_model_that_brings_mujoco_down(stranger, monkeypatch, end):
     monkeypatch.setattr(checking, "_inspect", inspect)
     named = {"crash": "SIGSEGV", "exit": "was not compiled", "bug": "cannot be checked: KeyError"}
     refused(stranger(above("<!-- falling -->")), named[end])
+
+
+def test_a_pipe_is_not_waited_for(stranger):
+    folder = stranger(above('<include file="parts.xml"/>'))
+    os.mkfifo(folder / "parts.xml")
+    refused(folder, r"parts\.xml' is not a regular file")
 
 
 def test_a_file_of_any_size_is_not_read(stranger):

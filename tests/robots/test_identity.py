@@ -57,6 +57,7 @@ def test_a_robot_of_many_files_is_carried_whole(unseen, tmp_path):
 
 
 BOMB = base64.b64encode(zlib.compress(bytes(20_000_000))).decode()
+READING = base64.b64encode(zlib.compress(b"<mujoco><include file='/etc/passwd'/></mujoco>")).decode()
 LAUGHS = base64.b64encode(zlib.compress(b"<!DOCTYPE m [<!ENTITY a 'ha'>]><mujoco model='&a;'/>")).decode()
 
 
@@ -68,6 +69,7 @@ LAUGHS = base64.b64encode(zlib.compress(b"<!DOCTYPE m [<!ENTITY a 'ha'>]><mujoco
         (lambda e: e | {"files": dict.fromkeys("abc", BOMB)}, "unpacks to more than 50 MB"),
         (lambda e: e | {"files": {"a\0b": "", **e["files"]}}, "without control characters"),
         (lambda e: e | {"files": {"unseen.xml": LAUGHS}}, "defines XML entities"),
+        (lambda e: e | {"files": {"unseen.xml": READING}}, "names the file '/etc/passwd', which is none of its own"),
         (lambda e: e | {"description": e["description"] | {"mjcf": "none.xml"}}, "none.xml' cannot be read"),
         (lambda e: e | {"digest": "0" * 64}, "is damaged: its digest"),
         (lambda e: e | {"digest": "short"}, "the robot that the policy remembers.*digest"),
