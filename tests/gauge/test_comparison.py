@@ -4,6 +4,7 @@ import csv
 import io
 import json
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 from gaitgauge.gauge.comparison import ComparisonError, compare, holm, load_result
 from gaitgauge.gauge.comparison_report import as_csv, as_latex, as_page, write_comparison
 from test_report import sample
+
+SCORE_CARDS = Path(__file__).parents[2] / "docs" / "data" / "scorecards"
 
 
 def results(*, change=0.0, path="a/first.pt", **choices):
@@ -260,3 +263,9 @@ def test_csv_of_one_seed_has_empty_ends():
     row = next(csv.DictReader(io.StringIO(as_csv(found))))
     assert (row["low"], row["high"], row["real"]) == ("", "", "False")
     assert replace(found.differences[0], corrected=0.01).real
+
+
+@pytest.mark.parametrize("card", sorted(SCORE_CARDS.glob("*.json")), ids=lambda card: card.stem)
+def test_score_cards_that_ship_can_be_compared(card):
+    result = load_result(card)
+    assert compare([result, result], ["one", "other"]).differences[0].difference == 0.0
