@@ -52,6 +52,19 @@ def test_fallen_robot_is_shown_and_starts_again(session):
     assert abs(played.position()[0]) < 0.2
 
 
+def test_a_robot_that_falls_at_once_is_named_with_what_tries_why(session, caplog):
+    played = session()
+    side = torch.tensor([[math.cos(math.pi / 4), math.sin(math.pi / 4), 0.0, 0.0]], dtype=torch.float64)
+    place = torch.tensor([[1.0, 0.0, 0.2]], dtype=torch.float64)
+    for _ in range(2):
+        played.backend.reset(ResetState(base_position=place, base_quaternion=side))
+        for _ in range(60):
+            played.step((0.0, 0.0, 0.0))
+    said = [m for m in caplog.messages if "falls at once" in m]
+    assert len(said) == 1
+    assert "gaitgauge doctor" in said[0]
+
+
 def test_robot_at_the_target_starts_again(session):
     played = session("stairs_fd", 3)
     x, y, z = played.terrain.target

@@ -163,6 +163,21 @@ def test_bare_checkpoints(tmp_path, observations, prefix, key):
     assert policy.contract.provenance["adapter"] == "rsl_rl checkpoint"
 
 
+def test_a_contract_file_says_how_a_bare_checkpoint_is_run(tmp_path, cts_file):
+    layers = nn.Sequential(nn.Linear(45, 8), nn.ELU(), nn.Linear(8, 12))
+    path = checkpoint(tmp_path / "model_5.pt", layers, "mlp.", "actor_state_dict")
+    described = tmp_path / "contract.toml"
+    described.write_text("control_period = 0.01")
+    contract = load_policy(path, contract_file=described).contract
+    assert contract.control_period == 0.01
+    assert "assumed" not in contract.provenance
+    described.write_text("history = { length = 5 }")
+    with pytest.raises(PolicyError, match="model_5"):
+        load_policy(path, contract_file=described)
+    with pytest.raises(PolicyError, match="has its contract inside; leave out --contract"):
+        load_policy(cts_file, contract_file=described)
+
+
 def test_bare_checkpoint_with_normalization_and_activation(tmp_path, observations):
     layers = multilayer_perceptron((45, 16, 12), activation="tanh")
     normalizer = {
