@@ -141,7 +141,7 @@ def test_a_gauging_is_played_where_it_is_told(tmp_path):
     command = SweepRun.gauging_command(run, SWEEP, where=["--cluster", "auto", "--threads", "4"])
     assert command[3:] == [
         *("evaluate", str(run.policy(SWEEP)), "--suite", SWEEP.suite, "--cluster", "auto", "--threads", "4"),
-        *("--out", str(results), "--json"),
+        *("--out", str(results), "--json", "--no-clip"),
     ]
 
 

@@ -100,7 +100,7 @@ class SweepRun:
         """Gauges its policy, or goes on with that; ``where`` are the options ``--threads`` and ``--cluster``."""
         policy, results = self.policy(sweep), self.results(sweep)
         assert policy is not None and results is not None
-        options = ["--suite", sweep.suite, *where, "--out", str(results), "--json"]
+        options = ["--suite", sweep.suite, *where, "--out", str(results), "--json", "--no-clip"]
         return [*_PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
 
     def claim(self) -> None:
