@@ -31,6 +31,8 @@ _GOOD = 0.88
 """Score from which no further mistake is looked for."""
 _MOST = 3
 """Mistakes at once that are looked for."""
+_TOGETHER = 64
+"""Contracts that are played at once; each world asks for some 14 MB, of which it uses little."""
 _BEGUN = 4
 """Kinds of mistakes from which a next one is looked for."""
 _SHARES = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.5))
@@ -157,12 +159,13 @@ def diagnose(
         own = [Alternative(kind="", text="as described", contract=c) for c in contracts]
         chosen = [[one, *alternatives(one.contract, robot)] for one in own]
         flat = [each for group in chosen for each in group]
-        count = len(flat) * len(_SHARES)
-        with (
-            closing(_worlds(robot, policy.contract, count, backend, device, threads)) as physics,
-            torch.inference_mode(),
-        ):
-            outcomes = iter(_play(policy, flat, physics, steps))
+        played: list[Outcome] = []
+        for begin in range(0, len(flat), _TOGETHER):
+            part = flat[begin : begin + _TOGETHER]
+            worlds = _worlds(robot, policy.contract, len(part) * len(_SHARES), backend, device, threads)
+            with closing(worlds) as physics, torch.inference_mode():
+                played += _play(policy, part, physics, steps)
+        outcomes = iter(played)
         return [[next(outcomes) for _ in group] for group in chosen]
 
     ((described, *others),) = tried([policy.contract])
