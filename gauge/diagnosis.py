@@ -154,18 +154,17 @@ def diagnose(
     check_robot(policy.contract, robot)
     steps = round(seconds / policy.contract.control_period)
 
+    def played(chosen: Sequence[Alternative]) -> list[Outcome]:
+        worlds = _worlds(robot, policy.contract, len(chosen) * len(_SHARES), backend, device, threads)
+        with closing(worlds) as physics, torch.inference_mode():
+            return _play(policy, chosen, physics, steps)
+
     def tried(contracts: Sequence[PolicyContract]) -> list[list[Outcome]]:
         """Outcomes of each contract and its alternatives, itself first."""
         own = [Alternative(kind="", text="as described", contract=c) for c in contracts]
         chosen = [[one, *alternatives(one.contract, robot)] for one in own]
         flat = [each for group in chosen for each in group]
-        played: list[Outcome] = []
-        for begin in range(0, len(flat), _TOGETHER):
-            part = flat[begin : begin + _TOGETHER]
-            worlds = _worlds(robot, policy.contract, len(part) * len(_SHARES), backend, device, threads)
-            with closing(worlds) as physics, torch.inference_mode():
-                played += _play(policy, part, physics, steps)
-        outcomes = iter(played)
+        outcomes = iter([o for i in range(0, len(flat), _TOGETHER) for o in played(flat[i : i + _TOGETHER])])
         return [[next(outcomes) for _ in group] for group in chosen]
 
     ((described, *others),) = tried([policy.contract])
