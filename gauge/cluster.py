@@ -54,6 +54,10 @@ _HEADLESS = 30.0
 """Longest time for which the head node may be out of reach [s]; after 60 s Ray ends this process without a word."""
 _MOST_LOSSES = 3
 """How often in a row a worker is replaced that never finished an episode: then it is not the nodes' fault."""
+_MOST_STARTS = 60
+"""How often in a row a worker may die before its first answer: Ray starts some on a dead node until it knows."""
+_PAUSE = 2.0
+"""Time from such a death to the next start [s]."""
 _KEPT = "what had finished is kept: go on with --resume"
 
 Message = Finished | Progress | Failed
@@ -141,7 +145,10 @@ class Cluster:
 class _Seat:
     """One worker, seen from here."""
 
-    actor: Any
+    actor: Any = None
+    """None before it is started."""
+    begin: float = 0.0
+    """Value of ``time.monotonic()`` from which it is started."""
     call: Any = None
     """The call that it is at; None while it has nothing to do."""
     outbox: list[Play | Drop | Stop] = field(default_factory=list)
@@ -150,6 +157,8 @@ class _Seat:
     """Whether it has answered yet."""
     losses: int = 0
     """Workers before it in this seat that were lost since one last finished an episode."""
+    failures: int = 0
+    """Workers before it in this seat that died before their first answer, since one last gave any."""
 
 
 class ClusterWorkers:
@@ -175,10 +184,8 @@ class ClusterWorkers:
         self._next_look = self._reached = time.monotonic()
         self._make = ray.remote(num_cpus=1, max_restarts=0)(_actor_class())
         self._shipment = ray.put(pickle.dumps((job, packed(job.robot))))
-        self._seats = [_Seat(actor=None) for _ in range(count)]
+        self._seats = [_Seat() for _ in range(count)]
         self._heard: list[tuple[int, Message | Lost]] = []
-        for number in range(count):
-            self._start(number, losses=0)
         until = time.monotonic() + _ARRIVING
         while not all(s.there for s in self._seats) and (time.monotonic() < until or not self._anyone):
             self._listen()
@@ -209,13 +216,14 @@ class ClusterWorkers:
     def close(self) -> None:
         """See ``Transport.close``."""
         for seat in self._seats:
-            self._ray.kill(seat.actor)
+            if seat.actor is not None:
+                self._ray.kill(seat.actor)
 
     # ---- workers come and go --------------------------------------------------------------------------------------
 
-    def _start(self, number: int, *, losses: int) -> None:
+    def _start(self, seat: _Seat) -> None:
         """Have Ray start a worker wherever a CPU is free, as soon as one is."""
-        seat = self._seats[number] = _Seat(actor=self._make.remote(fingerprint(), self._shipment), losses=losses)
+        seat.actor = self._make.remote(fingerprint(), self._shipment)
         self._call(seat)
 
     def _call(self, seat: _Seat) -> None:
@@ -228,10 +236,16 @@ class ClusterWorkers:
         if time.monotonic() >= self._next_look:
             self._look_at_nodes()
             self._next_look = time.monotonic() + _LISTENING
-        if all(seat.call is None for seat in self._seats):
-            for seat in self._seats:
-                self._call(seat)
+        for seat in self._seats:
+            if seat.actor is None and time.monotonic() >= seat.begin:
+                self._start(seat)
         ray, calls = self._ray, {seat.call: n for n, seat in enumerate(self._seats) if seat.call is not None}
+        if not calls:
+            idle = [seat for seat in self._seats if seat.there]
+            for seat in idle:
+                self._call(seat)
+            time.sleep(0.0 if idle else _PAUSE / 10)
+            return
         done, _ = ray.wait(list(calls), timeout=_LISTENING)
         if done:
             done, _ = ray.wait(list(calls), num_returns=len(calls), timeout=0)
@@ -261,7 +275,7 @@ class ClusterWorkers:
             idle = isinstance(message, Failed) or (
                 isinstance(message, Progress) and (message.stopped or message.room == self.worlds)
             )
-        seat.there = True
+        seat.there, seat.failures = True, 0
         if seat.outbox or not idle:
             self._call(seat)
 
@@ -277,19 +291,23 @@ class ClusterWorkers:
 
     def _replace(self, number: int, error: Exception) -> None:
         """A worker is gone."""
-        seat = self._seats[number]
+        seat, reason = self._seats[number], _first_sentence(error)
+        self._ray.kill(seat.actor)  # it may only have been out of reach
         if seat.there:
             self._heard.append((number, Lost()))
-        self._ray.kill(seat.actor)  # it may only have been out of reach
-        if seat.losses + 1 > _MOST_LOSSES:
+            seat.losses += 1
+            logging.getLogger(__name__).warning(
+                "a worker on the Ray cluster was lost (%s); what it had is played again", reason
+            )
+        else:
+            seat.failures += 1
+        if seat.losses > _MOST_LOSSES or seat.failures > _MOST_STARTS:
             raise ClusterError(
-                f"a worker on the Ray cluster died {seat.losses + 1} times in a row ({_first_sentence(error)}); {_KEPT}, with "
+                f"a worker on the Ray cluster died {max(seat.losses, seat.failures)} times in a row ({reason}); {_KEPT}, with "
                 "fewer --threads if memory ran out"
             )
-        logging.getLogger(__name__).warning(
-            "a worker on the Ray cluster was lost (%s); what it had is played again", _first_sentence(error)
-        )
-        self._start(number, losses=seat.losses + 1)
+        begin = time.monotonic() + (0.0 if seat.there else _PAUSE)
+        self._seats[number] = _Seat(begin=begin, losses=seat.losses, failures=seat.failures)
 
     def _look_at_nodes(self) -> None:
         """See whether anybody is there or can still come.
