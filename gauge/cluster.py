@@ -10,27 +10,19 @@ An actor does nothing between two calls. A call brings it messages and lets it p
 
 from __future__ import annotations
 
-import gc
 import importlib
 import logging
 import pickle
 import re
 import socket
-import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
-import torch
-
 from ..files.parsing import one_line, shown
-from ..files.provenance import plugins, processor, source_digest, versions
-from ..robots.identity import packed, unpacked
-from ..robots.loading import LARGEST_MODEL
+from ..robots.identity import packed
+from .cluster_node import Arrived, Message, fingerprint
 from .workers import (
-    PROGRESS_INTERVAL,
     Drop,
     Failed,
     Finished,
@@ -39,8 +31,6 @@ from .workers import (
     Play,
     Progress,
     Stop,
-    Worker,
-    portable,
 )
 
 _ADDRESS = re.compile(r"auto|(ray://)?(?P<host>[\w.-]+|\[[\da-fA-F:]+\]):(?P<port>\d{1,5})")
@@ -60,19 +50,9 @@ _PAUSE = 2.0
 """Time from such a death to the next start [s]."""
 _KEPT = "what had finished is kept: go on with --resume"
 
-Message = Finished | Progress | Failed
-
 
 class ClusterError(RuntimeError):
     """A cluster cannot be used, or not any more; the message says why and what to do."""
-
-
-@dataclass(frozen=True)
-class Arrived:
-    """A worker's first message."""
-
-    processor: str
-    """Its node's CPU."""
 
 
 def check_address(address: str) -> None:
@@ -87,11 +67,6 @@ def check_address(address: str) -> None:
             f"{shown(address)} is no address of a Ray cluster; give auto for the one of this machine, HOST:PORT (--cluster "
             "10.0.0.1:6379) or ray://HOST:PORT"
         )
-
-
-def fingerprint() -> dict[str, str]:
-    """What has to be the same on all nodes."""
-    return {**versions(), **plugins(), "source of gaitgauge": source_digest()}
 
 
 class Cluster:
@@ -353,75 +328,13 @@ def _actor_class() -> type:
 
                 node = ray.util.get_node_ip_address()
                 try:
-                    from gaitgauge.gauge.cluster import NodeWorker
+                    from gaitgauge.gauge.cluster_node import NodeWorker
                 except ImportError as error:
                     return f"node {node} of the Ray cluster lacks this gaitgauge ({error}); install it on all nodes"
                 self.worker = NodeWorker(node, self.wanted, self.shipment)
             return self.worker.exchange(messages)
 
     return GaitgaugeWorker
-
-
-class NodeWorker:
-    """A worker in an actor's process."""
-
-    def __init__(self, node: str, wanted: dict[str, str], shipment: bytes) -> None:
-        """Keep what is needed to begin.
-
-        Args:
-            node: the node's name, for messages.
-            wanted: ``fingerprint`` of the machine that asks.
-            shipment: what to play with.
-        """
-        self._node, self._wanted, self._shipment = node, wanted, shipment
-        self._worker: Worker | None = None
-
-    def exchange(self, messages: Sequence[Play | Drop | Stop]) -> bytes | str:
-        """Take messages, play until there is something to tell, and tell it (pickled), or why this node is refused."""
-        told: list[Any] = []
-        try:
-            if self._worker is None:
-                if reason := self._difference():
-                    return reason
-                self._worker = self._begin()
-                told.append(Arrived(processor()))
-            told += self._play(self._worker, messages)
-        except Exception as error:  # noqa: BLE001  (whatever it is, who asked has to hear of it)
-            told.append(Failed(portable(error)))
-        return pickle.dumps(told)
-
-    def _difference(self) -> str | None:
-        """What this node has not as it is wanted."""
-        mine = fingerprint()
-        for name in sorted(mine.keys() | self._wanted.keys()):
-            here, there = (found.get(name, "not there")[:40] for found in (mine, self._wanted))
-            if here != there:
-                return (
-                    f"node {self._node} of the Ray cluster has another {one_line(name, 80)} ({one_line(here)}) than this machine "
-                    f"({one_line(there)}), so that results would mix; install the same on all nodes"
-                )
-        return None
-
-    def _begin(self) -> Worker:
-        torch.set_num_threads(1)
-        job, robot = pickle.loads(self._shipment)
-        with tempfile.TemporaryDirectory(
-            prefix="gaitgauge-robot-"
-        ) as folder:  # its engine has read all when it is made
-            worker = Worker(replace(job, robot=unpacked(robot, Path(folder), largest=LARGEST_MODEL)))
-        gc.freeze()
-        return worker
-
-    def _play(self, worker: Worker, messages: Sequence[Play | Drop | Stop]) -> list[Message]:
-        """Play; told is a record at once, and so is room that was not there before."""
-        for message in messages:
-            worker.take(message)
-        rollout, until = worker.rollout, time.monotonic() + PROGRESS_INTERVAL
-        room = max(rollout.room, 0)
-        records: list[Message] = []
-        while not (records or worker.stopped or rollout.idle or rollout.room > room or time.monotonic() >= until):
-            records += [Finished(record) for record in rollout.advance()]
-        return [*records, worker.progress()]
 
 
 # ---- Ray --------------------------------------------------------------------------------------------------------------

@@ -14,8 +14,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 from gaitgauge.backends.registry import make_backend
-from gaitgauge.gauge import cluster
-from gaitgauge.gauge.cluster import Arrived, Cluster, ClusterError, NodeWorker, check_address, fingerprint
+from gaitgauge.gauge import cluster, cluster_node
+from gaitgauge.gauge.cluster import Cluster, ClusterError, check_address
+from gaitgauge.gauge.cluster_node import Arrived, NodeWorker, fingerprint
 from gaitgauge.gauge.dispatcher import Speculation, play
 from gaitgauge.gauge.evaluate import Request, evaluate, prepare
 from gaitgauge.gauge.plan import plan_list
@@ -179,7 +180,7 @@ def test_the_class_of_the_actors_travels_without_this_module(monkeypatch):
     monkeypatch.setitem(
         sys.modules, "ray", type("Ray", (), {"util": type("U", (), {"get_node_ip_address": lambda: "n"})})
     )
-    monkeypatch.setitem(sys.modules, "gaitgauge.gauge.cluster", None)
+    monkeypatch.setitem(sys.modules, "gaitgauge.gauge.cluster_node", None)
     assert node.exchange([]).startswith("node n of the Ray cluster lacks this gaitgauge (")
 
 
@@ -323,7 +324,7 @@ def test_a_head_node_out_of_reach_ends_the_run(fake, monkeypatch):
 
 def test_different_processors_are_said_once(fake, monkeypatch, caplog):
     kinds = itertools.cycle(["A", "B", "C"])
-    monkeypatch.setattr(cluster, "processor", lambda: next(kinds))
+    monkeypatch.setattr(cluster_node, "processor", lambda: next(kinds))
     monkeypatch.setattr(cluster, "_ARRIVING", 60.0)
     workers = fake(_lives, count=3)
     assert workers.processors == {"A", "B", "C"}
@@ -412,7 +413,7 @@ def test_three_nodes_equal_one_machine_also_when_one_is_killed(head, nodes, smal
             head.remove_node(nodes.pop(), allow_graceful=False)
             killed.append(kept(folder))
 
-    request = Request(policy=str(PRETRAINED), suite=str(small), threads=None, cluster=head.address)
+    request = Request(policy=str(PRETRAINED), suite=str(small), threads=3, cluster=head.address)
     results = evaluate(request, folder, watch=watch)
     assert reproducible(folder) == reproducible(alone)
     assert len(killed) == dying
