@@ -13,7 +13,8 @@ import typer
 from rich.text import Text
 
 from ..gauge.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
-from ..gauge.consistency.study import StudyRequest, StudyStatus, prepare_study, study
+from ..gauge.consistency.request import StudyRequest, StudyStatus
+from ..gauge.consistency.study import prepare_study, study
 from .console import Terminal, make_table, shell_command
 from .progress import ProgressDisplay
 

@@ -23,12 +23,11 @@ from ..files.writing import replacing
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, deploy_contract
 from .base import Policy, PolicyError
-from .composed import AcMoeNetwork, McpNetwork
 from .contract import TERM_WIDTH, HistoryOrder, PolicyContract, difference
-from .estimators import DreamwaqNetwork, HimNetwork
+from .export_modules import SCRIPTS, Explained, TermMajor, term_major_order
 from .loading import load_policy
 from .native import NativePolicy
-from .networks import CtsNetwork, MlpNetwork, MoeCtsNetwork
+from .networks import MlpNetwork
 from .torchscript import CONTRACT_FILE
 
 TOLERANCE = 1e-5
@@ -57,101 +56,6 @@ class ExportError(PolicyError):
     """A policy cannot be exported; the message says why."""
 
 
-class _Explained(nn.Module):
-    """A network as a function of its history: actions, latent, and the weights of its experts where it has any."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network: Any = network
-
-    def forward(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return self.network.explained(history)
-
-
-class _WithMemory(nn.Module):
-    """Keeps the history of one robot in a tensor that ``forward`` changes. At the start its frames are zero, or NaN where
-    the first observation is to take their place.
-    """
-
-    def __init__(self, traced: nn.Module, start: torch.Tensor) -> None:
-        super().__init__()
-        self.network = traced
-        self.history = start.clone()
-        self.unseen: float = float(start[0, 0, 0])
-
-    @torch.jit.export
-    def reset(self) -> None:
-        self.history = torch.full_like(self.history, self.unseen)
-
-    def remember(self, observation: torch.Tensor) -> torch.Tensor:
-        newest = observation.unsqueeze(1)
-        history = torch.cat((self.history[:, 1:], newest), dim=1)
-        self.history = torch.where(torch.isnan(history), newest, history)
-        return self.history
-
-
-class _MlpScript(_WithMemory):
-    """Observation (1, F) to actions (1, J)."""
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        return self.network(self.remember(observation))
-
-
-class _LatentScript(_WithMemory):
-    """Observation (1, F) to actions (1, J) and (nothing, latent (1, L))."""
-
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor | None, torch.Tensor]]:
-        actions, latent = self.network(self.remember(observation))
-        weights: torch.Tensor | None = None
-        return actions, (weights, latent)
-
-
-class _ExpertsScript(_WithMemory):
-    """Observation (1, F) to actions (1, J) and (gate weights (1, K), latent (1, L))."""
-
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-        actions, latent, weights = self.network(self.remember(observation))
-        return actions, (weights, latent)
-
-
-_SCRIPTS: dict[type[nn.Module], type[_WithMemory]] = {
-    MlpNetwork: _MlpScript,
-    CtsNetwork: _LatentScript,
-    HimNetwork: _LatentScript,
-    DreamwaqNetwork: _LatentScript,
-    MoeCtsNetwork: _ExpertsScript,
-    AcMoeNetwork: _ExpertsScript,
-    McpNetwork: _ExpertsScript,
-}
-
-
-class _TermMajor(nn.Module):
-    """Takes the history term by term, as Isaac Lab stacks it, and puts the frames together for the network."""
-
-    order: torch.Tensor
-
-    def __init__(self, network: nn.Module, order: torch.Tensor) -> None:
-        super().__init__()
-        self.network = network
-        self.register_buffer("order", order)
-        self.frames = (int(network.history_length), int(network.frame_width))  # type: ignore[arg-type]
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return self.network(obs[:, self.order].unflatten(1, self.frames))
-
-
-def term_major_order(contract: PolicyContract, frames: int) -> torch.Tensor:
-    """Position in a term-major history of each entry of the frame-major one, (frames * F,) int64; both oldest first."""
-    columns = []
-    start = 0
-    for term in contract.observation:
-        width = TERM_WIDTH[term.name] or contract.num_joints
-        block = start + torch.arange(frames * width).view(frames, width)
-        columns.append(block)
-        start += frames * width
-    return torch.cat(columns, dim=1).flatten()
-
-
 def export_torchscript(policy: Policy, path: str | Path) -> float:
     """Write a TorchScript file for one robot: one observation (1, F) in, the history inside, ``reset()`` to clear it.
 
@@ -173,13 +77,13 @@ def export_torchscript(policy: Policy, path: str | Path) -> float:
     contract = policy.contract
     history = torch.zeros(1, int(network.history_length), int(network.frame_width))  # type: ignore[arg-type]
     start = torch.full_like(history, math.nan) if contract.history.start == "repeat" else history
-    core = network if isinstance(network, MlpNetwork) else _Explained(network)
+    core = network if isinstance(network, MlpNetwork) else Explained(network)
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # torch announces TorchScript's retirement; the published evaluation and many deployments read nothing else.
         warnings.simplefilter("ignore", DeprecationWarning)
         traced = torch.jit.trace(core.eval(), history, check_trace=False)
-        script = torch.jit.script(_SCRIPTS[type(network)](traced, start).eval())
+        script = torch.jit.script(SCRIPTS[type(network)](traced, start).eval())
         torch.jit.save(script, buffer, _extra_files={CONTRACT_FILE: contract.to_json()})
     return _write_checked(Path(path), buffer.getvalue(), lambda written: _largest_difference(policy, written))
 
@@ -203,7 +107,7 @@ def export_onnx(policy: Policy, path: str | Path) -> float:
     """
     network = _network(policy)
     frames = int(network.history_length)  # type: ignore[arg-type]
-    module = _TermMajor(network, term_major_order(policy.contract, frames)).eval()
+    module = TermMajor(network, term_major_order(policy.contract, frames)).eval()
     contract = stacked_contract(policy.contract, frames)
     buffer = io.BytesIO()
     with warnings.catch_warnings():
@@ -430,7 +334,7 @@ def _network(policy: Policy) -> nn.Module:
         raise ExportError(
             f"'{policy.path}' is an exported file already; export a checkpoint of the project's own format"
         )
-    if type(policy.network) not in _SCRIPTS:
+    if type(policy.network) not in SCRIPTS:
         raise ExportError(f"no export is known for the network {type(policy.network).__name__} of '{policy.path}'")
     return policy.network
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 
-from ..backends.registry import choose_device
 from ..files.parsing import build, shown
 from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
@@ -24,6 +23,7 @@ from ..robots.registry import lasting
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .configuration import ConfigurationError, TrainingConfiguration, to_plain
+from .devices import idle_gpus, own_device
 from .environment import TrainingEnvironment
 from .environment_configuration import FLAT_TILE, EnvironmentConfiguration
 from .filming import Filmer
@@ -169,7 +169,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         begun = _going_on(task, _first_weights(request, task)) if request.init_from is not None else []
         task = find_task(request.task, [*begun, *own], robot=robot)
     check_logger(task.training.run.logger)
-    device = _device(request.device, backend)
+    device = own_device(request.device, backend)
     if request.capture and not device.startswith("cuda"):
         raise ConfigurationError(f"--capture replays CUDA graphs and the device is '{device}'; leave it out")
     settings = {
@@ -280,33 +280,6 @@ def _own_overrides(request: TrainRequest) -> list[str]:
         ("training.run.logger", request.logger),
     ]
     return [f"{key}={value}" for key, value in options if value is not None] + list(request.overrides)
-
-
-def _device(asked: str | None, backend: str) -> str:
-    """The torch device of this process.
-
-    Raises:
-        ConfigurationError: there is no such device here.
-    """
-    asked = choose_device(backend) if asked is None else asked
-    place, gpus = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
-    if asked == "cuda" and place >= gpus > 0:
-        raise ConfigurationError(
-            f"torchrun started more processes than this machine has GPUs ({gpus}); give --nproc-per-node {gpus}"
-        )
-    return choose_device(backend, f"cuda:{place}" if asked == "cuda" and gpus > 0 else asked)
-
-
-def idle_gpus(device: str) -> str:
-    """A sentence on GPUs that no process of a run uses, empty if there are none."""
-    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "0"))
-    gpus = torch.cuda.device_count() if device.startswith("cuda") else 0
-    if not 0 < processes < gpus:
-        return ""
-    return (
-        f"{processes} of {gpus} GPUs are used; --nproc-per-node {gpus} uses all, and CUDA_VISIBLE_DEVICES says which are "
-        "meant."
-    )
 
 
 def train(

@@ -32,7 +32,7 @@ from .closed_loop import Cell, Design, compare, floor_only, gap_only, health_of,
 from .errors import ConsistencyError
 from .models import compare_models
 from .open_loop import Trajectory, compare_trajectories, record_targets, replay
-from .statistics import MARGIN
+from .request import StudyRequest, StudyStatus
 from .variants import MakeBackend, Variant, parse_variant, place
 
 SCHEMA = 2
@@ -40,53 +40,6 @@ LEVEL = 3
 """Level of terrains that have levels, where none is asked for."""
 SEEDS_CPU, SEEDS_GPU = 3, 10
 """Seeds where no number is asked for."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StudyRequest:
-    """What is to be compared. Empty tuples and None stand for a choice that suits the machine."""
-
-    policies: tuple[str, ...]
-    backends: tuple[str, ...] = ("mujoco", "mujoco-warp", "newton")
-    """Engines, each as ``parse_variant`` reads it."""
-    reference: str | None = None
-    """The one that the others are compared with; None for the first."""
-    device: str | None = None
-    """Device of the engines that can use a GPU; None: a GPU, and engines made for one are left out where there is none."""
-    suite: str = "robogauge-1.1"
-    robot: str | None = None
-    """Name or path; None for the one that the policies are for."""
-    terrains: tuple[str, ...] = ()
-    """Empty: all of the suite's."""
-    levels: tuple[int, ...] = ()
-    """Empty: level 3."""
-    frictions: tuple[float, ...] = ()
-    """Empty: the nominal one on a CPU, all of the suite's where every engine but the reference runs on a GPU."""
-    seeds: int | None = None
-    """Number of seeds, at least 2; None: 3 on a CPU, 10 on a GPU."""
-    margin: float = MARGIN
-    """Difference of quality that does not matter: engines whose difference surely lies within it are equivalent."""
-    attribution: bool = True
-    factors: tuple[str, ...] = ()
-    """Factors to switch; empty: all."""
-    threads: int = 1
-    trust: bool = False
-    """Run the programs that policy files of the project's own format carry inside."""
-
-
-@dataclass
-class StudyStatus:
-    """How far a study is, for the progress display."""
-
-    policy: str
-    variant: str
-    part: int
-    """Number of the present run of episodes, from 1."""
-    parts: int
-    done: int
-    """Episodes of this run that have ended."""
-    episodes: int
-    seconds: float
 
 
 Watch = Callable[[StudyStatus], None]
