@@ -296,13 +296,13 @@ def test_a_wrong_export_is_not_left_behind(tmp_path, monkeypatch):
     policy = make_policy("cts")
     path = tmp_path / "policy.pt"
     path.write_bytes(b"previous")
-    monkeypatch.setattr(export, "_Explained", WrongOutput)
+    monkeypatch.setattr(export, "Explained", WrongOutput)
     with pytest.raises(ExportError, match="differs from it by"):
         export_torchscript(policy, path)
     assert path.read_bytes() == b"previous" and [p.name for p in tmp_path.iterdir()] == ["policy.pt"]
 
 
-class WrongOutput(export._Explained):
+class WrongOutput(export.Explained):
     def forward(self, history):
         actions, *rest = super().forward(history)
         return actions + 1e-3, *rest
