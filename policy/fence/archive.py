@@ -71,7 +71,9 @@ def read_archive(data: bytes, *, source: str) -> dict[str, bytes]:
 
 
 def _records(archive: zipfile.ZipFile, source: str) -> dict[str, bytes]:
-    entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+    entries = [
+        entry for entry in archive.infolist() if not entry.filename.endswith("/")
+    ]  # is_dir() fails without a name
     if len(entries) > MOST_RECORDS:
         raise PolicyError(f"'{source}' has {len(entries):,} entries; at most {MOST_RECORDS:,} are read")
     size = sum(entry.file_size for entry in entries)
@@ -84,7 +86,9 @@ def _records(archive: zipfile.ZipFile, source: str) -> dict[str, bytes]:
     records: dict[str, bytes] = {}
     for entry in entries:
         name = entry.filename.partition("/")[2]
-        if not name or name in records:
+        if not name:
+            raise PolicyError(f"'{source}' is a damaged archive: it has an entry without a name")
+        if name in records:
             raise PolicyError(f"'{source}' is a damaged archive: it has the entry '{entry.filename}' twice")
         with archive.open(entry) as record:
             # reading to the end checks the sum, and stops where the archive says that the record does

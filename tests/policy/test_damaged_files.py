@@ -32,6 +32,16 @@ def rewritten(path, change) -> bytes:
     return archive.packed(records)
 
 
+def test_an_entry_without_a_name_is_refused(cts_file):
+    data = bytearray(cts_file.read_bytes())
+    last = data.rindex(b"PK\x01\x02")  # the directory's last entry, whose name's length stands 28 bytes on
+    length = int.from_bytes(data[last + 28 : last + 30], "little")
+    data[last + 28 : last + 30] = b"\0\0"
+    data[last + 32 : last + 34] = length.to_bytes(2, "little")  # what was the name is the comment
+    cts_file.write_bytes(data)
+    refused(cts_file, "an entry without a name|neither TorchScript nor a torch.save file")
+
+
 def test_one_flipped_bit_of_a_weight_is_found(cts_file):
     stored = torch.load(cts_file, weights_only=True)["state_dict"][WEIGHT].numpy().tobytes()
     data = bytearray(cts_file.read_bytes())
