@@ -10,7 +10,7 @@ from gaitgauge.cli.drawing import Shot, Tile, draw, processes_for
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.picture import PLAIN, RICH, Follower, choose_renderer
 
-TILES = [Tile(model=None, heading=0.0), Tile(model=None, heading=1.0)]
+TILES = [Tile(model=None, heading=0.0, leg_length=0.4), Tile(model=None, heading=1.0, leg_length=0.4)]
 
 
 def shots(count):
@@ -22,7 +22,7 @@ def test_tiles_stand_side_by_side_and_pictures_are_drawn_as_they_are_needed(monk
     closed, taken = [], []
 
     class Flat:
-        def __init__(self, model, *, size, heading):
+        def __init__(self, model, *, size, heading, leg_length):
             self.size = size
 
         def draw(self, position, looks_at):
@@ -83,7 +83,7 @@ from gaitgauge.cli.scenery import visual_model
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.registry import make_terrain
 
-tiles = [Tile(model=visual_model(load_robot("go2"), make_terrain("flat"), PLAIN), heading=0.0)]
+tiles = [Tile(model=visual_model(load_robot("go2"), make_terrain("flat"), PLAIN), heading=0.0, leg_length=0.4)]
 
 def shots(count):
     for i in range(count):

@@ -107,7 +107,8 @@ def completed(command: str, parameter: str, incomplete: str = "") -> list[str]:
         ("list", "what", "r", ["robots"]),
     ],
 )
-def test_values_are_completed(command, parameter, incomplete, offered):
+def test_values_are_completed(command, parameter, incomplete, offered, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # files are offered too
     assert sorted(completed(command, parameter, incomplete)) == offered
 
 
