@@ -143,6 +143,19 @@ def outcome(folder: Path) -> dict[str, object]:
     return {"results.json": results, "episodes.csv": (folder / "episodes.csv").read_bytes(), "episodes": episodes}
 
 
+def difference(one: object, other: object, place: str = "") -> str:
+    """Where two contents first differ, and how."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in sorted(one.keys() | other.keys(), key=str):
+            if one.get(key) != other.get(key):
+                return difference(one.get(key), other.get(key), f"{place}/{key}")
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for number, pair in enumerate(zip(one, other, strict=True)):
+            if pair[0] != pair[1]:
+                return difference(*pair, f"{place}/{number}")
+    return f"{place} {str(one)[:200]} became {str(other)[:200]}"
+
+
 def check_end(folder: Path, expected: dict[str, object]) -> None:
     """A run that has ended is the undisturbed one.
 
@@ -152,7 +165,9 @@ def check_end(folder: Path, expected: dict[str, object]) -> None:
     found = outcome(folder)
     for part, value in expected.items():
         if found[part] != value:
-            raise DamageError(f"{part} of {folder.name} differs from the undisturbed run")
+            raise DamageError(
+                f"{part} of {folder.name} differs from the undisturbed run: {difference(value, found[part])}"
+            )
     if left := [str(p.relative_to(folder)) for p in folder.rglob("*") if "partial" in p.name]:
         raise DamageError(f"partial files are left: {', '.join(left)}")
     if not (folder / "report.html").is_file():

@@ -6,7 +6,7 @@ import random
 
 import torch
 
-from ..robots.rotation import yaw_of
+from ..robots.rotation import heading_of
 from .segments import Segment
 from .suite import Push, Suite
 
@@ -36,5 +36,5 @@ def sideways(quaternion: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
     Returns:
         [N], (N, 3), horizontal.
     """
-    yaw = yaw_of(quaternion)
-    return torch.stack((-torch.sin(yaw) * force, torch.cos(yaw) * force, torch.zeros_like(force)), dim=1)
+    cosine, sine = heading_of(quaternion)
+    return torch.stack((-sine * force, cosine * force, torch.zeros_like(force)), dim=1)

@@ -39,6 +39,16 @@ def yaw_of(quaternion: torch.Tensor) -> torch.Tensor:
     return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
+def heading_of(quaternion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Cosine and sine of ``yaw_of``, (…, 4) to (…) each, of operations that round alike wherever a row stands: torch's atan2
+    does not. A body whose x axis is vertical has the heading (0, 0).
+    """
+    w, x, y, z = quaternion.unbind(-1)
+    sine, cosine = 2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)
+    length = torch.clamp(torch.sqrt(sine * sine + cosine * cosine), min=1e-12)
+    return cosine / length, sine / length
+
+
 def projected_gravity(quaternion: torch.Tensor) -> torch.Tensor:
     """Unit vector of gravity in the body frame, Rᵀ (0, 0, −1): (0, 0, −1) for an upright body, (…, 4) to (…, 3)."""
     w, x, y, z = quaternion.unbind(-1)

@@ -97,3 +97,13 @@ def test_an_engine_that_cannot_push_is_refused_in_one_sentence(monkeypatch):
     with pytest.raises(BackendError, match="suite 'gaitgauge-1' pushes robots, and engine 'fake' knows no external"):
         pushed(MAXIMUM)
     assert pushed(MAXIMUM, suite=replace(short_suite("gaitgauge-1"), push=None))
+
+
+def test_a_push_does_not_depend_on_the_row_of_its_robot():
+    """One unit in the last place of a push is another episode: results would depend on the number of workers."""
+    generator = torch.Generator().manual_seed(0)
+    quaternions = torch.nn.functional.normalize(torch.randn(3000, 4, generator=generator, dtype=torch.float64))
+    forces = torch.rand(3000, generator=generator, dtype=torch.float64)
+    together = sideways(quaternions, forces)
+    apart = [sideways(q, f) for q, f in zip(quaternions.split(3), forces.split(3), strict=True)]
+    assert torch.equal(together, torch.cat(apart))

@@ -52,3 +52,11 @@ def _same(quaternions: torch.Tensor, turns: Rotation) -> bool:
     expected = turns.as_quat(scalar_first=True)
     signs = np.sign(np.sum(expected * quaternions.numpy(), axis=-1, keepdims=True))
     return np.allclose(quaternions.numpy() * signs, expected, atol=1e-12)
+
+
+def test_heading_is_that_of_yaw(sample):
+    _, quaternions, _ = sample
+    cosine, sine = rotation.heading_of(quaternions)
+    yaw = rotation.yaw_of(quaternions)
+    np.testing.assert_allclose(cosine, torch.cos(yaw), atol=1e-12)
+    np.testing.assert_allclose(sine, torch.sin(yaw), atol=1e-12)
