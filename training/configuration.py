@@ -128,8 +128,9 @@ class AlgorithmConfiguration:
     """Initial learning rate of teacher encoder, actor and critic."""
     learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
     """Bounds of the adaptive learning rate."""
-    desired_kl: float | None = 0.01
-    """KL divergence that the learning rate is adapted to after every minibatch; None keeps the rate fixed."""
+    desired_kl: Ramp | float | None = 0.01
+    """KL divergence that the learning rate is adapted to after every minibatch; a ramp moves with the environment's schedules, None
+    keeps the rate fixed."""
     max_gradient_norm: float = 1.0
     """Gradient norm limit, of each optimizer; actor side and critic share one norm."""
     student_learning_rate: float = 1e-3

@@ -98,6 +98,8 @@ _ALL_TERRAINS_LEARNING = AlgorithmConfiguration(
     student_period=2,
     # Exploration is worth more while the robot learns to walk and to climb than once it is to be precise.
     entropy_coefficient=Ramp(start=0.01, end=0.002, begin=0.3, until=0.5),
+    # Large steps learn fast; small ones, which a trained policy loses least by, end the run.
+    desired_kl=Ramp(start=0.01, end=0.003, begin=0.4, until=0.8),
 )
 
 

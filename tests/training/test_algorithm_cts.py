@@ -195,6 +195,15 @@ def test_entropy_bonus_follows_the_run():
         assert float(loss.detach()) == pytest.approx(surrogate + value - expected * entropy, rel=1e-4)
 
 
+def test_the_divergence_aimed_at_follows_the_run():
+    algorithm, _ = build(desired_kl=Ramp(start=0.01, end=0.002, begin=0.5, until=1.0))
+    for progress, factor in ((0.0, 1.0), (0.75, 1.0), (2.0, 1 / 1.5)):  # 0.007 is too far only from where 0.002 is the aim
+        algorithm.follow(torch.tensor(progress))
+        algorithm.learning_rate = 1e-3
+        algorithm._adapt_learning_rate(torch.tensor(0.007))
+        assert algorithm.learning_rate == pytest.approx(factor * 1e-3)
+
+
 def test_load_balance_is_a_sum_over_the_experts():
     algorithm, env = build("moe")
     rollout(algorithm, env)

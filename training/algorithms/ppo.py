@@ -103,7 +103,9 @@ class PPO:
         self.student_optimizer = torch.optim.Adam(
             actor.student_parameters(), lr=configuration.student_learning_rate, fused=on_gpu, capturable=on_gpu
         )
-        self._entropy = RampTable([configuration.entropy_coefficient], device)
+        self._adapts = configuration.desired_kl is not None
+        self._ramps = RampTable([configuration.entropy_coefficient, configuration.desired_kl or 0.0], device)
+        self._desired_kl = torch.zeros((), device=device)
         self.follow(torch.zeros((), device=device))
         self._policy_metrics = torch.zeros(len(self.losses.policy_names) + 2, device=device)
         self._student_metrics = torch.zeros(len(self.losses.student_names) + 1, device=device)
@@ -202,7 +204,9 @@ class PPO:
 
     def follow(self, progress: torch.Tensor) -> None:
         """Take the settings of a fraction of the run, a scalar tensor, for the next update."""
-        self.losses.entropy_coefficient.copy_(self._entropy.at(progress)[0])
+        entropy, desired_kl = self._ramps.at(progress)
+        self.losses.entropy_coefficient.copy_(entropy)
+        self._desired_kl.copy_(desired_kl)
 
     def follow_student(self, iterations: int) -> None:
         """Spend the next iterations on what a bare policy lacks, while it stands still (see ``bootstrap``)."""
@@ -397,12 +401,12 @@ class PPO:
 
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
         """rsl_rl's rule, on the device: slower above twice the desired divergence, faster below half of it."""
-        target = self.configuration.desired_kl
-        if target is None:
+        if not self._adapts:
             return
         low, high = self.configuration.learning_rate_range
         slower, faster = (self._rate / 1.5).clamp(min=low), (self._rate * 1.5).clamp(max=high)
-        rate = torch.where(kl > 2.0 * target, slower, torch.where((kl < 0.5 * target) & (kl > 0.0), faster, self._rate))
+        too_far, too_near = kl > 2.0 * self._desired_kl, (kl < 0.5 * self._desired_kl) & (kl > 0.0)
+        rate = torch.where(too_far, slower, torch.where(too_near, faster, self._rate))
         self._rate.copy_(rate)
 
     # Checkpoints
