@@ -197,7 +197,7 @@ def test_entropy_bonus_follows_the_run():
 
 def test_the_divergence_aimed_at_follows_the_run():
     algorithm, _ = build(desired_kl=Ramp(start=0.01, end=0.002, begin=0.5, until=1.0))
-    for progress, factor in ((0.0, 1.0), (0.75, 1.0), (2.0, 1 / 1.5)):  # 0.007 is too far only from where 0.002 is the aim
+    for progress, factor in ((0.0, 1.0), (0.75, 1.0), (2.0, 1 / 1.5)):  # 0.007 is too far where 0.002 is the aim
         algorithm.follow(torch.tensor(progress))
         algorithm.learning_rate = 1e-3
         algorithm._adapt_learning_rate(torch.tensor(0.007))
