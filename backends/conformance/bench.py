@@ -13,6 +13,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ...robots.base import JointParameters, Robot
+from ...robots.body_plan import body_plan
 from ...terrains.base import Terrain
 from ..base import (
     Capability,
@@ -28,6 +29,8 @@ from ..base import (
 FLAT = Terrain(name="conformance_flat", family="flat")
 WORLDS = 4
 """Number of worlds in nearly every scene, so that an engine that compiles for sizes compiles once."""
+STIFF_LOAD = 6.478
+"""Mass times leg length for which ``Bench.stiff`` has kp 800, kd 16 and armature 0.1: a Go2's [kg·m]."""
 
 
 class ConformanceError(AssertionError):
@@ -206,8 +209,18 @@ class Bench:
         return JointParameters(**values)
 
     def stiff(self) -> JointParameters:
-        """Joints that hold the standing pose nearly rigidly: the robot becomes a table with four feet."""
-        return self.soft(stiffness=800.0, damping=16.0, armature=0.1, joint_damping=0.0, torque_limit=1000.0)
+        """Joints that hold the standing pose nearly rigidly: the robot becomes a table with four feet. All constants grow with the
+        weight times leg length that the joints carry.
+        """
+        plan = body_plan(self.robot)
+        load = plan.mass * plan.leg_length / STIFF_LOAD
+        return self.soft(
+            stiffness=800.0 * load,
+            damping=16.0 * load,
+            armature=0.1 * load,
+            joint_damping=0.0,
+            torque_limit=1000.0 * load,
+        )
 
     @contextmanager
     def worlds(

@@ -31,7 +31,7 @@ PLATFORM = _box("platform", Box(center=(0.0, 0.0, 0.25), half_size=(1.0, 1.0, 0.
 # Turned by a right angle it is long in y; taken unturned it would leave nothing to stand on at y = 1.2.
 PLANK = _box(
     "plank",
-    Box(center=(0.0, 0.0, 0.1), half_size=(2.0, 0.45, 0.1), quaternion=(0.70710678, 0.0, 0.0, 0.70710678)),
+    Box(center=(0.0, 0.0, 0.1), half_size=(2.0, 0.7, 0.1), quaternion=(0.70710678, 0.0, 0.0, 0.70710678)),
     Box(center=(3.0, 0.0, 0.4), half_size=(0.2, 0.2, 0.4)),
 )
 PALETTE = (FLOOR, PLATFORM, PLANK, incline(PITCH))

@@ -6,6 +6,7 @@ import numpy as np
 
 from ...terrains.base import Box, Terrain
 from .bench import Bench, expect, expect_close
+from .contact import back_height
 from .kinematics import base_up
 from .reference import Reference, level_stance
 from .stepping import MOTION_FIELDS, stand, wave
@@ -123,12 +124,13 @@ def divergence(bench: Bench) -> str:
 @check("health/no_overflow", "contact_forces")
 def no_overflow(bench: Bench) -> str:
     """A robot lying on its back has contacts enough for all engines, and none overflows."""
+    height = back_height(Reference(bench.robot, bench.soft()), clearance=0.06)
     with bench.worlds() as worlds:
         worlds.reset(
-            base_position=np.tile([0.0, 0.0, 0.12], (worlds.count, 1)),
+            base_position=np.tile([0.0, 0.0, height], (worlds.count, 1)),
             base_quaternion=np.tile([0.0, 1.0, 0.0, 0.0], (worlds.count, 1)),
         )
-        worlds.run(0.2)
+        worlds.run(0.4)
         state = worlds.read()
         expect(not state.overflowed.any(), "overflowed with the engine's own contact capacity")
         expect(not state.diverged.any(), "a robot dropped on its back diverges")

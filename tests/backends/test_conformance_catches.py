@@ -55,6 +55,16 @@ class MomentAboutTheOrigin(StateFault):
         return altered(state, ground_moment_w=about_origin)
 
 
+class TrunkIsWholeBase(StateFault):
+    def spoil(self, state):
+        return altered(state, trunk_contact_force_w=state.body_contact_force_w[:, 0])
+
+
+class TrunkFeelsNothing(StateFault):
+    def spoil(self, state):
+        return altered(state, trunk_contact_force_w=torch.zeros_like(state.trunk_contact_force_w))
+
+
 class FootForceCountedTwice(StateFault):
     def spoil(self, state):
         bodies = state.body_contact_force_w.clone()
@@ -223,6 +233,8 @@ FAULTS = [
     (FrictionNeverAboveItsOwn, "friction/incline"),
     (FrictionNeverAboveItsOwn, "friction/bodies"),
     (FrictionOfTheFirstWorld, "friction/braking"),
+    (TrunkIsWholeBase, "contact/trunk"),
+    (TrunkFeelsNothing, "contact/trunk"),
     (CenterOfMassMirrored, "model/base_com"),
     (CenterOfMassMirrored, "model/base_com_motion"),
     (MassesIgnored, "model/base_mass"),
