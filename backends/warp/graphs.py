@@ -69,8 +69,14 @@ class RecordedFunction(Generic[Result]):
     def _record(self, arguments: tuple[torch.Tensor, ...]) -> torch.cuda.CUDAGraph:
         self._inputs = tuple(argument.clone() for argument in arguments)
         graph = torch.cuda.CUDAGraph()
-        # other threads may talk to the device meanwhile
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            self._result = self._function(*self._inputs)
+        generator = torch.cuda.default_generators[torch.cuda.current_device()]
+        before = generator.clone_state()
+        try:
+            # other threads may talk to the device meanwhile
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                self._result = self._function(*self._inputs)
+        except BaseException:
+            generator.graphsafe_set_state(before)  # torch leaves it as if it were still recording, unable to draw
+            raise
         self.recordings += 1
         return graph

@@ -40,3 +40,14 @@ def test_what_waits_for_the_device_cannot_be_recorded_and_has_not_run():
         recorded()
     torch.cuda.synchronize()
     assert total.item() == 1.0 and recorded.due
+
+
+def test_random_numbers_go_on_after_a_recording_that_failed():
+    torch.cuda.manual_seed(3)
+    wanted = torch.rand(4, device="cuda").tolist(), torch.rand(4, device="cuda").tolist()
+    torch.cuda.manual_seed(3)
+    first = torch.rand(4, device="cuda").tolist()
+    with pytest.raises(RuntimeError):
+        RecordedFunction(lambda: torch.zeros(1, device="cuda").item(), warm_up=0)()
+    torch.cuda.synchronize()
+    assert (first, torch.rand(4, device="cuda").tolist()) == wanted
