@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.loading import PRETRAINED
+from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.robots import load_robot
 from gaitgauge.robots.geometry import total_mass

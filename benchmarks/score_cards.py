@@ -26,7 +26,7 @@ from gaitgauge.gauge.report import write_report
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.verify import tolerance_band
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.loading import PRETRAINED
+from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import load_robot

@@ -14,7 +14,7 @@ import viser
 from ..backends.base import BackendError
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError
-from ..policy.loading import find_policy
+from ..policy.finding import find_policy, shipped_policies
 from ..terrains.gauge_terrains import LEVELS
 from ..terrains.registry import TerrainError, gauge_terrain_names
 from .browser_access import is_loopback, own_requests_only
@@ -34,7 +34,7 @@ _AIMING = 2.0
 _LOST = 4.0
 """How far from the robots a camera may look before it is aimed again [m]."""
 _FRICTIONS = (0.05, 1.5)
-_NAMED = ("pretrained", "best", "latest")
+_OF_RUNS = ("best", "latest")
 _REFUSALS = (PolicyError, ContractError, TerrainError, BackendError, UserError)
 """What may be wrong with a choice; the page says it and goes on as before."""
 
@@ -167,7 +167,7 @@ def _limits(sessions: Sequence[PlaySession]) -> Command:
 def _policies(chosen: Sequence[str]) -> list[str]:
     """What the menu of policies offers: those that were named on the command line, and those that have names."""
     found = list(chosen)
-    for name in _NAMED:
+    for name in (*shipped_policies(), *_OF_RUNS):
         with suppress(PolicyError):
             find_policy(name)
             found.append(name)

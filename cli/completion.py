@@ -62,14 +62,19 @@ def tasks(incomplete: str) -> list[str]:
 
 def policies(incomplete: str) -> list[str]:
     """Names of policies, the checkpoints of all runs, and files."""
-    names = ["latest", "best", "pretrained"]
-    runs = [f.as_posix() for f in sorted(Path("logs/rsl_rl").glob("*/*/*.pt"), reverse=True)]
-    return [*names, *runs, *(f for f in _files(incomplete, _ENDINGS) if f not in runs)]
+    from ..policy.finding import policy_names
+
+    return [*policy_names(), *_checkpoints_and_files(incomplete)]
 
 
 def checkpoints(incomplete: str) -> list[str]:
     """What a run is gone on with."""
-    return ["latest", *policies(incomplete)[3:]]
+    return ["latest", *_checkpoints_and_files(incomplete)]
+
+
+def _checkpoints_and_files(incomplete: str) -> list[str]:
+    runs = [f.as_posix() for f in sorted(Path("logs/rsl_rl").glob("*/*/*.pt"), reverse=True)]
+    return [*runs, *(f for f in _files(incomplete, _ENDINGS) if f not in runs)]
 
 
 def of(*values: str) -> Completer:

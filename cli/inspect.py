@@ -60,7 +60,8 @@ def import_file(
     if trainable and contract is not None:
         raise UserError("a training checkpoint has its contract inside; leave out --contract")
     if trainable:
-        from ..policy.loading import find_policy, load_policy
+        from ..policy.finding import find_policy
+        from ..policy.loading import load_policy
         from ..training.checkpoint import trim_checkpoint
 
         trim_checkpoint(find_policy(source), destination, raw=raw)
@@ -223,10 +224,10 @@ def _tasks() -> Table:
 
 def _policies() -> Table:
     from ..policy.base import PolicyError
-    from ..policy.loading import LOG_ROOT, POLICY_NAMES, find_policy
+    from ..policy.finding import LOG_ROOT, find_policy, policy_names
 
     table = make_table("policies (a name, or any policy file)", "name", "file", "robot", "contract", "saved")
-    for name in POLICY_NAMES:
+    for name in policy_names():
         try:
             path = find_policy(name)
         except PolicyError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..policy.loading import find_policy
+from ..policy.finding import find_policy
 from ..training.run_directory import latest_checkpoint
 from .errors import UserError
 

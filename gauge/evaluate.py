@@ -27,8 +27,9 @@ from ..files.provenance import plugins, provenance, versions
 from ..files.writing import json_text, write_atomically
 from ..policy.contract import kind_of_observations
 from ..policy.digest import policy_digest
+from ..policy.finding import find_policy
 from ..policy.its_robot import robot_for, without_copy
-from ..policy.loading import find_policy, load_policy
+from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
 from ..robots import Robot, load_robot
 from ..robots.loading import robot_digest

@@ -10,8 +10,9 @@ from typing import Any
 
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError, PolicyContract
+from ..policy.finding import find_policy
 from ..policy.its_robot import robot_for, without_copy
-from ..policy.loading import find_policy, load_policy
+from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
 from .suite import Suite, SuiteError

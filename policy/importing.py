@@ -9,8 +9,9 @@ from ..robots import load_robot
 from ..robots.identity import identify
 from .base import PolicyError
 from .contract import PolicyContract
+from .finding import LOG_ROOT
 from .its_robot import REMEMBERED
-from .loading import LOG_ROOT, load_policy
+from .loading import load_policy
 from .native import ForeignFile, load_entries, read_policy, save_policy
 
 

@@ -1,9 +1,8 @@
-"""Loads a policy from any file that the project understands, and finds the policies that have names."""
+"""Loads a policy from any file that the project understands."""
 
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -24,15 +23,13 @@ from .adapters import (
 from .base import PolicyError
 from .contract import ContractError, PolicyContract, check_robot, standard_contract
 from .fence.archive import archive_names, read_limited
+from .finding import LOG_ROOT, find_policy
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 from .rebuilt import rebuilt
 
 if TYPE_CHECKING:
     from .fence.child import Child
 
-LOG_ROOT = Path("logs/rsl_rl")
-PRETRAINED = Path(__file__).parent / "pretrained" / "go2.gauge.pt"
-POLICY_NAMES = ("latest", "best", "pretrained")
 DEFAULT_ROBOT = "go2"
 
 
@@ -51,8 +48,7 @@ def load_policy(
     (``docs/security.md``).
 
     Args:
-        path_or_name: a file; or ``latest`` (last checkpoint of the last training run), ``best`` (the last run's best
-            checkpoint), ``pretrained`` (the one that ships with the project).
+        path_or_name: a file, or a name (see ``find_policy``).
         robot: the robot it has to fit, and whose data stand in where a foreign file does not say; None: any robot is
             accepted, and the Go2 stands in.
         trust: run a program that a file of the project's own format carries inside; it is fenced in either way.
@@ -92,54 +88,6 @@ def restore_policy(
 @cache  # once, and not again in each process that is forked from this one
 def _say(path: str, sentence: str) -> None:
     logging.getLogger(__name__).warning("'%s' does not say how it is to be run; %s", path, sentence)
-
-
-def find_policy(path_or_name: str | Path, *, log_root: Path = LOG_ROOT) -> Path:
-    """The file behind a path or one of ``POLICY_NAMES``. A file that exists wins over a name.
-
-    Raises:
-        PolicyError: there is none.
-    """
-    path = Path(path_or_name)
-    name = str(path_or_name)
-    try:
-        path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except (OSError, ValueError) as error:  # a name that is too long, holds a null character, leads in circles
-        raise PolicyError(f"'{name}' cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if name in POLICY_NAMES and not path.is_file():
-        return _named(name, log_root)
-    if path.is_dir():
-        raise PolicyError(f"'{name}' is a folder; name a policy file in it, or one of: {', '.join(POLICY_NAMES)}")
-    if not path.exists():
-        raise PolicyError(
-            f"there is no policy file '{name}'; give the path of a file, or one of: {', '.join(POLICY_NAMES)}"
-        )
-    if not path.is_file():
-        raise PolicyError(f"'{name}' is not a regular file")
-    return path
-
-
-def _named(name: str, log_root: Path) -> Path:
-    if name == "pretrained":
-        if not PRETRAINED.is_file():
-            raise PolicyError(
-                f"no pretrained policy ships with this installation (looked for '{PRETRAINED}'); give a path"
-            )
-        return PRETRAINED
-    # Runs are named by their time, so the name's order is that of time.
-    runs = sorted((r for r in log_root.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True)
-    for run in runs:
-        if name == "best" and (run / "best.pt").is_file():
-            return run / "best.pt"
-        checkpoints = [(int(m.group(1)), f) for f in run.iterdir() if (m := re.fullmatch(r"model_(\d+)\.pt", f.name))]
-        if name == "latest" and checkpoints:
-            return max(checkpoints)[1]
-    wanted = "best.pt" if name == "best" else "model_<iteration>.pt"
-    raise PolicyError(
-        f"there is no policy '{name}': no run in '{log_root}/<experiment>/<run>/' has a {wanted}; give a path"
-    )
 
 
 def _load(

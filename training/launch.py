@@ -17,8 +17,8 @@ from ..files.parsing import build, shown
 from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
 from ..policy.contract import PolicyContract
+from ..policy.finding import find_policy
 from ..policy.its_robot import robot_for
-from ..policy.loading import find_policy
 from ..robots.registry import lasting
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers

@@ -10,7 +10,7 @@ from gaitgauge.gauge.board import board_data
 from gaitgauge.gauge.coverage import notes, score_label
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.policy.contract import ObservationTerm, standard_contract
-from gaitgauge.policy.loading import PRETRAINED
+from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from scripted_gauge import GO2, Puppet

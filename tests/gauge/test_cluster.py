@@ -22,7 +22,8 @@ from gaitgauge.gauge.evaluate import Request, evaluate, prepare
 from gaitgauge.gauge.plan import plan_list
 from gaitgauge.gauge.workers import Failed, Finished, InProcess, Job, Play, Progress, Stop, Worker
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.loading import PRETRAINED, load_policy
+from gaitgauge.policy.finding import PRETRAINED
+from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork
 from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import load_robot

@@ -1,5 +1,6 @@
 import os
 import pickle
+import shutil
 import sys
 import zipfile
 from pathlib import Path
@@ -8,10 +9,11 @@ import import_public_cts
 import numpy as np
 import pytest
 import torch
-from gaitgauge.policy import loading
+from gaitgauge.policy import finding
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import ContractError, PolicyContract
 from gaitgauge.policy.digest import policy_digest
+from gaitgauge.policy.finding import find_policy
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import save_policy
@@ -133,18 +135,27 @@ def test_latest_and_best(tmp_path, cts_file):
     last = put("go2_rough/2026-01-02_10-00-00_first", "model_1000.pt")
     put("go2_rough/2026-01-02_10-00-00_first", "model_999.pt")
     (tmp_path / "go2_rough" / "2026-01-03_10-00-00").mkdir()
-    assert loading.find_policy("latest", log_root=tmp_path) == last
+    assert find_policy("latest", log_root=tmp_path) == last
     assert load_policy("latest", log_root=tmp_path).path == "latest"
     assert "best.pt" in refused("best", log_root=tmp_path)
     best = put("go2_flat/2026-01-01_10-00-00", "best.pt")
-    assert loading.find_policy("best", log_root=tmp_path) == best
+    assert find_policy("best", log_root=tmp_path) == best
 
 
-def test_pretrained(monkeypatch, cts_file, tmp_path):
-    monkeypatch.setattr(loading, "PRETRAINED", tmp_path / "absent.pt")
-    assert "pretrained" in refused("pretrained")
-    monkeypatch.setattr(loading, "PRETRAINED", cts_file)
+def test_policies_that_ship(monkeypatch, cts_file, tmp_path):
+    folder = tmp_path / "shipped"
+    folder.mkdir()
+    monkeypatch.setattr(finding, "SHIPPED", folder)
+    monkeypatch.setattr(finding, "PRETRAINED", folder / "go2.gauge.pt")
+    assert finding.policy_names() == ("latest", "best", "pretrained")
+    assert "no pretrained policy ships" in refused("pretrained")
+    assert "no policy file 'pretrained-go9'" in refused("pretrained-go9")
+    for name in ("go2", "go9"):
+        shutil.copy(cts_file, folder / f"{name}.gauge.pt")
+    assert finding.policy_names() == ("latest", "best", "pretrained", "pretrained-go9")
     assert load_policy("pretrained").contract.observation_width == 45
+    assert find_policy("pretrained-go9") == folder / "go9.gauge.pt"
+    assert "pretrained-go9" in refused("pretrained-go8")
 
 
 def checkpoint(path: Path, layers: nn.Module, prefix: str, key: str, **more: torch.Tensor) -> Path:

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 import pytest
-from gaitgauge.policy.loading import PRETRAINED
+from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.training.filming import Filmer
 from gaitgauge.training.scoring import Scorer
 from gaitgauge.training.side_process import Job, SideProcess

@@ -1,0 +1,82 @@
+"""Finds the policies that have names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+LOG_ROOT = Path("logs/rsl_rl")
+"""Where training runs lie: ``<LOG_ROOT>/<experiment>/<run>/``."""
+SHIPPED = Path(__file__).parent / "pretrained"
+"""The folder of the policies that ship with the project, ``<name>.gauge.pt``."""
+PRETRAINED = SHIPPED / "go2.gauge.pt"
+"""The one that ``pretrained`` stands for."""
+_OF_RUNS = ("latest", "best")
+_ENDING = ".gauge.pt"
+
+
+def shipped_policies() -> dict[str, Path]:
+    """The files that ship, by name: ``pretrained``, and ``pretrained-<name>`` for every other file of the folder."""
+    others = sorted(path for path in SHIPPED.glob(f"*{_ENDING}") if path != PRETRAINED)
+    return {"pretrained": PRETRAINED} | {f"pretrained-{path.name.removesuffix(_ENDING)}": path for path in others}
+
+
+def policy_names() -> tuple[str, ...]:
+    """What ``find_policy`` takes beside paths."""
+    return (*_OF_RUNS, *shipped_policies())
+
+
+def find_policy(path_or_name: str | Path, *, log_root: Path = LOG_ROOT) -> Path:
+    """The file behind a path or a name. A file that exists wins over a name.
+
+    Args:
+        path_or_name: a file; or ``latest`` (last checkpoint of the last training run), ``best`` (the last run's best
+            checkpoint), ``pretrained`` (the Go2's that ships with the project), ``pretrained-go1`` … (the others that do).
+        log_root: where ``latest`` and ``best`` look.
+
+    Raises:
+        PolicyError: there is none.
+    """
+    from .base import PolicyError  # waits for torch, which a list of names need not
+
+    path = Path(path_or_name)
+    name = str(path_or_name)
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:  # a name that is too long, holds a null character, leads in circles
+        raise PolicyError(f"'{name}' cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    names = policy_names()
+    if name in names and not path.is_file():
+        found, otherwise = _of_runs(name, log_root) if name in _OF_RUNS else _shipped(name)
+        if found is None:
+            raise PolicyError(f"{otherwise}; give a path")
+        return found
+    if path.is_dir():
+        raise PolicyError(f"'{name}' is a folder; name a policy file in it, or one of: {', '.join(names)}")
+    if not path.exists():
+        raise PolicyError(f"there is no policy file '{name}'; give the path of a file, or one of: {', '.join(names)}")
+    if not path.is_file():
+        raise PolicyError(f"'{name}' is not a regular file")
+    return path
+
+
+def _shipped(name: str) -> tuple[Path | None, str]:
+    """The file, and what is to be said if there is none."""
+    path = shipped_policies()[name]
+    return path if path.is_file() else None, f"no {name} policy ships with this installation (looked for '{path}')"
+
+
+def _of_runs(name: str, log_root: Path) -> tuple[Path | None, str]:
+    """The same for a checkpoint of the last run that has one."""
+    # Runs are named by their time, so the name's order is that of time.
+    runs = sorted((r for r in log_root.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True)
+    for run in runs:
+        if name == "best" and (run / "best.pt").is_file():
+            return run / "best.pt", ""
+        checkpoints = [(int(m.group(1)), f) for f in run.iterdir() if (m := re.fullmatch(r"model_(\d+)\.pt", f.name))]
+        if name == "latest" and checkpoints:
+            return max(checkpoints)[1], ""
+    wanted = "best.pt" if name == "best" else "model_<iteration>.pt"
+    return None, f"there is no policy '{name}': no run in '{log_root}/<experiment>/<run>/' has a {wanted}"
