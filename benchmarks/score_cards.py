@@ -5,8 +5,11 @@
 Each policy is evaluated on each suite, whole; what the folder holds is not played again. A card is the run's ``results.json``
 with the policy's name in place of its path and without the machine's name, with the band in which the score of a replay on
 another machine must lie, and with the repeatability of its suite (``--repeatability``). Weights of others are not written to
-``--out``: of the CTS policy its card alone. ``--only`` and
-``--suite`` choose, ``--terrain`` and ``--friction`` take a part for a first try.
+``--out``: of the CTS policy its card alone. ``--only`` and ``--suite`` choose, so that several processes can share the work;
+``--terrain`` and ``--friction`` take a part for a first try.
+
+``--made`` plays nothing: cards are made of the results that the folder holds, on this machine or on another that was given the
+folder. ``--commit`` says which commit played, where the machine that played had the source without its repository.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import make_trot_policy
 import numpy as np
 import torch
 from gaitgauge.files.writing import json_text, write_atomically
+from gaitgauge.gauge.comparison import load_result
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.report import write_report
 from gaitgauge.gauge.store import StoreError
@@ -60,19 +64,46 @@ def save_constant(path: Path, action: list[float], *, kind: str) -> None:
     save_policy(path, contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=state))
 
 
-def card_of(results: dict[str, Any], name: str, repeated: dict[str, Any] | None) -> dict[str, Any]:
-    """A card that names no folder and no machine, with the figures of repeated evaluations by the same rules if there are any."""
+def card_of(
+    results: dict[str, Any], name: str, repeated: dict[str, Any] | None, commit: str | None = None
+) -> dict[str, Any]:
+    """A card that names no folder and no machine, with the figures of repeated evaluations by the same rules if there are any.
+
+    Args:
+        results: content of ``results.json``.
+        name: the policy's.
+        repeated: what ``benchmarks/repeatability.py`` wrote.
+        commit: the one that played, where the results do not know.
+    """
     path = "pretrained" if name == "pretrained" else f"{name}.gauge.pt"
     suite = results["suite"]["name"]
     provenance = {k: v for k, v in results["provenance"].items() if k not in ("host", "command")}
     provenance["command"] = f"gaitgauge evaluate {path} --suite {suite}"
     provenance["host"] = ""
+    provenance["commit"] = provenance.get("commit") or commit
     band = tolerance_band(results["score"], results["score_interval"])
     card = {**results, "policy": {**results["policy"], "path": path}, "provenance": provenance, "tolerance": band}
     if repeated and repeated["suite"]["digest"] == results["suite"]["digest"]:
-        figures = ("sigma", "mean", "coverage", "control_steps", "cost", "policy")
+        figures = ("sigma", "interval", "by_environments", "mean", "coverage", "control_steps", "cost", "policy")
         card["repeatability"] = {k: repeated[k] for k in figures} | {"evaluations": len(repeated["evaluations"])}
     return card
+
+
+def play(name: str, suite: str, run: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Evaluate a policy on a suite; returns the content of ``results.json``."""
+    path = PRETRAINED if name == "pretrained" else arguments.folder / f"{name}-{suite}.gauge.pt"
+    if name != "pretrained":
+        make_policy(name, path, arguments.cts)
+    request = Request(
+        policy="pretrained" if name == "pretrained" else str(path),
+        suite=suite,
+        threads=arguments.threads,
+        terrains=tuple(arguments.terrain),
+        frictions=tuple(arguments.friction),
+    )
+    results = evaluate(request, run, resume=True)
+    write_report(run)
+    return results
 
 
 def main() -> None:
@@ -85,12 +116,14 @@ def main() -> None:
     parser.add_argument(
         "--repeatability", type=Path, help="figures that benchmarks/repeatability.py wrote, for the cards"
     )
+    parser.add_argument("--made", action="store_true", help="take the results that the folder holds, play nothing")
+    parser.add_argument("--commit", help="commit of the source that played, where the results do not know it")
     parser.add_argument("--only", nargs="+", choices=NAMES, default=list(NAMES))
     parser.add_argument("--suite", nargs="+", default=list(SUITES))
     parser.add_argument("--terrain", action="append", default=[])
     parser.add_argument("--friction", action="append", type=float, default=[])
     arguments = parser.parse_args()
-    if "cts" in arguments.only and arguments.cts is None:
+    if "cts" in arguments.only and arguments.cts is None and not arguments.made:
         parser.error("the card of 'cts' needs the archive of its weights; give --cts, or choose others with --only")
     repeated = None
     if arguments.repeatability is not None:
@@ -98,20 +131,10 @@ def main() -> None:
     arguments.folder.mkdir(parents=True, exist_ok=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.only:
-        path = PRETRAINED if name == "pretrained" else arguments.folder / f"{name}.gauge.pt"
-        if name != "pretrained":
-            make_policy(name, path, arguments.cts)
         for suite in arguments.suite:
-            request = Request(
-                policy="pretrained" if name == "pretrained" else str(path),
-                suite=suite,
-                threads=arguments.threads,
-                terrains=tuple(arguments.terrain),
-                frictions=tuple(arguments.friction),
-            )
             run = arguments.folder / f"{name}-{suite}"
-            card = card_of(evaluate(request, run, resume=True), name, repeated)
-            write_report(run)
+            results = load_result(run) if arguments.made else play(name, suite, run, arguments)
+            card = card_of(results, name, repeated, arguments.commit)
             write_atomically(arguments.out / f"{run.name}.json", json_text(json.loads(json.dumps(card))), StoreError)
             low, high = card["tolerance"] or (float("nan"),) * 2
             where = f" ({card['coverage']['text']})" if card["coverage"]["kind"] != "complete" else ""

@@ -14,7 +14,9 @@ from importlib.metadata import PackageNotFoundError, distributions, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("gaitgauge", "mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib", "onnxruntime")
+from ..version import __version__
+
+PACKAGES = ("mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib", "onnxruntime")
 _GROUPS = "gaitgauge."
 _JUDGING = ("backends", "files", "gauge", "policy", "robots", "terrains")
 _ROOT = Path(__file__).resolve().parents[1]
@@ -55,7 +57,7 @@ def provenance(
 @cache
 def versions() -> dict[str, str]:
     """Versions of the programs that decide about results."""
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version(), "gaitgauge": __version__}
     for package in PACKAGES:
         try:
             found[package] = version(package)

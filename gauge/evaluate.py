@@ -23,7 +23,7 @@ from ..backends.base import PhysicsBackend
 from ..backends.mujoco import MujocoBackend
 from ..backends.registry import find_backend, make_backend
 from ..files.parsing import shown
-from ..files.provenance import plugins, provenance, versions
+from ..files.provenance import plugins, provenance, source_digest, versions
 from ..files.writing import json_text, write_atomically
 from ..policy.contract import kind_of_observations
 from ..policy.digest import policy_digest
@@ -305,6 +305,7 @@ def evaluate(
                 "policy": policy_digest(prepared.policy),
                 "robot": robot_digest(prepared.robot),
                 "suite": suite.digest,
+                "source": source_digest(),
             },
             seconds=round(time.perf_counter() - began, 2),
             physics_steps=effort.physics_steps,

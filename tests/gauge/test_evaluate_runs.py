@@ -19,7 +19,7 @@ import torch
 from gaitgauge.backends import make_backend
 from gaitgauge.backends.base import BackendError
 from gaitgauge.backends.fake import FakeScript
-from gaitgauge.files.provenance import versions
+from gaitgauge.files.provenance import commit, versions
 from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.evaluate import Request, identity, prepare
@@ -143,7 +143,8 @@ def test_a_whole_run(request_for, tmp_path, base):
     assert results["health"] == {"episodes": 4, "falls": 0, "diverged": 0, "overflowed": 0}
     assert results["suite"]["digest"] == results["provenance"]["digests"]["suite"]
     assert {len(d) for d in results["provenance"]["digests"].values()} == {64}
-    assert results["provenance"]["digests"].keys() == {"policy", "suite", "robot"}
+    assert results["provenance"]["digests"].keys() == {"policy", "suite", "robot", "source"}
+    assert results["provenance"]["commit"] == commit()
     assert results["chance"]["seeds"] == [0, 1] and results["chance"]["search_seeds"] == [100, 101, 102]
     assert results["provenance"]["processor"]
     # every episode that was played is a row, those of the level tests too
