@@ -51,10 +51,18 @@ class BodyPlan:
     """Centres of the feet in the default pose [m], (F, 3)."""
     standing_height: float
     """Height of the base above level ground that the lowest foot touches in the default pose [m]."""
+    stretched_height: float
+    """Height of the base above level ground at which all legs hang straight down to it [m], the mean of all legs."""
     leg_length: float
     """Length of a stretched leg [m]: the links from its first joint beside abduction to the foot, the mean of all legs."""
     mass: float
     """Of the whole robot [kg]."""
+
+    @property
+    def stance(self) -> tuple[float, float]:
+        """Length and width of the rectangle around the feet's centres in the default pose [m]."""
+        length, width, _ = np.ptp(self.foot_position, axis=0)
+        return float(length), float(width)
 
     def part(self, joint: int) -> str:
         """What a joint moves, in the words of ``LEG_PARTS``: the last of a leg its calf, abduction its hip, any other its
@@ -76,7 +84,7 @@ def body_plan(robot: Robot) -> BodyPlan:
     order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
     base = model.body(robot.base_body).id
     feet = [model.geom(name).id for name in robot.foot_geoms]
-    legs, abduction, lengths = [], [], []
+    legs, abduction, lengths, below = [], [], [], []
     for name, foot in zip(robot.foot_names, feet, strict=True):
         chain = joint_chain(model, int(model.geom_bodyid[foot]), base)
         if not chain or any(j not in order for j in chain):
@@ -87,6 +95,8 @@ def body_plan(robot: Robot) -> BodyPlan:
             abduction.append(order[sideways])
         swinging = [j for j in chain if j != sideways] or chain
         ends = [*(data.xanchor[j] for j in swinging), data.geom_xpos[foot]]
+        # from the base down to the leg's first joint, and from the foot's centre to its lowest point
+        below.append(data.geom_xpos[foot, 2] - lowest_point(model, data, foot) - data.xanchor[swinging[0], 2])
         # what lies along a hinge is width, not length
         lengths.append(
             sum(
@@ -102,6 +112,7 @@ def body_plan(robot: Robot) -> BodyPlan:
         limb_bodies=tuple(i for i, chain in enumerate(bodies) if set(chain) - sideways_ids),
         foot_position=data.geom_xpos[feet].copy(),
         standing_height=max(-lowest_point(model, data, foot) for foot in feet),
+        stretched_height=float(np.mean(below) + np.mean(lengths)),
         leg_length=float(np.mean(lengths)),
         mass=float(model.body_mass.sum()),
     )

@@ -6,10 +6,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from ..policy.contract import standard_contract
 from ..robots import Robot, load_robot
 from ..robots.body_plan import body_plan
-from .configuration import RunConfiguration
-from .environment_configuration import CommandStage, EnvironmentConfiguration, Range
+from .configuration import TrainingConfiguration
+from .environment_configuration import CommandStage, EnvironmentConfiguration, Ramp, Range
 
 Triple = tuple[float, float, float]
 
@@ -21,8 +22,12 @@ class Ratios:
     length: float
     """Of stretched legs."""
     height: float
-    """Of the base above the ground in the standing pose."""
+    """Of the base above the ground on stretched legs."""
+    stance: tuple[float, float]
+    """Of the length and the width of the rectangle between the feet in the standing pose."""
     mass: float
+    action: float
+    """Of the angle that an output of 1 of the network moves a joint's target, the mean of all joints."""
     speed: Triple
     """Of the largest forward, lateral and yaw commands."""
 
@@ -44,8 +49,10 @@ def ratios(robot: Robot, reference: Robot) -> Ratios:
     )
     return Ratios(
         length=mine.leg_length / its.leg_length,
-        height=mine.standing_height / its.standing_height,
+        height=mine.stretched_height / its.stretched_height,
+        stance=(mine.stance[0] / its.stance[0], mine.stance[1] / its.stance[1]),
         mass=mine.mass / its.mass,
+        action=_action_scale(robot) / _action_scale(reference),
         speed=(forward, lateral, yaw),
     )
 
@@ -53,9 +60,11 @@ def ratios(robot: Robot, reference: Robot) -> Ratios:
 def scaled_environment(environment: EnvironmentConfiguration, source: str) -> EnvironmentConfiguration:
     """An environment's settings for another robot.
 
-    Scaled are the height of the base and the areas below it with the leg; masses that are added; penalties on torque and
-    power with what the robot must carry; contact forces that teacher and critic see; and commands with the robot's own
-    limits. The parameter set is the robot's default one where it has none of the name that the task asks for.
+    Scaled are the height of the base with what the legs reach; the place to start on with the stance; masses that are added;
+    penalties on torque and power with what the robot must carry; penalties on actions with the angle that an action is;
+    contact forces that teacher and critic see; and commands with the robot's own limits. Terrain is not: every robot
+    meets the ground that the gauge has. The parameter set is the robot's default one where it has none of the name that
+    the task asks for.
 
     Args:
         environment: settings for ``environment.robot``.
@@ -85,12 +94,15 @@ def scaled_environment(environment: EnvironmentConfiguration, source: str) -> En
             joint_power=rewards.joint_power / by.mass,
             torque=rewards.torque / by.torque**2,
             torque_change=rewards.torque_change / by.torque**2,
+            action_rate=rewards.action_rate * by.action**2,
+            action_smoothness=rewards.action_smoothness * by.action**2,
+            base_height=_ramp(rewards.base_height, by.height**-2),
             base_height_target=rewards.base_height_target * by.height,
             trunk_area=_scaled(rewards.trunk_area, by.length),
             sigma_linear_range=_scaled(rewards.sigma_linear_range, by.speed[0]),
             sigma_yaw_range=_scaled(rewards.sigma_yaw_range, by.speed[2]),
         ),
-        reset=replace(environment.reset, footprint=_scaled(environment.reset.footprint, by.length)),
+        reset=replace(environment.reset, footprint=_footprint(environment.reset.footprint, by.stance)),
         randomization=replace(
             randomization,
             base_mass=_scaled(randomization.base_mass, by.mass),
@@ -100,26 +112,57 @@ def scaled_environment(environment: EnvironmentConfiguration, source: str) -> En
         terrain=replace(
             environment.terrain,
             tiles=tuple(
-                replace(tile, command_limits=_limits(tile.command_limits, by.speed))
+                replace(tile, command_limits=_limits(tile.command_limits, by.speed, robot))
                 for tile in environment.terrain.tiles
             ),
         ),
     )
 
 
-def renamed_run(run: RunConfiguration, robot: str, reference: str) -> RunConfiguration:
-    """A run whose experiment is named for another robot than the task's."""
-    name = run.experiment
-    named = name.replace(reference, robot, 1) if name.startswith(reference) else f"{robot}_{name}"
-    return replace(run, experiment=named)
+def scaled_training(training: TrainingConfiguration, source: str, reference: str) -> TrainingConfiguration:
+    """How another robot learns the task: exploring by the same angles, in an experiment that is named for it.
+
+    Args:
+        training: settings for the robot ``reference``.
+        source: the other robot's name, or the path of its description.
+        reference: name of the robot that the task was written for.
+
+    Raises:
+        RobotError: one of the robots cannot be found, or is wrong.
+    """
+    robot, its = load_robot(source), load_robot(reference)
+    by, network, name = ratios(robot, its), training.network, training.run.experiment
+    named = name.replace(its.name, robot.name, 1) if name.startswith(its.name) else f"{robot.name}_{name}"
+    return replace(
+        training,
+        network=replace(network, initial_std=network.initial_std / by.action),
+        run=replace(training.run, experiment=named),
+    )
 
 
 def _scaled(pair: Range, factor: float) -> Range:
     return pair[0] * factor, pair[1] * factor
 
 
-def _limits(limits: Triple, factor: Triple) -> Triple:
-    return limits[0] * factor[0], limits[1] * factor[1], limits[2] * factor[2]
+def _footprint(footprint: Range, stance: Range) -> Range:
+    return footprint[0] * stance[0], footprint[1] * stance[1]
+
+
+def _ramp(ramp: Ramp, factor: float) -> Ramp:
+    return replace(ramp, start=ramp.start * factor, end=ramp.end * factor)
+
+
+def _action_scale(robot: Robot) -> float:
+    scales = standard_contract(robot).action_scale
+    return sum(scales) / len(scales)
+
+
+def _limits(limits: Triple, factor: Triple, robot: Robot) -> Triple:
+    """A terrain's limits: faster for a faster robot, but for a slower one only as slow as it is."""
+    forward, lateral, yaw = (
+        max(limit * by, min(limit, own)) for limit, by, own in zip(limits, factor, robot.command_limits, strict=True)
+    )
+    return forward, lateral, yaw
 
 
 def _stage(stage: CommandStage, speed: Triple) -> CommandStage:

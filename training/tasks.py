@@ -24,7 +24,7 @@ from .environment_configuration import (
     TerrainConfiguration,
 )
 from .overrides import TaskError, apply_overrides
-from .scaling import renamed_run, scaled_environment
+from .scaling import scaled_environment, scaled_training
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +58,10 @@ class Task:
         own, robot = load_robot(self.environment.robot, check=False), load_robot(source)
         if robot_digest(robot) == robot_digest(own):
             return self
-        run = renamed_run(self.training.run, robot.name, own.name)
         return replace(
             self,
             environment=scaled_environment(self.environment, source),
-            training=replace(self.training, run=run),
+            training=scaled_training(self.training, source, self.environment.robot),
         )
 
     def with_horizon(self) -> Task:
