@@ -46,7 +46,7 @@ check: install
 # The site, with strict links; what its pages show is run first.
 docs: install
 	$(BIN)/python -m pytest -m 'slow or not slow' tests/docs
-	$(BIN)/python -m mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 
 format: install
 	$(BIN)/ruff check --fix .

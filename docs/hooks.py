@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,21 +12,29 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
+PATHS = ROOT / "build" / "package"
+"""Where mkdocstrings looks (``mkdocs.yml`` names it too)."""
 
 
 def on_config(config: Any) -> Any:
-    """Let mkdocstrings find the package: the repository's root is the package ``gaitgauge``."""
-    links = ROOT / "build" / "docs"
-    links.mkdir(parents=True, exist_ok=True)
-    link = links / "gaitgauge"
-    if not link.exists():
-        link.symlink_to(ROOT, target_is_directory=True)
+    """Let mkdocstrings find the package under its own name, and nothing else.
+
+    The repository's root is the package ``gaitgauge``, but a link to the root holds itself, and ``.venv``: mkdocstrings
+    reads every Python file below. So its modules and sub-packages are linked one by one.
+    """
+    package = PATHS / "gaitgauge"
+    shutil.rmtree(package, ignore_errors=True)
+    package.mkdir(parents=True)
+    for path in ROOT.iterdir():
+        if path.suffix == ".py" or (path / "__init__.py").exists():
+            (package / path.name).symlink_to(path)
+    os.environ["JUPYTER_CONFIG_PATH"] = str(Path(__file__).parent)  # jupyter_nbconvert_config.py
     return config
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Write the command reference out of the commands themselves."""
-    with_package = {**os.environ, "PYTHONPATH": str(ROOT / "build" / "docs"), "TERMINAL_WIDTH": "100"}
+    with_package = {**os.environ, "PYTHONPATH": str(PATHS), "TERMINAL_WIDTH": "100"}
     command = [sys.executable, "-m", "typer", "gaitgauge.cli.main", "utils", "docs", "--name", "gaitgauge"]
     text = subprocess.run(command, check=True, capture_output=True, text=True, env=with_package, cwd=ROOT).stdout
     files.append(File.generated(config, "cli.md", content=text.replace("# `gaitgauge`", "# Commands", 1)))

@@ -1,0 +1,28 @@
+"""What the build of the site reads."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_reference_reads_the_package_and_nothing_else(tmp_path, monkeypatch):
+    """A link to the repository's root held itself and ``.venv``: the build read it 40 times over and did not end."""
+    pytest.importorskip("mkdocs")
+    spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs" / "hooks.py")
+    assert spec and spec.loader
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    monkeypatch.setattr(hooks, "PATHS", tmp_path)
+    monkeypatch.setenv("JUPYTER_CONFIG_PATH", "")
+    hooks.on_config({})
+    walk = os.walk(tmp_path / "gaitgauge", followlinks=True)
+    found = {Path(folder, name).resolve() for folder, _, names in walk for name in names if name.endswith(".py")}
+    packages = {path.parent for path in ROOT.glob("*/__init__.py")}
+    assert found == {*ROOT.glob("*.py"), *(file for folder in packages for file in folder.rglob("*.py"))}
+    assert ROOT / "tests" not in packages
