@@ -14,6 +14,7 @@ from ..files.writing import write_atomically
 from ..policy.contract import PRIVILEGED_TERMS
 from .coverage import COMPLETE, coverage_of
 from .report import TEMPLATES
+from .result_check import robot_digest_of
 from .verify import CardError, load_card
 
 
@@ -39,20 +40,21 @@ def write_board(folder: Path, page: Path) -> Path:
 
 
 def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) -> list[dict[str, Any]]:
-    """Tables of a board, one for each digest of a suite, engine and robot, those with most cards first.
+    """Tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first.
 
     Args:
         cards: contents by file name.
         folder: what the command that checks a card finds the files in.
 
     Returns:
-        For each table ``suite``, ``backend``, ``robot``, ``ranked`` (complete cards, best first, with their ``rank``) and
-        ``others`` (parts, custom runs, levels alone and policies with privileged observations, which have no rank).
+        For each table ``suite``, ``backend``, ``robot``, ``robot_digest`` (None where cards do not say), ``ranked`` (complete
+        cards, best first, with their ``rank``) and ``others`` (parts, custom runs, levels alone and policies with privileged
+        observations, which have no rank).
     """
-    tables: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
-    suites: dict[tuple[str, str, str], Mapping[str, Any]] = {}
+    tables: dict[tuple[str, str, str, str | None], list[dict[str, Any]]] = {}
+    suites: dict[tuple[str, str, str, str | None], Mapping[str, Any]] = {}
     for name, card in cards.items():
-        key = (card["suite"]["digest"], card["backend"], card["robot"])
+        key = (card["suite"]["digest"], card["backend"], card["robot"], robot_digest_of(card))
         suites[key] = card["suite"]
         tables.setdefault(key, []).append(_entry(name, card, folder))
     found = []
@@ -62,7 +64,9 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
         for entry in ranked:  # equal scores share a rank
             entry["rank"] = 1 + sum(other["score"] > entry["score"] for other in ranked)
         others = [e for e in entries if not e["ranked"]]
-        found.append({"suite": suites[key], "backend": key[1], "robot": key[2], "ranked": ranked, "others": others})
+        _, backend, robot, files = key
+        place = {"suite": suites[key], "backend": backend, "robot": robot, "robot_digest": files}
+        found.append({**place, "ranked": ranked, "others": others})
     return found
 
 

@@ -20,7 +20,7 @@ from ..files.parsing import edited, one_line, read_results, shown
 from .coverage import COMPLETE, coverage_of
 from .episodes import QUALITY
 from .intervals import CONFIDENCE, Array, Chance, Evidence
-from .result_check import chance_rules_of, check_result
+from .result_check import chance_rules_of, check_result, robot_digest_of
 from .results import ONE_SEED, SCHEMA, environment_weights
 
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
@@ -246,6 +246,12 @@ def _check(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
                     f"results with different {word}s do not compare: '{labels[0]}' has {results[0].get(key)}, "
                     f"'{label}' has {found.get(key)}; evaluate both alike"
                 )
+        files = [robot_digest_of(r) for r in (results[0], found)]
+        if None not in files and files[0] != files[1]:
+            raise ComparisonError(
+                f"'{labels[0]}' and '{label}' name the robot {found['robot']}, but its files differ "
+                f"({' and '.join(str(f)[:12] for f in files)}); evaluate both on one robot (--robot)"
+            )
         searched = [any(row.get("trials") for row in r["environments"]) for r in (results[0], found)]
         if searched[0] != searched[1]:
             given, other = (label, labels[0]) if searched[0] else (labels[0], label)

@@ -13,17 +13,21 @@ from .suite import Push, Suite
 
 def push_force(push: Push, segment: Segment) -> float:
     """Force of a segment's push, to the left of the heading [N]: a draw that belongs to the segment alone."""
-    draw = random.Random(f"push {segment.episode.key} {segment.goal} {segment.sub_command}")
+    draw = _draw("push", segment)
     side = draw.choice((-1.0, 1.0))
     return side * draw.uniform(*push.force)
 
 
-def push_steps(suite: Suite) -> tuple[int, int]:
-    """Commanded control steps, counted from 1, from which and before which the push acts."""
+def push_steps(suite: Suite, segment: Segment) -> tuple[int, int]:
+    """Commanded control steps, counted from 1, from which and before which a segment's push acts: a draw of its own."""
     push, period = suite.push, suite.physics.control_period
     assert push is not None
-    begin = round(push.after / period) + 1
+    begin = round(_draw("time of push", segment).uniform(*push.after) / period) + 1
     return begin, begin + max(round(push.duration / period), 1)
+
+
+def _draw(what: str, segment: Segment) -> random.Random:
+    return random.Random(f"{what} {segment.episode.key} {segment.goal} {segment.sub_command}")
 
 
 def sideways(quaternion: torch.Tensor, force: torch.Tensor) -> torch.Tensor:

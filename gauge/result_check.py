@@ -64,6 +64,12 @@ class _Provenance:
     digests: Mapping[str, Text] = field(default_factory=dict)
 
 
+def robot_digest_of(data: Mapping[str, Any]) -> str | None:
+    """SHA-256 of the files of the robot that was judged; None in results from before, which do not say."""
+    found: str | None = data.get("provenance", {}).get("digests", {}).get("robot")
+    return found
+
+
 def check_result(data: Mapping[str, Any], source: str, error: type[Exception]) -> None:
     """Check names, numbers and their ranges in the content of a ``results.json``; what is not named here is left as it is.
 

@@ -215,8 +215,8 @@ class Push:
 
     goal: Name
     """Velocity goal of whose sub-commands each has a push."""
-    after: _Time
-    """When it begins, from the first commanded control step on [s]."""
+    after: tuple[_Time, _Time]
+    """Earliest and latest beginning, from the first commanded control step on, all between equally likely [s]."""
     duration: _Time
     """[s]."""
     force: tuple[_Force, _Force]
@@ -409,6 +409,7 @@ def _check(suite: Suite, source: str) -> None:
         ] = half == 0.0 or suite.noise.stream == "counter"
     rules |= _goal_rules(suite)
     if (push := suite.push) is not None:
+        rules[f"push.after ({push.after[0]:g} to {push.after[1]:g} s) must rise"] = push.after[0] <= push.after[1]
         rules[f"push.force ({push.force[0]:g} to {push.force[1]:g} N) must rise"] = push.force[0] <= push.force[1]
         rules[f"push.goal ({push.goal}) is none of goals with sub-commands ({', '.join(goals)})"] = any(
             g.name == push.goal and (g.phases or g.sub_commands) for g in suite.goals

@@ -17,7 +17,7 @@ from .comparison import load_result
 from .evaluate import Prepared, Request, Status, evaluate, file_digest, prepare
 from .intervals import Evidence
 from .pipelines import Environment
-from .result_check import chance_rules_of
+from .result_check import chance_rules_of, robot_digest_of
 from .results import environment_weights
 from .suite import Suite, load_suite
 
@@ -84,7 +84,7 @@ def prepare_replay(
             trust=trust,
         )
     )
-    expected = card["provenance"].get("digests", {}).get("robot")
+    expected = robot_digest_of(card)
     if expected is not None and expected != robot_digest(prepared.robot):
         raise CardError(
             f"the files of robot '{card['robot']}' are not the card's; check out the commit that made the card"

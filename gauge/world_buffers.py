@@ -203,11 +203,10 @@ class WorldBuffers:
         write(self.length, lengths)
         write(self.noise_start, [rules.noise_start(s) for s in segments])
         if suite.push is not None:
-            begin, end = push_steps(suite)
-            pushed = [s.goal == suite.push.goal for s in segments]
+            steps = [push_steps(suite, s) if s.goal == suite.push.goal else (0, 0) for s in segments]
             write(self.push_force, [push_force(suite.push, s) for s in segments])
-            write(self.push_begin, [begin if p else 0 for p in pushed])
-            write(self.push_end, [end if p else 0 for p in pushed])
+            write(self.push_begin, [begin for begin, _ in steps])
+            write(self.push_end, [end for _, end in steps])
         write(self.aims, aims)
         write(self.watched, [rules.restarts and not s.again for s in segments])
         write(self.sampled, [e.stage == "eval" for e in episodes])

@@ -50,6 +50,17 @@ def test_other_rules_engines_and_robots_have_tables_of_their_own():
     assert len(board_data(cards)) == 4
 
 
+def test_a_robot_of_the_same_name_with_other_files_has_a_table_of_its_own():
+    """A policy may carry its robot: a lighter one that is called go2 is none."""
+    files = {"a": "ab" * 32, "b": "ab" * 32, "c": "cd" * 32}
+    cards = {name: card(0.5, provenance={"digests": {"robot": digest}}) for name, digest in files.items()}
+    tables = board_data(cards)
+    assert [len(table["ranked"]) for table in tables] == [2, 1]
+    assert [table["robot_digest"] for table in tables] == ["ab" * 32, "cd" * 32]
+    assert "cdcdcdcdcdcd" in render_board(tables)
+    assert board_data({"old": card(0.5)})[0]["robot_digest"] is None
+
+
 def test_privileged_observations_are_marked_and_have_no_rank():
     cards = {
         "1": card(0.9, observations=("command", "base_linear_velocity_b")),

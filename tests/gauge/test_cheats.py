@@ -32,7 +32,7 @@ name = "moment"
 goals = [{ name = "max_velocity", phases = [0.8, 0.2] }, { name = "target_pos_velocity", phases = [] }]
 
 [push]
-after = 0.3
+after = [0.3, 0.5]
 
 [settling]
 longest = 0.5

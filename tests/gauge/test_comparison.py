@@ -197,6 +197,18 @@ def test_a_suite_whose_rules_were_changed_is_another_one():
         compare([first, second])
 
 
+def test_a_robot_whose_files_were_changed_is_another_one():
+    first, second = both()
+    for found, digest in ((first, "ab" * 32), (second, "cd" * 32)):
+        found["provenance"] = {"digests": {"robot": digest}}
+    with pytest.raises(
+        ComparisonError, match=r"name the robot go2, but its files differ \(abababababab and cdcdcdcdcdcd\)"
+    ):
+        compare([first, second])
+    second["provenance"] = {}  # results of before do not say
+    assert compare([first, second])
+
+
 def test_other_environments_are_refused():
     first, second = results(frictions=(0.6,)), results(frictions=(0.6, 0.9), path="second.pt")
     with pytest.raises(ComparisonError, match=r"only 'second' has flat at friction 0.9"):

@@ -29,6 +29,7 @@ from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.robots import RobotError
 from gaitgauge.terrains.registry import TerrainError
 from scripted_gauge import GO2, Puppet
 
@@ -311,6 +312,19 @@ def test_a_run_does_not_go_on_with_another_robot(request_for, tmp_path):
     file.write_text(file.read_text().replace("stiffness = 20.0", "stiffness = 20.5", 1))
     with pytest.raises(StoreError, match=r"belongs to another run \(robot_digest differs\)"):
         evaluate(request, tmp_path / "run", resume=True)
+
+
+def test_a_robot_with_its_feet_in_the_ground_is_not_judged(request_for, tmp_path):
+    folder = tmp_path / "robot"
+    shutil.copytree(GO2.mjcf.parent, folder)
+    file = folder / "robot.toml"
+    # with its trunk at 0.445 m the lowest feet hang 0.1215 m above the ground
+    file.write_text(file.read_text().replace("stand_height = 0.445", "stand_height = 0.3075"))
+    with pytest.raises(
+        RobotError, match=r"at stand_height 0\.3075 m the geom '.*' is 0\.016 m below the ground; raise it to 0\.323 m"
+    ):
+        evaluate(request_for(robot=str(folder)), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_does_not_go_on_with_another_engine_version(request_for, tmp_path, monkeypatch):

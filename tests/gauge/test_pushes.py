@@ -12,7 +12,7 @@ from gaitgauge.gauge.suite import Push, load_suite
 from gaitgauge.robots.rotation import from_yaw
 from scripted_gauge import DIAGONAL, MAXIMUM, PERIOD, Puppet, episode, run, scene, short_suite
 
-PUSH = Push(goal=MAXIMUM, after=0.06, duration=0.04, force=(80.0, 100.0))
+PUSH = Push(goal=MAXIMUM, after=(0.06, 0.06), duration=0.04, force=(80.0, 100.0))
 
 
 class Pushed(Puppet):
@@ -77,6 +77,24 @@ def test_pushes_go_to_both_sides_and_have_all_strengths():
     assert push_force(PUSH, segments[7]) == force[7]
 
 
+def test_nobody_can_know_when_a_push_comes():
+    """A push at one time would be none for a policy that counts: it comes at any control step from 1.5 to 3.5 s, for 0.2 s."""
+    suite = load_suite("gaitgauge-1")
+    segments = [
+        Segment(episode=episode(MAXIMUM, seed=seed), goal=MAXIMUM, goal_index=0, sub_command=part)
+        for seed in range(300)
+        for part in range(6)
+    ]
+    steps = np.array([push_steps(suite, s) for s in segments])
+    assert set(steps[:, 1] - steps[:, 0]) == {10}
+    # control steps are counted from 1: the first after 1.5 s is the 76th
+    assert steps[:, 0].min() == 76 and steps[:, 0].max() == 176
+    assert np.histogram(steps[:, 0], bins=4, range=(76, 177))[0] == pytest.approx(450, abs=75)
+    forces = np.abs([push_force(suite.push, s) for s in segments])
+    assert abs(np.corrcoef(steps[:, 0], forces)[0, 1]) < 0.08
+    assert push_steps(suite, segments[7]) == tuple(steps[7])
+
+
 def test_a_push_is_sideways_of_the_heading():
     force = sideways(from_yaw(torch.tensor([0.0, torch.pi / 2, torch.pi])), torch.tensor([90.0, 90.0, -90.0]))
     assert force.flatten().tolist() == pytest.approx([0, 90, 0, -90, 0, 0, 0, 90, 0], abs=1e-4)
@@ -85,8 +103,7 @@ def test_a_push_is_sideways_of_the_heading():
 def test_the_own_suite_pushes_as_the_papers_trials_did():
     push = load_suite("gaitgauge-1").push
     assert push.force == (80.0, 100.0)
-    # 2.5 s into 5 s of a command, for 0.2 s
-    assert push_steps(load_suite("gaitgauge-1")) == (126, 136)
+    assert push.after == (1.5, 3.5) and push.duration == 0.2
     assert load_suite("robogauge-1.1").push is None
 
 

@@ -149,7 +149,7 @@ def test_replayed_steps_push_at_the_same_time_with_the_same_force(tapes, monkeyp
 
     monkeypatch.setattr(Puppet, "apply_force", apply_force)
     suite = short_suite(OWN)
-    push = replace(suite.push, after=0.04, duration=0.04)
+    push = replace(suite.push, after=(0.04, 0.04), duration=0.04)
     logs = []
     for record in (False, True):
         capturing.append(record)
