@@ -321,7 +321,7 @@ def test_a_robot_with_its_feet_in_the_ground_is_not_judged(request_for, tmp_path
     # with its trunk at 0.445 m the lowest feet hang 0.1215 m above the ground
     file.write_text(file.read_text().replace("stand_height = 0.445", "stand_height = 0.3075"))
     with pytest.raises(
-        RobotError, match=r"at stand_height 0\.3075 m the geom '.*' is 0\.016 m below the ground; raise it to 0\.323 m"
+        RobotError, match=r"at stand_height 0\.3075 m the geom '.*' is 0\.016 m below the ground; raise it to 0\.324 m"
     ):
         evaluate(request_for(robot=str(folder)), tmp_path / "run")
     assert not (tmp_path / "run").exists()
