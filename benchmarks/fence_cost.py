@@ -12,6 +12,8 @@ worker and program take turns, but on one core each would wait for the other to 
 from __future__ import annotations
 
 import argparse
+import gc
+import resource
 import statistics
 import tempfile
 import time
@@ -35,37 +37,45 @@ class Unfenced:
 
     def __init__(self, make: Callable[[bytes, str], Program], data: bytes, *, source: str) -> None:
         self._program = make(data, source)
-        self._sessions: dict[int, PolicySession] = {}
 
     def ask(self, do: str, **details: Any) -> dict[str, Any]:
         """See ``Child``."""
         return dict(self._program.answer({"do": do, **details}))
 
-    def session(self, rows: int, *, rowwise: bool) -> tuple[int, bool]:
+    def session(self, rows: int, width: int, joints: int, *, rowwise: bool) -> UnfencedSession:
         """See ``Child``."""
-        made = self._program.session(rows, rowwise=rowwise)
-        number = max(self._sessions, default=0) + 1
-        self._sessions[number] = made
-        return number, made.batched
+        return UnfencedSession(self._program.session(rows, rowwise=rowwise))
 
-    def drop(self, number: int) -> None:
-        """See ``Child``."""
-        self._sessions.pop(number, None)
 
-    def act(self, number: int, observation: np.ndarray, forget: np.ndarray | None, joints: int) -> torch.Tensor:
-        """See ``Child``."""
-        session = self._sessions[number]
+class UnfencedSession:
+    """In the place of ``policy.fence.child.ChildSession``."""
+
+    def __init__(self, session: PolicySession) -> None:
+        self._session, self.batched = session, session.batched
+
+    def act(self, observation: np.ndarray, forget: np.ndarray | None) -> np.ndarray:
+        """See ``ChildSession``."""
         if forget is not None:
-            session.reset(torch.from_numpy(forget))
-        return session.act(torch.from_numpy(observation))
+            self._session.reset(torch.from_numpy(forget))
+        return self._session.act(torch.from_numpy(observation)).numpy()
 
 
-def run(request: Request) -> tuple[float, float]:
-    """Seconds and score of one run."""
+def processor_seconds() -> float:
+    """Processor time of this process and of its children that have ended, user and system."""
+    return sum(
+        used.ru_utime + used.ru_stime
+        for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+
+
+def run(request: Request) -> tuple[float, float, float]:
+    """Wall time, processor time and score of one run."""
     with tempfile.TemporaryDirectory() as folder:
-        began = time.perf_counter()
+        began, used = time.perf_counter(), processor_seconds()
         results = evaluate(request, Path(folder) / "run")
-        return time.perf_counter() - began, results["score"]
+        wall = time.perf_counter() - began
+        gc.collect()  # a program's process ends, and is counted, with what refers to it
+        return wall, processor_seconds() - used, results["score"]
 
 
 def main() -> None:
@@ -81,18 +91,23 @@ def main() -> None:
         if arguments.policy is None:
             export_torchscript(load_policy("pretrained", load_robot("go2")), policy)
         request = Request(policy=policy, suite=arguments.suite, terrains=tuple(arguments.terrain), threads=1)
-        pairs = []
-        print("fenced [s]  in the worker [s]  ratio   score", flush=True)
+        ratios = []
+        print("        fenced [s]       in the worker [s]          ratio")
+        print("    wall processor       wall   processor    wall processor   score", flush=True)
         for _ in range(arguments.repeat):
-            fenced, score = run(request)
+            wall, used, score = run(request)
             with patch("gaitgauge.policy.fence.child.Child", Unfenced):
-                alone, same = run(request)
+                wall_alone, used_alone, same = run(request)
             if score != same:
                 raise SystemExit(f"scores differ: {score} behind the fence, {same} without")
-            pairs.append((fenced, alone))
-            print(f"{fenced:10.2f}  {alone:17.2f}  {fenced / alone:5.3f}  {score:.4f}", flush=True)
-    first, second = (statistics.median(column) for column in zip(*pairs, strict=True))
-    print(f"{first:10.2f}  {second:17.2f}  {statistics.median(a / b for a, b in pairs):5.3f}  medians")
+            ratios.append((wall / wall_alone, used / used_alone))
+            print(
+                f"{wall:8.2f} {used:9.2f}  {wall_alone:9.2f}   {used_alone:9.2f}  "
+                f"{ratios[-1][0]:6.3f} {ratios[-1][1]:9.3f}  {score:.4f}",
+                flush=True,
+            )
+    medians = [statistics.median(column) for column in zip(*ratios, strict=True)]
+    print(f"medians of the ratios: wall {medians[0]:.3f}, processor {medians[1]:.3f}")
 
 
 if __name__ == "__main__":

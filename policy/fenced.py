@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Collection, Sequence
-from typing import Any
 
 import torch
 
@@ -84,7 +82,7 @@ class FencedPolicy(FilePolicy):
 
 
 class FencedSession(PolicySession):
-    """A session in another process: one message there and one back for a control step."""
+    """A session in another process."""
 
     def __init__(
         self,
@@ -96,11 +94,11 @@ class FencedSession(PolicySession):
         device: torch.device,
         rowwise: bool = False,
     ) -> None:
-        self._number, self.batched = child.session(num_episodes, rowwise=rowwise)
-        weakref.finalize(self, child.drop, self._number)
-        self._child, self._contract, self._source, self._device = child, contract, source, device
+        self._session = child.session(num_episodes, contract.observation_width, contract.num_joints, rowwise=rowwise)
+        self.batched = self._session.batched
+        self._contract, self._source, self._device = contract, source, device
         self._num_episodes = num_episodes
-        self._forget: Any = None
+        self._forget: torch.Tensor | None = None
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """See ``PolicySession``: it is done before the next action."""
@@ -111,6 +109,6 @@ class FencedSession(PolicySession):
         """See ``PolicySession``."""
         check_observation(observation, self._num_episodes, self._contract, self._source)
         forget = None if self._forget is None else self._forget.numpy()
-        action = self._child.act(self._number, observation.detach().cpu().numpy(), forget, self._contract.num_joints)
+        action = torch.from_numpy(self._session.act(observation.numpy(force=True), forget))
         self._forget = None
-        return action.to(self._device)
+        return action if self._device.type == "cpu" else action.to(self._device)

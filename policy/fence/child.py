@@ -1,12 +1,15 @@
 """The process in which a foreign program runs, and how its owner talks with it.
 
-One message there and one back for a control step. What comes back is never unpickled: a word, JSON, or numbers. The process
-ends when its owner does, when it takes too long, and when nothing refers to it any more.
+Observations and actions lie in memory that both see; one short message there and one back make a control step. What comes
+back is never unpickled: a word, JSON, or numbers. The process ends when its owner does, when it takes too long, and when
+nothing refers to it any more.
 """
 
 from __future__ import annotations
 
+import gc
 import json
+import mmap
 import os
 import select
 import signal
@@ -16,6 +19,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
+from multiprocessing.heap import Arena
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,9 +34,10 @@ STEP_SECONDS = 10
 _WALL_SECONDS = 6 * STEP_SECONDS
 """Longest that its owner waits for that, on a machine that has other things to do."""
 _LONGEST_REPLY = 2**28
+_ROOM = 2**26  # of the memory that both see; what is not used takes none
 
 _FINE, _FAILED = b"\0\0\0\0", b"\1\0\0\0"
-_ACT = struct.Struct("=IIII")  # zero, session, rows, whether a mask of those to forget follows
+_ACT = struct.Struct("=II?")  # zero, session, whether some rows forget first
 
 
 class Program(Protocol):
@@ -49,6 +54,16 @@ class Program(Protocol):
         """Start work on so many episodes, together or each alone."""
 
 
+class _Seats:
+    """Where the numbers of a session lie in the memory that both see: all sessions use the same places in turn."""
+
+    def __init__(self, memory: Any, rows: int, width: int, joints: int) -> None:
+        numbers = np.frombuffer(memory, np.float32, rows * (width + joints))
+        self.observation = numbers[: rows * width].reshape(rows, width)
+        self.action = numbers[rows * width :].reshape(rows, joints)
+        self.forget = np.frombuffer(memory, np.bool_, rows, offset=numbers.nbytes)
+
+
 class Child:
     """A process of one foreign program, seen from its owner."""
 
@@ -63,13 +78,17 @@ class Child:
         Raises:
             PolicyError: it cannot be loaded, takes too long or too much memory.
         """
-        self._source = source
+        self._source, self._owner = source, os.getpid()
         self._busy = threading.Lock()
         self._dropped: list[int] = []
         self._connection, theirs = CONTEXT.Pipe()
+        self._memory, shared = _shared_memory()
         with theirs:
             self._process = CONTEXT.Process(
-                target=_run, args=(make, theirs, self._connection, source, os.getpid()), daemon=True, name="fence"
+                target=_run,
+                args=(make, theirs, self._connection, shared, source, self._owner),
+                daemon=True,
+                name="fence",
             )
             self._process.start()
         self._end = weakref.finalize(self, _end, self._process, self._connection, os.getpid())
@@ -93,41 +112,60 @@ class Child:
             raise PolicyError(f"'{self._source}' failed: its process answered nonsense")
         return answer
 
-    def session(self, rows: int, *, rowwise: bool) -> tuple[int, bool]:
-        """Start a session; its number, and whether one run of the program serves all its rows."""
-        dropped, self._dropped = self._dropped, []
-        answer = self.ask("session", rows=rows, rowwise=rowwise, dropped=dropped)
-        return int(answer["number"]), bool(answer["batched"])
+    def session(self, rows: int, width: int, joints: int, *, rowwise: bool) -> ChildSession:
+        """Start a session of so many rows, observations ``width`` and actions ``joints`` wide.
 
-    def drop(self, number: int) -> None:
+        Raises:
+            PolicyError: the program fails, or one step has more numbers than there is room for.
+        """
+        if 4 * rows * (width + joints) + rows > _ROOM:
+            raise PolicyError(
+                f"'{self._source}' is a program, which is given at most {_ROOM // 2**20} MiB of observations and actions at "
+                f"once; those of {rows} episodes are more: play fewer at a time"
+            )
+        dropped, self._dropped = self._dropped, []
+        answer = self.ask("session", rows=rows, width=width, joints=joints, rowwise=rowwise, dropped=dropped)
+        number = int(answer["number"])
+        session = ChildSession(self, number, _Seats(self._memory, rows, width, joints), batched=bool(answer["batched"]))
+        weakref.finalize(session, self._dropped_later, number)
+        return session
+
+    def _dropped_later(self, number: int) -> None:
         """Forget a session, with the next one that is started: this may be called at any time."""
         self._dropped.append(number)
 
-    def act(self, number: int, observation: np.ndarray, forget: np.ndarray | None, joints: int) -> torch.Tensor:
-        """Actions (N, J) of a session for observations (N, W) float32, after those of ``forget`` (N,) bool were reset."""
-        rows = len(observation)
-        parts = [_ACT.pack(0, number, rows, forget is not None), b"" if forget is None else forget.tobytes()]
-        reply = self._exchange(b"".join([*parts, np.ascontiguousarray(observation, dtype=np.float32).tobytes()]))
-        if len(reply) != 4 * rows * joints:
-            raise PolicyError(f"'{self._source}' failed: its process answered nonsense")
-        # a bytearray may be written to, as torch wants it
-        return torch.frombuffer(bytearray(reply), dtype=torch.float32).view(rows, joints)
+    def act(self, number: int, seats: _Seats, observation: np.ndarray, forget: np.ndarray | None) -> np.ndarray:
+        """See ``ChildSession.act``."""
+        if os.getpid() != self._owner:
+            raise PolicyError(f"'{self._source}' runs for another process; load it in the one that asks for actions")
+        with self._busy:
+            seats.observation[:] = observation
+            if forget is not None:
+                seats.forget[:] = forget
+            reply = self._answered(_ACT.pack(0, number, forget is not None))
+            if reply != _FINE:
+                raise PolicyError(reply[4:].decode("utf-8", errors="replace"))
+            return seats.action.copy()
 
     def _exchange(self, message: bytes) -> bytes:
         with self._busy:
-            try:
-                self._connection.send_bytes(message)
-                if not self._arrives():
-                    raise PolicyError(f"'{self._source}' took over {_WALL_SECONDS} s for one step and was ended")
-                reply = self._connection.recv_bytes(_LONGEST_REPLY)
-            except (OSError, EOFError) as error:
-                raise PolicyError(f"'{self._source}' {self._how_it_ended()}") from error
-            except BaseException:
-                self._end()  # whoever interrupts it leaves an answer behind that belongs to nobody
-                raise
+            reply = self._answered(message)
         if reply[:4] != _FINE:
             raise PolicyError(reply[4:].decode("utf-8", errors="replace"))
-        return bytes(reply[4:])
+        return reply[4:]
+
+    def _answered(self, message: bytes) -> bytes:
+        """Send a message and wait for its answer, while nobody else does."""
+        try:
+            self._connection.send_bytes(message)
+            if not self._arrives():
+                raise PolicyError(f"'{self._source}' took over {_WALL_SECONDS} s for one step and was ended")
+            return self._connection.recv_bytes(_LONGEST_REPLY)
+        except (OSError, EOFError) as error:
+            raise PolicyError(f"'{self._source}' {self._how_it_ended()}") from error
+        except BaseException:
+            self._end()  # whoever interrupts it leaves an answer behind that belongs to nobody
+            raise
 
     def _arrives(self) -> bool:
         if self._poll is None:
@@ -148,6 +186,32 @@ class Child:
         return "ended its own process"
 
 
+class ChildSession:
+    """A session in the process of a program, seen from its owner."""
+
+    def __init__(self, child: Child, number: int, seats: _Seats, *, batched: bool) -> None:
+        self._child, self._number, self._seats = child, number, seats
+        self.batched = batched
+        """Whether one run of the program serves all rows."""
+
+    def act(self, observation: np.ndarray, forget: np.ndarray | None) -> np.ndarray:
+        """Actions (N, J) float32 for observations (N, W), after those of ``forget`` (N,) bool were reset.
+
+        Raises:
+            PolicyError: the program fails, takes too long or too much memory.
+        """
+        return self._child.act(self._number, self._seats, observation, forget)
+
+
+def _shared_memory() -> tuple[Any, Any]:
+    """Memory that both processes see: for the owner, and as it is handed to the other one."""
+    if CONTEXT.get_start_method() == "fork":
+        memory = mmap.mmap(-1, _ROOM)
+        return memory, memory
+    arena = Arena(_ROOM)
+    return arena.buffer, arena
+
+
 def _end(process: Any, connection: Connection, owner: int) -> None:
     connection.close()
     if os.getpid() != owner:
@@ -156,24 +220,29 @@ def _end(process: Any, connection: Connection, owner: int) -> None:
     process.join(5.0)
 
 
-def _run(make: Any, connection: Connection, parents: Connection, source: str, owner: int) -> None:
+def _run(make: Any, connection: Connection, parents: Connection, shared: Any, source: str, owner: int) -> None:
     """The process's whole life."""
     if parents.fileno() != connection.fileno():
         parents.close()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
+    gc.freeze()  # what it has from its owner is not looked through for garbage again
     enclose(connection.fileno(), owner, [Path(__file__).parent.parent])
+    memory = shared.buffer if isinstance(shared, Arena) else shared
     try:
         allow_seconds(STEP_SECONDS)
         program = _answered(connection, source, lambda: make(connection.recv_bytes(), source))
-        sessions: dict[int, PolicySession] = {}
+        sessions: dict[int, tuple[PolicySession, _Seats]] = {}
+        allowed = 0.0
         while program is not None:
             message = connection.recv_bytes()
-            allow_seconds(STEP_SECONDS)
+            if time.monotonic() > allowed + 1.0:  # three system calls, which not every control step has to make
+                allow_seconds(STEP_SECONDS + 1)
+                allowed = time.monotonic()
             if message[:4] == _FINE:
                 _act(connection, source, sessions, message)
             else:
-                _answer(connection, source, program, sessions, json.loads(message))
+                _answer(connection, source, program, sessions, memory, json.loads(message))
     except (EOFError, OSError):
         pass
     os._exit(0)  # nothing of what the owner would do at its end
@@ -197,7 +266,12 @@ def _answered(connection: Connection, source: str, work: Callable[[], Any], pack
 
 
 def _answer(
-    connection: Connection, source: str, program: Program, sessions: dict[int, PolicySession], request: dict[str, Any]
+    connection: Connection,
+    source: str,
+    program: Program,
+    sessions: dict[int, tuple[PolicySession, _Seats]],
+    memory: Any,
+    request: dict[str, Any],
 ) -> None:
     def work() -> Mapping[str, Any]:
         if request["do"] != "session":
@@ -206,20 +280,21 @@ def _answer(
             sessions.pop(number, None)
         made = program.session(request["rows"], rowwise=request["rowwise"])
         number = max(sessions, default=0) + 1
-        sessions[number] = made
+        sessions[number] = made, _Seats(memory, request["rows"], request["width"], request["joints"])
         return {"number": number, "batched": made.batched}
 
     _answered(connection, source, work, lambda answer: json.dumps(answer).encode())
 
 
-def _act(connection: Connection, source: str, sessions: dict[int, PolicySession], message: bytes) -> None:
-    _, number, rows, masked = _ACT.unpack_from(message)
-    start = _ACT.size + rows * masked
+def _act(
+    connection: Connection, source: str, sessions: dict[int, tuple[PolicySession, _Seats]], message: bytes
+) -> None:
+    def work() -> None:
+        _, number, some_forget = _ACT.unpack(message)
+        session, seats = sessions[number]
+        if some_forget:
+            session.reset(torch.from_numpy(seats.forget.copy()))
+        # a copy: a program may keep what it is given
+        seats.action[:] = session.act(torch.from_numpy(seats.observation.copy())).numpy()
 
-    def work() -> torch.Tensor:
-        if masked:
-            sessions[number].reset(torch.frombuffer(bytearray(message[_ACT.size : start]), dtype=torch.bool))
-        observation = torch.frombuffer(bytearray(message[start:]), dtype=torch.float32)
-        return sessions[number].act(observation.view(rows, -1))
-
-    _answered(connection, source, work, lambda action: action.numpy().tobytes())
+    _answered(connection, source, work)

@@ -18,6 +18,7 @@ from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.fence import child as fence_child
 from gaitgauge.policy.fence.archive import packed, read_archive
 from gaitgauge.policy.fence.script import check_script
+from gaitgauge.policy.fenced import FencedPolicy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import ForeignFile, save_policy
 from onnx import TensorProto, helper, numpy_helper
@@ -339,6 +340,72 @@ def test_the_process_ends_with_its_policy(tmp_path, contract):
     del session
     with pytest.raises(ProcessLookupError):
         os.kill(number, 0)
+
+
+class Remembering(Plain):
+    """Acts on what it was given a step ago, which it keeps without a copy."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last = torch.zeros(1, 45)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        action = self.layer(self.last)
+        self.last = observation
+        return action
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch) -> FencedPolicy:
+    """A program that is run although its network could be rebuilt."""
+    monkeypatch.setattr("gaitgauge.policy.loading.rebuilt", lambda policy: policy)
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(Remembering()))
+    policy = load_policy(path)
+    assert isinstance(policy, FencedPolicy)
+    return policy
+
+
+def test_a_program_may_keep_what_it_is_given(program):
+    session, observations = program.session(3), torch.randn(4, 3, 45)
+    actions = [session.act(observation) for observation in observations]
+    expected = [program.session(3).act(torch.zeros(3, 45))]  # what it remembers at first
+    for observation in observations[:3]:
+        other = program.session(3)
+        other.act(observation)
+        expected.append(other.act(torch.zeros(3, 45)))
+    assert torch.allclose(torch.stack(actions), torch.stack(expected), atol=1e-6)
+
+
+def test_sessions_of_one_program_do_not_meet(program):
+    small, large = program.session(2), program.session(5)
+    kept = small.act(torch.zeros(2, 45))
+    before = kept.clone()
+    large.act(torch.randn(5, 45))
+    large.reset(torch.tensor([True, False, True, False, True]))
+    large.act(torch.randn(5, 45))
+    assert torch.equal(kept, before) and torch.equal(small.act(torch.zeros(2, 45)), before)
+
+
+def test_more_numbers_than_there_is_room_for(program, monkeypatch):
+    monkeypatch.setattr(fence_child, "_ROOM", 24 * 4 * (45 + 12) + 24)
+    assert program.session(24).act(torch.zeros(24, 45)).shape == (24, 12)
+    with pytest.raises(PolicyError, match="those of 25 episodes are more"):
+        program.session(25)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="only where processes are forked")
+def test_a_copy_of_its_owner_does_not_ask_it(program):
+    session = program.session(1)
+    process = os.fork()
+    if process == 0:
+        try:
+            session.act(torch.zeros(1, 45))
+        except PolicyError as error:
+            os._exit(7 if "load it in the one that asks" in str(error) else 1)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 7
+    assert session.act(torch.zeros(1, 45)).shape == (1, 12)
 
 
 # ---- ONNX -----------------------------------------------------------------------------------------------------------
