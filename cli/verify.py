@@ -24,6 +24,7 @@ def run_verification(
     device: str | None,
     threads: int | None,
     quick: bool,
+    fresh: int | None,
     out: Path | None,
     json_output: bool,
     trust: bool,
@@ -37,14 +38,18 @@ def run_verification(
         device=choose_device(content["backend"], device),
         threads=threads or os.cpu_count() or 1,
         quick=quick,
+        fresh=fresh,
         trust=trust,
     )
     stem = card.resolve().parent.name if card.name == "results.json" else card.stem
-    folder = out or Path("results") / f"verify-{stem}{'-quick' if quick else ''}"
+    folder = (
+        out or Path("results") / f"verify-{stem}{'-quick' if quick else ''}{'' if fresh is None else f'-fresh-{fresh}'}"
+    )
     console = Terminal(stderr=True)
     try:
         with ProgressDisplay(console, "gauging") as display:
-            found = verify(content, prepared, folder, command=["gaitgauge", *sys.argv[1:]], watch=shower(display))
+            command = ["gaitgauge", *sys.argv[1:]]
+            found = verify(content, prepared, folder, fresh=fresh, command=command, watch=shower(display))
     except KeyboardInterrupt:
         console.say(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {shell_command()}")
         raise typer.Exit(130) from None
@@ -56,7 +61,9 @@ def run_verification(
             where = f"{item['terrain']}, friction {item['friction']:g}, payload {item['payload']:g} kg"
             console.say(f"{where}: level {item['card']} on the card, {item['here']} here")
         played, whole = found["environments"]
-        console.say(f"played {played} of the card's {whole} environments" + (", one of each terrain" if quick else ""))
+        seeds = "" if fresh is None else ", with other seeds"
+        sample = ", one of each terrain" if quick else ""
+        console.say(f"played {played} of the card's {whole} environments{sample}{seeds}")
         if found["score"] is not None:
             band = "no interval" if found["band"] is None else "a replay within {:.4f} to {:.4f}".format(*found["band"])
             console.say(f"score on the card {found['score']:.4f} ({band}), here {found['replayed']:.4f}")
@@ -64,6 +71,10 @@ def run_verification(
             console.say("the card holds: every outcome is the same to the last digit")
         elif found["holds"]:
             console.say("the card holds: the score lies within its band, single outcomes differ")
+        elif fresh is not None:
+            console.say(
+                "the card does NOT hold with other seeds: its score owes something to those that everybody knows"
+            )
         else:
             console.say("the card does NOT hold on this machine")
     if not found["holds"]:

@@ -22,6 +22,8 @@ from .results import environment_weights
 from .suite import Suite, load_suite
 
 Row = Mapping[str, Any]
+_APART = 1_000_000
+"""Distance of fresh seeds from those of the next number."""
 _OUTCOME = ("level", "score", "quality", "metrics", "trials", "runs", "falls", "diverged", "overflowed", "restarted")
 """What of an environment's row must be the same to the last digit for a replay to be called equal."""
 
@@ -38,6 +40,7 @@ def prepare_replay(
     device: str = "cpu",
     threads: int = 1,
     quick: bool = False,
+    fresh: int | None = None,
     trust: bool = False,
 ) -> Prepared:
     """What must be played to check a card.
@@ -49,13 +52,16 @@ def prepare_replay(
         device: torch device.
         threads: CPU threads.
         quick: one environment of each terrain, at nominal friction and payload where the card has it, else the card's first.
+        fresh: number from which other seeds than the card's are made; None for the card's.
         trust: as for ``evaluate``.
 
     Raises:
-        CardError: policy, suite or robot is not the card's.
+        CardError: policy, suite or robot is not the card's, or other seeds can say nothing about it.
         SuiteError, PolicyError, …: as ``evaluate.prepare``.
     """
     path, wanted = policy or card["policy"]["path"], card["suite"]
+    if fresh is not None and card["score_interval"] is None:
+        raise CardError("the card has no interval, so that nothing can be said of other seeds; leave out --fresh")
     if policy is None and not Path(path).is_file():
         raise CardError(f"the card's policy is not at '{path}' on this machine; say where it is with --policy")
     found = file_digest(path)
@@ -89,7 +95,29 @@ def prepare_replay(
         raise CardError(
             f"the files of robot '{card['robot']}' are not the card's; check out the commit that made the card"
         )
-    return replace(prepared, environments=tuple(_environment(row) for row in rows))
+    prepared = replace(prepared, environments=tuple(_environment(row) for row in rows))
+    return prepared if fresh is None else with_fresh_seeds(prepared, fresh)
+
+
+def with_fresh_seeds(prepared: Prepared, number: int) -> Prepared:
+    """The same evaluation with other seeds, which those who made the policy could not know.
+
+    Args:
+        prepared: an evaluation with the suite's own seeds.
+        number: chosen by whoever checks, 1 to 1000000; other numbers make other seeds.
+
+    Raises:
+        CardError: the number is out of range.
+    """
+    if not 1 <= number <= 1_000_000:
+        raise CardError(f"fresh seeds are made from a number of 1 to 1000000, not {number}; give another with --fresh")
+
+    def moved(seeds: Sequence[int]) -> tuple[int, ...]:
+        return tuple(_APART * number + seed for seed in seeds)
+
+    matrix = prepared.suite.matrix
+    own = replace(matrix, seeds=moved(matrix.seeds), search_seeds=moved(matrix.search_seeds))
+    return replace(prepared, suite=replace(prepared.suite, matrix=own), seeds=moved(prepared.seeds))
 
 
 def verify(
@@ -97,6 +125,7 @@ def verify(
     prepared: Prepared,
     folder: Path,
     *,
+    fresh: int | None = None,
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
     play: Callable[..., dict[str, Any]] = evaluate,
@@ -104,9 +133,9 @@ def verify(
     """Play what ``prepare_replay`` chose, into a folder that keeps finished episodes, and compare.
 
     Returns:
-        Plain data of ``judge``.
+        Plain data of ``judge``, and the number that ``fresh`` seeds were made from.
     """
-    return judge(card, play(prepared, folder, resume=True, command=command, watch=watch))
+    return judge(card, play(prepared, folder, resume=True, command=command, watch=watch)) | {"fresh": fresh}
 
 
 def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:

@@ -172,6 +172,10 @@ def verify(
     quick: Annotated[
         bool, typer.Option("--quick", help="One environment of each terrain, at nominal friction and payload.")
     ] = False,
+    fresh: Annotated[
+        int | None,
+        typer.Option(help="Play with other seeds, made from this number, instead of those that everybody knows."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the replay. Default: results/verify-<card>.")] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
     trust: TrustOption = False,
@@ -181,6 +185,7 @@ def verify(
     Examples:
       gaitgauge verify results/walk --quick
       gaitgauge verify card.json --policy walk.gauge.pt
+      gaitgauge verify card.json --quick --fresh 4711
     """
     from ..verify import run_verification
 
@@ -191,6 +196,7 @@ def verify(
         device=device,
         threads=threads,
         quick=quick,
+        fresh=fresh,
         out=out,
         json_output=json_output,
         trust=trust,

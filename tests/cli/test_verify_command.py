@@ -58,6 +58,18 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
     (level,) = found["levels"]
     assert (level["terrain"], level["friction"], level["card"]) == ("slope_fd", 0.6, 9)
 
+    path.write_text((tmp_path / "run" / "results.json").read_text())
+    done = run("verify", path, *options, "--quick", "--fresh", 5, "--out", tmp_path / "fresh", "--json")
+    replayed = json.loads((tmp_path / "fresh" / "results.json").read_text())
+    assert replayed["chance"]["seeds"] == [5_000_000, 5_000_001]
+    assert replayed["chance"]["search_seeds"] == [5_000_100, 5_000_101]
+    found = json.loads(done.stdout)
+    assert found["fresh"] == 5 and not found["equal"]
+    assert done.exit_code == (0 if found["holds"] else 1)
+    done = run("verify", path, *options, "--quick", "--fresh", 5, "--out", tmp_path / "fresh")
+    assert "with other seeds" in " ".join(done.stdout.split())
+
+    path.write_text(json.dumps(content))
     assert "digest" in refused("verify", path, "--suite", "demo")
     content["policy"]["file_sha256"] = "ab" * 32
     path.write_text(json.dumps(content))

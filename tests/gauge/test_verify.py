@@ -4,8 +4,8 @@ from copy import deepcopy
 
 import pytest
 from gaitgauge.gauge.comparison import ComparisonError
-from gaitgauge.gauge.evaluate import file_digest
-from gaitgauge.gauge.verify import judge, load_card
+from gaitgauge.gauge.evaluate import Request, file_digest, identity, prepare
+from gaitgauge.gauge.verify import CardError, judge, load_card, prepare_replay, with_fresh_seeds
 from test_report import sample
 
 
@@ -74,3 +74,29 @@ def test_results_of_something_else_are_no_card(tmp_path):
     path.write_text('{"schema": 2, "environments": [], "suite": {}}')
     with pytest.raises(ComparisonError, match=r"half\.json': it lacks score, backend, robot, pipeline"):
         load_card(path)
+
+
+@pytest.mark.parametrize("suite", ["gaitgauge-1", "robogauge-1.1"])
+def test_fresh_seeds_are_all_others_and_share_what_the_suites_share(suite):
+    """Whoever trained on the seeds that everybody knows, or found out which episode a seed's noise belongs to, has no use of it."""
+    known = prepare(Request(policy="pretrained", suite=suite))
+    fresh = with_fresh_seeds(known, 7)
+    seeds, search = known.suite.matrix.seeds, known.suite.matrix.search_seeds
+    assert fresh.rules.seeds == fresh.suite.matrix.seeds == tuple(7_000_000 + s for s in seeds)
+    assert not {*fresh.seeds, *fresh.suite.matrix.search_seeds} & {*seeds, *search}
+    shared = len({*seeds} & {*search})
+    assert len({*fresh.seeds} & {*fresh.suite.matrix.search_seeds}) == shared
+    assert fresh.environments == known.environments
+    assert identity(fresh) != identity(known)
+    other = with_fresh_seeds(known, 8)
+    assert not {*fresh.seeds, *fresh.suite.matrix.search_seeds} & {*other.seeds, *other.suite.matrix.search_seeds}
+    with pytest.raises(CardError, match="fresh seeds are made from a number of 1 to 1000000, not 0"):
+        with_fresh_seeds(known, 0)
+
+
+def test_a_card_without_an_interval_says_nothing_about_other_seeds(card):
+    card["score_interval"] = None
+    with pytest.raises(
+        CardError, match="the card has no interval, so that nothing can be said of other seeds; leave out --fresh"
+    ):
+        prepare_replay(card, fresh=1)
