@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from gaitgauge.backends.base import TRAINING_PHYSICS
 from gaitgauge.backends.conformance import Outcome, run_conformance
 from gaitgauge.robots import load_robot, robot_names
 from gaitgauge.robots.body_plan import body_plan, default_pose, mirror_image
@@ -84,6 +85,28 @@ def _seen(model, robot, image, joint):
     """The range that a joint must have for its counterpart's."""
     low, high = model.joint(robot.joint_names[image.joint[joint]]).range
     return (low, high) if image.sign[joint] > 0 else (-high, -low)
+
+
+@pytest.mark.parametrize("name", ["go2", *ROBOTS])
+def test_motors_are_stable_at_the_step_of_training(name):
+    """The motor law is explicit: damping, and the line along which torque falls with speed, must take less than twice a joint's
+    speed in a step, or the joint swings ever further.
+    """
+    robot = load_robot(name)
+    motors = robot.parameters["training" if name == "go2" else "gauge"]
+    model, data = default_pose(robot)
+    at = [int(model.joint(n).dofadr[0]) for n in robot.joint_names]
+    model.dof_armature[at] = motors.armature
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    inertia[at, at] += TRAINING_PHYSICS.timestep * np.array(motors.joint_damping)
+    driving = np.array(motors.driving_torque_limit or motors.torque_limit)
+    falling = driving / np.subtract(motors.no_load_speed, motors.full_torque_speed)
+    damping = np.zeros_like(inertia)
+    damping[at, at] = np.maximum(motors.damping, falling)
+    share = np.linalg.eigvals(TRAINING_PHYSICS.timestep * np.linalg.inv(inertia) @ damping)
+    assert np.abs(share).max() < 2.0
 
 
 def test_anymals_frames_knees_and_order_are_unlike_go2s():
