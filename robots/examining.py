@@ -12,8 +12,8 @@ import numpy as np
 
 from ..files.parsing import build, parse_json
 from .apart import run_apart
-from .base import Robot
-from .body_plan import body_plan, mirror_image
+from .base import JointParameters, Robot
+from .body_plan import body_plan, default_pose, mirror_image
 from .checking import ModelChecks
 from .geometry import joint_ranges
 from .loading import RobotError
@@ -21,6 +21,7 @@ from .loading import RobotError
 STANDING_SECONDS = 2.0
 """How long the robot is left standing [s]."""
 _TIMESTEP = 0.002
+_TRAINING_TIMESTEP = 0.005
 _MOST_TILT = 0.3
 """Tilt beyond which a robot does not stand [rad]."""
 _LOWEST = 0.7
@@ -71,6 +72,7 @@ def _findings(robot: Robot) -> str:
         note("standing", partial(stand, robot))
         note("mirror image", partial(_mirror, robot), "training with symmetry")
         note("joint ranges", partial(_ranges, robot), "the metric dof_limits and the reward joint_limits")
+        note("motor law", partial(_motor_law, robot), "training, whose physics steps 5 ms")
         note("parameters", partial(_parameters, robot), "the suites that ship with the project")
         note("SDK order", partial(_sdk, robot), "export of a deploy.yaml")
     return json.dumps([asdict(finding) for finding in found])
@@ -148,6 +150,40 @@ def _ranges(robot: Robot) -> str:
     if free:
         raise RobotError(f"{len(free)} joints have no range in the model ('{free[0]}' …); give them one")
     return "every joint has a range"
+
+
+def damped_share(robot: Robot, motors: JointParameters) -> float:
+    """Largest share of a motion of the joints in the default pose that the explicit motor law takes away in a step of training's
+    physics, by damping or along the line on which torque falls with speed; from 2 on the joints swing ever further.
+    """
+    import mujoco
+
+    model, data = default_pose(robot)
+    at = model.jnt_dofadr[[model.joint(name).id for name in robot.joint_names]]
+    model.dof_armature[at] = motors.armature
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    inertia[at, at] += _TRAINING_TIMESTEP * np.array(motors.joint_damping)  # what is passive is integrated implicitly
+    slope = np.array(motors.damping)
+    if motors.full_torque_speed is not None and motors.no_load_speed is not None:
+        driving = np.array(motors.driving_torque_limit or motors.torque_limit)
+        slope = np.maximum(slope, driving / np.subtract(motors.no_load_speed, motors.full_torque_speed))
+    damping = np.zeros_like(inertia)
+    damping[at, at] = slope
+    return float(np.abs(np.linalg.eigvals(_TRAINING_TIMESTEP * np.linalg.solve(inertia, damping))).max())
+
+
+def _motor_law(robot: Robot) -> str:
+    name = "training" if "training" in robot.parameters else robot.default_parameters
+    share = damped_share(robot, robot.parameters[name])
+    if share >= 2.0:
+        raise RobotError(
+            f"the motors of parameters.{name} take {share:.1f} times a joint's speed away in a step of "
+            f"{1e3 * _TRAINING_TIMESTEP:g} ms, which must stay below 2, or joints swing ever further; give armature, the "
+            "motors' rotor inertia, or lower damping"
+        )
+    return f"in a step of {1e3 * _TRAINING_TIMESTEP:g} ms motors take up to {share:.1f} times a joint's speed away; below 2 is stable"
 
 
 def _parameters(robot: Robot) -> str:
