@@ -84,12 +84,14 @@ def _records(archive: zipfile.ZipFile, source: str) -> dict[str, bytes]:
     if len({entry.filename.partition("/")[0] for entry in entries}) > 1:
         raise PolicyError(f"'{source}' is a zip archive, but neither TorchScript nor a torch.save file")
     records: dict[str, bytes] = {}
+    spelled: set[str] = set()
     for entry in entries:
         name = entry.filename.partition("/")[2]
         if not name:
             raise PolicyError(f"'{source}' is a damaged archive: it has an entry without a name")
-        if name in records:
+        if name.lower() in spelled:  # torch asks for names in any case
             raise PolicyError(f"'{source}' is a damaged archive: it has the entry '{entry.filename}' twice")
+        spelled.add(name.lower())
         with archive.open(entry) as record:
             # reading to the end checks the sum, and stops where the archive says that the record does
             content = record.read()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import onnx
@@ -17,6 +17,8 @@ MOST_NODES = 100_000
 """Most nodes of all graphs of a file."""
 _DEEPEST = 16
 _OWN_SETS = ("", "ai.onnx")
+# Where onnxruntime has operators of its own: those go before a file's functions of the same name.
+_TAKEN_SETS = ("ai.onnx", "com.microsoft", "com.ms", "org.pytorch")
 
 
 def check_graph(data: bytes, *, source: str, folder: Path | None) -> onnx.ModelProto:
@@ -58,24 +60,31 @@ def check_graph(data: bytes, *, source: str, folder: Path | None) -> onnx.ModelP
 def _nodes(model: onnx.ModelProto, source: str) -> Iterator[onnx.NodeProto]:
     """All nodes, those of functions and of graphs inside nodes included."""
     for function in model.functions:
-        if function.domain in _OWN_SETS:
-            raise PolicyError(f"'{source}' was not loaded: it defines ONNX's own operator {function.name} anew")
+        if not function.domain or function.domain.lower().startswith(_TAKEN_SETS):
+            where = f" in '{function.domain}'" if function.domain else ""
+            raise PolicyError(
+                f"'{source}' was not loaded: it defines {function.name}{where} anew, which is not the file's own set"
+            )
         yield from _inside(function.node, source, 0)
+        yield from _graphs_of(function.attribute_proto, source, 0)
     for training in model.training_info:
         yield from _inside(training.initialization.node, source, 0)
         yield from _inside(training.algorithm.node, source, 0)
     yield from _inside(model.graph.node, source, 0)
 
 
-def _inside(nodes: Iterator[onnx.NodeProto], source: str, depth: int) -> Iterator[onnx.NodeProto]:
+def _inside(nodes: Iterable[onnx.NodeProto], source: str, depth: int) -> Iterator[onnx.NodeProto]:
     if depth > _DEEPEST:
         raise PolicyError(f"'{source}' has graphs inside graphs over {_DEEPEST} deep")
     for node in nodes:
         yield node
-        for attribute in node.attribute:
-            yield from _inside(attribute.g.node, source, depth + 1)
-            for graph in attribute.graphs:
-                yield from _inside(graph.node, source, depth + 1)
+        yield from _graphs_of(node.attribute, source, depth)
+
+
+def _graphs_of(attributes: Iterable[onnx.AttributeProto], source: str, depth: int) -> Iterator[onnx.NodeProto]:
+    for attribute in attributes:
+        for graph in (attribute.g, *attribute.graphs):
+            yield from _inside(graph.node, source, depth + 1)
 
 
 def _load_weights(model: onnx.ModelProto, source: str, folder: Path | None) -> None:
@@ -117,8 +126,9 @@ def _tensors(model: onnx.ModelProto, source: str) -> Iterator[onnx.TensorProto]:
     """All tensors but the main graph's own weights."""
     for sparse in model.graph.sparse_initializer:
         yield from (sparse.values, sparse.indices)
-    for node in _nodes(model, source):
-        for attribute in node.attribute:
+    nodes = (node.attribute for node in _nodes(model, source))
+    for attributes in (*(function.attribute_proto for function in model.functions), *nodes):
+        for attribute in attributes:
             yield attribute.t
             yield from attribute.tensors
             for sparse in (attribute.sparse_tensor, *attribute.sparse_tensors):

@@ -32,6 +32,11 @@ _PLAIN_NAMES = re.compile(
     r"torch\.jit\._pickle (build_(int|double|bool|tensor)list|restore_type_tag)|collections OrderedDict|torch (\w+)Storage"
     r"|torch\._utils _rebuild_(tensor_v2|qtensor)|torch device|builtins complex|torch per_(tensor|channel)_affine"
 )
+# What torch loads of an archive. It finds a name in whatever case that stands there, so that only these names are handed on.
+_RECORDS = re.compile(
+    r"data\.pkl|constants\.pkl|(data|constants)/[^/]+|code/[\w/.]+\.py|version|byteorder|\.data/(version|serialization_id)",
+    re.ASCII,
+)
 # Written by hand, code may differ in how Python and torch read it; what torch itself writes has none of these.
 _STRANGE = re.compile(r"[^\n\x20-\x7e]|\\\n")
 # The words that torch's code has for a module's attributes, its types, and numbers that are none.
@@ -76,8 +81,7 @@ def check_script(data: bytes, *, source: str) -> ScriptFile:
     if len(contract) > LONGEST_CONTRACT:
         raise PolicyError(f"'{source}' carries a contract of over {LONGEST_CONTRACT:,} characters")
     attributes = frozenset(_attributes(trees.values()))
-    # the tables that lead from code back to the author's files are pickles of their own; nothing here needs them
-    kept = {name: content for name, content in records.items() if not name.endswith(".debug_pkl")}
+    kept = {name: content for name, content in records.items() if _RECORDS.fullmatch(name)}
     return ScriptFile(data=packed(kept), contract=contract.decode("utf-8", errors="replace"), attributes=attributes)
 
 
@@ -106,7 +110,7 @@ def _check_code(trees: Mapping[str, ast.Module], source: str) -> None:
             node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
         }
         variables |= {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
-        checker = _Checker(frozenset(methods - operators), frozenset(variables), source, name)
+        checker = _Checker(frozenset(methods - operators), source, name)
         if taken := sorted(variables & _RESERVED):
             checker.refuse(f"a variable named {taken[0]}")
         try:
@@ -118,8 +122,8 @@ def _check_code(trees: Mapping[str, ast.Module], source: str) -> None:
 class _Checker(ast.NodeVisitor):
     """Walks through a file's code; whatever is not expected is refused."""
 
-    def __init__(self, methods: frozenset[str], variables: frozenset[str], source: str, file: str) -> None:
-        self._methods, self._variables = methods, variables
+    def __init__(self, methods: frozenset[str], source: str, file: str) -> None:
+        self._methods, self._functions = methods, frozenset[str]()
         self._source, self._file = source, file
 
     def refuse(self, what: str) -> None:
@@ -151,6 +155,12 @@ class _Checker(ast.NodeVisitor):
         elif words[0] == _OWN and _CUSTOM_CLASS.match(dotted):
             self.refuse(dotted)
 
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        """Variables that are called are functions of the archive's own, and never anything else in the same function."""
+        outside, self._functions = self._functions, _own_functions(node)
+        self.generic_visit(node)
+        self._functions = outside
+
     def visit_Call(self, node: ast.Call) -> None:
         function = node.func
         if isinstance(function, ast.Attribute):
@@ -159,8 +169,7 @@ class _Checker(ast.NodeVisitor):
             if not known and function.attr not in self._methods | TORCH_OPERATORS:
                 self.refuse(f"{function.attr}()")
         elif isinstance(function, ast.Name):
-            # a variable that is called is a function of the archive's own: any other is named where it is assigned
-            if function.id not in PYTHON_NAMES | self._variables:
+            if function.id not in PYTHON_NAMES | self._functions:
                 self.refuse(f"{function.id}()")
             if function.id in ("getattr", "hasattr") and not _names_attribute(node):
                 self.refuse(f"{function.id}() with a name that it computes")
@@ -196,6 +205,24 @@ def _words(node: ast.expr) -> list[str] | None:
         words.append(node.attr)
         node = node.value
     return [node.id, *reversed(words)] if isinstance(node, ast.Name) else None
+
+
+def _own_functions(function: ast.FunctionDef) -> frozenset[str]:
+    """Variables to which a function assigns classes and functions of the archive, by their names, and nothing else."""
+    own: list[ast.Name] = []
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign) and len(node.targets) == 1 and isinstance(node.targets[0], ast.Name):
+            words = _words(node.value)
+            if words is not None and len(words) > 1 and words[0] == _OWN:
+                own.append(node.targets[0])
+    places = set(map(id, own))
+    others = {
+        node.id
+        for node in ast.walk(function)
+        if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load) and id(node) not in places
+    }
+    others |= {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
+    return frozenset({name.id for name in own} - others)
 
 
 def _names_attribute(call: ast.Call) -> bool:

@@ -134,6 +134,11 @@ def test_a_program_that_opens_a_file_is_refused_by_name(tmp_path, contract, plac
         ("x = [observation][0].set_(observation)", "set_"),
         ("x = observation.resize_([100, 100])", "resize_"),
         ("x = observation.as_strided([100, 100], [1, 1])", "as_strided"),
+        ("f = observation.as_strided\n    x = f([100, 100], [1, 1])", r"f\(\)"),
+        ("f = getattr(observation, 'resize_')\n    x = f([100, 100])", r"f\(\)"),
+        ("f = __torch__.a\n    f = observation.resize_\n    x = f([100, 100])", r"f\(\)"),
+        ("f = __torch__.a\n    for f in [observation.resize_]:\n      x = f([100, 100])", r"f\(\)"),
+        ("observation = __torch__.a\n    x = observation([100, 100])", r"observation\(\)"),
         ("import os", "import os"),
         ("x = open(self.target)", "open"),
         ("x = eval(self.target)", "eval"),
@@ -154,6 +159,28 @@ def test_other_ways_to_say_it(line, named):
     records[name] = (text[:at] + f"    {line}\n" + text[at:]).encode()
     with pytest.raises(PolicyError, match=named):
         check_script(packed(records), source="policy")
+
+
+@pytest.mark.parametrize("name", ["code/__torch__.PY", "CODE/__torch__.py"])
+@pytest.mark.parametrize("alone", [True, False])
+def test_torch_finds_no_code_that_was_not_read(tmp_path, name, alone):
+    """torch asks an archive for names in any case."""
+    target = tmp_path / "victim"
+    records = read_archive(hostile("setstate", target), source="")
+    code = next(n for n in records if n.endswith(".py") and b"from_file" in records[n])
+    content = records[code]
+    if alone:
+        del records[code]
+    else:
+        records[code] = content.replace(b"torch.from_file", b"torch.zeros").replace(b", True, 64", b"")
+    records[name.replace("__torch__", code[len("code/") : -len(".py")])] = content
+    path = tmp_path / "policy.pt"
+    path.write_bytes(packed(records))
+    with pytest.raises(PolicyError):
+        load_policy(path)
+    with suppress(PolicyError, RuntimeError):  # and what is handed on to torch, outside of any process of its own
+        torch.jit.load(io.BytesIO(check_script(packed(records), source="policy").data))
+    assert not target.exists()
 
 
 class Plain(nn.Module):
@@ -446,6 +473,54 @@ def outside(location: str, **more: int) -> TensorProto:
     for key, value in {"location": location, **more}.items():
         tensor.external_data.add(key=key, value=str(value))
     return tensor
+
+
+def with_function(path: Path, function: onnx.FunctionProto) -> Path:
+    """A file that uses a function of its own in the place of its last operator."""
+    node = helper.make_node(function.name, ["product"], ["actions"], domain=function.domain)
+    product = helper.make_node("MatMul", ["obs", "w"], ["product"])
+    opsets = [(function.domain, 1)] if function.domain else []
+    graph_file(path, product, node, weights=[WEIGHT], opsets=opsets)
+    model = onnx.load(path)
+    model.functions.append(function)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("domain", "name"),
+    [("com.microsoft", "Inverse"), ("ai.onnx.ml", "Normalizer"), ("com.ms.internal.nhwc", "Conv"), ("", "Neg")],
+)
+def test_a_function_does_not_lend_its_name_to_an_operator(tmp_path, domain, name):
+    """onnxruntime takes its own operator, where it has one of a function's name."""
+    body = [helper.make_node("Neg", ["x"], ["y"])]
+    function = helper.make_function(domain, name, ["x"], ["y"], body, [helper.make_opsetid("", 17)])
+    refused(with_function(tmp_path / "policy.onnx", function), f"defines {name}")
+
+
+def test_functions_of_its_own_are_run(tmp_path):
+    body = [helper.make_node("Neg", ["x"], ["y"])]
+    function = helper.make_function("own", "F", ["x"], ["y"], body, [helper.make_opsetid("", 17)])
+    session = load_policy(with_function(tmp_path / "policy.onnx", function)).session(2)
+    assert torch.equal(session.act(torch.ones(2, 45)), torch.zeros(2, 12))
+
+
+def test_graphs_that_a_function_has_by_default_are_read(tmp_path):
+    value = helper.make_tensor_value_info("z", TensorProto.FLOAT, None)
+    constant = helper.make_node("Constant", [], ["one"], value=numpy_helper.from_array(np.ones((12, 12), np.float32)))
+    hidden = helper.make_graph(
+        [constant, helper.make_node("Inverse", ["one"], ["z"], domain="com.microsoft")], "g", [], [value]
+    )
+    harmless = helper.make_graph([helper.make_node("Identity", ["x"], ["z"])], "g", [], [value])
+    condition = helper.make_node("Constant", [], ["c"], value=numpy_helper.from_array(np.array(True)))
+    choice = helper.make_node("If", ["c"], ["y"], else_branch=harmless)
+    choice.attribute.append(
+        onnx.AttributeProto(name="then_branch", ref_attr_name="body", type=onnx.AttributeProto.GRAPH)
+    )
+    sets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
+    function = helper.make_function("own", "F", ["x"], ["y"], [condition, choice], sets)
+    function.attribute_proto.append(helper.make_attribute("body", hidden))
+    refused(with_function(tmp_path / "policy.onnx", function), "com.microsoft.Inverse")
 
 
 def test_weights_outside_the_folder(tmp_path):
