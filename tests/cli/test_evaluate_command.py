@@ -48,6 +48,7 @@ def reproducible(folder: Path) -> tuple[dict, bytes]:
     [
         (("--terrain", "flat", "--friction", 0.6), "score of a part (1 of 2 terrains, 1 of 2 frictions) 0."),
         (("--terrain", "flat", "--friction", 9, "--seed", 77), "score of a custom run (friction 9, seed 77"),
+        (("--terrain", "flat", "--friction", 0.6, "--seed", 0), "(no interval: one seed)"),
     ],
 )
 def test_only_the_whole_suite_gives_its_score(run, tmp_path, policy, tiny, options, words):

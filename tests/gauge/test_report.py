@@ -159,6 +159,18 @@ def test_a_part_and_a_custom_run_are_never_shown_as_the_suites_score():
     assert "custom, after robogauge-1.1 1.1.0" in words and "custom, robogauge-1.1" in heading
 
 
+@pytest.mark.parametrize("suite", ["demo", "mid", "quick"])
+def test_suites_with_one_quality_seed_show_no_interval(suite):
+    """One seed shows no spread; the intervals that were printed came from sub-commands, which are no sample."""
+    results = sample(suite=suite)
+    assert (results["score_interval"], results["chance"]["note"]) == (None, "no interval: one seed")
+    assert {row["interval"] for row in results["terrains"].values()} == {None}
+    assert {row["interval"] for row in results["metrics"].values()} == {None}
+    words = Page(render(results)).text
+    assert "no interval: one seed" in words and "There are no intervals: one seed shows no spread." in words
+    assert "Intervals say what" not in words
+
+
 def test_policy_that_passes_nothing_is_a_result():
     results = sample(terrains=("wave", "obstacle"), frictions=(0.4, 0.6), reach=0)
     page = Page(render(results))

@@ -134,6 +134,7 @@ def test_a_suite_may_limit_torque_by_speed(suite_file):
         ),
         ("[scoring]\nbracket_seeds = 7", "scoring.bracket_seeds is 7; at most the 6 of matrix.search_seeds"),
         ("[push]\nforce = [100.0, 80.0]", "push.force .100 to 80 N. must rise"),
+        ("[push]\nafter = [3.5, 1.5]", "push.after .3.5 to 1.5 s. must rise"),
         ("[push]\ngoal = 'target_pos_velocity'", "push.goal .target_pos_velocity. is none of goals with sub-commands"),
         ("gains = 'mine'", "gains is 'mine'"),
         ("[matrix]\nfriction = [1.0]", "unknown field 'matrix.friction'; did you mean 'frictions'"),
