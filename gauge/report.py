@@ -129,6 +129,7 @@ def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
     searched = any("search" in r for r in rows)
     both = (("friction", "over friction"), ("payload", "over payload"))
     level_figures = _figures(rows, "level", both) if searched else []
+    expected = results["chance"].get("level") == "curve"
     return {
         "title": PurePath(results["policy"]["path"].replace("\\", "/")).name,
         "suite": results["suite"],
@@ -144,7 +145,8 @@ def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
         "level": results["level"],
         "level_interval": results["level_interval"],
         "chance_note": results["chance"]["note"],
-        "level_label": "mean maximum level" if searched else "mean level played",
+        "level_label": f"mean {'expected' if expected else 'maximum'} level" if searched else "mean level played",
+        "expected_level": expected,
         "counts": _counts(results),
         "warnings": warnings(results),
         "statistics": STATISTIC_LABELS,

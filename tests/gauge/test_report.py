@@ -159,6 +159,26 @@ def test_a_part_and_a_custom_run_are_never_shown_as_the_suites_score():
     assert "custom, after robogauge-1.1 1.1.0" in words and "custom, robogauge-1.1" in heading
 
 
+@pytest.mark.parametrize(
+    ("suite", "label", "sentence"),
+    [
+        (
+            "robogauge-1.1",
+            "mean maximum level",
+            "Maximum level The highest of ten levels of difficulty that the level search",
+        ),
+        (
+            "gaitgauge-1",
+            "mean expected level",
+            "Expected level The level of ten that is reached on average, the area under the",
+        ),
+    ],
+)
+def test_levels_are_called_what_they_are(suite, label, sentence):
+    words = " ".join(Page(render(sample(suite=suite, terrains=("flat", "wave"), frictions=(0.4, 0.6)))).text.split())
+    assert label in words and sentence in words
+
+
 @pytest.mark.parametrize("suite", ["demo", "mid", "quick"])
 def test_suites_with_one_quality_seed_show_no_interval(suite):
     """One seed shows no spread; the intervals that were printed came from sub-commands, which are no sample."""
