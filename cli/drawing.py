@@ -42,6 +42,8 @@ class Tile:
     """Of the robot at the start [rad]."""
     leg_length: float
     """Of the robot [m]."""
+    ground_shadows: bool = True
+    """Whether the ground casts shadows too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +112,14 @@ class _Artist:
 
     def __init__(self, tiles: Sequence[Tile], size: tuple[int, int]) -> None:
         self._pictures = [
-            Picture(tile.model, size=size, heading=tile.heading, leg_length=tile.leg_length) for tile in tiles
+            Picture(
+                tile.model,
+                size=size,
+                heading=tile.heading,
+                leg_length=tile.leg_length,
+                ground_shadows=tile.ground_shadows,
+            )
+            for tile in tiles
         ]
 
     def draw(self, poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:

@@ -75,6 +75,8 @@ def run_evaluation(
 
         options = [
             policy,
+            "--suite",
+            suite,
             *(["--trust"] if request.trust else []),
             *(["--robot", request.robot] if request.robot else []),
         ]

@@ -46,6 +46,8 @@ class Quality:
     """Width of the map of the sun's shadow [pixels]."""
     shadow_reach: float
     """How far from the robot there are shadows [m]."""
+    ground_shadows: bool
+    """Whether the ground casts shadows too, beside the robot."""
     reflections: bool
     """Whether the floor shines; everything is drawn twice then."""
     slices: int
@@ -62,6 +64,7 @@ RICH = Quality(
     samples=4,
     shadow_pixels=4096,
     shadow_reach=3.0,
+    ground_shadows=True,
     reflections=True,
     slices=28,
     stacks=16,
@@ -72,14 +75,15 @@ PLAIN = Quality(
     size=(960, 540),
     tile=(480, 360),
     samples=0,
-    shadow_pixels=1024,
+    shadow_pixels=768,
     shadow_reach=2.5,
+    ground_shadows=False,
     reflections=False,
-    slices=16,
+    slices=12,
     stacks=6,
     field_nodes=64,
 )
-"""For a CPU that draws: a tenth of the time of ``RICH`` (``benchmarks/video_speed.py``)."""
+"""For a CPU that draws: an eighth of the time of ``RICH`` (``benchmarks/video_speed.py``)."""
 
 
 def choose_renderer() -> Quality:
@@ -134,7 +138,15 @@ class Picture:
     DISTANCE = 4.46
     """Of the camera, in lengths of the robot's legs."""
 
-    def __init__(self, model: mujoco.MjModel, *, size: tuple[int, int], heading: float, leg_length: float) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        size: tuple[int, int],
+        heading: float,
+        leg_length: float,
+        ground_shadows: bool = True,
+    ) -> None:
         """Prepare the renderer.
 
         Args:
@@ -142,6 +154,7 @@ class Picture:
             size: width and height of the picture [pixels].
             heading: of the robot at the start [rad].
             leg_length: of the robot [m].
+            ground_shadows: whether the ground casts shadows too.
         """
         import mujoco
 
@@ -153,13 +166,25 @@ class Picture:
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 1
         self._options.sitegroup[:] = 0
+        self._ground_shadows = ground_shadows
 
     def draw(self, position: np.ndarray, looks_at: np.ndarray) -> np.ndarray:
         """The picture of a pose (7 + J,) from a camera that looks at a point (3,) [m]; (height, width, 3) uint8."""
         show(self._model, self._data, position)
         self._camera.lookat[:] = looks_at
         self._renderer.update_scene(self._data, self._camera, self._options)
+        if not self._ground_shadows:
+            self._take_shadows_from_ground()
         return self._renderer.render()
+
+    def _take_shadows_from_ground(self) -> None:
+        """Call the ground decoration: MuJoCo draws shadows on that, and none of it."""
+        import mujoco
+
+        scene = self._renderer.scene
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.category == mujoco.mjtCatBit.mjCAT_STATIC:
+                geom.category = mujoco.mjtCatBit.mjCAT_DECOR
 
     def close(self) -> None:
         """Free the renderer."""

@@ -50,6 +50,7 @@ class PlayRequest:
     gamepad: bool
     trust: bool
     robot: str | None = None
+    suite: str = "gaitgauge-1"
 
 
 def run_play(asked: PlayRequest) -> None:
@@ -66,7 +67,12 @@ def run_play(asked: PlayRequest) -> None:
 
     console = Terminal()
     maker = WorldMaker(
-        backend=asked.backend, device=asked.device, seed=asked.seed, trust=asked.trust, robot=asked.robot
+        backend=asked.backend,
+        device=asked.device,
+        seed=asked.seed,
+        trust=asked.trust,
+        robot=asked.robot,
+        suite=asked.suite,
     )
     level = maker.default_level(asked.terrain) if asked.level is None else asked.level
     with ExitStack() as stack:

@@ -65,6 +65,7 @@ def record(wanted: Recording, quality: Quality, progress: Callable[[float], None
             model=visual_model(session.robot, session.terrain, quality),
             heading=session.terrain.spawns["level_search"].yaw,
             leg_length=body_plan(session.robot).leg_length,
+            ground_shadows=quality.ground_shadows,
         )
         for session in sessions
     ]

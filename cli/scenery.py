@@ -34,7 +34,6 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
     """
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     _set_light(spec, quality)
-    _add_floor(spec, reflectance=0.04 if quality.reflections else 0.0)
     steps = [box for box in terrain.boxes if not box.wall]
     for i, box in enumerate(steps):
         spec.worldbody.add_geom(
@@ -59,6 +58,8 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
             contype=0,
             conaffinity=0,
         )
+    # Last, since drawing goes in this order: what steps hide of the floor need not be drawn.
+    _add_floor(spec, reflectance=0.04 if quality.reflections else 0.0)
     shown = any(geom.group == VISUAL_GROUP for geom in spec.geoms)
     for geom in list(spec.geoms):
         if geom.group == COLLISION_GROUP and shown:

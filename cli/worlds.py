@@ -20,7 +20,16 @@ from .policies import policy_file
 class WorldMaker:
     """What all worlds of one command share. Policies are loaded once."""
 
-    def __init__(self, *, backend: str, device: str | None, seed: int, trust: bool, robot: str | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        backend: str,
+        device: str | None,
+        seed: int,
+        trust: bool,
+        robot: str | None = None,
+        suite: str = "gaitgauge-1",
+    ) -> None:
         """Choose an engine.
 
         Args:
@@ -29,13 +38,15 @@ class WorldMaker:
             seed: of the heading at each start.
             trust: run the program that a policy file carries inside.
             robot: name or path of the robot; None for the one that each policy is for.
+            suite: name or path of the suite whose physics, joint parameters and speeds are played with.
 
         Raises:
             BackendError: no such engine or device.
+            SuiteError: no such suite.
         """
         self._backend, self._device = backend, choose_device(backend, device)
         self._seed, self._trust, self._robot = seed, trust, robot
-        self._suite = load_suite("gaitgauge-1")
+        self._suite = load_suite(suite)
         self._policies: dict[str, Policy] = {}
 
     def make(self, choice: str, terrain: str, level: int | None, friction: float, label: str) -> PlaySession:

@@ -83,7 +83,7 @@ def play(
         Path | None, typer.Option("--out", "--video", help="Write a video (.mp4); needs no display.")
     ] = None,
     gif: Annotated[
-        Path | None, typer.Option(help="Write a small one that plays by itself in a page (.gif, .webp).")
+        Path | None, typer.Option(help="Write a small clip that plays by itself in a page (.gif, .webp).")
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="How long [s]. Default: 10 for a video, else no end.")] = None,
     command: Annotated[
@@ -94,7 +94,7 @@ def play(
         ),
     ] = None,
     friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.6,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the heading at each start.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the robot's heading at each start.")] = 0,
     backend: BackendOption = "mujoco",
     device: DeviceOption = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,
@@ -104,6 +104,13 @@ def play(
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
     trust: TrustOption = False,
     robot: RobotOption = None,
+    suite: Annotated[
+        str,
+        typer.Option(
+            help="Suite whose physics, gains and speeds are played with: a name or a .toml file.",
+            autocompletion=completion.suites,
+        ),
+    ] = "gaitgauge-1",
 ) -> None:
     """Watch policies walk: in MuJoCo's viewer, in a browser, or in a video file without a display.
 
@@ -133,6 +140,7 @@ def play(
             gamepad=gamepad,
             trust=trust,
             robot=robot,
+            suite=suite,
         )
     )
 

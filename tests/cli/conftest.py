@@ -92,9 +92,9 @@ def session(policy: Path) -> Iterator[Callable[..., PlaySession]]:
     made = []
 
     def make(
-        terrain: str = "flat", level: int | None = None, friction: float = 0.8, policy: Path = policy
+        terrain: str = "flat", level: int | None = None, friction: float = 0.8, policy: Path = policy, **options: str
     ) -> PlaySession:
-        maker = WorldMaker(backend="mujoco", device="cpu", seed=0, trust=False)
+        maker = WorldMaker(backend="mujoco", device="cpu", seed=0, trust=False, **options)
         made.append(maker.make(str(policy), terrain, level, friction, "standing"))
         return made[-1]
 

@@ -60,10 +60,10 @@ settling = { longest = 0.1 }
     monkeypatch.setattr(clip, "make_clip", film)
     command = ("evaluate", policy, "--suite", suite, "--threads", 1, "--out")
     assert run(*command, tmp_path / "a").exit_code == 0
-    assert asked == [("tiny", [str(policy)])]
+    assert asked == [("tiny", [str(policy), "--suite", str(suite)])]
     assert "data:image/webp;base64,UklGRg==" in (tmp_path / "a" / "report.html").read_text()
     assert "no clip: nothing draws" in run(*command, tmp_path / "b", "--trust").stderr
-    assert asked[1][1] == [str(policy), "--trust"]
+    assert asked[1][1] == [str(policy), "--suite", str(suite), "--trust"]
     assert run(*command, tmp_path / "a", "--resume", "--no-clip").exit_code == 0
     assert len(asked) == 2
 

@@ -22,7 +22,7 @@ def test_tiles_stand_side_by_side_and_pictures_are_drawn_as_they_are_needed(monk
     closed, taken = [], []
 
     class Flat:
-        def __init__(self, model, *, size, heading, leg_length):
+        def __init__(self, model, *, size, heading, leg_length, ground_shadows):
             self.size = size
 
         def draw(self, position, looks_at):
@@ -71,6 +71,39 @@ def test_several_processes_draw_what_one_draws_and_one_that_dies_is_a_sentence(m
     done = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "a process that draws was ended" in done.stdout
+
+
+@pytest.mark.slow
+def test_plain_pictures_keep_the_robots_shadow_and_leave_out_that_of_the_ground(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    try:
+        choose_renderer()
+    except UserError as error:
+        pytest.skip(str(error))
+    done = subprocess.run([sys.executable, "-c", _SHADOWS], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+_SHADOWS = """
+import numpy as np
+from gaitgauge.cli.picture import PLAIN, Picture
+from gaitgauge.cli.scenery import visual_model
+from gaitgauge.robots import load_robot
+from gaitgauge.terrains import make_terrain
+robot = load_robot("go2")
+model = visual_model(robot, make_terrain("obstacle", 5), PLAIN)
+def drawn(ground_shadows):
+    picture = Picture(model, size=(480, 270), heading=0.0, leg_length=0.4, ground_shadows=ground_shadows)
+    position = np.array([-1.0, 0.0, 0.4, 1.0, 0.0, 0.0, 0.0, *robot.default_joint_position])
+    image = picture.draw(position, np.array([-0.5, 0.0, 0.2])).astype(int).sum(axis=2)
+    picture.close()
+    return image
+all_of_them, robots = drawn(True), drawn(False)
+model.light_castshadow[:] = 0
+none = drawn(False)
+assert (none - robots > 30).sum() > 500, "the robot has a shadow"
+assert (robots - all_of_them > 30).sum() > 100, "obstacles have one too where it is asked for"
+"""
 
 
 _SCRIPT = """

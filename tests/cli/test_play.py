@@ -38,6 +38,13 @@ def test_standing_policy_stands(session):
     assert len(played.position()) == 7 + ROBOT.num_joints
 
 
+def test_world_is_that_of_the_suite(session, tmp_path):
+    suite = tmp_path / "coarse.toml"
+    suite.write_text('extends = "gaitgauge-1"\nname = "coarse"\nphysics = { timestep = 0.005 }\n')
+    assert session().substeps == 0.02 / load_suite("gaitgauge-1").physics.timestep
+    assert session(suite=str(suite)).substeps == 4
+
+
 def test_fallen_robot_is_shown_and_starts_again(session):
     played = session()
     side = torch.tensor([[math.cos(math.pi / 4), math.sin(math.pi / 4), 0.0, 0.0]], dtype=torch.float64)
