@@ -1,8 +1,8 @@
 """What a foreign program may use: operators on tensors, numbers, texts and lists, which compute and touch nothing else.
 
 Whatever is absent is refused by its name. Absent on purpose: what opens files (``from_file``, ``save``), starts tasks or calls
-other machines, reaches into memory without checking (``set_``, ``resize_``, ``as_strided``, ``empty_strided``), or comes from
-elsewhere than torch's and ONNX's own sets.
+other machines, reaches into memory without checking (``set_``, ``resize_``, ``as_strided``, ``empty_strided``, and
+``native_batch_norm`` and ``upsample_*``, which take sizes on trust), or comes from elsewhere than torch's and ONNX's own sets.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ is_floating_point is_nonzero is_same_size is_signed isclose isfinite isin isinf 
 kthvalue layer_norm linalg_cross linalg_det linalg_eigh linalg_inv linalg_lstsq linalg_matrix_norm linalg_multi_dot linalg_norm
 linalg_pinv linalg_qr linalg_solve linalg_svd linalg_vecdot linalg_vector_norm linear linspace log_sigmoid log_softmax
 logcumsumexp logspace logsumexp lstm lstm_cell masked_select matmul matrix_exp matrix_power max max_pool1d max_pool2d
-max_pool3d mean median meshgrid min mm mode movedim moveaxis multinomial mv nanmean nanmedian nansum narrow native_batch_norm
+max_pool3d mean median meshgrid min mm mode movedim moveaxis multinomial mv nanmean nanmedian nansum narrow
 native_dropout native_group_norm native_layer_norm native_norm new_empty new_full new_ones new_zeros nonzero norm numel
 numpy_T one_hot ones ones_like outer pad pairwise_distance permute pinverse pixel_shuffle pixel_unshuffle positive prod rand
 rand_like randint randint_like randn randn_like randperm range ravel real reflection_pad1d reflection_pad2d reflection_pad3d
@@ -42,11 +42,11 @@ repeat repeat_interleave replication_pad1d replication_pad2d replication_pad3d r
 rms_norm rnn_relu rnn_relu_cell rnn_tanh rnn_tanh_cell roll rot90 row_stack scalar_tensor scaled_dot_product_attention
 scatter_reduce searchsorted select select_scatter size slice slice_scatter softmax sort split split_with_sizes stack std
 std_mean stride sum sum_to_size svd take take_along_dim tensor_split tensordot tile to topk trace trapezoid trapz tril_indices
-triu_indices type_as unbind unflatten unfold unique_consecutive unique_dim unsafe_chunk unsafe_split upsample_bilinear2d
-upsample_linear1d upsample_nearest1d upsample_nearest2d vander var var_mean vdot view view_as view_as_complex view_as_real
-vsplit vstack where zeros zeros_like _cast_Float _cast_Double _cast_Int _cast_Long _softmax _log_softmax _unique2
-_weight_norm _reshape_from_tensor _shape_as_tensor _pack_padded_sequence _pad_packed_sequence lift_fresh mT mH matrix_H
-get_device is_inference is_contiguous is_grad_enabled storage_offset element_size cpu result_type can_cast promote_types
+triu_indices type_as unbind unflatten unfold unique_consecutive unique_dim unsafe_chunk unsafe_split vander var var_mean vdot
+view view_as view_as_complex view_as_real vsplit vstack where zeros zeros_like _cast_Float _cast_Double _cast_Int _cast_Long
+_softmax _log_softmax _unique2 _weight_norm _reshape_from_tensor _shape_as_tensor _pack_padded_sequence _pad_packed_sequence
+lift_fresh mT mH matrix_H get_device is_inference is_contiguous is_grad_enabled storage_offset element_size cpu result_type
+can_cast promote_types
 """
 
 _PLAIN = """

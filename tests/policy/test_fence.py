@@ -134,6 +134,11 @@ def test_a_program_that_opens_a_file_is_refused_by_name(tmp_path, contract, plac
         ("x = [observation][0].set_(observation)", "set_"),
         ("x = observation.resize_([100, 100])", "resize_"),
         ("x = observation.as_strided([100, 100], [1, 1])", "as_strided"),
+        (
+            "x = ops.aten.native_batch_norm(observation, None, None, observation, observation, True, 0.1, 0.1)",
+            "native_batch",
+        ),
+        ("x = torch.upsample_bilinear2d(observation, [4, 4], False, 1e-30, 1e-30)", "upsample_bilinear2d"),
         ("f = observation.as_strided\n    x = f([100, 100], [1, 1])", r"f\(\)"),
         ("f = getattr(observation, 'resize_')\n    x = f([100, 100])", r"f\(\)"),
         ("f = __torch__.a\n    f = observation.resize_\n    x = f([100, 100])", r"f\(\)"),
@@ -252,6 +257,19 @@ class Deep(Plain):
         return self.layer(observation) + float(len(texts))
 
 
+class WrongSizes(Plain):
+    """Gives an LSTM fewer hidden states than rows: some implementations write outside of memory then."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weights = [torch.ones(8, 2), torch.ones(8, 2), torch.ones(8), torch.ones(8)]
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        state = [torch.zeros(1, 1, 2), torch.zeros(1, 1, 2)]
+        out = torch.lstm(torch.ones(3, 50, 2), state, self.weights, True, 1, 0.0, False, False, False)
+        return self.layer(observation) + out[0].sum()
+
+
 class Raising(Plain):
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         if observation.size(0) > 0:
@@ -270,6 +288,7 @@ class Raising(Plain):
         (Huge, "memory|allocate"),
         pytest.param(Deep, "memory|alloc|crashed|took over", marks=pytest.mark.slow),
         (Raising, "leg"),
+        (WrongSizes, "shape"),
     ],
 )
 def test_what_is_no_action_ends_in_one_sentence(tmp_path, module, named):
