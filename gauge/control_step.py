@@ -96,7 +96,7 @@ class ControlStep:
         self._action = torch.zeros_like(self.buffers.action)
         # control steps since they were asked for, added up over worlds: a plain number where values may be read
         self._world_steps = 0 if early_outs else torch.zeros(1, device=device, dtype=torch.int64)
-        self.recording = StepRecording(enabled=capture and not early_outs and device.type == "cuda")
+        self.recording = StepRecording(device, enabled=capture and not early_outs and device.type == "cuda")
 
     # ---- between control steps ------------------------------------------------------------------------------------
 

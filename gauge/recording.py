@@ -21,8 +21,9 @@ class StepRecording:
     are, which costs time and changes nothing.
     """
 
-    def __init__(self, *, enabled: bool) -> None:
-        """``enabled``: whether to record at all."""
+    def __init__(self, device: torch.device | str, *, enabled: bool) -> None:
+        """``device``: where the functions run; ``enabled``: whether to record at all."""
+        self._device = device
         self.enabled = enabled
         """Whether functions are recorded, or will be."""
         self._functions: dict[str, RecordedFunction[None]] = {}
@@ -41,7 +42,7 @@ class StepRecording:
         if not self.enabled:
             function()
             return
-        recorded = self._functions.setdefault(function.__name__, RecordedFunction(function))
+        recorded = self._functions.setdefault(function.__name__, RecordedFunction(function, self._device))
         if recorded.due and recorded.recordings >= _MOST_RECORDINGS:
             self._give_up(function, f"its memory moved {_MOST_RECORDINGS} times")
             return

@@ -173,8 +173,8 @@ class TrainingEnvironment(VecEnv):
         before = memory.snapshot()
         motors_before = motors.snapshot()
         with torch.no_grad():
-            self._after_physics = RecordedFunction(self._after_physics)
-            self._observe = RecordedFunction(self._observe)
+            self._after_physics = RecordedFunction(self._after_physics, self.device)
+            self._observe = RecordedFunction(self._observe, self.device)
             for _ in range(WARM_UP + 1):
                 self._after_physics()
                 self._observe()

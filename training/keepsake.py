@@ -27,7 +27,7 @@ class Keepsake:
         self.iteration = iteration
         if torch.device(device).type == "cuda":
             self._done = torch.cuda.Event()
-            self._done.record()
+            self._done.record(torch.cuda.current_stream(device))
 
     def take(self) -> Mapping[str, Any] | None:
         """The copy, None if there is none."""

@@ -100,7 +100,7 @@ class Processes:
         if not self.several or torch.device(device).type != "cuda":
             return
         done, begin = torch.cuda.Event(), time.monotonic()
-        done.record()
+        done.record(torch.cuda.current_stream(device))
         while not done.query():
             limit = PATIENCE_AFTER_SIGNAL if stopping() else PATIENCE
             if time.monotonic() - begin > limit:

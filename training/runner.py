@@ -323,7 +323,8 @@ class TrainingRunner:
         if path.exists() and time.time() - path.stat().st_mtime < time.monotonic() - begin:
             return ProcessLostError(sentence)
         # The device's own stream may wait for the lost process forever; the environment is not touched by that.
-        aside = torch.cuda.stream(torch.cuda.Stream()) if torch.device(self.device).type == "cuda" else nullcontext()
+        on_gpu = torch.device(self.device).type == "cuda"
+        aside = torch.cuda.stream(torch.cuda.Stream(self.device)) if on_gpu else nullcontext()
         with aside:
             local = {"num_envs": self.env.num_envs, "log": self.logger.state_dict(), "world_size": 0}
             write_learned(self, path, learned, local)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Generic, TypeVar
 
 import torch
@@ -21,9 +22,14 @@ class RecordedFunction(Generic[Result]):
     same tensors with new contents.
     """
 
-    def __init__(self, function: Callable[..., Result], *, warm_up: int = WARM_UP) -> None:
-        """``warm_up``: calls that run as they are, on a stream of their own, as recording asks for."""
+    def __init__(self, function: Callable[..., Result], device: torch.device | str, *, warm_up: int = WARM_UP) -> None:
+        """Args:
+        function: see above.
+        device: the GPU that it runs on, whichever is torch's current one.
+        warm_up: calls that run as they are, on a stream of their own, as recording asks for.
+        """
         self._function = function
+        self._device = torch.device(device)
         self._left = warm_up
         self._inputs: tuple[torch.Tensor, ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
@@ -43,10 +49,11 @@ class RecordedFunction(Generic[Result]):
             RuntimeError: it cannot be recorded. It has not run then, and the next call tries again.
         """
         if self._graph is None:
-            if self._left > 0:
-                self._left -= 1
-                return self._run(arguments)
-            self._graph = self._record(arguments)
+            with torch.cuda.device(self._device) if self._device.type == "cuda" else nullcontext():
+                if self._left > 0:
+                    self._left -= 1
+                    return self._run(arguments)
+                self._graph = self._record(arguments)
         for static, argument in zip(self._inputs, arguments, strict=True):
             static.copy_(argument)
         self._graph.replay()
@@ -57,7 +64,7 @@ class RecordedFunction(Generic[Result]):
         self._graph = None
 
     def _run(self, arguments: tuple[torch.Tensor, ...]) -> Result:
-        if not torch.cuda.is_available():
+        if self._device.type != "cuda":
             return self._function(*arguments)
         current, aside = torch.cuda.current_stream(), torch.cuda.Stream()
         aside.wait_stream(current)
@@ -69,14 +76,25 @@ class RecordedFunction(Generic[Result]):
     def _record(self, arguments: tuple[torch.Tensor, ...]) -> torch.cuda.CUDAGraph:
         self._inputs = tuple(argument.clone() for argument in arguments)
         graph = torch.cuda.CUDAGraph()
-        generator = torch.cuda.default_generators[torch.cuda.current_device()]
-        before = generator.clone_state()
-        try:
-            # other threads may talk to the device meanwhile
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                self._result = self._function(*self._inputs)
-        except BaseException:
-            generator.graphsafe_set_state(before)  # torch leaves it as if it were still recording, unable to draw
-            raise
+        # torch's own stream for it belongs to the first GPU that recorded; other threads may talk to the device meanwhile
+        stream = torch.cuda.Stream() if self._device.type == "cuda" else None
+        with (
+            _drawing_afterwards(self._device),
+            torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+        ):
+            self._result = self._function(*self._inputs)
         self.recordings += 1
         return graph
+
+
+@contextmanager
+def _drawing_afterwards(device: torch.device) -> Iterator[None]:
+    """Put the device's random generator back where a recording fails: torch leaves it unable to draw, as if it still recorded."""
+    generators = [torch.cuda.default_generators[torch.cuda.current_device()]] if device.type == "cuda" else []
+    before = [generator.clone_state() for generator in generators]
+    try:
+        yield
+    except BaseException:
+        for generator, state in zip(generators, before, strict=True):
+            generator.graphsafe_set_state(state)
+        raise

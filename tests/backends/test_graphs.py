@@ -15,7 +15,7 @@ def test_every_call_counts_once_and_sees_its_arguments():
         total.add_(value)
         return total * 2.0
 
-    recorded = RecordedFunction(add)
+    recorded = RecordedFunction(add, "cuda")
     for k in range(WARM_UP + 4):
         doubled = recorded(torch.full((3,), float(k), device="cuda"))
         assert total.tolist() == [sum(range(k + 1))] * 3
@@ -34,7 +34,7 @@ def test_what_waits_for_the_device_cannot_be_recorded_and_has_not_run():
         total.add_(1.0)
         return total.item()
 
-    recorded = RecordedFunction(wait, warm_up=1)
+    recorded = RecordedFunction(wait, "cuda", warm_up=1)
     assert recorded() == 1.0
     with pytest.raises(RuntimeError):
         recorded()
@@ -48,6 +48,20 @@ def test_random_numbers_go_on_after_a_recording_that_failed():
     torch.cuda.manual_seed(3)
     first = torch.rand(4, device="cuda").tolist()
     with pytest.raises(RuntimeError):
-        RecordedFunction(lambda: torch.zeros(1, device="cuda").item(), warm_up=0)()
+        RecordedFunction(lambda: torch.zeros(1, device="cuda").item(), "cuda", warm_up=0)()
     torch.cuda.synchronize()
     assert (first, torch.rand(4, device="cuda").tolist()) == wanted
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="no second CUDA device")
+def test_any_gpu_records_whichever_is_the_current_one():
+    total = torch.zeros(3, device="cuda:1")
+
+    def add():
+        return total.add_(1.0) * 2.0
+
+    recorded = RecordedFunction(add, "cuda:1")
+    assert torch.cuda.current_device() == 0
+    for k in range(WARM_UP + 3):
+        assert recorded().tolist() == [2.0 * (k + 1)] * 3
+    assert recorded.recordings == 1

@@ -84,7 +84,9 @@ class Recorder(TorchDispatchMode):
 def tapes(monkeypatch):
     """Recording on the CPU, where a rollout is asked to capture."""
     Tape.made = 0
-    monkeypatch.setattr(control_step, "StepRecording", lambda *, enabled: StepRecording(enabled=capturing[-1]))
+    monkeypatch.setattr(
+        control_step, "StepRecording", lambda device, *, enabled: StepRecording(device, enabled=capturing[-1])
+    )
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Tape)
     monkeypatch.setattr(torch.cuda, "graph", Recorder)
     return Tape
@@ -181,7 +183,7 @@ def test_steps_that_cannot_be_recorded_are_played_as_they_are(interval, tapes, m
 
 def test_memory_that_moves_is_recorded_anew_for_some_time_only(tapes, monkeypatch, caplog):
     monkeypatch.setattr(recording, "_MOST_RECORDINGS", 3)
-    steps, total = StepRecording(enabled=True), torch.zeros(1)
+    steps, total = StepRecording("cpu", enabled=True), torch.zeros(1)
 
     def count():
         total.add_(1)

@@ -353,7 +353,9 @@ class PPO:
         """One step of two halves. Between several processes each half is a CUDA graph of its own: a message inside a graph
         could not be given up when a process is lost.
         """
-        recorded: Callable[[Step], Step] = RecordedFunction if self._graphs else (lambda step: step)
+
+        def recorded(step: Step) -> Step:
+            return RecordedFunction(step, self.device) if self._graphs else step
 
         def whole(*rows: torch.Tensor) -> None:
             compute(*rows)
