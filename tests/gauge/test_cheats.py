@@ -6,12 +6,14 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import torch
 from gaitgauge.gauge.board import board_data
 from gaitgauge.gauge.coverage import notes, score_label
-from gaitgauge.gauge.evaluate import Request, evaluate
-from gaitgauge.policy.contract import ObservationTerm, standard_contract
+from gaitgauge.gauge.evaluate import Request, evaluate, prepare
+from gaitgauge.policy.base import PolicySession
+from gaitgauge.policy.contract import TERM_WIDTH, ObservationTerm, standard_contract
 from gaitgauge.policy.finding import PRETRAINED
-from gaitgauge.policy.native import StoredNetwork, save_policy
+from gaitgauge.policy.native import FilePolicy, StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from scripted_gauge import GO2, Puppet
 
@@ -113,6 +115,82 @@ def test_a_cheat_has_at_most_a_quarter_on_flat_ground_and_nothing_elsewhere(fold
     found = evaluate(Request(policy=str(policy(name)), suite=str(suite), threads=2), folder / f"whole-{name}")
     assert found["terrains"].pop("flat")["score"] < 0.25
     assert {row["score"] for row in found["terrains"].values()} == {0.0}
+
+
+class Altered(FilePolicy):
+    """The policy that ships, with other commands than it is given, or other actions than it answers."""
+
+    def __init__(self, walking, *, command=None, action=None):
+        self.walking, self.command, self.action = walking, command, action
+        self.contract, self.path, self.stored = walking.contract, walking.path, walking.stored
+
+    def session(self, num_episodes, *, device="cpu"):
+        return AlteredSession(self, self.walking.session(num_episodes, device=device), num_episodes)
+
+
+class AlteredSession(PolicySession):
+    def __init__(self, policy, walking, num_episodes):
+        self.policy, self.walking, self.step = policy, walking, torch.zeros(num_episodes)
+        widths = [TERM_WIDTH[t.name] or 12 for t in policy.contract.observation]
+        place = [t.name for t in policy.contract.observation].index("command")
+        self.scale = torch.tensor(policy.contract.observation[place].scale)
+        self.frame, self.place = sum(widths), sum(widths[:place])
+
+    def reset(self, episodes=None):
+        self.walking.reset(episodes)
+        self.step[... if episodes is None else episodes] = 0.0
+
+    def act(self, observation, rows=None):
+        frames = observation.clone().unflatten(1, (-1, self.frame))
+        commands = frames[:, :, self.place : self.place + 3]
+        if self.policy.command:
+            commands[:] = self.policy.command(commands / self.scale) * self.scale
+        action = self.walking.act(frames.flatten(1))
+        if self.policy.action:
+            action = self.policy.action(action, self.step * self.policy.contract.control_period)
+        self.step += 1.0
+        return action
+
+
+ALTERED = {
+    "falls at the end of every long sub-command": {
+        "action": lambda action, time: torch.where((time > 6.6)[:, None], torch.full_like(action, 8.0), action)
+    },
+    "stands where two directions are asked for at once": {
+        "command": lambda c: torch.where((c[..., :2].abs() > 0.3).all(-1, keepdim=True), 0.0 * c, c)
+    },
+    "marches on the spot": {"command": lambda c: 0.0 * c},
+    "spins": {"command": lambda c: torch.tensor([0.0, 0.0, 2.0]).expand_as(c)},
+    "freezes when it is told to stand": {
+        "action": lambda action, time: torch.where((time > 5.0)[:, None], 0.0 * action, action)
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def altered(folder):
+    request = Request(
+        policy="pretrained",
+        suite="gaitgauge-1",
+        pipeline="multi",
+        terrains=("flat",),
+        frictions=(0.6,),
+        payloads=(0.0,),
+        seeds=(0,),
+    )
+    prepared = prepare(request)
+
+    def score(name):
+        policy = Altered(prepared.policy, **ALTERED.get(name, {}))
+        return evaluate(replace(prepared, policy=policy), folder / f"altered-{name}".replace(" ", "-"))["score"]
+
+    return cache(score)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALTERED)
+def test_walking_that_picks_its_moments_earns_less_than_walking(altered, name):
+    assert altered(name) < 0.97 * altered("as it is")
 
 
 @pytest.mark.slow
