@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: install demo test test-slow test-gpu fuzz torture check docs format clean
+.PHONY: install demo test test-slow test-gpu cpp fuzz torture check docs format clean
 
 install: $(READY)
 
@@ -27,6 +27,12 @@ test-slow: install
 
 test-gpu: install
 	$(BIN)/python -m pytest -m gpu
+
+# The C++ controller of examples/. Needs apt, cmake, a C++ compiler and libyaml-cpp-dev.
+cpp: install
+	examples/cpp_controller/headers.sh build/onnxruntime
+	ONNXRUNTIME_INCLUDE=$(CURDIR)/build/onnxruntime/usr/include/onnxruntime \
+		$(BIN)/python -m pytest -m slow tests/policy/test_cpp_controller.py
 
 # What somebody else may have written, against every parser: CASES of all of them together. Prints a table.
 CASES ?= 100000

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 import gaitgauge
 import onnxruntime
@@ -17,16 +18,17 @@ from gaitgauge.robots import load_robot
 
 ROOT = Path(gaitgauge.__path__[0])
 EXAMPLE = ROOT / "examples" / "cpp_controller"
-HEADERS = [
-    Path(p)
-    for p in (
-        os.environ.get("ONNXRUNTIME_INCLUDE", ""),
-        "/usr/include/onnxruntime",
-        "/usr/local/include/onnxruntime",
-        "/usr/include/onnxruntime/core/session",
-    )
-    if p
-]
+ASKED = os.environ.get("ONNXRUNTIME_INCLUDE")
+"""Folder of onnxruntime's headers, as ``make cpp`` sets it: what is missing then is a failure."""
+HEADERS = (
+    [Path(ASKED)]
+    if ASKED
+    else [
+        Path("/usr/include/onnxruntime"),
+        Path("/usr/local/include/onnxruntime"),
+        Path("/usr/include/onnxruntime/core/session"),
+    ]
+)
 
 pytestmark = pytest.mark.slow
 
@@ -35,15 +37,19 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run([str(w) for w in words], capture_output=True, text=True, check=False)
 
 
+def missing(sentence: str) -> NoReturn:
+    (pytest.fail if ASKED else pytest.skip)(sentence)
+
+
 @pytest.fixture(scope="module")
 def controller(tmp_path_factory) -> Path:
     """The program, built against the library of the Python package."""
     for program in ("cmake", "c++"):
         if shutil.which(program) is None:
-            pytest.skip(f"{program} is not installed")
+            missing(f"{program} is not installed")
     headers = next((p for p in HEADERS if (p / "onnxruntime_cxx_api.h").is_file()), None)
     if headers is None:
-        pytest.skip("onnxruntime's C++ headers are not here: install libonnxruntime-dev, or set ONNXRUNTIME_INCLUDE")
+        missing("onnxruntime's C++ headers are not here: run make cpp, or set ONNXRUNTIME_INCLUDE")
     (library,) = (Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*")
     folder = tmp_path_factory.mktemp("cpp")
     for name in ("libonnxruntime.so", "libonnxruntime.so.1"):
@@ -51,7 +57,7 @@ def controller(tmp_path_factory) -> Path:
     settings = [f"-DONNXRUNTIME_INCLUDE={headers}", f"-DONNXRUNTIME_LIBRARY={folder / 'libonnxruntime.so'}"]
     configured = run("cmake", "-S", EXAMPLE, "-B", folder / "build", *settings)
     if "yaml-cpp" in configured.stderr:
-        pytest.skip("yaml-cpp is not installed: install libyaml-cpp-dev")
+        missing("yaml-cpp is not installed: install libyaml-cpp-dev")
     assert configured.returncode == 0, configured.stderr
     built = run("cmake", "--build", folder / "build")
     assert built.returncode == 0, built.stdout + built.stderr
