@@ -1,0 +1,84 @@
+"""``docs/architecture.md`` names the functions that an episode and a training step pass; here they do, in that order."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from types import CodeType, FrameType
+
+import pytest
+from gaitgauge.cli.main import app
+from typer.testing import CliRunner
+
+ROOT = Path(__file__).parents[2]
+SMALL = (
+    "training.algorithm.minibatches=1",
+    "training.algorithm.epochs=1",
+    "training.run.steps_per_iteration=4",
+)
+
+
+def hops(title: str) -> list[str]:
+    """The functions of a section's table, as ``file:name``."""
+    section = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split(f"## {title}")[1].split("\n## ")[0]
+    return re.findall(r"^\| \d+ \| `([\w/]+\.py:[\w.]+)` \|", section, re.MULTILINE)
+
+
+def passed(command: list[str], wanted: list[str]) -> list[str]:
+    """The wanted functions in the order in which a command called them."""
+    names: dict[CodeType, str | None] = {}
+    calls: list[str] = []
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        if event != "call":
+            return
+        code = frame.f_code
+        if code not in names:
+            path = Path(code.co_filename).resolve()
+            name = f"{path.relative_to(ROOT)}:{code.co_qualname}" if path.is_relative_to(ROOT) else ""
+            names[code] = name if name in wanted else None
+        if (name := names[code]) is not None:
+            calls.append(name)
+
+    sys.setprofile(note)
+    try:
+        ended = CliRunner().invoke(app, command)
+    finally:
+        sys.setprofile(None)
+    assert ended.exit_code == 0, ended.output
+    return calls
+
+
+def assert_in_order(wanted: list[str], calls: list[str]) -> None:
+    """One way through the calls passes all that is wanted."""
+    rest = iter(calls)
+    for hop in wanted:
+        assert hop in rest, f"{hop} is not called after the hops above it"
+
+
+@pytest.mark.parametrize("title", ["One episode, from the command to the result", "One training step"])
+def test_every_function_exists(title):
+    for hop in hops(title):
+        file, _, name = hop.partition(":")
+        *classes, function = name.split(".")
+        source = (ROOT / file).read_text(encoding="utf-8")
+        assert all(f"\nclass {c}" in source for c in classes), hop
+        assert re.search(rf"^{'    ' if classes else ''}def {function}\(", source, re.MULTILINE), hop
+
+
+@pytest.mark.slow
+def test_an_episode(tmp_path):
+    wanted = hops("One episode, from the command to the result")
+    assert len(wanted) > 12
+    command = ["evaluate", "pretrained", "--suite", "demo", "--pipeline", "base", "--terrain", "flat", "--threads", "1"]
+    assert_in_order(wanted, passed([*command, "--no-clip", "--out", str(tmp_path)], wanted))
+
+
+@pytest.mark.slow
+def test_a_training_step(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    wanted = [hop for hop in hops("One training step") if not hop.startswith("backends/")]  # the engine is another
+    assert len(wanted) > 12
+    command = ["train", "go2-flat", *SMALL, "--backend", "fake", "--device", "cpu", "--num-envs", "8", "--no-score"]
+    assert_in_order(wanted, passed([*command, "--iterations", "1"], wanted))
