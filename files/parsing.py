@@ -10,7 +10,7 @@ import json
 import re
 import reprlib
 import tomllib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import is_dataclass
 from difflib import get_close_matches
@@ -70,8 +70,9 @@ def shown(value: object) -> str:
 def one_line(text: object, longest: int = 300) -> str:
     """Somebody else's words in a sentence of ours: one line, shortened, control characters escaped."""
     words = " ".join(str(text).split())
-    safe = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in words)
-    return safe if len(safe) <= longest else safe[: longest - 1] + "…"
+    if not words.isprintable():
+        words = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in words)
+    return words if len(words) <= longest else words[: longest - 1] + "…"
 
 
 def did_you_mean(word: object, known: Collection[str]) -> str:
@@ -205,31 +206,39 @@ def plain(data: Any, source: str, error: type[Exception], *, most: int = _MOST) 
     """
     left = most
 
-    def copy(value: Any, path: str, depth: int) -> Any:
+    def copy(value: Any, steps: tuple[str | int, ...]) -> Any:
         nonlocal left
         left -= 1
-        if depth > _DEEPEST or left < 0:
-            raise error(f"{source} is {'nested too deep' if depth > _DEEPEST else 'too long'} at {path[:_SHOWN]}")
+        if len(steps) > _DEEPEST or left < 0:
+            reason = "nested too deep" if len(steps) > _DEEPEST else "too long"
+            raise error(f"{source} is {reason} at {_path(steps)[:_SHOWN]}")
         if isinstance(value, str):
             return value.encode("utf-8", "backslashreplace").decode()
         if isinstance(value, list | tuple):
-            return [copy(v, f"{path}[{i}]", depth + 1) for i, v in enumerate(value)]
+            return [copy(v, (*steps, i)) for i, v in enumerate(value)]
         if isinstance(value, Mapping):
             for key in value:
                 if not isinstance(key, str):
-                    raise error(f"{source}: {path or 'a table'} has the key {shown(key)}; keys must be texts")
-            return {copy(k, path, depth): copy(v, _joined(path, k), depth + 1) for k, v in value.items()}
+                    raise error(f"{source}: {_path(steps) or 'a table'} has the key {shown(key)}; keys must be texts")
+            return {copy(k, steps): copy(v, (*steps, k)) for k, v in value.items()}
         if isinstance(value, int) and not -(2**63) <= value < 2**63:
-            raise error(f"{source}: {path} is {shown(value)}; it must lie between -2^63 and 2^63")
+            raise error(f"{source}: {_path(steps)} is {shown(value)}; it must lie between -2^63 and 2^63")
         if value is None or isinstance(value, bool | int | float):
             return value
-        raise error(f"{source}: {path} is {shown(value)}; it must be a text, a number, a list or a table")
+        raise error(f"{source}: {_path(steps)} is {shown(value)}; it must be a text, a number, a list or a table")
 
-    return copy(data, "", 0)
+    return copy(data, ())
 
 
-def _joined(path: str, key: str) -> str:
-    return f"{path}.{one_line(key, _SHOWN)}" if path else one_line(key, _SHOWN)
+def _path(steps: Iterable[str | int]) -> str:
+    """The way to a value: ``tables[2].key``."""
+    path = ""
+    for step in steps:
+        if isinstance(step, int):
+            path += f"[{step}]"
+        else:
+            path += ("." if path else "") + one_line(step, _SHOWN)
+    return path
 
 
 # ---- dataclasses ----------------------------------------------------------------------------------------------------
@@ -332,10 +341,8 @@ def _sentence(problem: ValidationError, kind: Any) -> str:
     errors = problem.errors(include_url=False)
     order = ("unexpected_keyword_argument", "missing")
     first = min(errors, key=lambda e: order.index(e["type"]) if e["type"] in order else len(order))
-    path = ""
-    for step in first["loc"][first["loc"][0] == 0 :]:  # a number: the place in the tuple around it
-        if isinstance(step, int) or not _MEMBER.match(step):
-            path = f"{path}[{step}]" if isinstance(step, int) else _joined(path, step)
+    steps = first["loc"][first["loc"][0] == 0 :]  # a number: the place in the tuple around it
+    path = _path(step for step in steps if isinstance(step, int) or not _MEMBER.match(step))
     if first["type"] == "missing" and isinstance(first["loc"][-1], int):
         return f"{path.rpartition('[')[0]} is {shown(first['input'])}; more entries are needed"
     if first["type"] == "missing":

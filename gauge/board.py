@@ -13,7 +13,7 @@ from ..files.parsing import edited, one_line
 from ..files.writing import write_atomically
 from ..policy.contract import PRIVILEGED_TERMS
 from .coverage import COMPLETE, coverage_of
-from .report import TEMPLATES
+from .pages import page_template
 from .result_check import robot_digest_of
 from .verify import CardError, load_card
 
@@ -72,14 +72,7 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
 
 def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
     """The page, as HTML text. Whatever cards contain is shown as text and never becomes markup."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("board.html.j2").render(tables=tables)
+    return page_template("board.html.j2").render(tables=tables)
 
 
 def _entry(name: str, card: Mapping[str, Any], folder: Path) -> dict[str, Any]:

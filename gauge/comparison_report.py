@@ -15,7 +15,8 @@ from ..files.writing import write_atomically, write_failure
 from .charts import terrain_label
 from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p
 from .consistency import charts
-from .report import TEMPLATES, metric_label
+from .pages import page_template
+from .report import metric_label
 
 _TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}", "\\": r"\textbackslash{}"}
 _TEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", "–": "--"}
@@ -81,7 +82,7 @@ def as_latex(found: Comparison) -> str:
                     f"{d.values[1]:.4f}",
                     rf"\textbf{{{difference}}}" if d.real else difference,
                     low_high,
-                    _tex(format_p(d.corrected).removeprefix("= ")),
+                    _tex(_odds(d.corrected)),
                 ]
                 lines.append(" & ".join(cells) + r" \\")
         tables.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
@@ -91,19 +92,6 @@ def as_latex(found: Comparison) -> str:
 
 def as_page(found: Comparison) -> str:
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "fixed": _fixed,
-        "signed": lambda v: f"{v:+.4f}".replace("-", "−"),
-        "odds": lambda v: format_p(v).removeprefix("= "),
-        "label": label,
-    }
     pairs = []
     for first, second in _pairs(found):
         kinds = []
@@ -114,7 +102,8 @@ def as_page(found: Comparison) -> str:
             rows = list(zip(group, strips, strict=True))
             kinds.append({"kind": kind, "scale": charts.strip_scale(scale), "rows": rows})
         pairs.append({"first": first, "second": second, "kinds": kinds})
-    return environment.get_template("comparison.html.j2").render(
+    template = page_template("comparison.html.j2", fixed=_fixed, signed=_signed, odds=_odds, label=label)
+    return template.render(
         suite=found.suite,
         policies=found.policies,
         sentences=found.sentences,
@@ -122,6 +111,14 @@ def as_page(found: Comparison) -> str:
         pairs=pairs,
         details=sum(d.kind != "score" for d in found.differences),
     )
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.4f}".replace("-", "−")
+
+
+def _odds(p: float | None) -> str:
+    return format_p(p).removeprefix("= ")
 
 
 def label(found: Difference) -> str:

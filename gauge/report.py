@@ -16,11 +16,10 @@ from . import charts
 from .breakdown import breakdown
 from .charts import FLAT, Row, number, terrain_label
 from .coverage import coverage_of, notes, score_label, suite_label
+from .pages import page_template
 from .references import references_for
 from .results import SCHEMA
 from .store import StoreError
-
-TEMPLATES = Path(__file__).parent / "templates"
 
 STATISTIC_LABELS = {"mean": "mean", "mean50": "mean@50", "mean25": "mean@25"}
 """In the order in which the radar draws them."""
@@ -94,24 +93,26 @@ def render(results: Mapping[str, Any], clip: bytes | None = None) -> str:
         raise StoreError(
             f"the results have schema {shown(found)}, this version reads {SCHEMA}; evaluate the policy again"
         )
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    template = page_template(
+        "report.html.j2",
+        fixed=_fixed,
+        number=number,
+        terrain=terrain_label,
+        metric=metric_label,
+        short_metric=_short_metric_label,
+        grouped=_grouped,
     )
-    environment.filters |= {"fixed": _fixed, "number": number, "terrain": terrain_label, "metric": metric_label}
-    environment.filters |= {"short_metric": lambda name: metric_label(name, short=True), "grouped": _grouped}
-    return environment.get_template("report.html.j2").render(
-        **report_data(results), clip=None if clip is None else base64.b64encode(clip).decode()
-    )
+    return template.render(**report_data(results), clip=None if clip is None else base64.b64encode(clip).decode())
 
 
-def metric_label(name: str, *, short: bool = False) -> str:
-    """A metric's name for readers; ``short`` for a column's head."""
-    labels = METRIC_LABELS.get(name)
-    return labels[short] if labels else name.replace("_", " ")
+def metric_label(name: str) -> str:
+    """A metric's name for readers."""
+    return METRIC_LABELS[name][0] if name in METRIC_LABELS else name.replace("_", " ")
+
+
+def _short_metric_label(name: str) -> str:
+    """A metric's name at a column's head."""
+    return METRIC_LABELS[name][1] if name in METRIC_LABELS else metric_label(name)
 
 
 def report_data(results: Mapping[str, Any]) -> dict[str, Any]:

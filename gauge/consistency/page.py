@@ -11,7 +11,8 @@ import jinja2
 from ...files.parsing import edited, read_results, shown
 from ...files.writing import write_atomically
 from ..charts import number, terrain_label
-from ..report import TEMPLATES, metric_label
+from ..pages import page_template
+from ..report import metric_label
 from ..store import StoreError
 from . import charts
 from .statistics import DIFFERENT, EQUIVALENT
@@ -73,21 +74,10 @@ def render(results: Mapping[str, Any]) -> str:
         raise StoreError(
             f"the study has schema {shown(results.get('schema'))}, this version reads {SCHEMA}; run it again"
         )
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    template = page_template(
+        "consistency.html.j2", fixed=_fixed, short=_short, number=number, terrain=terrain_label, metric=metric_label
     )
-    environment.filters |= {
-        "fixed": _fixed,
-        "short": _short,
-        "number": number,
-        "terrain": terrain_label,
-        "metric": metric_label,
-    }
-    return environment.get_template("consistency.html.j2").render(page_data(results))
+    return template.render(page_data(results))
 
 
 def page_data(results: Mapping[str, Any]) -> dict[str, Any]:

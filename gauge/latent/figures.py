@@ -11,7 +11,7 @@ import markupsafe
 import numpy as np
 from numpy.typing import NDArray
 
-from ..report import TEMPLATES
+from ..pages import page_template
 from .collecting import Notes
 
 FIGURES = ("terrains", "commands", "experts")
@@ -71,17 +71,13 @@ def render_figure(name: str, results: Mapping[str, Any], points: Points) -> str 
         item["x"], item["line"] = round(at, 1), line
         at += width
     height = _TOP + max(p["height"] for p in panels) + 44.0
-    return (
-        _environment()
-        .get_template("latent.svg.j2")
-        .render(
-            name=name,
-            panels=panels,
-            legend=legend,
-            top=_TOP,
-            legend_y=height,
-            size=(round(max(x, 380.0), 1), round(height + 18.0 * (line + 1) if legend else height - 30.0, 1)),
-        )
+    return _template("latent.svg.j2").render(
+        name=name,
+        panels=panels,
+        legend=legend,
+        top=_TOP,
+        legend_y=height,
+        size=(round(max(x, 380.0), 1), round(height + 18.0 * (line + 1) if legend else height - 30.0, 1)),
     )
 
 
@@ -89,19 +85,11 @@ def render_page(results: Mapping[str, Any], pictures: Mapping[str, str]) -> str:
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
     # the figures' templates have escaped what is in them
     figures = {name: markupsafe.Markup(text) for name, text in pictures.items()}
-    return _environment().get_template("latent.html.j2").render(results=results, figures=figures, spaces=SPACES)
+    return _template("latent.html.j2").render(results=results, figures=figures, spaces=SPACES)
 
 
-def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"label": label, "fixed": _fixed}
-    return environment
+def _template(name: str) -> jinja2.Template:
+    return page_template(name, label=label, fixed=_fixed)
 
 
 def _fixed(value: float) -> str:

@@ -6,9 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jinja2
-
-from ..report import TEMPLATES
+from ..pages import page_template
 
 _WIDTH = 720.0
 _MARGIN = 34.0
@@ -17,20 +15,12 @@ _TALLEST = 320.0
 
 def render_page(results: Mapping[str, Any]) -> str:
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"percent": percent, "measures": measures}
     scenarios = [
         {**entry, "reported_text": reported(entry["reported"]), "views": [view(entry, r) for r in entry["results"]]}
         for entry in results["scenarios"]
         if entry["results"]
     ]
-    return environment.get_template("trial.html.j2").render(
+    return page_template("trial.html.j2", percent=percent, measures=measures).render(
         scenarios=scenarios,
         policies=results["policies"],
         refused=results["refused"],
