@@ -15,7 +15,8 @@ from ..policy.contract import PRIVILEGED_TERMS
 from .coverage import COMPLETE, coverage_of
 from .pages import page_template
 from .result_check import robot_digest_of
-from .verify import CardError, load_card
+from .suite import load_suite, suite_names
+from .verify import CardError, check_coverage, load_card
 
 
 def write_board(folder: Path, page: Path) -> Path:
@@ -26,13 +27,17 @@ def write_board(folder: Path, page: Path) -> Path:
         page: where the page goes.
 
     Raises:
-        CardError: there is no card.
+        CardError: there is no card, or one does not hold what it says it holds of a suite that ships.
         ComparisonError: a file that is none, or a damaged one; nothing is left out in silence.
     """
     files = sorted([*folder.glob("*.json"), *folder.glob("*/results.json")])
     if not files:
         raise CardError(f"'{folder}' holds no score cards; put results.json files or folders of evaluations there")
     cards = {str(file.relative_to(folder)): load_card(file) for file in files}
+    for file, card in cards.items():
+        name, digest = card["suite"]["name"], card["suite"]["digest"]
+        if name in suite_names() and (suite := load_suite(name)).digest == digest:
+            check_coverage(card, suite, f"the card '{one_line(file)}'")
     with edited(f"a card in '{one_line(folder)}'", CardError, jinja2.TemplateError):
         text = render_board(board_data(cards, folder))
     write_atomically(page, text, CardError)

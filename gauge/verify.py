@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ..files.parsing import edited
+from ..files.parsing import edited, one_line
 from ..robots import robot_names
 from ..robots.loading import robot_digest
 from .comparison import load_result
+from .coverage import UNKNOWN, coverage, coverage_of
 from .evaluate import Prepared, Request, Status, evaluate, file_digest, prepare
 from .intervals import Evidence
 from .pipelines import Environment
@@ -76,6 +77,7 @@ def prepare_replay(
             f"the card was made on {wanted['name']} {wanted['version']} with digest {wanted['digest'][:12]}…, here it is "
             f"{rules.name} {rules.version} with {rules.digest[:12]}…; give the card's suite file with --suite"
         )
+    check_coverage(card, rules, "the card")
     rows = _sample(card["environments"], rules) if quick else card["environments"]
     prepared = prepare(
         Request(
@@ -97,6 +99,27 @@ def prepare_replay(
         )
     prepared = replace(prepared, environments=tuple(_environment(row) for row in rows))
     return prepared if fresh is None else with_fresh_seeds(prepared, fresh)
+
+
+def check_coverage(card: Mapping[str, Any], suite: Suite, source: str) -> None:
+    """Check that a card holds what of its suite it says it holds: else a replay of what is left would confirm it.
+
+    Args:
+        card: content of a ``results.json``.
+        suite: the card's, by digest.
+        source: what the card is called in the sentence.
+
+    Raises:
+        CardError: it says something else.
+    """
+    stated = coverage_of(card)["kind"]
+    seeds = chance_rules_of(card, source, CardError).seeds
+    held = coverage(suite, [_environment(row) for row in card["environments"]], seeds, pipeline=card["pipeline"])
+    if stated not in (held["kind"], UNKNOWN):
+        raise CardError(
+            f"{source} calls itself {one_line(stated)}, but holds {one_line(held['text'])} of {suite.name}; it was changed by hand, "
+            "so ask its maker for the results.json of the run"
+        )
 
 
 def with_fresh_seeds(prepared: Prepared, number: int) -> Prepared:

@@ -5,8 +5,9 @@ import json
 import pytest
 from gaitgauge.gauge.board import board_data, render_board, write_board
 from gaitgauge.gauge.comparison import ComparisonError
+from gaitgauge.gauge.suite import load_suite
 from gaitgauge.gauge.verify import CardError
-from test_report import HOSTILE, Page
+from test_report import HOSTILE, Page, sample
 
 
 def card(
@@ -93,3 +94,14 @@ def test_a_folder_becomes_a_page_and_what_is_no_card_is_named(tmp_path):
     with pytest.raises(ComparisonError, match=r"other.json"):
         write_board(tmp_path, tmp_path / "second.html")
     assert not (tmp_path / "second.html").exists()
+
+
+def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(tmp_path):
+    whole = sample()
+    whole["suite"]["digest"] = load_suite("robogauge-1.1").digest
+    (tmp_path / "card.json").write_text(json.dumps(whole))
+    write_board(tmp_path, tmp_path / "board.html")
+    whole["environments"] = [row for row in whole["environments"] if row["friction"] != 0.2]
+    (tmp_path / "card.json").write_text(json.dumps(whole))
+    with pytest.raises(CardError, match=r"card\.json' calls itself complete, but holds 8 of 9 frictions"):
+        write_board(tmp_path, tmp_path / "board.html")

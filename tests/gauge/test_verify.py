@@ -5,7 +5,8 @@ from copy import deepcopy
 import pytest
 from gaitgauge.gauge.comparison import ComparisonError
 from gaitgauge.gauge.evaluate import Request, file_digest, identity, prepare
-from gaitgauge.gauge.verify import CardError, judge, load_card, prepare_replay, with_fresh_seeds
+from gaitgauge.gauge.suite import load_suite
+from gaitgauge.gauge.verify import CardError, check_coverage, judge, load_card, prepare_replay, with_fresh_seeds
 from test_report import sample
 
 
@@ -100,3 +101,16 @@ def test_a_card_without_an_interval_says_nothing_about_other_seeds(card):
         CardError, match="the card has no interval, so that nothing can be said of other seeds; leave out --fresh"
     ):
         prepare_replay(card, fresh=1)
+
+
+def test_a_card_that_holds_less_than_it_says_is_refused():
+    """Bad environments left out, and the score worked out anew: a replay of what is left would hold."""
+    whole = sample()
+    check_coverage(whole, load_suite("robogauge-1.1"), "it")
+    part = whole | {"environments": [row for row in whole["environments"] if row["terrain"] != "obstacle"]}
+    with pytest.raises(
+        CardError,
+        match=r"it calls itself complete, but holds 6 of 7 terrains of robogauge-1\.1; it was changed by hand",
+    ):
+        check_coverage(part, load_suite("robogauge-1.1"), "it")
+    check_coverage(part | {"coverage": None}, load_suite("robogauge-1.1"), "it")  # results from before say nothing
