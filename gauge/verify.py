@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..files.parsing import edited, one_line
+from ..files.parsing import edited, one_line, shown
 from ..robots import robot_names
 from ..robots.loading import robot_digest
 from .comparison import load_result
@@ -92,6 +92,12 @@ def prepare_replay(
             trust=trust,
         )
     )
+    stated, observed = card["policy"].get("observations"), [t.name for t in prepared.policy.contract.observation]
+    if stated is not None and list(stated) != observed:
+        raise CardError(
+            f"the card says that the policy observes {shown(list(stated))}, its file says {shown(observed)}; the card was changed "
+            "by hand, so ask its maker for the results.json of the run"
+        )
     expected = robot_digest_of(card)
     if expected is not None and expected != robot_digest(prepared.robot):
         raise CardError(

@@ -71,7 +71,11 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
 
     path.write_text(json.dumps(content))
     assert "digest" in refused("verify", path, "--suite", "demo")
-    content["policy"]["file_sha256"] = "ab" * 32
+    told = content["policy"]["observations"]
+    content["policy"]["observations"] = told[1:]
+    path.write_text(json.dumps(content))
+    assert "the card says that the policy observes" in refused("verify", path, *options)
+    content["policy"] |= {"observations": told, "file_sha256": "ab" * 32}
     path.write_text(json.dumps(content))
     assert "another policy than the card's" in refused("verify", path, *options)
     content["policy"]["path"] = "elsewhere/policy.pt"
