@@ -21,53 +21,67 @@ HEAVY = {
     "onnxruntime",
     "rsl_rl",
 }
+COMMANDS = sorted(get_command(app).commands)
+LISTS = {
+    "robots": "Unitree Go2",
+    "terrains": "stairs_bd",
+    "backends": "mujoco-warp",
+    "suites": "gaitgauge-1",
+    "tasks": "go2-moe-cts",
+}
 PROGRAM = """
-import json, sys
+import io, json, sys
+from contextlib import redirect_stdout
 from gaitgauge.cli.main import main
-sys.argv = ["gaitgauge", *json.loads(sys.argv[1])]
-try:
-    main()
-except SystemExit as end:
-    code = end.code
-print(json.dumps([code, sorted(sys.modules)]))
+for line in json.loads(sys.argv[1]):
+    sys.argv = ["gaitgauge", *line]
+    with redirect_stdout(io.StringIO()) as printed:
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    print(json.dumps([code, sorted(sys.modules), printed.getvalue()]))
 """
 
 
-def loaded_by(*arguments: str) -> tuple[set[str], str]:
-    """The heavy packages that a command line loads, and what it prints."""
+def loaded_by(*lines: list[str]) -> list[tuple[set[str], str]]:
+    """The heavy packages that a process has loaded after each of the command lines, and what each prints."""
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, json.dumps(arguments)], capture_output=True, text=True, timeout=120, check=True
+        [sys.executable, "-c", PROGRAM, json.dumps(lines)], capture_output=True, text=True, timeout=120, check=True
     )
-    *printed, last = done.stdout.splitlines()
-    code, modules = json.loads(last)
-    assert not code, done.stderr
-    return HEAVY & {m.partition(".")[0] for m in modules}, "\n".join(printed)
+    found = []
+    for code, modules, printed in map(json.loads, done.stdout.splitlines()):
+        assert not code, done.stderr
+        found.append((HEAVY & {m.partition(".")[0] for m in modules}, printed))
+    assert len(found) == len(lines)
+    return found
 
 
-def test_help_loads_no_heavy_package():
-    loaded, printed = loaded_by("--help")
+@pytest.fixture(scope="module")
+def helps():
+    return dict(zip(("", *COMMANDS), loaded_by(["--help"], *([name, "-h"] for name in COMMANDS)), strict=True))
+
+
+@pytest.fixture(scope="module")
+def lists():
+    return dict(zip(LISTS, loaded_by(*(["list", what] for what in LISTS)), strict=True))
+
+
+def test_help_loads_no_heavy_package(helps):
+    loaded, printed = helps[""]
     assert loaded == set()
     assert "evaluate" in printed
 
 
-@pytest.mark.parametrize("command", sorted(get_command(app).commands))
-def test_help_of_each_command_loads_no_heavy_package(command):
-    loaded, printed = loaded_by(command, "-h")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_each_command_loads_no_heavy_package(helps, command):
+    loaded, printed = helps[command]
     assert loaded == set()
     assert command in printed
 
 
-@pytest.mark.parametrize(
-    ("what", "shown"),
-    [
-        ("robots", "Unitree Go2"),
-        ("terrains", "stairs_bd"),
-        ("backends", "mujoco-warp"),
-        ("suites", "gaitgauge-1"),
-        ("tasks", "go2-moe-cts"),
-    ],
-)
-def test_lists_load_no_engine(what, shown):
-    loaded, printed = loaded_by("list", what)
+@pytest.mark.parametrize(("what", "shown"), LISTS.items())
+def test_lists_load_no_engine(lists, what, shown):
+    loaded, printed = lists[what]
     assert loaded <= {"numpy"}
     assert shown in printed

@@ -362,21 +362,26 @@ def assert_equal(records, others):
             assert getattr(one, field).tobytes() == getattr(other, field).tobytes()
 
 
-@pytest.mark.parametrize("name", [REFERENCE, OWN])
-@pytest.mark.parametrize("events", EVENTS)
-def test_worlds_and_neighbours_change_no_bit_of_a_record(name, events):
-    alone = stage(name, 1, *events, count=2)
-    assert len(alone) == 4
-    for worlds in (3, 24, 40):
-        assert_equal(alone, stage(name, worlds, *events, count=2))
+@pytest.fixture(scope="module", params=[(name, events) for name in (REFERENCE, OWN) for events in EVENTS])
+def alone(request):
+    """Suite, events, and the records of one world after the other."""
+    name, events = request.param
+    records = stage(name, 1, *events, count=2)
+    assert len(records) == 4
+    return name, events, records
 
 
-@pytest.mark.parametrize("name", [REFERENCE, OWN])
-@pytest.mark.parametrize("events", EVENTS)
+@pytest.mark.parametrize("worlds", [3, 24, 40])
+def test_worlds_and_neighbours_change_no_bit_of_a_record(alone, worlds):
+    name, events, records = alone
+    assert_equal(records, stage(name, worlds, *events, count=2))
+
+
 @pytest.mark.parametrize("poll_interval", [2, 3, 10])
-def test_the_poll_interval_changes_no_bit_of_a_record(name, events, poll_interval):
+def test_the_poll_interval_changes_no_bit_of_a_record(alone, poll_interval):
     """On a GPU reading a value would wait for the device: everything is worked out for every world, and those that end wait."""
-    assert_equal(stage(name, 5, *events, count=2), stage(name, 5, *events, count=2, poll_interval=poll_interval))
+    name, events, records = alone
+    assert_equal(records, stage(name, 5, *events, count=2, poll_interval=poll_interval))
 
 
 @pytest.mark.parametrize("poll_interval", [1, 3, 10])

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -111,13 +112,26 @@ def test_deploy_file_is_exact_for_a_history_that_starts_with_copies(tmp_path):
     assert load_policy(tmp_path / "policy.onnx").contract.history == runtime.history
 
 
+@pytest.fixture(scope="module")
+def scripted(tmp_path_factory):
+    """A policy and its TorchScript file, by network and start of the history; each is exported once."""
+    folder = tmp_path_factory.mktemp("scripted")
+
+    @cache
+    def export(kind, start="zeros"):
+        policy, path = make_policy(kind, starting_with(start)), folder / f"{kind} {start}.pt"
+        assert export_torchscript(policy, path) <= 1e-5
+        return policy, path
+
+    return export
+
+
 @pytest.mark.parametrize(
     ("kind", "start"), [*((kind, "zeros") for kind in NETWORKS), ("moe", "repeat"), ("him", "repeat")]
 )
-def test_torchscript_runs_step_by_step_like_the_policy(kind, start, tmp_path):
-    policy = make_policy(kind, starting_with(start))
-    assert export_torchscript(policy, tmp_path / "policy.pt") <= 1e-5
-    module = torch.jit.load(tmp_path / "policy.pt")
+def test_torchscript_runs_step_by_step_like_the_policy(kind, start, scripted):
+    policy, path = scripted(kind, start)
+    module = torch.jit.load(path)
     session = policy.session(1)
     for episode in range(2):
         module.reset()
@@ -127,16 +141,15 @@ def test_torchscript_runs_step_by_step_like_the_policy(kind, start, tmp_path):
             output = module(observation)
             actions = output if isinstance(output, torch.Tensor) else output[0]
             assert torch.allclose(actions, session.act(observation), atol=1e-6), episode
-    reloaded = load_policy(tmp_path / "policy.pt")
+    reloaded = load_policy(path)
     assert reloaded.contract == policy.contract and reloaded.contract.provenance == policy.contract.provenance
     assert reloaded.batched
 
 
-def test_torchscript_output_is_the_published_one(tmp_path):
+def test_torchscript_output_is_the_published_one(scripted):
     outputs = {}
     for kind in ("mlp", "cts", "moe"):
-        export_torchscript(make_policy(kind), tmp_path / f"{kind}.pt")
-        module = torch.jit.load(tmp_path / f"{kind}.pt")
+        module = torch.jit.load(scripted(kind)[1])
         assert module.history.shape == (1, 1 if kind == "mlp" else 5, 45)
         outputs[kind] = module(torch.zeros(1, 45))
     assert outputs["mlp"].shape == (1, 12)
@@ -148,9 +161,8 @@ def test_torchscript_output_is_the_published_one(tmp_path):
 
 
 @pytest.mark.parametrize(("kind", "experts", "width"), [("ac moe", 4, 8), ("mcp", 4, 8), ("him", 0, 11)])
-def test_torchscript_gives_latent_and_weights_of_experts(kind, experts, width, tmp_path):
-    export_torchscript(make_policy(kind), tmp_path / "policy.pt")
-    actions, (weights, latent) = torch.jit.load(tmp_path / "policy.pt")(torch.zeros(1, 45))
+def test_torchscript_gives_latent_and_weights_of_experts(kind, experts, width, scripted):
+    actions, (weights, latent) = torch.jit.load(scripted(kind)[1])(torch.zeros(1, 45))
     assert actions.shape == (1, 12) and latent.shape == (1, width)
     assert weights is None if experts == 0 else weights.shape == (1, experts)
 
@@ -308,10 +320,9 @@ class WrongOutput(export.Explained):
         return actions + 1e-3, *rest
 
 
-def test_bad_input(tmp_path):
-    policy = make_policy("cts")
-    export_torchscript(policy, tmp_path / "policy.pt")
+def test_bad_input(tmp_path, scripted):
+    policy, path = scripted("cts")
     with pytest.raises(ExportError, match="exported file already"):
-        export_onnx(load_policy(tmp_path / "policy.pt"), tmp_path / "again.onnx")
+        export_onnx(load_policy(path), tmp_path / "again.onnx")
     with pytest.raises(ExportError, match=r"cannot write .*: no such file"):
         export_torchscript(policy, Path(tmp_path / "none" / "policy.pt"))
