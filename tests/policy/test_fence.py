@@ -140,6 +140,7 @@ def test_a_program_that_opens_a_file_is_refused_by_name(tmp_path, contract, plac
         ),
         ("x = torch.upsample_bilinear2d(observation, [4, 4], False, 1e-30, 1e-30)", "upsample_bilinear2d"),
         ("f = observation.as_strided\n    x = f([100, 100], [1, 1])", r"f\(\)"),
+        ("f = getattr(torch, 'from_file')\n    x = f(self.target, True, 64)", r"f\(\)"),
         ("f = getattr(observation, 'resize_')\n    x = f([100, 100])", r"f\(\)"),
         ("f = __torch__.a\n    f = observation.resize_\n    x = f([100, 100])", r"f\(\)"),
         ("f = __torch__.a\n    for f in [observation.resize_]:\n      x = f([100, 100])", r"f\(\)"),
