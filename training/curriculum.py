@@ -13,11 +13,11 @@ import torch
 from ..terrains.base import Terrain
 from ..terrains.training_tiles import TILE_KINDS, make_tile
 from .configuration import ConfigurationError
-from .environment_configuration import TerrainConfiguration, TileConfiguration
 from .environment_memory import EnvironmentMemory
 from .own_terms import resolve
 from .randomness import UniformColumns
 from .step_inputs import StepInputs
+from .terrain_configuration import TerrainConfiguration, TileConfiguration
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,15 +15,11 @@ from ..backends.base import PhysicsOptions, PhysicsState
 from ..robots.base import Robot
 from ..robots.geometry import joint_ranges
 from ..robots.rotation import from_yaw
-from .environment_configuration import (
-    PushConfiguration,
-    RandomizationConfiguration,
-    ResetConfiguration,
-    TerrainConfiguration,
-)
+from .environment_configuration import PushConfiguration, RandomizationConfiguration, ResetConfiguration
 from .environment_memory import EnvironmentMemory
 from .height_scan import HeightRasters, place_pattern, scan_pattern
 from .randomness import UniformColumns
+from .terrain_configuration import TerrainConfiguration
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .configuration import ConfigurationError, TrainingConfiguration, to_plain
 from .devices import idle_gpus, own_device
 from .environment import TrainingEnvironment
-from .environment_configuration import FLAT_TILE, EnvironmentConfiguration
+from .environment_configuration import EnvironmentConfiguration
 from .filming import Filmer
 from .logger import check_logger
 from .own_terms import foreign_functions
@@ -45,6 +45,7 @@ from .scoring import Scorer
 from .seeding import seed_everything
 from .stopping import Progress, TrainingOutcome
 from .tasks import TASKS, Task, find_task
+from .terrain_configuration import FLAT_TILE
 
 DEFAULT_BACKEND = "mujoco-warp"
 QUICK_SUITE = "quick"

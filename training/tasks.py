@@ -12,7 +12,6 @@ from ..robots import load_robot
 from ..robots.loading import robot_digest
 from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
 from .environment_configuration import (
-    FLAT_TILE,
     CommandConfiguration,
     CommandStage,
     EnvironmentConfiguration,
@@ -21,10 +20,10 @@ from .environment_configuration import (
     RewardConfiguration,
     ScheduleConfiguration,
     TerminationConfiguration,
-    TerrainConfiguration,
 )
 from .overrides import TaskError, apply_overrides
 from .scaling import scaled_environment, scaled_training
+from .terrain_configuration import FLAT_TILE, TerrainConfiguration
 
 
 @dataclass(frozen=True, kw_only=True)

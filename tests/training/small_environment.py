@@ -6,14 +6,12 @@ import torch
 from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
-    ALL_TILES,
-    FLAT_TILE,
     EnvironmentConfiguration,
     PushConfiguration,
     ResetConfiguration,
     TerminationConfiguration,
-    TerrainConfiguration,
 )
+from gaitgauge.training.terrain_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration
 
 torch.set_num_threads(1)  # small tensors: threads only get in each other's way
 

@@ -8,16 +8,13 @@ from gaitgauge.backends.fake import FakeScript
 from gaitgauge.terrains import TerrainError
 from gaitgauge.training.curriculum import assign_kinds, build_palette, next_level
 from gaitgauge.training.environment_configuration import (
-    ALL_TILES,
-    FLAT_TILE,
     CommandConfiguration,
     CommandStage,
     Ramp,
     ScheduleConfiguration,
     TerminationConfiguration,
-    TerrainConfiguration,
-    TileConfiguration,
 )
+from gaitgauge.training.terrain_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration, TileConfiguration
 from small_environment import STAIRS, gliding, idle, make
 
 

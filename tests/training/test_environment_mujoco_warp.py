@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 from gaitgauge.training.environment import TrainingEnvironment
-from gaitgauge.training.environment_configuration import ALL_TILES, EnvironmentConfiguration, TerrainConfiguration
+from gaitgauge.training.environment_configuration import EnvironmentConfiguration
 from gaitgauge.training.step_inputs import AFTER_RESET, AFTER_STEP
+from gaitgauge.training.terrain_configuration import ALL_TILES, TerrainConfiguration
 
 torch.set_num_threads(1)
 

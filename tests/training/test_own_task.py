@@ -19,11 +19,10 @@ from gaitgauge.training.environment_configuration import (
     OwnTermination,
     RewardConfiguration,
     TerminationConfiguration,
-    TerrainConfiguration,
-    TileConfiguration,
 )
 from gaitgauge.training.own_terms import resolve
 from gaitgauge.training.tasks import TaskError, find_task
+from gaitgauge.training.terrain_configuration import TerrainConfiguration, TileConfiguration
 from small_environment import idle, make
 
 FOLDER = Path(__file__).parents[2] / "examples" / "own_task"
