@@ -19,24 +19,27 @@ class _EstimatorNetwork(nn.Module):
     State dict: ``encoder.<layer>.*`` and ``actor.<layer>.*``; the actor's input is velocity, latent, then the current frame.
     """
 
+    latents = 1
+    """What the encoder gives out beside the velocity, in widths of the latent."""
+
     def __init__(
         self,
         *,
-        encoded: int,
-        frame_width: int,
-        num_actions: int,
-        history_length: int,
-        latent_width: int,
-        encoder_hidden: Sequence[int],
-        actor_hidden: Sequence[int],
-        activation: str,
+        frame_width: int = 45,
+        num_actions: int = 12,
+        history_length: int = 5,
+        latent_width: int = 16,
+        encoder_hidden: Sequence[int] = (128, 64),
+        actor_hidden: Sequence[int] = (512, 256, 128),
+        activation: str = "elu",
     ) -> None:
         super().__init__()
         self.history_length = history_length
         self.frame_width = frame_width
         self.latent_width = latent_width
         self.encoder = multilayer_perceptron(
-            (frame_width * history_length, *encoder_hidden, encoded), activation=activation
+            (frame_width * history_length, *encoder_hidden, VELOCITY + self.latents * latent_width),
+            activation=activation,
         )
         self.actor = multilayer_perceptron(
             (VELOCITY + latent_width + frame_width, *actor_hidden, num_actions), activation=activation
@@ -61,27 +64,7 @@ class DreamwaqNetwork(_EstimatorNetwork):
     outputs are velocity, means, and logarithms of variances, which only training uses.
     """
 
-    def __init__(
-        self,
-        *,
-        frame_width: int = 45,
-        num_actions: int = 12,
-        history_length: int = 5,
-        latent_width: int = 16,
-        encoder_hidden: Sequence[int] = (128, 64),
-        actor_hidden: Sequence[int] = (512, 256, 128),
-        activation: str = "elu",
-    ) -> None:
-        super().__init__(
-            encoded=VELOCITY + 2 * latent_width,
-            frame_width=frame_width,
-            num_actions=num_actions,
-            history_length=history_length,
-            latent_width=latent_width,
-            encoder_hidden=encoder_hidden,
-            actor_hidden=actor_hidden,
-            activation=activation,
-        )
+    latents = 2
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Velocity and mean of the latent, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
@@ -90,28 +73,6 @@ class DreamwaqNetwork(_EstimatorNetwork):
 
 class HimNetwork(_EstimatorNetwork):
     """A hybrid internal model (Long et al., "Hybrid Internal Model", 2024): velocity and an embedding on the unit sphere."""
-
-    def __init__(
-        self,
-        *,
-        frame_width: int = 45,
-        num_actions: int = 12,
-        history_length: int = 5,
-        latent_width: int = 16,
-        encoder_hidden: Sequence[int] = (128, 64),
-        actor_hidden: Sequence[int] = (512, 256, 128),
-        activation: str = "elu",
-    ) -> None:
-        super().__init__(
-            encoded=VELOCITY + latent_width,
-            frame_width=frame_width,
-            num_actions=num_actions,
-            history_length=history_length,
-            latent_width=latent_width,
-            encoder_hidden=encoder_hidden,
-            actor_hidden=actor_hidden,
-            activation=activation,
-        )
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Velocity and embedding, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""

@@ -15,6 +15,7 @@ from ..options import (
     DeviceOption,
     FrictionsOption,
     LevelOption,
+    PayloadsOption,
     PolicyArgument,
     RobotOption,
     SeedsOption,
@@ -45,9 +46,7 @@ def evaluate(
     terrain: TerrainsOption = None,
     level: LevelOption = None,
     friction: FrictionsOption = None,
-    payload: Annotated[
-        list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")
-    ] = None,
+    payload: PayloadsOption = None,
     seed: SeedsOption = None,
     threads: ThreadsOption = None,
     cluster: ClusterOption = None,
@@ -117,9 +116,7 @@ def compare(
     terrain: TerrainsOption = None,
     level: LevelOption = None,
     friction: FrictionsOption = None,
-    payload: Annotated[
-        list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")
-    ] = None,
+    payload: PayloadsOption = None,
     seed: SeedsOption = None,
     threads: ThreadsOption = None,
     out: Annotated[
