@@ -1,4 +1,4 @@
-"""Make the score cards that ship: a robot that stands, the hand-made trot, a published CTS policy and ``pretrained``.
+"""Make the score cards that ship: a robot that stands, the hand-made trot, a published CTS policy and those that ship.
 
     python benchmarks/score_cards.py --threads 13 --folder /tmp/cards --cts go2_cts_public.npz --out docs/data/scorecards
 
@@ -30,12 +30,12 @@ from gaitgauge.gauge.report import write_report
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.verify import tolerance_band
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.finding import PRETRAINED
+from gaitgauge.policy.finding import shipped_policies
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import load_robot
 
-NAMES = ("standing", "trotting", "cts", "pretrained")
+NAMES = ("standing", "trotting", "cts", *shipped_policies())
 SUITES = ("robogauge-1.1", "gaitgauge-1")
 
 
@@ -75,7 +75,7 @@ def card_of(
         repeated: what ``benchmarks/repeatability.py`` wrote.
         commit: the one that played, where the results do not know.
     """
-    path = "pretrained" if name == "pretrained" else f"{name}.gauge.pt"
+    path = name if name in shipped_policies() else f"{name}.gauge.pt"
     suite = results["suite"]["name"]
     provenance = {k: v for k, v in results["provenance"].items() if k not in ("host", "command")}
     provenance["command"] = f"gaitgauge evaluate {path} --suite {suite}"
@@ -91,11 +91,13 @@ def card_of(
 
 def play(name: str, suite: str, run: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     """Evaluate a policy on a suite; returns the content of ``results.json``."""
-    path = PRETRAINED if name == "pretrained" else arguments.folder / f"{name}-{suite}.gauge.pt"
-    if name != "pretrained":
+    policy = name
+    if name not in shipped_policies():
+        path = arguments.folder / f"{name}-{suite}.gauge.pt"
         make_policy(name, path, arguments.cts)
+        policy = str(path)
     request = Request(
-        policy="pretrained" if name == "pretrained" else str(path),
+        policy=policy,
         suite=suite,
         threads=arguments.threads,
         terrains=tuple(arguments.terrain),

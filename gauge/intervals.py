@@ -219,7 +219,7 @@ class Evidence:
         shared = self._rules.shared_noise
         return Chance(
             levels=np.zeros(self._rules.resamples),
-            seeds=(deviations.sum(0, keepdims=True) if shared else deviations[weights != 0.0],),
+            seeds=(deviations.sum(0, keepdims=True) if shared else deviations,),
         )
 
     def value(self, weights: Array, columns: Sequence[str] = (QUALITY,)) -> float:
