@@ -8,7 +8,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from scipy.stats import ttest_ind
 
 from ...files.writing import json_text, write_atomically
@@ -16,7 +15,7 @@ from ...gauge import charts
 from ...gauge.comparison import ComparisonError, compare, format_p, holm, load_result
 from ...gauge.comparison_report import write_comparison
 from ...gauge.intervals import CONFIDENCE
-from ...gauge.report import TEMPLATES
+from ...gauge.pages import page_template
 from ..run_directory import read_run_json
 from .curves import Curve, by_figure, curves_csv, learning_curves
 from .file import Sweep, SweepError
@@ -151,20 +150,16 @@ def _seeds_sentence(pairs: Sequence[Mapping[str, Any]]) -> str:
 
 def _page(data: Mapping[str, Any], curves: Mapping[tuple[str, int], Mapping[str, Curve]], *, compared: bool) -> str:
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["fixed"] = lambda v, digits=4: "–" if v is None else f"{v:.{digits}f}".replace("-", "−")
     names = [entry["entry"] for entry in data["entries"]]
     groups = list(dict.fromkeys(g for e in data["entries"] if e["best"] for g in e["best"]["groups"] or {}))
-    return environment.get_template("sweep.html.j2").render(
+    return page_template("sweep.html.j2", fixed=_fixed).render(
         sweep=data,
         groups=groups,
         names=names,
         compared=compared,
         figures={figure: charts.curves(series) for figure, series in by_figure(curves, names).items()},
     )
+
+
+def _fixed(value: float | None, digits: int = 4) -> str:
+    return "–" if value is None else f"{value:.{digits}f}".replace("-", "−")
