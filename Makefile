@@ -47,6 +47,7 @@ torture: install
 check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	mkdir -p build/types && ln -sfn ../.. build/types/gaitgauge
 	$(BIN)/mypy
 
 # The site, with strict links; what its pages show is run first.

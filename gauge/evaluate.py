@@ -159,7 +159,7 @@ def prepare(request: Request) -> Prepared:
     )
     for name, environment in {e.terrain: e for e in environments}.items():
         highest = suite.scoring.levels if environment.level is None else environment.level
-        check_terrain(suite, make_terrain(name, highest), searched=environment.searched)
+        check_terrain(suite, make_terrain(name, int(highest)), searched=environment.searched)
     robot, policy = _robot_and_policy(request)
     check_fit(suite, robot, policy.contract)
     return Prepared(

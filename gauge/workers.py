@@ -189,7 +189,8 @@ class Job:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make the policy again."""
-        vars(self).update(state | {"policy": restore_policy(*state["policy"], state["robot"])})
+        stored, contract, path = state["policy"]
+        vars(self).update(state | {"policy": restore_policy(stored, contract, path, state["robot"])})
 
 
 class Worker:

@@ -8,7 +8,7 @@ every difference from the published code and its reason.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -125,7 +125,7 @@ class ObservationConfiguration:
 
     history_length: Annotated[int, Field(ge=1, le=1000)] = 5
     """Frames in the student's history, the current one included."""
-    history_start: str = "repeat"
+    history_start: Literal["zeros", "repeat"] = "repeat"
     """What the history holds at the start of an episode: ``repeat`` for copies of the first frame, as the robot's own
     controller fills it, or ``zeros`` as published. It becomes part of the policy contract."""
     noise: NoiseConfiguration = NoiseConfiguration()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import fields
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -46,9 +47,11 @@ class WarpBackend(PhysicsBackend):
             len(robot.foot_names),
             len(robot.collision_bodies),
         )
-        sizes = {"joints": self._joints, "feet": self._feet, "bodies": self._bodies, "device": self.device}
-        self._state, self._live = allocate_state(n, **sizes)
-        self._sample, self._sampled = allocate_state(n, **sizes)
+        allocate = partial(
+            allocate_state, n, joints=self._joints, feet=self._feet, bodies=self._bodies, device=self.device
+        )
+        self._state, self._live = allocate()
+        self._sample, self._sampled = allocate()
         self._motors = MotorTensors(scene, self.device)
         self._active, self._sample_at = self._integers(n), self._integers(n)
         self._has_request = self._integers(1)

@@ -172,7 +172,7 @@ def _walk(backend: PhysicsBackend, suite: Suite, policy: Policy, friction: float
 def _begin(backend: PhysicsBackend, friction: float) -> None:
     """The state from which every test starts: the standing pose, held; ``air`` starts high up."""
     robot, n = backend.scene.robot, backend.num_worlds
-    kind = {"device": backend.device, "dtype": backend.dtype}
+    kind: dict[str, Any] = {"device": backend.device, "dtype": backend.dtype}
     backend.randomize(Randomization(friction=torch.full((n,), friction, **kind)))
     position = torch.zeros(n, 3, **kind)
     position[:, 2] = robot.stand_height

@@ -15,7 +15,6 @@ from ...backends.base import BackendError
 from ...backends.registry import make_backend
 from ...files.provenance import plugins, provenance, versions
 from ...files.writing import json_text, write_atomically
-from ...policy.base import Policy
 from ...policy.digest import policy_digest
 from ...policy.native import FilePolicy
 from ...robots import Robot
@@ -52,7 +51,7 @@ class _Prepared:
     request: StudyRequest
     suite: Suite
     robot: Robot
-    policies: list[tuple[str, Policy]]
+    policies: list[tuple[str, FilePolicy]]
     reference: Variant
     others: list[Variant]
     cells: list[Cell]

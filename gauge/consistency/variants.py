@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 from ...backends.base import PhysicsBackend, PhysicsOptions, Scene, Support
 from ...backends.registry import choose_device, find_backend, make_backend
@@ -60,7 +60,8 @@ class Variant:
         Raises:
             ConsistencyError: the timestep does not divide the control period.
         """
-        changed = replace(suite, **dict(self.overrides))
+        changes: dict[str, Any] = dict(self.overrides)
+        changed = replace(suite, **changes)
         if changed.timestep == suite.timestep:
             return changed
         count = suite.control_period / changed.timestep if changed.timestep > 0.0 else 0.0

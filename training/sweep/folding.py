@@ -128,7 +128,7 @@ def across_seeds(scores: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
         ``first``, ``second``, ``difference`` of the second's mean minus the first's, ``p_value`` and ``corrected`` of each pair.
     """
     known = {name: own for name, own in scores.items() if len(own) > 1}
-    pairs = []
+    pairs: list[dict[str, Any]] = []
     for (first, one), (second, two) in combinations(known.items(), 2):
         spread = statistics.variance(one) + statistics.variance(two)
         difference = statistics.fmean(two) - statistics.fmean(one)
