@@ -227,6 +227,8 @@ def _policies() -> Table:
     from ..policy.finding import LOG_ROOT, find_policy, policy_names
 
     table = make_table("policies (a name, or any policy file)", "name", "file", "robot", "contract", "saved")
+    for column in table.columns:
+        column.no_wrap = column.header != "robot"  # where a sentence may stand that says what is wrong
     for name in policy_names():
         try:
             path = find_policy(name)

@@ -36,7 +36,9 @@ def test_policies_of_training_runs_are_listed(run, tmp_path, policy, contract):
     for name in ("2026-01-01_10-00-00/model_50.pt", "2026-01-01_10-00-00/model_100.pt", "2026-01-02_10-00-00/best.pt"):
         (runs / name).parent.mkdir(parents=True, exist_ok=True)
         (runs / name).write_bytes(policy.read_bytes())
-    (runs / "2026-01-02_10-00-00" / "model_7.pt").write_bytes(b"damaged")
+    long = runs / f"2026-01-02_10-00-01_{'with_a_long_name' * 2}"
+    long.mkdir()
+    (long / "model_7.pt").write_bytes(b"damaged")
     result = run("list", "policies")
     assert result.exit_code == 0
     rows = result.stdout.splitlines()
