@@ -23,10 +23,12 @@ class RecordedFunction(Generic[Result]):
     """
 
     def __init__(self, function: Callable[..., Result], device: torch.device | str, *, warm_up: int = WARM_UP) -> None:
-        """Args:
-        function: see above.
-        device: the GPU that it runs on, whichever is torch's current one.
-        warm_up: calls that run as they are, on a stream of their own, as recording asks for.
+        """Keep the function; nothing runs yet.
+
+        Args:
+            function: see above.
+            device: the GPU that it runs on, whichever is torch's current one.
+            warm_up: calls that run as they are, on a stream of their own, as recording asks for.
         """
         self._function = function
         self._device = torch.device(device)
