@@ -9,16 +9,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import typer
 from rich.text import Text
 
 from ..backends.registry import choose_device
 from ..gauge.comparing import compare_all
 from ..gauge.comparison import format_p
 from ..gauge.evaluate import Request
-from .console import Terminal, make_table, shell_command
+from .console import Terminal, make_table
 from .evaluate import shower
-from .progress import ProgressDisplay
+from .studies import joined_names, resumable
 
 
 def run_comparison(
@@ -41,21 +40,15 @@ def run_comparison(
         threads=threads or os.cpu_count() or 1,
         **choices,
     )
-    names = "-".join(Path(c).name.partition(".")[0] for c in contestants[:3])
-    console = Terminal(stderr=True)
-    try:
-        with ProgressDisplay(console, "gauging") as display:
-            found, paths = compare_all(
-                contestants,
-                request,
-                folder=out or Path("results") / f"compare-{names}",
-                runs=out or Path("results"),
-                command=["gaitgauge", *sys.argv[1:]],
-                watch=shower(display),
-            )
-    except KeyboardInterrupt:
-        console.say(f"stopped; every finished episode is kept. Go on with:\n  {shell_command()}")
-        raise typer.Exit(130) from None
+    with resumable(Terminal(stderr=True), "gauging") as display:
+        found, paths = compare_all(
+            contestants,
+            request,
+            folder=out or Path("results") / f"compare-{joined_names(contestants)}",
+            runs=out or Path("results"),
+            command=["gaitgauge", *sys.argv[1:]],
+            watch=shower(display),
+        )
     if json_output:
         print(json.dumps(found, indent=1))
         return

@@ -9,14 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import typer
 from rich.text import Text
 
 from ..gauge.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
 from ..gauge.consistency.request import StudyRequest, StudyStatus
 from ..gauge.consistency.study import prepare_study, study
-from .console import Terminal, make_table, shell_command
+from .console import Terminal, make_table
 from .progress import ProgressDisplay
+from .studies import joined_names, resumable
 
 
 def run_consistency(
@@ -40,17 +40,10 @@ def run_consistency(
     prepared = prepare_study(request)  # all that can be wrong with the request is said before anything is written
     for engine in prepared.skipped:
         console.say(f"{engine['backend']} is left out: {engine['reason']}")
-    names = "-".join(Path(p).name.partition(".")[0] for p in request.policies[:3])
-    folder = out or Path("results") / f"{names}-{Path(request.suite).stem}-consistency"
-    try:
-        with ProgressDisplay(console, "comparing") as display:
-            results = study(
-                request, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=_shower(display)
-            )
-    except KeyboardInterrupt:
-        again = shell_command(None, "--resume")
-        console.say(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}")
-        raise typer.Exit(130) from None
+    folder = out or Path("results") / f"{joined_names(policies)}-{Path(request.suite).stem}-consistency"
+    with resumable(console, "comparing", folder, "--resume") as display:
+        command = ["gaitgauge", *sys.argv[1:]]
+        results = study(request, folder, resume=resume, command=command, watch=_shower(display))
     page = write_page(folder)
     if json_output:
         print(json.dumps(results, indent=1))

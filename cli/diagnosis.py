@@ -93,14 +93,8 @@ def _table(choice: str, found: Diagnosis) -> Any:
 
 def _as_data(found: Diagnosis, lines: Sequence[str], assumed: str | None) -> dict[str, Any]:
     def row(outcome: Outcome) -> dict[str, Any]:
-        return {
-            "kind": outcome.kind,
-            "text": outcome.text,
-            "score": outcome.score,
-            "survival": outcome.survival,
-            "tracking": outcome.tracking,
-            "smoothness": outcome.smoothness,
-        }
+        names = ("kind", "text", "score", "survival", "tracking", "smoothness")
+        return {name: getattr(outcome, name) for name in names}
 
     return {
         "sound": found.sound,

@@ -35,7 +35,7 @@ _FREE_MEMORY = 4.0
 """Free memory below which the engines may not fit [GB]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """One row of the table."""
 
@@ -82,9 +82,9 @@ def check_python() -> Iterator[Finding]:
     except PackageNotFoundError:
         wanted = SpecifierSet()
     if wanted.contains(platform.python_version(), prereleases=True):
-        yield Finding(what="Python", status=OK, found=found)
+        yield Finding("Python", OK, found)
     else:
-        yield Finding(what="Python", status=PROBLEM, found=found, advice=f"use Python {wanted}")
+        yield Finding("Python", PROBLEM, found, f"use Python {wanted}")
 
 
 def check_packages() -> Iterator[Finding]:
@@ -92,12 +92,7 @@ def check_packages() -> Iterator[Finding]:
     try:
         lines = requires("gaitgauge") or []
     except PackageNotFoundError:
-        yield Finding(
-            what="gaitgauge",
-            status=PROBLEM,
-            found="not installed",
-            advice="run 'make install', or pip install the project",
-        )
+        yield Finding("gaitgauge", PROBLEM, "not installed", "run 'make install', or pip install the project")
         return
     for line in lines:
         wanted = Requirement(line)
@@ -106,13 +101,13 @@ def check_packages() -> Iterator[Finding]:
         try:
             present = version(wanted.name)
         except PackageNotFoundError:
-            yield Finding(what=wanted.name, status=PROBLEM, found="not installed", advice=f"pip install '{line}'")
+            yield Finding(wanted.name, PROBLEM, "not installed", f"pip install '{line}'")
             continue
         if wanted.specifier.contains(present, prereleases=True):
-            yield Finding(what=wanted.name, status=OK, found=present)
+            yield Finding(wanted.name, OK, present)
         else:
             found = f"{present}, but {wanted.specifier} is needed"
-            yield Finding(what=wanted.name, status=PROBLEM, found=found, advice=f"pip install '{line}'")
+            yield Finding(wanted.name, PROBLEM, found, f"pip install '{line}'")
 
 
 # ---- devices --------------------------------------------------------------------------------------------------------
@@ -130,30 +125,23 @@ print(json.dumps([torch.version.cuda, gpus]))
 
 def check_gpu() -> Iterator[Finding]:
     """Whether torch can use a GPU, which training needs."""
-    answer, trouble = _ask(_TORCH_PROBE)
+    what, (answer, trouble) = "GPU (torch)", _ask(_TORCH_PROBE)
     if trouble:
-        yield Finding(
-            what="GPU (torch)", status=PROBLEM, found=f"torch fails: {trouble}", advice="reinstall torch: make install"
-        )
+        yield Finding(what, PROBLEM, f"torch fails: {trouble}", "reinstall torch: make install")
         return
     built, gpus = answer
     driver = _driver()
     if gpus:
         text = "; ".join(f"{name}, {free:.0f} of {total:.0f} GB free" for name, free, total in gpus)
-        yield Finding(what="GPU (torch)", status=OK, found=f"{text}; CUDA {built}, driver {driver or 'unknown'}")
+        yield Finding(what, OK, f"{text}; CUDA {built}, driver {driver or 'unknown'}")
     elif driver and not built:
         advice = "install a CUDA build of torch (pytorch.org, Get started), in the version that constraints.txt names"
-        yield Finding(
-            what="GPU (torch)", status=WARNING, found=f"driver {driver}, but torch is built without CUDA", advice=advice
-        )
+        yield Finding(what, WARNING, f"driver {driver}, but torch is built without CUDA", advice)
     elif driver:
         advice = f"update the driver to one that CUDA {built} accepts; check with nvidia-smi"
-        yield Finding(
-            what="GPU (torch)", status=WARNING, found=f"driver {driver}, but torch finds no GPU", advice=advice
-        )
+        yield Finding(what, WARNING, f"driver {driver}, but torch finds no GPU", advice)
     else:
-        advice = "evaluating needs none; train on a machine with an NVIDIA GPU"
-        yield Finding(what="GPU (torch)", status=WARNING, found="none", advice=advice)
+        yield Finding(what, WARNING, "none", "evaluating needs none; train on a machine with an NVIDIA GPU")
 
 
 def _driver() -> str | None:
@@ -180,19 +168,14 @@ print(json.dumps([str(d) for d in warp.get_devices()]))
 
 def check_warp() -> Iterator[Finding]:
     """The devices of Warp, on which the training engines run."""
-    answer, trouble = _ask(_WARP_PROBE)
+    what, (answer, trouble) = "Warp devices", _ask(_WARP_PROBE)
     if trouble:
-        yield Finding(
-            what="Warp devices",
-            status=PROBLEM,
-            found=f"Warp fails: {trouble}",
-            advice="reinstall warp-lang: make install",
-        )
+        yield Finding(what, PROBLEM, f"Warp fails: {trouble}", "reinstall warp-lang: make install")
     elif any(d.startswith("cuda") for d in answer):
-        yield Finding(what="Warp devices", status=OK, found=", ".join(answer))
+        yield Finding(what, OK, ", ".join(answer))
     else:
         advice = "mujoco-warp and newton run here with --device cpu only, slowly"
-        yield Finding(what="Warp devices", status=WARNING, found=", ".join(answer) or "none", advice=advice)
+        yield Finding(what, WARNING, ", ".join(answer) or "none", advice)
 
 
 _MUJOCO_PROBE = """
@@ -203,18 +186,16 @@ print(json.dumps([mujoco.__version__, mujoco.mj_versionString()]))
 
 def check_mujoco() -> Iterator[Finding]:
     """Whether MuJoCo loads, with the batched stepping that the gauge runs on."""
-    answer, trouble = _ask(_MUJOCO_PROBE)
+    what, (answer, trouble) = "MuJoCo engine", _ask(_MUJOCO_PROBE)
     if trouble:
-        advice = "reinstall it: make install"
-        yield Finding(what="MuJoCo engine", status=PROBLEM, found=f"fails: {trouble}", advice=advice)
+        yield Finding(what, PROBLEM, f"fails: {trouble}", "reinstall it: make install")
         return
     package, library = answer
     if package == library:
-        yield Finding(what="MuJoCo engine", status=OK, found=f"{library}, mujoco.batch, {os.cpu_count()} CPU threads")
+        yield Finding(what, OK, f"{library}, mujoco.batch, {os.cpu_count()} CPU threads")
     else:
-        found = f"package {package} loads library {library}"
         advice = "another MuJoCo comes first: unset LD_LIBRARY_PATH and MUJOCO_PATH"
-        yield Finding(what="MuJoCo engine", status=PROBLEM, found=found, advice=advice)
+        yield Finding(what, PROBLEM, f"package {package} loads library {library}", advice)
 
 
 # ---- pictures -------------------------------------------------------------------------------------------------------
@@ -242,35 +223,32 @@ def check_rendering() -> Iterator[Finding]:
     for backend, good in works.items():
         what = f"rendering ({backend})"
         if good:
-            yield Finding(what=what, status=OK, found=f"works (MUJOCO_GL={backend})")
+            yield Finding(what, OK, f"works (MUJOCO_GL={backend})")
         elif any(works.values()):
-            yield Finding(what=what, status=OK, found="does not work, but the other way does")
+            yield Finding(what, OK, "does not work, but the other way does")
         else:
             advice = f"for videos, install {_PACKAGES_OF[backend]}, with apt on Debian and Ubuntu"
-            yield Finding(what=what, status=WARNING, found="does not work", advice=advice)
+            yield Finding(what, WARNING, "does not work", advice)
 
 
 def check_display() -> Iterator[Finding]:
     """Whether a window can be opened."""
     if sys.platform in ("darwin", "win32"):
-        yield Finding(what="display", status=OK, found="the system's own")
+        yield Finding("display", OK, "the system's own")
         return
-    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if display:
-        yield Finding(what="display", status=OK, found=display)
+    if display := os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        yield Finding("display", OK, display)
     else:
         advice = (
             "none is needed but for the viewer's window; in a browser it works without (viser), over ssh use ssh -X"
         )
-        yield Finding(what="display", status=WARNING, found="neither DISPLAY nor WAYLAND_DISPLAY is set", advice=advice)
+        yield Finding("display", WARNING, "neither DISPLAY nor WAYLAND_DISPLAY is set", advice)
 
 
 def check_ffmpeg() -> Iterator[Finding]:
     """The program that encodes videos."""
     if find_spec("imageio_ffmpeg") is None:
-        yield Finding(
-            what="ffmpeg", status=PROBLEM, found="imageio-ffmpeg is not installed", advice="pip install imageio-ffmpeg"
-        )
+        yield Finding("ffmpeg", PROBLEM, "imageio-ffmpeg is not installed", "pip install imageio-ffmpeg")
         return
     import imageio_ffmpeg
 
@@ -278,9 +256,9 @@ def check_ffmpeg() -> Iterator[Finding]:
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError:
         advice = "for videos, install ffmpeg, or set IMAGEIO_FFMPEG_EXE to it"
-        yield Finding(what="ffmpeg", status=WARNING, found="no program for this platform", advice=advice)
+        yield Finding("ffmpeg", WARNING, "no program for this platform", advice)
         return
-    yield Finding(what="ffmpeg", status=OK, found=program)
+    yield Finding("ffmpeg", OK, program)
 
 
 # ---- room -----------------------------------------------------------------------------------------------------------
@@ -290,13 +268,11 @@ def check_room() -> Iterator[Finding]:
     """Free disk and memory, and whether the folders of runs and results can be written."""
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     advice = "" if free >= _FREE_DISK else f"make room: a training run may write up to {_FREE_DISK:g} GB"
-    yield Finding(
-        what="free disk", status=WARNING if advice else OK, found=f"{free:.1f} GB in {Path.cwd()}", advice=advice
-    )
+    yield Finding("free disk", WARNING if advice else OK, f"{free:.1f} GB in {Path.cwd()}", advice)
     memory = _free_memory()
     if memory is not None:
         advice = "" if memory >= _FREE_MEMORY else f"close programs: the engines may want {_FREE_MEMORY:g} GB"
-        yield Finding(what="free memory", status=WARNING if advice else OK, found=f"{memory:.1f} GB", advice=advice)
+        yield Finding("free memory", WARNING if advice else OK, f"{memory:.1f} GB", advice)
     for name in ("logs", "results"):
         yield _writable(Path(name))
 
@@ -322,9 +298,9 @@ def _writable(folder: Path) -> Finding:
             pass
     except OSError as error:
         advice = f"make {there} writable, or work in another folder"
-        return Finding(what=what, status=PROBLEM, found=f"{there}: {error.strerror}", advice=advice)
+        return Finding(what, PROBLEM, f"{there}: {error.strerror}", advice)
     found = "writable" if there == folder.absolute() else "will be created when it is needed"
-    return Finding(what=what, status=OK, found=found)
+    return Finding(what, OK, found)
 
 
 def _ask(program: str, **environment: str) -> tuple[Any, str]:

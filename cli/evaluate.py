@@ -12,7 +12,6 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-import typer
 from rich.text import Text
 
 from ..backends.registry import choose_device
@@ -23,8 +22,9 @@ from ..gauge.results import ALL
 from ..gauge.suite import Suite
 from ..policy.adapters import assumptions
 from ..policy.contract import PolicyContract
-from .console import Terminal, make_table, shell_command
+from .console import Terminal, make_table
 from .progress import ProgressDisplay, duration
+from .studies import resumable
 
 _AT_ONCE = 1.0
 """Time after settling within which a fall says that the policy is run wrongly [s]."""
@@ -59,16 +59,11 @@ def run_evaluation(
     prepared = prepare(request)  # all that can be wrong with the request is said before anything is written
     folder = out or Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
     console = Terminal(stderr=True)
-    try:
-        # Ray prints its nodes' logs to standard output; that a worker was lost is one of the notices
-        with redirect_stdout(io.StringIO() if cluster else sys.stdout), ProgressDisplay(console, "gauging") as display:
-            results = evaluate(
-                prepared, folder, resume=resume, command=["gaitgauge", *sys.argv[1:]], watch=shower(display)
-            )
-    except KeyboardInterrupt:
-        again = shell_command(None, "--resume")
-        console.say(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {again}")
-        raise typer.Exit(130) from None
+    # Ray prints its nodes' logs to standard output; that a worker was lost is one of the notices
+    quiet = redirect_stdout(io.StringIO() if cluster else sys.stdout)
+    with resumable(console, "gauging", folder, "--resume") as display, quiet:
+        command = ["gaitgauge", *sys.argv[1:]]
+        results = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display))
     report = write_report(folder)
     if clip:
         from .clip import make_clip

@@ -2,54 +2,28 @@
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import typer
-
 from ..gauge.latent.figures import SPACES, label
 from ..gauge.latent.study import PAIRS, LatentRequest, study_latents
 from .console import Terminal, make_table
-from .errors import UserError
-from .policies import policy_file
-from .progress import ProgressDisplay
+from .policies import policy_files
+from .studies import joined_names, make_study
 
 
 def run_latent(
     *, policies: Sequence[str], threads: int | None, out: Path | None, json_output: bool, **choices: Any
 ) -> None:
     """Walk, look, print tables and where the files are; exit code 1 where something was left out."""
-    request = LatentRequest(
-        policies=tuple(str(policy_file(p)) if Path(p).is_dir() else p for p in policies),
-        threads=threads or os.cpu_count() or 1,
-        **choices,
+    request = LatentRequest(policies=policy_files(policies), threads=threads or os.cpu_count() or 1, **choices)
+    folder = out or Path("results") / f"latent-{joined_names(policies)}"
+    files = ("latent.json", "latent.html")
+    make_study(
+        study_latents, request, folder, title="looking", show=print_latents, files=files, json_output=json_output
     )
-    names = "-".join(Path(p).name.partition(".")[0] for p in policies[:3])
-    folder = out or Path("results") / f"latent-{names}"
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"'{folder}' is a file; give another folder with --out")
-    errors = Terminal(stderr=True)
-    with ProgressDisplay(errors, "looking") as display:
-        results = study_latents(
-            request,
-            folder,
-            command=["gaitgauge", *sys.argv[1:]],
-            watch=lambda turn, turns, name: display.update((turn - 1) / turns, f"{turn} of {turns}: {name}"),
-        )
-    if json_output:
-        print(json.dumps(results, indent=1))
-    else:
-        console = Terminal()
-        print_latents(console, results)
-        console.say(f"results  {folder / 'latent.json'}\npage     {folder / 'latent.html'}")
-    for refused in results["refused"]:
-        errors.say(f"{refused['what']} was left out: {refused['reason']}")
-    if results["refused"]:
-        raise typer.Exit(1)
 
 
 def print_latents(console: Terminal, results: Mapping[str, Any]) -> None:

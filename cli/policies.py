@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..policy.finding import find_policy
@@ -26,3 +27,8 @@ def policy_file(choice: str) -> Path:
             f"'{choice}' is a folder without a best.pt or model_<iteration>.pt; give a run directory or a policy file"
         )
     return found
+
+
+def policy_files(policies: Sequence[str]) -> tuple[str, ...]:
+    """The policies, run directories replaced by their best checkpoint, else their last."""
+    return tuple(str(policy_file(p)) if Path(p).is_dir() else p for p in policies)

@@ -11,9 +11,9 @@ import typer
 
 from ..backends.registry import choose_device
 from ..gauge.verify import load_card, prepare_replay, verify
-from .console import Terminal, shell_command
+from .console import Terminal
 from .evaluate import shower
-from .progress import ProgressDisplay
+from .studies import resumable
 
 
 def run_verification(
@@ -45,14 +45,9 @@ def run_verification(
     folder = (
         out or Path("results") / f"verify-{stem}{'-quick' if quick else ''}{'' if fresh is None else f'-fresh-{fresh}'}"
     )
-    console = Terminal(stderr=True)
-    try:
-        with ProgressDisplay(console, "gauging") as display:
-            command = ["gaitgauge", *sys.argv[1:]]
-            found = verify(content, prepared, folder, fresh=fresh, command=command, watch=shower(display))
-    except KeyboardInterrupt:
-        console.say(f"stopped; every finished episode is kept in {folder}. Go on with:\n  {shell_command()}")
-        raise typer.Exit(130) from None
+    with resumable(Terminal(stderr=True), "gauging", folder) as display:
+        command = ["gaitgauge", *sys.argv[1:]]
+        found = verify(content, prepared, folder, fresh=fresh, command=command, watch=shower(display))
     if json_output:
         print(json.dumps(found, indent=1))
     else:

@@ -211,9 +211,9 @@ def board(
     Examples:
       gaitgauge board cards --out board.html
     """
-    from ..board import run_board
+    from ...gauge.board import write_board
 
-    run_board(folder=folder, out=out)
+    print(write_board(folder, out or folder / "board.html"))
 
 
 @app.command()

@@ -1,0 +1,74 @@
+"""What the commands that look at several policies have in common: folders, how to go on, what was left out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from .console import Terminal, shell_command
+from .errors import UserError
+from .progress import ProgressDisplay
+
+
+def joined_names(policies: Sequence[str]) -> str:
+    """Names of the first policies, for a folder's name."""
+    return "-".join(Path(p).name.partition(".")[0] for p in policies[:3])
+
+
+@contextmanager
+def resumable(console: Terminal, title: str, folder: Path | None = None, *more: str) -> Iterator[ProgressDisplay]:
+    """A display around work that keeps what has finished: Ctrl-C says how to go on and ends with exit code 130.
+
+    Args:
+        console: where progress is shown.
+        title: of what is going on.
+        folder: where finished episodes are kept, where there is one such folder.
+        more: arguments that the command needs to go on.
+    """
+    try:
+        with ProgressDisplay(console, title) as display:
+            yield display
+    except KeyboardInterrupt:
+        where = "" if folder is None else f" in {folder}"
+        again = shell_command(None, *more)
+        console.say(f"stopped; every finished episode is kept{where}. Go on with:\n  {again}")
+        raise typer.Exit(130) from None
+
+
+def make_study(
+    study: Callable[..., Mapping[str, Any]],
+    request: Any,
+    folder: Path,
+    *,
+    title: str,
+    show: Callable[[Terminal, Mapping[str, Any]], None],
+    files: tuple[str, str],
+    json_output: bool,
+) -> None:
+    """Make a study policy by policy, print it and where its two ``files`` are; exit code 1 where something was left out."""
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"'{folder}' is a file; give another folder with --out")
+    errors = Terminal(stderr=True)
+    with ProgressDisplay(errors, title) as display:
+        results = study(
+            request,
+            folder,
+            command=["gaitgauge", *sys.argv[1:]],
+            watch=lambda turn, turns, name: display.update((turn - 1) / turns, f"{turn} of {turns}: {name}"),
+        )
+    if json_output:
+        print(json.dumps(results, indent=1))
+    else:
+        console = Terminal()
+        show(console, results)
+        console.say(f"results  {folder / files[0]}\npage     {folder / files[1]}")
+    for refused in results["refused"]:
+        errors.say(f"{refused['what']} was left out: {refused['reason']}")
+    if results["refused"]:
+        raise typer.Exit(1)
