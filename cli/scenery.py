@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from scipy.ndimage import zoom
@@ -34,30 +36,15 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
     """
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     _set_light(spec, quality)
-    steps = [box for box in terrain.boxes if not box.wall]
-    for i, box in enumerate(steps):
-        spec.worldbody.add_geom(
-            name=f"step_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=box.half_size,
-            pos=box.center,
-            quat=box.quaternion,
-            rgba=BOX_COLORS[i % 2],
-            contype=0,
-            conaffinity=0,
-        )
+    for i, box in enumerate(box for box in terrain.boxes if not box.wall):
+        shape = {"size": box.half_size, "pos": box.center, "quat": box.quaternion, "rgba": BOX_COLORS[i % 2]}
+        _add_geom(spec, f"step_{i}", mujoco.mjtGeom.mjGEOM_BOX, **shape)
     if terrain.height_field is not None:
         _add_field(spec, terrain, quality.field_nodes)
     if terrain.target is not None:
-        spec.worldbody.add_geom(
-            name="target",
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=[0.12, 0.004, 0.0],
-            pos=[*terrain.target[:2], _ground(terrain, *terrain.target[:2]) + 0.006],
-            rgba=[0.95, 0.45, 0.15, 1.0],
-            contype=0,
-            conaffinity=0,
-        )
+        x, y = terrain.target[:2]
+        place, color = [x, y, float(terrain.height(x, y)) + 0.006], [0.95, 0.45, 0.15, 1.0]
+        _add_geom(spec, "target", mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.12, 0.004, 0.0], pos=place, rgba=color)
     # Last, since drawing goes in this order: what steps hide of the floor need not be drawn.
     _add_floor(spec, reflectance=0.04 if quality.reflections else 0.0)
     shown = any(geom.group == VISUAL_GROUP for geom in spec.geoms)
@@ -67,8 +54,9 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
     return spec.compile()
 
 
-def _ground(terrain: Terrain, x: float, y: float) -> float:
-    return float(terrain.height(x, y))
+def _add_geom(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtGeom, **shape: Any) -> None:
+    """Add something to the world that nothing collides with."""
+    spec.worldbody.add_geom(name=name, type=kind, contype=0, conaffinity=0, **shape)
 
 
 def _set_light(spec: mujoco.MjSpec, quality: Quality) -> None:
@@ -122,14 +110,7 @@ def _add_floor(spec: mujoco.MjSpec, reflectance: float) -> None:
     )
     material = spec.add_material(name="floor", texrepeat=[1.0, 1.0], texuniform=True, reflectance=reflectance)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
-    spec.worldbody.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[_FLOOR_REACH, _FLOOR_REACH, 1.0],
-        material="floor",
-        contype=0,
-        conaffinity=0,
-    )
+    _add_geom(spec, "floor", mujoco.mjtGeom.mjGEOM_PLANE, size=[_FLOOR_REACH, _FLOOR_REACH, 1.0], material="floor")
 
 
 def _add_field(spec: mujoco.MjSpec, terrain: Terrain, most_nodes: int) -> None:
@@ -140,15 +121,8 @@ def _add_field(spec: mujoco.MjSpec, terrain: Terrain, most_nodes: int) -> None:
     hfield = spec.add_hfield(name="ground", nrow=heights.shape[0], ncol=heights.shape[1])
     hfield.size = np.array([*field.half_size, top, field.base])
     hfield.userdata = (heights / top).astype(np.float32).ravel()
-    spec.worldbody.add_geom(
-        name="ground",
-        type=mujoco.mjtGeom.mjGEOM_HFIELD,
-        hfieldname="ground",
-        pos=[*field.center, 0.0],
-        rgba=FIELD_COLOR,
-        contype=0,
-        conaffinity=0,
-    )
+    shape = {"hfieldname": "ground", "pos": [*field.center, 0.0], "rgba": FIELD_COLOR}
+    _add_geom(spec, "ground", mujoco.mjtGeom.mjGEOM_HFIELD, **shape)
 
 
 def drawn_heights(heights: FloatArray, most_nodes: int) -> FloatArray:

@@ -102,7 +102,7 @@ def as_page(found: Comparison) -> str:
             rows = list(zip(group, strips, strict=True))
             kinds.append({"kind": kind, "scale": charts.strip_scale(scale), "rows": rows})
         pairs.append({"first": first, "second": second, "kinds": kinds})
-    template = page_template("comparison.html.j2", fixed=_fixed, signed=_signed, odds=_odds, label=label)
+    template = page_template("comparison.html.j2", signed=_signed, odds=_odds, label=label)
     return template.render(
         suite=found.suite,
         policies=found.policies,
@@ -130,11 +130,6 @@ def label(found: Difference) -> str:
     if found.kind == "payload":
         return f"{found.name} kg"
     return found.name.replace("_", " ")
-
-
-def _fixed(value: float | None, digits: int = 4) -> str:
-    """A number with fixed decimals; a dash for what does not exist."""
-    return "–" if value is None else f"{value:.{digits}f}".replace("-", "−")
 
 
 def _pairs(found: Comparison) -> Sequence[tuple[str, str]]:

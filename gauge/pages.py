@@ -15,7 +15,8 @@ def page_template(name: str, **filters: Callable[..., object]) -> jinja2.Templat
 
     Args:
         name: file in ``templates/``.
-        filters: what the template calls by these names; functions of a module, so that the template is found again.
+        filters: what the template calls by these names, beside ``fixed``; functions of a module, so that the template is found
+            again.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
@@ -24,5 +25,10 @@ def page_template(name: str, **filters: Callable[..., object]) -> jinja2.Templat
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= filters
+    environment.filters |= {"fixed": fixed} | filters
     return environment.get_template(name)
+
+
+def fixed(value: float | None, digits: int = 4) -> str:
+    """A number with fixed decimals; a dash for what does not exist."""
+    return "–" if value is None else f"{value:.{digits}f}".replace("-", "−")

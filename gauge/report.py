@@ -95,7 +95,6 @@ def render(results: Mapping[str, Any], clip: bytes | None = None) -> str:
         )
     template = page_template(
         "report.html.j2",
-        fixed=_fixed,
         number=number,
         terrain=terrain_label,
         metric=metric_label,
@@ -353,11 +352,6 @@ def _row(row: Row) -> dict[str, Any]:
 
 
 _FLAGS = {"diverged": "diverged", "overflowed": "overflowed", "restarted": "restarted"}
-
-
-def _fixed(value: float | None, digits: int = 4) -> str:
-    """A number with fixed decimals; a dash for what does not exist."""
-    return "–" if value is None else f"{value:.{digits}f}".replace("-", "−")
 
 
 def _grouped(value: int) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import nn
@@ -25,19 +26,12 @@ class GatedActor(Experts):
         inputs: int,
         num_actions: int,
         num_experts: int,
-        expert_width: int,
-        trunk_hidden: Sequence[int],
         gate_hidden: Sequence[int],
         activation: str,
+        **shape: Any,
     ) -> None:
-        super().__init__(
-            inputs=inputs,
-            trunk_hidden=trunk_hidden,
-            num_experts=num_experts,
-            expert_width=expert_width,
-            outputs=num_actions,
-            activation=activation,
-        )
+        """``shape``: of the experts, as ``Experts`` takes it."""
+        super().__init__(inputs=inputs, outputs=num_actions, num_experts=num_experts, activation=activation, **shape)
         self.gate = multilayer_perceptron((inputs, *gate_hidden, num_experts), activation=activation)
 
     def weigh(self, values: torch.Tensor) -> torch.Tensor:
@@ -65,21 +59,14 @@ class CompositeActor(Experts):
         inputs: int,
         num_actions: int,
         num_experts: int,
-        expert_width: int,
-        trunk_hidden: Sequence[int],
         gate_hidden: Sequence[int],
         blind_to: Sequence[int],
         activation: str,
+        **shape: Any,
     ) -> None:
-        seen = [i for i in range(inputs) if i not in set(blind_to)]
-        super().__init__(
-            inputs=len(seen),
-            trunk_hidden=trunk_hidden,
-            num_experts=num_experts,
-            expert_width=expert_width,
-            outputs=2 * num_actions,
-            activation=activation,
-        )
+        """``shape``: of the primitives, as ``Experts`` takes it."""
+        seen, outputs = [i for i in range(inputs) if i not in set(blind_to)], 2 * num_actions
+        super().__init__(inputs=len(seen), outputs=outputs, num_experts=num_experts, activation=activation, **shape)
         self.register_buffer("seen", torch.tensor(seen, dtype=torch.int64), persistent=False)
         self.gate = multilayer_perceptron((inputs, *gate_hidden, num_experts), activation=activation)
 
@@ -103,18 +90,30 @@ class _ComposedNetwork(nn.Module):
 
     def __init__(
         self,
+        make_actor: Callable[..., GatedActor | CompositeActor],
         *,
-        frame_width: int,
-        history_length: int,
-        latent_width: int,
-        encoder_hidden: Sequence[int],
-        activation: str,
+        frame_width: int = 45,
+        num_actions: int = 12,
+        history_length: int = 5,
+        latent_width: int = 32,
+        encoder_hidden: Sequence[int] = (512, 256),
+        num_experts: int = 8,
+        activation: str = "elu",
+        **actor: Any,
     ) -> None:
+        """``actor``: what ``make_actor`` takes beside the common widths."""
         super().__init__()
         self.history_length = history_length
         self.frame_width = frame_width
         self.encoder = multilayer_perceptron(
             (frame_width * history_length, *encoder_hidden, latent_width), activation=activation
+        )
+        self.actor = make_actor(
+            inputs=latent_width + frame_width,
+            num_actions=num_actions,
+            num_experts=num_experts,
+            activation=activation,
+            **actor,
         )
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
@@ -141,33 +140,13 @@ class AcMoeNetwork(_ComposedNetwork):
     def __init__(
         self,
         *,
-        frame_width: int = 45,
-        num_actions: int = 12,
-        history_length: int = 5,
-        latent_width: int = 32,
-        encoder_hidden: Sequence[int] = (512, 256),
-        num_experts: int = 8,
         expert_width: int = 128,
         trunk_hidden: Sequence[int] = (512, 256),
         gate_hidden: Sequence[int] = (512, 256),
-        activation: str = "elu",
+        **common: Any,
     ) -> None:
-        super().__init__(
-            frame_width=frame_width,
-            history_length=history_length,
-            latent_width=latent_width,
-            encoder_hidden=encoder_hidden,
-            activation=activation,
-        )
-        self.actor = GatedActor(
-            inputs=latent_width + frame_width,
-            num_actions=num_actions,
-            num_experts=num_experts,
-            expert_width=expert_width,
-            trunk_hidden=trunk_hidden,
-            gate_hidden=gate_hidden,
-            activation=activation,
-        )
+        experts = {"expert_width": expert_width, "trunk_hidden": trunk_hidden, "gate_hidden": gate_hidden}
+        super().__init__(GatedActor, **experts, **common)
 
 
 class McpNetwork(_ComposedNetwork):
@@ -179,33 +158,14 @@ class McpNetwork(_ComposedNetwork):
     def __init__(
         self,
         *,
-        frame_width: int = 45,
-        num_actions: int = 12,
-        history_length: int = 5,
         latent_width: int = 32,
-        encoder_hidden: Sequence[int] = (512, 256),
-        num_experts: int = 8,
         expert_width: int = 256,
         trunk_hidden: Sequence[int] = (512, 256, 128),
         gate_hidden: Sequence[int] = (512, 256, 128),
         primitives_blind_to: Sequence[int] = (),
-        activation: str = "elu",
+        **common: Any,
     ) -> None:
         """``primitives_blind_to``: entries of the current frame, as a rule the command's."""
-        super().__init__(
-            frame_width=frame_width,
-            history_length=history_length,
-            latent_width=latent_width,
-            encoder_hidden=encoder_hidden,
-            activation=activation,
-        )
-        self.actor = CompositeActor(
-            inputs=latent_width + frame_width,
-            num_actions=num_actions,
-            num_experts=num_experts,
-            expert_width=expert_width,
-            trunk_hidden=trunk_hidden,
-            gate_hidden=gate_hidden,
-            blind_to=[latent_width + i for i in primitives_blind_to],
-            activation=activation,
-        )
+        experts = {"expert_width": expert_width, "trunk_hidden": trunk_hidden, "gate_hidden": gate_hidden}
+        blind_to = [latent_width + i for i in primitives_blind_to]
+        super().__init__(CompositeActor, latent_width=latent_width, blind_to=blind_to, **experts, **common)

@@ -152,14 +152,10 @@ def _page(data: Mapping[str, Any], curves: Mapping[tuple[str, int], Mapping[str,
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
     names = [entry["entry"] for entry in data["entries"]]
     groups = list(dict.fromkeys(g for e in data["entries"] if e["best"] for g in e["best"]["groups"] or {}))
-    return page_template("sweep.html.j2", fixed=_fixed).render(
+    return page_template("sweep.html.j2").render(
         sweep=data,
         groups=groups,
         names=names,
         compared=compared,
         figures={figure: charts.curves(series) for figure, series in by_figure(curves, names).items()},
     )
-
-
-def _fixed(value: float | None, digits: int = 4) -> str:
-    return "–" if value is None else f"{value:.{digits}f}".replace("-", "−")
