@@ -6,6 +6,7 @@ from collections.abc import Callable
 from difflib import get_close_matches
 from pathlib import Path
 
+from ..files.writing import make_folder
 from ..policy.base import Policy
 from ..policy.export import (
     ExportError,
@@ -90,10 +91,7 @@ def run_export(
     folder = out or (path.parent if (path.parent / "run.json").is_file() else Path()) / (
         "unitree" if layout == "unitree" else "exported"
     )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ExportError(f"cannot create folder '{folder}': {error.strerror}; choose another --out") from error
+    make_folder(folder, ExportError)
     console = Terminal()
     console.say(f"policy {path}, contract {policy.contract.hash[:12]}")
     export = export_unitree if layout == "unitree" else FORMATS[form]

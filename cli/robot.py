@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from ..files.writing import write_atomically
+from ..files.writing import make_folder, write_atomically
 from ..robots import Robot, RobotError, load_robot
 from ..robots.drafting import draft_robot
 from ..robots.examining import Finding, examine
@@ -40,10 +40,7 @@ def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -
     draft = draft_robot(model, name, folder=folder)
     own = folder / f"{model.stem}-named.xml"
     made = not folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RobotError(f"cannot create folder '{folder}': {error.strerror}; choose another --out") from error
+    make_folder(folder, RobotError)
     written: list[Path] = []
     try:
         if draft.model:

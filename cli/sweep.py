@@ -11,7 +11,7 @@ from typing import Any
 
 import typer
 
-from ..files.writing import lock_folder
+from ..files.writing import lock_folder, make_folder
 from ..gauge.cluster import check_address
 from ..training.sweep.file import SweepError, load_sweep
 from ..training.sweep.folding import fold_sweep
@@ -44,7 +44,7 @@ def run_sweep(
         gauging = ["--cluster", cluster, *([] if threads is None else ["--threads", str(threads)])]
     if folder.exists() and not folder.is_dir():
         raise SweepError(f"'{folder}' is a file; give another folder with --out")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, SweepError)
     lock = lock_folder(folder, SweepError)
     try:
         runs, refused = plan_runs(sweep, folder)

@@ -62,10 +62,21 @@ def write_atomically(
         partial.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
-def write_failure(path: Path, problem: OSError) -> str:
-    """One sentence on why a file cannot be written."""
+def make_folder(folder: Path, error: type[Exception], *, option: str = "--out") -> None:
+    """Create a folder and those above it, where it is not there.
+
+    Raises:
+        error: it cannot be created; the sentence names the ``option`` that says where it is to be.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise error(write_failure(folder, problem, f"choose another {option}")) from problem
+
+
+def write_failure(path: Path, problem: OSError, hint: str = "choose another place") -> str:
+    """One sentence on why a file cannot be written; ``hint`` says what to do where the disk is not full."""
     reason = (problem.strerror or one_line(problem)).lower()
-    hint = "choose another place"
     if problem.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         hint = "free some space and run again; what was written before is intact"
     return f"cannot write '{one_line(path)}': {reason}; {hint}"

@@ -11,7 +11,7 @@ from pathlib import Path
 import jinja2
 
 from ..files.parsing import edited
-from ..files.writing import write_atomically, write_failure
+from ..files.writing import make_folder, write_atomically
 from .charts import terrain_label
 from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p
 from .consistency import charts
@@ -38,10 +38,7 @@ def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
             "tex": as_latex(found),
             "html": as_page(found),
         }
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ComparisonError(write_failure(folder, error)) from error
+    make_folder(folder, ComparisonError)
     paths = {kind: folder / f"comparison.{kind}" for kind in contents}
     for kind, text in contents.items():
         write_atomically(paths[kind], text, ComparisonError)

@@ -192,19 +192,7 @@ class _Outcome:
 
 _HEAD = [f.name for f in fields(_Outcome)]
 _READ_ERRORS = (
-    RecordError,
-    OSError,
-    KeyError,
-    ValueError,
-    TypeError,
-    EOFError,
-    IndexError,
-    MemoryError,
-    OverflowError,
-    NotImplementedError,
-    RuntimeError,
-    SyntaxError,
-    zipfile.BadZipFile,
-    zlib.error,
+    *(OSError, LookupError, ValueError, TypeError, EOFError, MemoryError, ArithmeticError, RuntimeError, SyntaxError),
+    *(zipfile.BadZipFile, zlib.error),
 )
 """What numpy and zipfile raise on files that are not theirs."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..files.parsing import one_line, parse_json, read_text, shown
-from ..files.writing import LOCK, lock_folder, write_atomically, write_failure
+from ..files.writing import LOCK, lock_folder, make_folder, write_atomically, write_failure
 from .episodes import Episode, Record, read_records
 
 
@@ -36,10 +36,7 @@ class RunFolder:
         self._episodes = folder / "episodes"
         wanted = json.loads(json.dumps(request))
         present = _present_request(folder, wanted, resume=resume)
-        try:
-            self._episodes.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StoreError(f"cannot write to {folder}: {error.strerror}; give another folder with --out") from error
+        make_folder(self._episodes, StoreError)
         self._lock = lock_folder(folder, StoreError)
         try:
             if present != wanted:

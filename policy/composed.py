@@ -145,8 +145,9 @@ class AcMoeNetwork(_ComposedNetwork):
         gate_hidden: Sequence[int] = (512, 256),
         **common: Any,
     ) -> None:
-        experts = {"expert_width": expert_width, "trunk_hidden": trunk_hidden, "gate_hidden": gate_hidden}
-        super().__init__(GatedActor, **experts, **common)
+        super().__init__(
+            GatedActor, expert_width=expert_width, trunk_hidden=trunk_hidden, gate_hidden=gate_hidden, **common
+        )
 
 
 class McpNetwork(_ComposedNetwork):
@@ -166,6 +167,12 @@ class McpNetwork(_ComposedNetwork):
         **common: Any,
     ) -> None:
         """``primitives_blind_to``: entries of the current frame, as a rule the command's."""
-        experts = {"expert_width": expert_width, "trunk_hidden": trunk_hidden, "gate_hidden": gate_hidden}
-        blind_to = [latent_width + i for i in primitives_blind_to]
-        super().__init__(CompositeActor, latent_width=latent_width, blind_to=blind_to, **experts, **common)
+        super().__init__(
+            CompositeActor,
+            latent_width=latent_width,
+            expert_width=expert_width,
+            trunk_hidden=trunk_hidden,
+            gate_hidden=gate_hidden,
+            blind_to=[latent_width + i for i in primitives_blind_to],
+            **common,
+        )

@@ -19,7 +19,7 @@ import torch
 import yaml
 from torch import nn
 
-from ..files.writing import replacing
+from ..files.writing import make_folder, replacing
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, deploy_contract
 from .base import Policy, PolicyError
@@ -168,7 +168,8 @@ def export_unitree(policy: Policy, folder: str | Path, robot: Robot) -> dict[Pat
         ExportError: see ``export_onnx`` and ``export_deploy``.
     """
     graph, deploy = Path(folder) / "exported" / "policy.onnx", Path(folder) / "params" / "deploy.yaml"
-    _make_folders(graph.parent, deploy.parent)
+    for folder_of in (graph.parent, deploy.parent):
+        make_folder(folder_of, ExportError)
     difference_of_graph = export_onnx(policy, graph)
     export_deploy(policy, deploy, robot, finite_clips=True)
     return {graph: difference_of_graph, deploy: 0.0}
@@ -195,7 +196,7 @@ def export_policy(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path
         ExportError: see the three exports.
     """
     target = Path(folder)
-    _make_folders(target)
+    make_folder(target, ExportError)
     script, graph, deploy = target / "policy.pt", target / "policy.onnx", target / "deploy.yaml"
     differences = {script: export_torchscript(policy, script), graph: export_onnx(policy, graph)}
     export_deploy(policy, deploy, robot)
@@ -319,14 +320,6 @@ def _with_wide_clips(contract: PolicyContract) -> PolicyContract:
     return replace(
         contract, observation=terms, target_range=contract.target_range or ((-WIDE, WIDE),) * contract.num_joints
     )
-
-
-def _make_folders(*folders: Path) -> None:
-    for folder in folders:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ExportError(f"cannot create folder '{folder}': {error.strerror}; choose another --out") from error
 
 
 def _network(policy: Policy) -> nn.Module:

@@ -37,7 +37,7 @@ import torch
 from torch import nn
 
 from ..files.parsing import shown
-from ..files.writing import replacing
+from ..files.writing import make_folder, replacing
 from .base import Policy, PolicyError, PolicySession, check_observation, checked_action
 from .contract import ContractError, PolicyContract
 from .fence.archive import packed, read_archive
@@ -146,7 +146,7 @@ def save_policy(
             f"extra entries of a policy file cannot be named {', '.join(sorted(taken))}: the format uses these names"
         )
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(target.parent, PolicyError, option="place")
     # Given a path, torch would write its name into the file: equal policies, unequal bytes.
     with replacing(target, PolicyError) as partial, partial.open("wb") as file:
         torch.save({**entries, **(extra or {})}, file)

@@ -16,7 +16,7 @@ import yaml
 
 from ..files.parsing import read_results
 from ..files.provenance import provenance
-from ..files.writing import json_text, write_atomically
+from ..files.writing import json_text, make_folder, write_atomically
 from ..policy.contract import PolicyContract
 from .checkpoint import CheckpointError
 from .configuration import to_plain
@@ -95,10 +95,7 @@ def write_parameters(run: Path, *, environment: Any, agent: Any) -> None:
         CheckpointError: the files cannot be written.
     """
     folder = run / "params"
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise CheckpointError(f"Cannot create '{folder}': {error.strerror}.") from error
+    make_folder(folder, CheckpointError, option="--log-root")
     for name, configuration in (("env", environment), ("agent", agent)):
         text = yaml.safe_dump(to_plain(configuration), sort_keys=False, allow_unicode=True)
         write_atomically(folder / f"{name}.yaml", text, CheckpointError)

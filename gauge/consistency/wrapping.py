@@ -58,17 +58,9 @@ class WrappedBackend(PhysicsBackend):
         """See ``PhysicsBackend.reset``."""
         self.inner.reset(start, worlds)
 
-    def step(
-        self,
-        joint_targets: torch.Tensor | None,
-        *,
-        delay: torch.Tensor | None = None,
-        sample_at: torch.Tensor | None = None,
-        worlds: torch.Tensor | None = None,
-        substeps: int | None = None,
-    ) -> None:
+    def step(self, joint_targets: torch.Tensor | None, **arguments: Any) -> None:
         """See ``PhysicsBackend.step``."""
-        self.inner.step(joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=substeps)
+        self.inner.step(joint_targets, **arguments)
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``."""
@@ -187,8 +179,8 @@ class RetimedBackend(WrappedBackend):
         *,
         delay: torch.Tensor | None = None,
         sample_at: torch.Tensor | None = None,
-        worlds: torch.Tensor | None = None,
         substeps: int | None = None,
+        **arguments: Any,
     ) -> None:
         """See ``PhysicsBackend.step``."""
         count = self._inner_substeps if substeps is None else max(1, round(substeps * self._ratio))
@@ -197,7 +189,7 @@ class RetimedBackend(WrappedBackend):
         if sample_at is not None:
             nearest = torch.round(sample_at * self._ratio).to(torch.int64).clamp(min=1)
             sample_at = torch.where(sample_at > 0, nearest, torch.zeros_like(nearest))
-        self.inner.step(joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=count)
+        self.inner.step(joint_targets, delay=delay, sample_at=sample_at, substeps=count, **arguments)
 
 
 class _RetimedState(PhysicsState):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...backends.base import BackendError, PhysicsBackend
 from ...backends.registry import find_backend, make_backend
 from ...files.provenance import provenance
-from ...files.writing import json_text, write_atomically
+from ...files.writing import json_text, make_folder, write_atomically
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...robots import RobotError
@@ -126,7 +126,7 @@ def study_latents(
             command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)
         ),
     }
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, LatentError)
     drawn = {name: render_figure(name, results, points) for name in FIGURES}
     pictures = {name: text for name, text in drawn.items() if text}
     for name, text in pictures.items():

@@ -14,7 +14,7 @@ from typing import Any
 from ...backends.base import BackendError, PhysicsBackend
 from ...backends.registry import find_backend, make_backend
 from ...files.provenance import provenance
-from ...files.writing import json_text, write_atomically
+from ...files.writing import json_text, make_folder, write_atomically
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
@@ -126,7 +126,7 @@ def run_trials(
             seconds=round(time.perf_counter() - began, 2),
         ),
     }
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder, ScenarioError)
     write_atomically(folder / "trials.csv", as_csv(results), ScenarioError)
     write_atomically(folder / "trial.html", render_page(results), ScenarioError)
     write_atomically(folder / "trials.json", json_text(results), ScenarioError)

@@ -10,7 +10,7 @@ from typing import Any
 
 from ...backends.base import BackendError
 from ...files.parsing import read_results
-from ...files.writing import json_text, write_atomically
+from ...files.writing import json_text, make_folder, write_atomically
 from ...gauge.suite import SuiteError, load_suite
 from ..checkpoint import CheckpointError
 from ..configuration import ConfigurationError
@@ -117,7 +117,7 @@ class SweepRun:
         }
         note = self.folder / "entry.json"
         if not note.exists():
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder, SweepError)
             write_atomically(note, json_text(dict(mine)), SweepError)
         elif (found := read_results(note, "sweep's note", SweepError)) != mine:
             changed = next(name for name in mine if found.get(name) != mine[name])
