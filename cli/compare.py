@@ -52,9 +52,10 @@ def run_comparison(
     if json_output:
         print(json.dumps(found, indent=1))
         return
-    print_comparison(Terminal(), found)
+    output = Terminal()
+    print_comparison(output, found)
     for kind, path in paths.items():
-        print(f"{kind:5}{path}")
+        output.say(f"{kind:5}{path}")
 
 
 def print_comparison(console: Terminal, found: Mapping[str, Any]) -> None:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -31,6 +32,11 @@ class Terminal(Console):
         """Print, after the notices that were held back."""
         _notices.tell()
         super().print(*objects, **options)
+
+    def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+        """What reaches the terminal: text of any kind, control characters escaped."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(printable(segment.text), segment.style)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Text as it is, control characters escaped."""

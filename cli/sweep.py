@@ -61,10 +61,11 @@ def run_sweep(
     if json_output:
         print(json.dumps(found, indent=1))
     else:
-        print_sweep(Terminal(), found)
+        output = Terminal()
+        print_sweep(output, found)
         for name in ("sweep.html", "comparison.html", "curves.csv"):
             if (folder / name).is_file():
-                print(f"{name.partition('.')[0]:11}{folder / name}")
+                output.say(f"{name.partition('.')[0]:11}{folder / name}")
     if outcome.unfinished:
         errors.say(f"{len(outcome.unfinished)} of {len(runs)} runs are not done; go on with:\n  {shell_command()}")
     if outcome.stopped is not None:

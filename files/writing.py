@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import json
 import math
 import os
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -32,8 +34,10 @@ def replacing(path: Path, error: type[Exception], *, durable: bool = True, endin
         ending: of the name, for libraries that go by it.
 
     Raises:
-        error: it cannot be written: the disk is full, read-only …
+        error: it cannot be written: the disk is full, read-only …; or there is something that is no file.
     """
+    if (other := _no_file(path)) is not None:
+        raise error(f"cannot write '{one_line(path)}': {other}; choose another place")
     # Of one's own: two processes never share it. Without the name: that may be as long as a name can be.
     partial = path.with_name(f".{secrets.token_hex(8)}.partial{ending.removeprefix('.partial')}")
     try:
@@ -74,6 +78,24 @@ def make_folder(folder: Path, error: type[Exception], *, option: str = "--out") 
         raise error(write_failure(folder, problem, f"choose another {option}")) from problem
 
 
+def _no_file(path: Path) -> str | None:
+    """What a path names that is not to be replaced by a file; None for a file, and for nothing.
+
+    A new file takes the place of whatever has its name: for root that could be one of the system's devices.
+    """
+    try:
+        if path.is_dir():
+            return "it is a folder"
+        if (path.exists() and not path.is_file()) or path.parent.resolve() == Path("/dev"):
+            return "it is no file, but a device or a pipe"
+        path.lstat()
+    except ValueError:
+        return "its name holds a null character"
+    except OSError:
+        pass  # nothing is there, or writing will say what is wrong
+    return None
+
+
 def write_failure(path: Path, problem: OSError, hint: str = "choose another place") -> str:
     """One sentence on why a file cannot be written; ``hint`` says what to do where the disk is not full."""
     reason = (problem.strerror or one_line(problem)).lower()
@@ -99,6 +121,24 @@ def _writable(value: Any) -> Any:
     return value
 
 
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """Rows as CSV text. A text that a spreadsheet would run as a formula gets an apostrophe before it."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([f"'{value}" if _is_formula(value) else value for value in row] for row in rows)
+    return text.getvalue()
+
+
+def _is_formula(value: object) -> bool:
+    if not isinstance(value, str) or not value.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return False
+    try:
+        float(value)
+    except ValueError:
+        return True
+    return False
+
+
 def lock_folder(folder: Path, error: type[Exception]) -> FileLock:
     """Keep a folder for this process, until ``release()`` or its end, and remove what a process that was killed left half written.
 
@@ -114,10 +154,19 @@ def lock_folder(folder: Path, error: type[Exception]) -> FileLock:
         ) from problem
     except OSError as problem:
         raise error(write_failure(folder / LOCK, problem)) from problem
-    for partial in folder.rglob(".*.partial*"):
+    for partial in _strays(folder):
         with suppress(OSError):
             partial.unlink()
     return lock
+
+
+def _strays(folder: Path) -> Iterator[Path]:
+    """Half written files of a folder, but not those of folders below that another process may have locked."""
+    for place, below, names in os.walk(folder):
+        if LOCK in names and Path(place) != folder:
+            below.clear()
+            continue
+        yield from (Path(place, name) for name in names if name.startswith(".") and ".partial" in name)
 
 
 def _flush(path: Path) -> None:

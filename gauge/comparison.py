@@ -364,12 +364,16 @@ def _key(row: Mapping[str, Any]) -> tuple[str, float, float]:
     return row["terrain"], row["friction"], row["payload"]
 
 
+_LABEL = 80
+"""Characters of a policy's short name."""
+
+
 def _labels(results: Sequence[Mapping[str, Any]]) -> list[str]:
     """Short names that tell the policies apart: of the file, with its folder where that is not enough, numbered at last."""
     paths = [PurePath(r["policy"]["path"].replace("\\", "/")) for r in results]
-    labels = [p.name.partition(".")[0] for p in paths]
+    labels = [one_line(p.name.partition(".")[0], _LABEL) for p in paths]
     if len(set(labels)) < len(labels):
-        labels = [f"{p.parent.name}/{p.name.partition('.')[0]}".lstrip("/") for p in paths]
+        labels = [one_line(f"{p.parent.name}/{p.name.partition('.')[0]}".lstrip("/"), _LABEL) for p in paths]
     if len(set(labels)) < len(labels):
         labels = [f"{label} ({at})" for at, label in enumerate(labels, 1)]
     return labels

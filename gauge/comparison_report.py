@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jinja2
 
-from ..files.parsing import edited
-from ..files.writing import make_folder, write_atomically
+from ..files.parsing import edited, one_line
+from ..files.writing import csv_text, make_folder, write_atomically
 from .charts import terrain_label
 from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p
 from .consistency import charts
@@ -19,6 +17,8 @@ from .pages import page_template
 from .report import metric_label
 
 _TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}", "\\": r"\textbackslash{}"}
+_LONGEST = 100_000
+"""Characters of a line of LaTeX: a line's end would end a comment, too."""
 _TEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", "–": "--"}
 
 
@@ -47,15 +47,13 @@ def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
 
 def as_csv(found: Comparison) -> str:
     """One row for each difference."""
-    text = io.StringIO()
     names = ("kind", "name", "first", "second", "first_value", "second_value", "difference", "low", "high")
-    writer = csv.writer(text)
-    writer.writerow([*names, "p_value", "corrected_p_value", "real"])
+    rows: list[Sequence[object]] = [(*names, "p_value", "corrected_p_value", "real")]
     for d in found.differences:
         low, high = d.interval or ("", "")
         ends = ["" if v is None else v for v in (d.p_value, d.corrected)]
-        writer.writerow([d.kind, d.name, d.first, d.second, *d.values, d.difference, low, high, *ends, d.real])
-    return text.getvalue()
+        rows.append((d.kind, d.name, d.first, d.second, *d.values, d.difference, low, high, *ends, d.real))
+    return csv_text(rows)
 
 
 def as_latex(found: Comparison) -> str:
@@ -83,8 +81,8 @@ def as_latex(found: Comparison) -> str:
                 ]
                 lines.append(" & ".join(cells) + r" \\")
         tables.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
-    head = f"% {found.suite['name']} {found.suite['version']}; {' '.join(found.sentences)}"
-    return "\n\n".join([head, *tables]) + "\n"
+    head = one_line(f"{found.suite['name']} {found.suite['version']}; {' '.join(found.sentences)}", _LONGEST)
+    return "\n\n".join([f"% {head}", *tables]) + "\n"
 
 
 def as_page(found: Comparison) -> str:
@@ -140,4 +138,4 @@ def _by_kind(found: Comparison, first: str, second: str) -> Mapping[str, list[Di
 
 
 def _tex(text: str) -> str:
-    return "".join(_TEX.get(c, c) for c in text)
+    return "".join(_TEX.get(c, c) for c in one_line(text, _LONGEST))

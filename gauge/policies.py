@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..files.parsing import one_line
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError, PolicyContract
 from ..policy.finding import find_policy
@@ -56,7 +57,7 @@ def load_policies(
     found: dict[str, Loaded] = {}
     refused: list[Refused] = []
     names = list(dict.fromkeys(names))
-    short = [Path(name).name.partition(".")[0] for name in names]
+    short = [one_line(Path(name).name.partition(".")[0], 80) for name in names]
     for name, stem in zip(names, short, strict=True):
         try:
             policy = load_policy(name, asked, trust=trust)
@@ -64,7 +65,7 @@ def load_policies(
         except (PolicyError, ContractError, RobotError) as error:
             refused.append(Refused(what=name, reason=str(error)))
         else:
-            found[stem if short.count(stem) == 1 else name] = loaded
+            found[stem if short.count(stem) == 1 else one_line(name, 4096)] = loaded
     return found, refused
 
 

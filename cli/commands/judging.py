@@ -212,8 +212,9 @@ def board(
       gaitgauge board cards --out board.html
     """
     from ...gauge.board import write_board
+    from ..console import Terminal
 
-    print(write_board(folder, out or folder / "board.html"))
+    Terminal().say(str(write_board(folder, out or folder / "board.html")))
 
 
 @app.command()

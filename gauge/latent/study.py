@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 from ...backends.base import BackendError, PhysicsBackend
 from ...backends.registry import find_backend, make_backend
 from ...files.provenance import provenance
-from ...files.writing import json_text, make_folder, write_atomically
+from ...files.writing import csv_text, json_text, make_folder, write_atomically
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...robots import RobotError
@@ -258,13 +256,13 @@ def _experts(
 
 def as_csv(results: Mapping[str, Any], points: Sequence[tuple[str, Notes, Mapping[str, NDArray[np.float64]]]]) -> str:
     """One row for each robot and moment: where it was, its places in both figures, its latent and the experts' weights."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     latents = max((n.latent.shape[1] for _, n, _ in points if n.latent is not None), default=0)
     experts = max((n.weights.shape[1] for _, n, _ in points if n.weights is not None), default=0)
     axes = [f"{pair}_pc{i}" for pair in PAIRS for i in (1, 2)]
     numbered = [f"latent_{i}" for i in range(latents)], [f"expert_{i}" for i in range(experts)]
-    writer.writerow(["policy", "terrain", "command", "robot", "time", *axes, *numbered[0], *numbered[1]])
+    rows: list[Sequence[object]] = [
+        ("policy", "terrain", "command", "robot", "time", *axes, *numbered[0], *numbered[1])
+    ]
     for label, notes, places in points:
         columns = [*(places.get(pair) for pair in PAIRS), notes.latent, notes.weights]
         widths = [2, 2, latents, experts]
@@ -274,5 +272,5 @@ def as_csv(results: Mapping[str, Any], points: Sequence[tuple[str, Notes, Mappin
                 own = [] if column is None else ["" if np.isnan(v) else f"{v:.4f}" for v in column[row]]
                 values += own + [""] * (width - len(own))
             terrain, told = results["terrains"][notes.terrain[row]], results["commands"][notes.command[row]]
-            writer.writerow([label, terrain, told, notes.robot[row], f"{notes.time[row]:.2f}", *values])
-    return text.getvalue()
+            rows.append((label, terrain, told, notes.robot[row], f"{notes.time[row]:.2f}", *values))
+    return csv_text(rows)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,7 +12,7 @@ from typing import Any
 from ...backends.base import BackendError, PhysicsBackend
 from ...backends.registry import find_backend, make_backend
 from ...files.provenance import provenance
-from ...files.writing import json_text, make_folder, write_atomically
+from ...files.writing import csv_text, json_text, make_folder, write_atomically
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
@@ -202,10 +200,8 @@ def summary(label: str, contract: PolicyContract, scenario: Scenario, trials: Se
 
 def as_csv(results: Mapping[str, Any]) -> str:
     """One row for each trial."""
-    text = io.StringIO()
     names = ("seed", "outcome", "diverged", "seconds", *MEASURES)
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["scenario", "policy", *names, "pulls"])
+    rows: list[Sequence[object]] = [("scenario", "policy", *names, "pulls")]
     for entry in results["scenarios"]:
         for result in entry["results"]:
             for row in result["rows"]:
@@ -213,5 +209,5 @@ def as_csv(results: Mapping[str, Any]) -> str:
                     f"{p['newtons']:.1f} N at {p['begin']:.2f} s for {p['seconds']:.2f} s" for p in row["pulls"]
                 )
                 values = ["" if row[n] is None else row[n] for n in names]
-                writer.writerow([entry["name"], result["policy"], *values, pulls])
-    return text.getvalue()
+                rows.append((entry["name"], result["policy"], *values, pulls))
+    return csv_text(rows)

@@ -2,14 +2,18 @@
 
 import io
 import logging
+import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import typer
 from gaitgauge.cli.console import Terminal, make_table, shell_command
 from gaitgauge.cli.errors import UserError, report_errors
 from gaitgauge.cli.progress import ProgressDisplay, duration
+from rich.text import Text
 
 PROGRAM = "from gaitgauge.cli.main import main; main()"
 
@@ -34,6 +38,18 @@ def test_control_characters_are_escaped():
     table.add_row("c\x9b31m\r")
     assert shown(lambda t: t.say("x\x1b[31m\r\x00")) == "x\\x1b[31m\\r\\x00\n"
     assert not set("\x1b\x07\x9b\r") & set(shown(lambda t: t.print(table)))
+    assert shown(lambda t: t.say(Text.assemble(("x\x1b[31m", "bold"), "\u202e\x00"))) == "x\\x1b[31m\\u202e\\x00\n"
+
+
+@pytest.mark.parametrize("name", [b"\xff", b"\x1b[31m"])
+def test_a_page_whose_name_is_no_text_is_named(run, tmp_path, name):
+    shutil.copy(Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json", tmp_path / "card.json")
+    page = os.fsdecode(name)
+    for arguments in (("board", ".", "--out", page), ("compare", "card.json", "card.json", "--out", page + "s")):
+        result = run(*arguments)
+        assert result.exit_code == 0, result.exception
+        assert not set("\x1b\udcff") & set(result.output)
+    assert (tmp_path / page).is_file()
 
 
 def test_commands_can_be_pasted_into_a_shell(monkeypatch):

@@ -6,9 +6,10 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
-from gaitgauge.files.writing import json_text, lock_folder, replacing, write_atomically
+from gaitgauge.files.writing import csv_text, json_text, lock_folder, replacing, write_atomically
 
 
 class WriteError(RuntimeError):
@@ -41,6 +42,42 @@ def test_impossible_places_are_one_sentence(tmp_path, name):
     with pytest.raises(WriteError, match="cannot write '") as caught:
         write_atomically(tmp_path / name, "text", WriteError)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "/", "a\0b", "pipe"])
+def test_only_a_file_is_ever_replaced(tmp_path, monkeypatch, name):
+    """As root, a new file would take the place of a device; ``--out .`` was a traceback."""
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    with pytest.raises(WriteError, match="cannot write '") as caught:
+        write_atomically(Path(name), "text", WriteError)
+    assert str(caught.value).isprintable()
+    assert [p.name for p in tmp_path.iterdir()] == ["pipe"]
+    assert Path("pipe").is_fifo()
+
+
+@pytest.mark.parametrize("device", ["/dev/null", "/dev/stdout"])
+def test_a_device_is_never_replaced(monkeypatch, device):
+    monkeypatch.setattr(os, "replace", lambda *names: pytest.fail("replaced"))
+    with pytest.raises(WriteError, match=f"cannot write '{device}': it is no file"):
+        write_atomically(Path(device), "text", WriteError)
+
+
+def test_no_text_of_a_table_is_a_formula():
+    row = ["=cmd|' /C calc'!A0", "+1+1", "@SUM(1)", "-2+3", "\t=1", "-0.5", -0.5, "a=b", None]
+    assert csv_text([row]) == "'=cmd|' /C calc'!A0,'+1+1,'@SUM(1),'-2+3,'\t=1,-0.5,-0.5,a=b,\n"
+
+
+def test_half_written_files_of_another_s_folder_are_left_alone(tmp_path):
+    """A training that outlived its sweep was writing its checkpoint there."""
+    mine, theirs = tmp_path / ".0123.partial", tmp_path / "runs" / "a" / ".4567.partial"
+    theirs.parent.mkdir(parents=True)
+    (theirs.parent / ".lock").touch()
+    for path in (mine, theirs):
+        path.write_text("half")
+    lock_folder(tmp_path, WriteError).release()
+    assert not mine.exists()
+    assert theirs.exists()
 
 
 def test_a_name_as_long_as_names_can_be(tmp_path):

@@ -1,13 +1,16 @@
 """``results.json`` and score cards that somebody edited: each is one sentence for every reader."""
 
 import copy
+import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
 from gaitgauge.api import ResultsError, load_results
 from gaitgauge.gauge.board import write_board
 from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
+from gaitgauge.gauge.comparison_report import write_comparison
 from gaitgauge.gauge.result_check import MOST_ROWS, chance_rules_of
 from gaitgauge.gauge.validation import Measurements, ValidationError, validate
 from gaitgauge.gauge.verify import CardError, load_card
@@ -95,6 +98,20 @@ def test_scores_that_no_evaluation_writes_are_not_compared(edited):
 def test_the_library_reads_coverage_with_care(edited):
     with pytest.raises(ResultsError, match="was edited or is damaged"):
         load_results(edited("coverage", value=["complete"]))
+
+
+@pytest.mark.parametrize("path", ["a\n^^5cinput{b}.pt", "=1+1\r\n^^5cwrite18{c}.pt", "@SUM(1)\u2028\x1b[31m.pt"])
+def test_a_policy_s_name_is_neither_latex_nor_a_formula(edited, tmp_path, path):
+    """The name stands in a comment of the table for LaTeX, which a line's end ends; ``^^5c`` is a backslash there."""
+    found = compare([load_result(edited("policy", "path", value=path)), TRUE])
+    files = write_comparison(tmp_path, found)
+    tex = files["tex"].read_text()
+    assert tex.isascii() and all(c.isprintable() or c == "\n" for c in tex)
+    assert tex.splitlines()[1] == "" and tex.splitlines()[2].startswith(r"\begin{tabular}")
+    assert not re.search(r"(?m)^[^%]*\^\^", tex)
+    assert all(d.first.isprintable() for d in found.differences)
+    cells = {cell for row in csv.reader(files["csv"].open(newline="")) for cell in row}
+    assert not [c for c in cells if c.startswith(("=", "@"))]
 
 
 def test_policies_measured_in_other_motions_do_not_compare():
