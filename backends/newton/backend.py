@@ -146,20 +146,12 @@ class NewtonBackend(WarpBackend):
         n, joints = self.num_worlds, self._joints
         physics, state, motors, active = self.scene.physics, self._live, self._motors.arrays, self._active_array
         now, after = self._now, self._next
-        keep = (*self._coordinates(now), self._solver.warm_start, *self._kept)
+        changed = (*self._coordinates(now), self._solver.warm_start)
         width = max(self._world.layout.coordinates, self._world.layout.bodies, self._solver.warm_start.shape[1])
         if masked:
-            self._launch(kernels.keep_inactive, (n, width), self._layout, active, 0, *keep)
-        arguments = (
-            self._layout,
-            active,
-            self._request_array,
-            joints,
-            motors,
-            *self._coordinates(now),
-            state,
-        )
-        self._launch(kernels.begin_period, n, *arguments)
+            self._launch(kernels.copy_inactive, (n, width), self._layout, active, *changed, *self._kept)
+        moving = self._coordinates(now)
+        self._launch(kernels.begin_period, n, self._layout, active, self._request_array, joints, motors, *moving, state)
         for substep in range(total):
             self._launch(
                 kernels.motor_law,
@@ -213,7 +205,7 @@ class NewtonBackend(WarpBackend):
             for source, target in zip(self._coordinates(now), self._coordinates(self._now), strict=True):
                 wp.copy(target, source)
         if masked:
-            self._launch(kernels.keep_inactive, (n, width), self._layout, active, 1, *keep)
+            self._launch(kernels.copy_inactive, (n, width), self._layout, active, *self._kept, *changed)
 
     def _read(self, select: Any, value: int, state: Any, out: Any, *, contacts_of: Any) -> None:
         """Write the state of the worlds whose ``select`` equals ``value``; without ``contacts_of`` forces are zero."""

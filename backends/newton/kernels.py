@@ -160,22 +160,21 @@ def begin_period(
 
 
 @wp.kernel
-def keep_inactive(
+def copy_inactive(
     layout: Layout,
     active: wp.array[int],
-    restore: int,
     joint_q: wp.array[float],
     joint_qd: wp.array[float],
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     warm_start: wp.array2d[float],
-    kept_q: wp.array[float],
-    kept_qd: wp.array[float],
-    kept_body_q: wp.array[wp.transform],
-    kept_body_qd: wp.array[wp.spatial_vector],
-    kept_warm_start: wp.array2d[float],
+    to_joint_q: wp.array[float],
+    to_joint_qd: wp.array[float],
+    to_body_q: wp.array[wp.transform],
+    to_body_qd: wp.array[wp.spatial_vector],
+    to_warm_start: wp.array2d[float],
 ):
-    """Save (or restore) what a step changes in the worlds that must not step."""
+    """Copy what a step changes in the worlds that must not step: out of the way before it, and back after it."""
     world, i = wp.tid()
     if active[world] != 0:
         return
@@ -183,27 +182,14 @@ def keep_inactive(
     v = world * layout.dofs + i
     b = world * layout.bodies + i
     if i < layout.coordinates:
-        if restore == 0:
-            kept_q[q] = joint_q[q]
-        else:
-            joint_q[q] = kept_q[q]
+        to_joint_q[q] = joint_q[q]
     if i < layout.dofs:
-        if restore == 0:
-            kept_qd[v] = joint_qd[v]
-        else:
-            joint_qd[v] = kept_qd[v]
+        to_joint_qd[v] = joint_qd[v]
     if i < layout.bodies:
-        if restore == 0:
-            kept_body_q[b] = body_q[b]
-            kept_body_qd[b] = body_qd[b]
-        else:
-            body_q[b] = kept_body_q[b]
-            body_qd[b] = kept_body_qd[b]
+        to_body_q[b] = body_q[b]
+        to_body_qd[b] = body_qd[b]
     if i < warm_start.shape[1]:
-        if restore == 0:
-            kept_warm_start[world, i] = warm_start[world, i]
-        else:
-            warm_start[world, i] = kept_warm_start[world, i]
+        to_warm_start[world, i] = warm_start[world, i]
 
 
 @wp.kernel

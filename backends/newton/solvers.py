@@ -52,6 +52,11 @@ class SolverAdapter(ABC):
 
     warm_start: wp.array
     """What the solver carries from step to step, (N, W); W is 1 and the entry unused where it carries nothing."""
+    solver: Any
+    timestep: float
+    """Of a physics step [s]."""
+    fields: _FieldGeom | _FieldShape | None
+    """The height field of every world, None where no terrain has one."""
     contacts: newton.Contacts
     observables: newton.solvers.SolverBase.Observables
 
@@ -83,25 +88,28 @@ class SolverAdapter(ABC):
     def __init__(self, world: WorldModel, scene: Scene) -> None:
         """Make the solver and its contact buffers."""
 
-    @abstractmethod
     def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
         """One physics step. ``observe``: the contact forces are wanted."""
+        wanted = self.observables if observe else None
+        self.solver.step(before, after, control, self.contacts, self.timestep, observables=wanted)
 
     @abstractmethod
     def collect_overflow(self, active: Any, overflowed: Any) -> None:
         """Set the flags of the active worlds in which the last step dropped contacts or constraints."""
 
-    @abstractmethod
     def reset(self, state: newton.State, mask: Any) -> None:
         """Forget the past of the masked worlds; ``mask`` is (N + 1,) bool."""
+        self.solver.reset(state, mask, flags=0)
 
-    @abstractmethod
     def shapes_changed(self, terrain: Any) -> None:
         """Take over poses, sizes and friction of the model's shapes; ``terrain`` is each world's, (N,)."""
+        self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+        if self.fields is not None:
+            self.fields.place(terrain)
 
-    @abstractmethod
     def inertia_changed(self) -> None:
         """Take over masses, inertias and centres of mass of the model's bodies."""
+        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
 
 def _contacts_per_world(scene: Scene, world: WorldModel) -> int:
@@ -140,7 +148,7 @@ class MujocoAdapter(SolverAdapter):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the margins that it complains about are repaired below
             try:
-                self.solver: Any = newton.solvers.SolverMuJoCo(
+                self.solver = newton.solvers.SolverMuJoCo(
                     model,
                     nconmax=contacts,
                     njmax=_constraint_rows(scene, world, contacts),
@@ -159,7 +167,7 @@ class MujocoAdapter(SolverAdapter):
                     f"Newton's MuJoCo solver cannot build these terrains together: {error}; use fewer of them in one "
                     "scene, PhysicsOptions(self_collision=False), or the backend 'mujoco-warp'"
                 ) from error
-        self._timestep = physics.timestep
+        self.timestep = physics.timestep
         self._data, self._model = self.solver.mjw_data, self.solver.mjw_model
         if physics.deterministic:
             # mujoco_warp's own mode; Newton's switch for it asks Warp for one in which Newton's kernels do not compile
@@ -173,7 +181,7 @@ class MujocoAdapter(SolverAdapter):
             if world.layout.shape_ground[shape] == 0:
                 margin[:, geom] = model.shape_margin.numpy()[shape]
         self._margin: wp.array = wp.array(margin, dtype=float, device=model.device)
-        self._fields = _FieldGeom(self.solver, world, scene) if world.slots.fields else None
+        self.fields = _FieldGeom(self.solver, world, scene) if world.slots.fields else None
         self.warm_start = self._data.qacc_warmstart
         self.contacts = newton.Contacts(self.solver.get_max_contact_count(), 0, device=model.device)
         self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
@@ -192,12 +200,6 @@ class MujocoAdapter(SolverAdapter):
                 "use the backend 'mujoco-warp', or change the robot's model file"
             )
 
-    def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
-        """See ``SolverAdapter.step``."""
-        self.solver.step(
-            before, after, control, self.contacts, self._timestep, observables=self.observables if observe else None
-        )
-
     def collect_overflow(self, active: Any, overflowed: Any) -> None:
         """See ``SolverAdapter.collect_overflow``."""
         wp.launch(
@@ -207,21 +209,11 @@ class MujocoAdapter(SolverAdapter):
             device=active.device,
         )
 
-    def reset(self, state: newton.State, mask: Any) -> None:
-        """See ``SolverAdapter.reset``."""
-        self.solver.reset(state, mask, flags=0)
-
     def shapes_changed(self, terrain: Any) -> None:
         """See ``SolverAdapter.shapes_changed``."""
-        self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+        super().shapes_changed(terrain)
         # Newton zeroes margins for fear of an old limit of mujoco_warp
         wp.copy(self._model.geom_margin, self._margin)
-        if self._fields is not None:
-            self._fields.place(terrain)
-
-    def inertia_changed(self) -> None:
-        """See ``SolverAdapter.inertia_changed``."""
-        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
 
 def _geom_shapes(solver: Any) -> np.ndarray:
@@ -369,13 +361,13 @@ class SteelAdapter(SolverAdapter):
     def __init__(self, world: WorldModel, scene: Scene) -> None:
         physics, model = scene.physics, world.model
         contacts = _contacts_per_world(scene, world)
-        self._timestep = physics.timestep
+        self.timestep = physics.timestep
         # one coefficient acts, and the mean of two equal ones is it: the feet's, until it is randomized
         feet = float(np.mean([world.reference.geom(name).friction[0] for name in scene.robot.foot_geoms]))
         model.shape_material_mu.fill_(feet)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            self.solver: Any = newton.solvers.SolverSteel(
+            self.solver = newton.solvers.SolverSteel(
                 model,
                 iterations=physics.iterations,
                 enable_joint_limits=True,
@@ -392,7 +384,7 @@ class SteelAdapter(SolverAdapter):
             self._pipeline = newton.CollisionPipeline(
                 model, rigid_contact_max=contacts * scene.num_worlds + 256, deterministic=physics.deterministic
             )
-        self._fields = _FieldShape(world, scene) if world.slots.fields else None
+        self.fields = _FieldShape(world, scene) if world.slots.fields else None
         self.contacts = self._pipeline.contacts()
         self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
         self.warm_start = wp.zeros((scene.num_worlds, 1), dtype=float, device=model.device)
@@ -400,9 +392,7 @@ class SteelAdapter(SolverAdapter):
     def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
         """See ``SolverAdapter.step``."""
         self._pipeline.collide(before, self.contacts)
-        self.solver.step(
-            before, after, control, self.contacts, self._timestep, observables=self.observables if observe else None
-        )
+        super().step(before, after, control, observe=observe)
 
     def collect_overflow(self, active: Any, overflowed: Any) -> None:
         """See ``SolverAdapter.collect_overflow``."""
@@ -412,20 +402,6 @@ class SteelAdapter(SolverAdapter):
             inputs=[active, self.solver.constraint_overflow, overflowed],
             device=active.device,
         )
-
-    def reset(self, state: newton.State, mask: Any) -> None:
-        """See ``SolverAdapter.reset``."""
-        self.solver.reset(state, mask, flags=0)
-
-    def shapes_changed(self, terrain: Any) -> None:
-        """See ``SolverAdapter.shapes_changed``."""
-        self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
-        if self._fields is not None:
-            self._fields.place(terrain)
-
-    def inertia_changed(self) -> None:
-        """See ``SolverAdapter.inertia_changed``."""
-        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
 
 SOLVERS: Mapping[str, type[SolverAdapter]] = {each.name: each for each in (MujocoAdapter, SteelAdapter)}
