@@ -16,6 +16,14 @@ PolicyArgument = Annotated[
         autocompletion=completion.policies,
     ),
 ]
+PoliciesArgument = Annotated[
+    list[str],
+    typer.Argument(
+        help="One or more policy files (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
+        metavar="POLICY...",
+        autocompletion=completion.policies,
+    ),
+]
 LARGEST_SEED = 2**63 - 2**32
 """Commands count on from a seed."""
 
@@ -59,6 +67,9 @@ PayloadsOption = Annotated[
 ]
 SeedsOption = Annotated[
     list[int] | None, typer.Option(help="Seed of the quality episodes; repeatable. Default: the suite's.")
+]
+FirstSeedOption = Annotated[
+    int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first robot; the others' follow it.")
 ]
 ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")

@@ -5,6 +5,7 @@ Every adapter notes in the contract's provenance where it took the facts from an
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -164,18 +165,14 @@ def _deploy_contract(data: Mapping[str, Any], path: Path, robot: Robot) -> Polic
     scale_first = bool(settings.pop("scale_first", False))
     terms, lengths = [], set()
     for name, term in settings.items():
-        if name not in FOREIGN_TERMS:
-            raise PolicyError(f"'{path}' asks for the observation '{name}'; supported are: {', '.join(FOREIGN_TERMS)}")
-        scale = tuple(float(s) for s in _listed(term.get("scale"), 1.0))
-        terms.append(
-            ObservationTerm(name=FOREIGN_TERMS[name], scale=scale, clip=_clip(term, scale, path, name, scale_first))
-        )
+        own, scale = _own_term(name, path), tuple(float(s) for s in _listed(term.get("scale"), 1.0))
+        clip_of_term = None
+        if (given := term.get("clip")) is not None:
+            limit = _limit(float(given[0]), float(given[1]), name, path)
+            clip_of_term = (limit,) if scale_first else tuple(limit * abs(s) for s in scale)
+        terms.append(ObservationTerm(name=own, scale=scale, clip=clip_of_term))
         lengths.add(int(term.get("history_length") or 1))
-    if len(lengths) > 1:
-        raise PolicyError(
-            f"'{path}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
-        )
-    length = lengths.pop() if lengths else 1
+    length = _one_length(lengths, path)
     order: HistoryOrder = "frame-major" if frame_major or length == 1 else "term-major"
     return PolicyContract(
         robot=robot.name,
@@ -224,19 +221,29 @@ def _listed(value: Any, missing: float, count: int = 1) -> list[float]:
     return list(value) if isinstance(value, (list, tuple)) else [value] * count
 
 
-def _clip(
-    term: Mapping[str, Any], scale: tuple[float, ...], path: Path, name: str, scale_first: bool
-) -> tuple[float, ...] | None:
-    """The clip of an observation as magnitudes after scaling."""
-    clip = term.get("clip")
-    if clip is None:
-        return None
-    low, high = float(clip[0]), float(clip[1])
+def _own_term(name: str, source: object) -> str:
+    """The project's name of an observation."""
+    if name not in FOREIGN_TERMS:
+        raise PolicyError(f"'{source}' asks for the observation '{name}'; supported are: {', '.join(FOREIGN_TERMS)}")
+    return FOREIGN_TERMS[name]
+
+
+def _limit(low: float, high: float, name: str, source: object) -> float:
+    """The magnitude that an observation is clipped to."""
     if low != -high:
         raise PolicyError(
-            f"'{path}' clips the observation '{name}' to [{low}, {high}]; only symmetric limits are supported"
+            f"'{source}' clips the observation '{name}' to [{low}, {high}]; only symmetric limits are supported"
         )
-    return (high,) if scale_first else tuple(high * abs(s) for s in scale)
+    return high
+
+
+def _one_length(lengths: set[int], source: object) -> int:
+    """The length that the histories of all observations have."""
+    if len(lengths) > 1:
+        raise PolicyError(
+            f"'{source}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
+        )
+    return lengths.pop() if lengths else 1
 
 
 def mjlab_contract(metadata: Mapping[str, str], robot: Robot, *, source: str) -> PolicyContract | None:
@@ -266,30 +273,17 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
 
     names = tuple(matching_joint(n, robot) for n in words("joint_names"))
     observations = words("observation_names")
-    unknown = [n for n in observations if n not in FOREIGN_TERMS]
-    if unknown:
-        raise PolicyError(
-            f"'{source}' asks for the observation '{unknown[0]}'; supported are: {', '.join(FOREIGN_TERMS)}"
-        )
+    own = [_own_term(name, source) for name in observations]
     count = len(observations)
     scales = [float(s) for s in words("observation_terms_scale")] or [1.0] * count
     clips = words("observation_terms_clip") or ["-inf;inf"] * count
-    lengths = {max(1, int(float(n))) for n in words("observation_terms_history_length")} or {1}
-    if len(lengths) > 1:
-        raise PolicyError(
-            f"'{source}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
-        )
+    length = _one_length({max(1, int(float(n))) for n in words("observation_terms_history_length")}, source)
     terms = []
-    for name, scale, clip in zip(observations, scales, clips, strict=True):
+    for name, term, scale, clip in zip(observations, own, scales, clips, strict=True):
         low, high = (float(v) for v in clip.split(";"))
-        if low != -high:
-            raise PolicyError(
-                f"'{source}' clips the observation '{name}' to [{low}, {high}]; only symmetric limits are supported"
-            )
-        limit = None if high == float("inf") else high * abs(scale)
-        terms.append(ObservationTerm(name=FOREIGN_TERMS[name], scale=(scale,), clip=limit))
+        limit = _limit(low, high, name, source)
+        terms.append(ObservationTerm(name=term, scale=(scale,), clip=None if limit == math.inf else limit * abs(scale)))
     action_scale = [float(v) for v in words("action_scale")]
-    length = lengths.pop()
     return PolicyContract(
         robot=robot.name,
         joint_names=names,

@@ -9,18 +9,18 @@ import typer
 
 from .. import completion
 from ..errors import report_errors
-from ..options import LARGEST_SEED, DeviceOption, RobotOption, SuiteOption, ThreadsOption, TrustOption
+from ..options import (
+    DeviceOption,
+    FirstSeedOption,
+    PoliciesArgument,
+    RobotOption,
+    SuiteOption,
+    ThreadsOption,
+    TrustOption,
+)
 
 app = typer.Typer()
 
-PoliciesArgument = Annotated[
-    list[str],
-    typer.Argument(
-        help="One or more policy files (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
-        metavar="POLICY...",
-        autocompletion=completion.policies,
-    ),
-]
 EngineOption = Annotated[
     str,
     typer.Option(
@@ -46,9 +46,7 @@ def trial(
     repeats: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Robots in each scenario. Default: the scenario's own.")
     ] = None,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first robot; the others' follow it.")
-    ] = 0,
+    seed: FirstSeedOption = 0,
     backend: EngineOption = "mujoco",
     device: DeviceOption = None,
     robot: RobotOption = None,
@@ -96,9 +94,7 @@ def latent(
         int,
         typer.Option(min=2, max=1000, help="Robots for each terrain and command; the probe is tried on each in turn."),
     ] = 4,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first robots; the others' follow it.")
-    ] = 0,
+    seed: FirstSeedOption = 0,
     backend: EngineOption = "mujoco",
     robot: RobotOption = None,
     threads: ThreadsOption = None,

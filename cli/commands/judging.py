@@ -16,6 +16,7 @@ from ..options import (
     FrictionsOption,
     LevelOption,
     PayloadsOption,
+    PoliciesArgument,
     PolicyArgument,
     RobotOption,
     SeedsOption,
@@ -165,7 +166,7 @@ def verify(
     device: Annotated[
         str | None, typer.Option(help="cpu or cuda. Default: what the card's engine is made for.")
     ] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads. Default: all cores.")] = None,
+    threads: ThreadsOption = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="One environment of each terrain, at nominal friction and payload.")
     ] = False,
@@ -249,14 +250,7 @@ def validate(
 @app.command()
 @report_errors
 def consistency(
-    policies: Annotated[
-        list[str],
-        typer.Argument(
-            help="One or more policy files (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
-            metavar="POLICY...",
-            autocompletion=completion.policies,
-        ),
-    ],
+    policies: PoliciesArgument,
     backends: Annotated[
         str,
         typer.Option(
