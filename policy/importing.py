@@ -7,7 +7,6 @@ from pathlib import Path
 
 from ..robots import load_robot
 from ..robots.identity import identify
-from .base import PolicyError
 from .contract import PolicyContract
 from .finding import LOG_ROOT
 from .its_robot import REMEMBERED
@@ -50,10 +49,7 @@ def import_policy(
     if asked is not None and robot is not None:
         provenance[REMEMBERED] = identify(asked, robot)
     contract = replace(policy.contract, provenance=provenance)
-    try:
-        save_policy(destination, contract, policy.stored)
-    except OSError as error:
-        raise PolicyError(f"'{destination}' cannot be written: {error.strerror or error}") from error
+    save_policy(destination, contract, policy.stored)
     return contract
 
 

@@ -242,7 +242,7 @@ def test_import_replaces_nothing_unasked(refused, run, tmp_path, policy):
 
 def test_unwritable_destination_of_an_import(refused, tmp_path, policy):
     (tmp_path / "file").write_text("not a folder")
-    assert "cannot be written" in refused("import", policy, tmp_path / "file" / "out.gauge.pt")
+    assert "cannot write" in refused("import", policy, tmp_path / "file" / "out.gauge.pt")
 
 
 def test_unknown_list(refused):
