@@ -90,7 +90,7 @@ def _entry(name: str, card: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         "hash": card["policy"]["file_sha256"],
         "score": card["score"],
         "interval": card["score_interval"],
-        "note": card["chance"]["note"],
+        "note": card["chance"].get("note"),
         "level": card["level"],
         "observations": "not stated" if terms is None else "privileged" if privileged else "measurable",
         "terms": list(terms or ()),

@@ -142,9 +142,11 @@ def _compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None)
     rows = results[0]["environments"]
     order = {_key(row): at for at, row in enumerate(rows)}
     evidence = []
-    for at, found in enumerate(results):
+    for at, (label, found) in enumerate(zip(labels, results, strict=True)):
+        source = f"the results of '{label}'"
         same_order = sorted(found["environments"], key=lambda row: order[_key(row)])
-        evidence.append(Evidence(same_order, chance_rules_of(found, "results", ComparisonError), name=str(at)))
+        with edited(source, ComparisonError):
+            evidence.append(Evidence(same_order, chance_rules_of(found, source, ComparisonError), name=str(at)))
     paired = len({(tuple(r["chance"]["seeds"]), len(r["chance"]["search_seeds"])) for r in results}) == 1
     raw: list[tuple[str, str, int, int, tuple[float, float], Chance]] = []
     for first, second in combinations(range(len(results)), 2):

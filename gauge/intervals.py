@@ -26,7 +26,7 @@ from .level_curve import expected_levels
 
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]
-_Seeds = Annotated[tuple[Seed, ...], Field(max_length=10_000)]
+_Seeds = Annotated[tuple[Seed, ...], Field(min_length=1, max_length=10_000)]
 
 CONFIDENCE = 0.95
 _QUALITY_STEP = 0.85

@@ -2,30 +2,47 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field
 
-from ..files.parsing import Kind, Name, Text, build, shown
+from ..files.parsing import Kind, Name, Seed, Text, build, one_line, shown
 from .intervals import ChanceRules
+from .results import environment_weights
 
 MOST_ROWS = 10_000
 """Environments of one result."""
 MOST_REPLICATES = 20_000_000
 """Environments times replicates of the level searches, which are done again when results are compared."""
+_ROUNDING = 2e-6
+"""Of a score and of those that it is the mean of."""
 _Words = Annotated[str, Field(max_length=4096)]
+_Score = Annotated[float, Field(ge=0.0, le=1001.0)]
+"""A level weighs at most 1, and there are at most 1000."""
+_Level = Annotated[float, Field(ge=0, le=1000)]
+_Table = Mapping[Text, Mapping[Text, float | tuple[float, float] | None]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Result:
-    score: float | None
+    score: _Score | None
     score_interval: tuple[float, float] | None = None
-    level: float | None = None
+    level: _Level | None = None
     backend: Text
     robot: Name
     pipeline: Text
+    groups: Mapping[Text, float] = field(default_factory=dict)
+    terrains: _Table = field(default_factory=dict)
+    metrics: _Table = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Chance:
+    note: _Words | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,13 +72,26 @@ class _Row:
     terrain: Text
     friction: Annotated[float, Field(gt=0.0, le=10.0)]
     payload: Annotated[float, Field(ge=-5.0, le=50.0)]
-    level: Annotated[float, Field(ge=0, le=1000)] | None = None
-    score: float | None = None
+    level: _Level | None = None
+    score: _Score | None = None
+    quality: Mapping[Text, float] | None = None
+    metrics: Mapping[Text, Mapping[Text, float]] = field(default_factory=dict)
+    trials: Mapping[Seed, Mapping[Seed, bool]] = field(default_factory=dict)
+    runs: Mapping[Seed, Mapping[Text, float | Mapping[Text, float]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Provenance:
     digests: Mapping[str, Text] = field(default_factory=dict)
+
+
+_TABLES: Mapping[str, type] = {
+    "suite": _Suite,
+    "policy": _Policy,
+    "provenance": _Provenance,
+    "chance": _Chance,
+    "coverage": _Coverage,
+}
 
 
 def robot_digest_of(data: Mapping[str, Any]) -> str | None:
@@ -77,7 +107,7 @@ def check_result(data: Mapping[str, Any], source: str, error: type[Exception]) -
         error: something is missing, of another type, or out of range.
     """
     take(_Result, data, source, error)
-    for key, kind in {"suite": _Suite, "policy": _Policy, "provenance": _Provenance, "coverage": _Coverage}.items():
+    for key, kind in _TABLES.items():
         if key != "coverage" or data.get(key) is not None:  # older results do not state theirs
             take(kind, data.get(key), f"{source}: {key}", error)
     rows = data.get("environments")
@@ -85,6 +115,32 @@ def check_result(data: Mapping[str, Any], source: str, error: type[Exception]) -
         raise error(f"{source}: environments is {shown(rows)}; it must be a list of at most {MOST_ROWS:,}")
     for at, row in enumerate(rows):
         take(_Row, row, f"{source}: environments[{at}]", error)
+    _check_score(data, source, error)
+
+
+def _check_score(data: Mapping[str, Any], source: str, error: type[Exception]) -> None:
+    """Check that a score is that of the environments: each once, the mean of theirs."""
+    score, interval, rows = data["score"], data.get("score_interval"), data["environments"]
+    keys = [(row["terrain"], row["friction"], row["payload"]) for row in rows]
+    if twice := next((key for key, count in Counter(keys).items() if count > 1), None):
+        terrain, friction, payload = twice
+        raise error(
+            f"{source}: {one_line(terrain, 80)} at friction {friction:g} and payload {payload:g} kg is "
+            f"there twice; {_BY_HAND}"
+        )
+    if interval is not None and interval[0] > interval[1]:
+        raise error(f"{source}: score_interval is {shown(list(interval))}; its ends must rise")
+    if score is None or not rows:
+        return
+    scores = [row.get("score") for row in rows]
+    if None in scores:
+        raise error(f"{source}: environments[{scores.index(None)}] has no score, but all of them have one; {_BY_HAND}")
+    mean = float(environment_weights([row["terrain"] for row in rows]) @ np.array(scores))
+    if abs(mean - score) > _ROUNDING:
+        raise error(f"{source}: score is {score:g}, but that of its environments is {mean:.6f}; {_BY_HAND}")
+
+
+_BY_HAND = "it was changed by hand, so ask its maker for the results.json of the run"
 
 
 def chance_rules_of(data: Mapping[str, Any], source: str, error: type[Exception]) -> ChanceRules:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -130,8 +131,8 @@ def fold(
 
 def environment_weights(terrains: Sequence[str]) -> Array:
     """Weight of each environment in the benchmark's score: terrains count the same, and so do the environments of one, (E,)."""
-    count = len(set(terrains))
-    return np.array([1.0 / (count * list(terrains).count(t)) for t in terrains])
+    counts = Counter(terrains)
+    return np.array([1.0 / (len(counts) * counts[t]) for t in terrains])
 
 
 def _level(found: float | None) -> float | None:

@@ -64,11 +64,13 @@ def prepare_replay(
     if fresh is not None and card["score_interval"] is None:
         raise CardError("the card has no interval, so that nothing can be said of other seeds; leave out --fresh")
     if policy is None and not Path(path).is_file():
-        raise CardError(f"the card's policy is not at '{path}' on this machine; say where it is with --policy")
+        raise CardError(
+            f"the card's policy is not at '{one_line(path)}' on this machine; say where it is with --policy"
+        )
     found = file_digest(path)
     if found != card["policy"]["file_sha256"]:
         raise CardError(
-            f"'{path}' is another policy than the card's: SHA-256 {found[:12]}…, not {card['policy']['file_sha256'][:12]}…; "
+            f"'{one_line(path)}' is another policy than the card's: SHA-256 {found[:12]}…, not {card['policy']['file_sha256'][:12]}…; "
             "give the right file with --policy"
         )
     rules = load_suite(suite or wanted["name"])

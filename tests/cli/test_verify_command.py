@@ -44,6 +44,7 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
     assert "played 2 of the card's 4 environments, one of each terrain" in words
     assert "every outcome is the same to the last digit" in words
 
+    content["score"] += 0.3
     for row in content["environments"]:
         row["score"] = row["score"] + 0.3
         for played in row.get("runs", {}).values():

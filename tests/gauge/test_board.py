@@ -5,6 +5,7 @@ import json
 import pytest
 from gaitgauge.gauge.board import board_data, render_board, write_board
 from gaitgauge.gauge.comparison import ComparisonError
+from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.gauge.verify import CardError
 from test_report import HOSTILE, Page, sample
@@ -101,7 +102,9 @@ def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(tmp_path):
     whole["suite"]["digest"] = load_suite("robogauge-1.1").digest
     (tmp_path / "card.json").write_text(json.dumps(whole))
     write_board(tmp_path, tmp_path / "board.html")
-    whole["environments"] = [row for row in whole["environments"] if row["friction"] != 0.2]
+    rows = [row for row in whole["environments"] if row["friction"] != 0.2]
+    weights = environment_weights([row["terrain"] for row in rows])
+    whole |= {"environments": rows, "score": float(weights @ [row["score"] for row in rows])}
     (tmp_path / "card.json").write_text(json.dumps(whole))
     with pytest.raises(CardError, match=r"card\.json' calls itself complete, but holds 8 of 9 frictions"):
         write_board(tmp_path, tmp_path / "board.html")

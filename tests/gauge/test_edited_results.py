@@ -59,6 +59,22 @@ def test_an_expected_level_is_no_edited_one(edited):
         (("environments", 0, "friction"), -1, "friction is -1"),
         (("environments", 1, "level"), 10**9, "level is 1000000000"),
         (("provenance", "digests"), 3, "provenance: digests is 3"),
+        (("score",), 1e308, "score is 1e"),
+        (("score",), -0.5, "score is -0.5"),
+        (("score",), 0.9, "score is 0.9, but that of its environments is 0.134166"),
+        (("score_interval",), [0.9, 0.1], "its ends must rise"),
+        (("groups",), {"tracking": "good"}, "groups.tracking is 'good'"),
+        (("metrics",), {"zmp_margin": 1.0}, "metrics.zmp_margin is 1.0"),
+        (("terrains", "flat"), 3, "terrains.flat is 3"),
+        (("chance",), None, "chance is None"),
+        (("chance", "note"), 3, "chance: note is 3"),
+        (("environments",), TRUE["environments"] * 2, "is there twice"),
+        (("environments", 0, "score"), None, r"environments\[0\] has no score"),
+        (("environments", 0, "runs"), 5, "runs is 5"),
+        (("environments", 0, "runs"), {"x": {}}, "'x'; it must be a whole number"),
+        (("environments", 0, "runs"), {"0": {"quality": "high"}}, "runs.0.quality is 'high'"),
+        (("environments", 0, "metrics"), {"zmp_margin": 3}, "metrics.zmp_margin is 3"),
+        (("environments", 1, "trials"), {"1": {"2": "no"}}, "trials.1.2 is 'no'"),
     ],
 )
 def test_every_reader_of_cards_names_the_value(edited, tmp_path, path, value, named):
@@ -72,9 +88,14 @@ def test_every_reader_of_cards_names_the_value(edited, tmp_path, path, value, na
 
 @pytest.mark.parametrize(
     ("key", "value", "named"),
-    [("resamples", 10**9, "resamples is"), ("levels", 10**9, "levels is"), ("seeds", "all", "seeds is")],
+    [
+        ("resamples", 10**9, "resamples is"),
+        ("levels", 10**9, "levels is"),
+        ("seeds", "all", "seeds is"),
+        ("seeds", [], r"the (card|results of 'one'): chance: seeds is \[\]"),
+    ],
 )
-def test_rules_of_chance_that_would_take_all_memory(edited, key, value, named):
+def test_rules_of_chance_that_are_none_or_would_take_all_memory(edited, key, value, named):
     file = edited("chance", key, value=value)
     with pytest.raises(ComparisonError, match=named):
         compare([load_result(file), TRUE], ["one", "two"])
@@ -83,7 +104,10 @@ def test_rules_of_chance_that_would_take_all_memory(edited, key, value, named):
 
 
 def test_many_rows_with_many_replicates_are_too_many(edited):
-    many = load_result(edited("environments", value=TRUE["environments"][:1] * 1000))
+    rows = [TRUE["environments"][0] | {"payload": 0.01 * at} for at in range(1000)]
+    file = edited("environments", value=rows)
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"score": rows[0]["score"]}))
+    many = load_result(file)
     many["chance"]["resamples"] = 100_000
     with pytest.raises(ComparisonError, match="1000 environments with 100,000 replicates"):
         compare([many, many], ["one", "two"])
