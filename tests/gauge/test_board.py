@@ -8,7 +8,7 @@ from gaitgauge.gauge.comparison import ComparisonError
 from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.gauge.verify import CardError
-from test_report import HOSTILE, Page, sample
+from sample_results import HOSTILE, Page, sample
 
 
 def card(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gaitgauge.gauge.comparison import ComparisonError, compare, holm, load_result
 from gaitgauge.gauge.comparison_report import as_csv, as_latex, as_page, write_comparison
-from test_report import sample
+from sample_results import sample
 
 SCORE_CARDS = Path(__file__).parents[2] / "docs" / "data" / "scorecards"
 

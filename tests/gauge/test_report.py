@@ -1,131 +1,20 @@
-"""The report: what it shows for every pipeline, where its charts put known data, and that hostile text stays text."""
+"""The report: what it shows for every pipeline, and that hostile text stays text."""
 
 import json
-import math
 import re
-import zlib
 from contextlib import suppress
-from copy import deepcopy
-from dataclasses import replace
-from functools import cache
-from html.parser import HTMLParser
 
-import numpy as np
 import pytest
 from gaitgauge.api import ResultsError, load_results
-from gaitgauge.gauge import charts
 from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
-from gaitgauge.gauge.coverage import coverage
-from gaitgauge.gauge.episodes import Record
-from gaitgauge.gauge.pipelines import make_environments
-from gaitgauge.gauge.plan import PlanRules, environment_result, plan
-from gaitgauge.gauge.report import CLIP, STATISTIC_LABELS, metric_matrix, render, report_data, warnings, write_report
-from gaitgauge.gauge.results import fold, health
+from gaitgauge.gauge.report import CLIP, metric_matrix, render, warnings, write_report
 from gaitgauge.gauge.store import StoreError
-from gaitgauge.gauge.suite import load_suite
-
-HOSTILE = 'a/<img src="http://evil.example/x.png" onerror=alert(1)></script><script>alert(2)</script>&"\'.pt'
-REACH = {"slope_fd": 7, "slope_bd": 6, "stairs_fd": 9, "stairs_bd": 4, "wave": 8, "obstacle": 3}
-
-
-def ended(suite, episode, generator, reached):
-    """A record of random but plausible samples, worse on harder ground and slippery floors; a target met up to a level."""
-    if episode.stage == "search":
-        return Record(episode=episode, success=episode.level <= reached)
-    names = [*suite.metrics.weights, "quality"]
-    centre = 0.82 - 0.03 * episode.level - 0.15 * (episode.friction < 0.35)
-    by_metric = np.array([0.12 * math.sin(zlib.crc32(n.encode())) for n in names])
-    samples = np.clip(centre + by_metric + 0.12 * generator.standard_normal((120, len(names))), 0, 1).astype(np.float32)
-    return Record(
-        episode=episode,
-        falls=int(generator.random() < 0.04),
-        columns=tuple(names),
-        samples=samples,
-        goal_index=np.repeat([0, 1], 60).astype(np.int16),
-        part_index=np.tile(np.repeat(np.arange(6), 10), 2).astype(np.int16),
-    )
-
-
-def sample(pipeline="stress", suite="robogauge-1.1", resamples=10, **choices):
-    """What ``evaluate`` would write, from synthetic records; a copy for the test to change."""
-    return deepcopy(_sample(pipeline, suite, resamples, **choices))
-
-
-@cache
-def _sample(pipeline, suite, resamples, reach=None, **choices):
-    suite = load_suite(suite)
-    suite = replace(suite, scoring=replace(suite.scoring, bootstrap=resamples))
-    generator = np.random.default_rng(0)
-    chosen = {"terrains": suite.matrix.terrains, "frictions": None, "payloads": None, "level": None, **choices}
-    rules = PlanRules(suite=suite, seeds=suite.matrix.seeds, quality=pipeline != "level")
-    environments = []
-    for environment in make_environments(suite, **chosen):
-        handicap = round(6 * max(0.0, 0.4 - environment.friction) + max(0.0, environment.payload))
-        reached = (REACH.get(environment.terrain, 0) if reach is None else reach) - 2 * handicap
-        records = {}
-        while required := plan(environment, records, rules).required:
-            records |= {e: ended(suite, e, generator, reached) for e in required}
-        environments.append(environment_result(environment, records, rules))
-    results = fold(suite, environments, (*suite.metrics.weights, "quality"))
-    policy = {"path": "policies/go2_cts.pt", "contract_hash": "ab" * 32, "file_sha256": "cd" * 32}
-    covered = coverage(suite, make_environments(suite, **chosen), suite.matrix.seeds, pipeline=pipeline)
-    return results | {
-        "coverage": covered,
-        "policy": policy | {"provenance": {"adapter": "TorchScript", "steps": 5}},
-        "pipeline": pipeline,
-        "backend": "mujoco",
-        "robot": "go2",
-        "health": dict(health(environments)),
-        "provenance": {
-            "versions": {"python": "3.11.2", "gaitgauge": "0.1.0", "mujoco": "3.17.0", "torch": "2.13.0"},
-            "command": "gaitgauge evaluate policies/go2_cts.pt --suite robogauge-1.1",
-            "date": "2026-01-02T03:04:05+00:00",
-            "host": "lab",
-            "machine": "x86_64, 2 CPUs, Linux 6.1",
-            "device": "cpu",
-            "threads": 2,
-            "seconds": 152.5,
-            "physics_steps": 1_234_567,
-        },
-    }
-
-
-PIPELINES = {
-    "base": {"terrains": ("flat",), "frictions": (0.6,), "payloads": (0.0,)},
-    "multi": {"terrains": ("slope_fd", "wave"), "frictions": (0.4, 0.6), "payloads": (0.0, 2.0), "level": 5},
-    "level": {"terrains": tuple(REACH)},
-    "stress": {},
-}
+from sample_results import HOSTILE, PIPELINES, Page, row, sample
 
 
 @pytest.fixture(scope="module")
 def stress():
     return sample()
-
-
-class Page(HTMLParser):
-    """Collects tags with their attributes, and text."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.words, self.open = [], [], []
-        self.feed(text)
-        self.text = " ".join(" ".join(self.words).split())
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append((tag, dict(attributes)))
-        if tag not in ("meta", "input", "img", "link", "br"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag, f"</{tag}> closes nothing"
-
-    def handle_data(self, data):
-        if self.open[-1:] not in (["style"], ["script"]):
-            self.words.append(data)
-
-    def count(self, tag):
-        return sum(t == tag for t, _ in self.tags)
 
 
 @pytest.mark.parametrize("pipeline", PIPELINES)
@@ -314,89 +203,6 @@ def test_missing_or_damaged_results_are_one_clear_sentence(tmp_path, content, wo
     assert (tmp_path / "report.html").read_text() == "earlier"
 
 
-def test_radar_puts_values_on_their_spokes():
-    terrains = {
-        n: {"mean": 1.0, "mean25": 0.0, "mean50": v} for n, v in zip("abcd", (1.0, 0.5, 0.25, 0.0), strict=True)
-    }
-    radar = charts.radar(terrains, STATISTIC_LABELS)
-    (x, y), radius = radar["centre"], radar["centre"][1] - radar["spokes"][0]["y"]
-    shapes = {s["statistic"]: s["points"] for s in radar["shapes"]}
-    assert shapes["mean50"] == [(x, y - radius), (x + radius / 2, y), (x, y + radius / 4), (x, y)]
-    assert shapes["mean25"] == [(x, y)] * 4
-    assert shapes["mean"] == [(s["x"], s["y"]) for s in radar["spokes"]]
-    assert [s["label"]["anchor"] for s in radar["spokes"]] == ["middle", "start", "middle", "end"]
-
-
-def test_two_terrains_have_bars_in_place_of_a_radar():
-    data = report_data(sample("multi", **PIPELINES["multi"]))
-    assert data["radar"] is None
-    marks = data["terrains"]["wave"]["strip"]["marks"]
-    row = data["terrains"]["wave"]
-    assert marks["mean50"] == pytest.approx(5 + 190 * row["mean50"], abs=0.01)
-    assert marks["mean25"] < marks["mean50"] < marks["mean"]
-
-
-def row(terrain="wave", friction=0.6, payload=0.0, level=5, **more):
-    return {"terrain": terrain, "friction": friction, "payload": payload, "level": level, **more}
-
-
-def test_sweep_puts_levels_between_nought_and_ten():
-    rows = [
-        row(friction=1.0, level=10),
-        row(friction=0.2, level=0),
-        row(friction=0.6, level=5),
-        row("stairs_fd", level=3),
-    ]
-    (panel,) = charts.sweep(rows, axis="friction", quantity="level")
-    left, right, top, bottom = panel["frame"]
-    points = panel["points"]
-    assert panel["terrain"] == "wave"
-    assert [p["y"] for p in points] == [bottom, (top + bottom) / 2, top]
-    assert [p["x"] for p in points] == [left + 8, (left + right) / 2, right - 8]
-    assert [p["failed"] for p in points] == [True, False, False]
-
-
-def test_sweep_draws_whiskers_at_the_interval_and_marks_falls():
-    rows = [row("flat", f, level=None, score=0.5, interval=[0.25, 0.75], falls=f > 0.5) for f in (0.4, 0.8)]
-    (panel,) = charts.sweep(rows, axis="friction", quantity="score")
-    _, _, top, bottom = panel["frame"]
-    for point in panel["points"]:
-        assert point["whisker"] == [bottom - 0.25 * (bottom - top), bottom - 0.75 * (bottom - top)]
-    assert [p["failed"] for p in panel["points"]] == [False, True]
-
-
-def test_payloads_have_their_own_axis_at_the_nominal_friction():
-    figures = report_data(sample(suite="gaitgauge-1"))["level_figures"]
-    assert [f["title"] for f in figures] == ["over friction at payload 0 kg", "over payload at friction 0.6"]
-    assert [len(p["points"]) for p in figures[1]["panels"]] == [5] * 6
-
-
-def test_crossed_payloads_become_a_map():
-    rows = [row(friction=f, payload=p, level=int(10 * f)) for f in (0.2, 0.6, 1.0) for p in (-1.0, 2.0)]
-    assert charts.sweep(rows, axis="friction", quantity="level") == []
-    assert charts.sweep(rows, axis="payload", quantity="level") == []
-    (chart,) = charts.heat(rows, quantity="level")
-    cells = {c["title"]: c for c in chart["cells"]}
-    low, high = cells["friction 0.2, payload −1 kg: 2"], cells["friction 1, payload 2 kg: 10"]
-    assert (low["share"], high["share"]) == (0.2, 1.0)
-    assert high["x"] - low["x"] == 2 * chart["cell"][0]
-    assert low["y"] - high["y"] == chart["cell"][1]
-
-
-def test_search_chart_tells_passed_missed_and_untried_levels():
-    rows = [row(level=6, search={"5": True, "8": False, "7": False, "6": True}), row("flat", level=None)]
-    (chart,) = charts.searches(rows)
-    (line,) = chart["lines"]
-    column = [round((x - chart["left"]) / chart["cell"]) + 1 for x in line["passed"] + line["failed"] + line["open"]]
-    assert column == [5, 6, 7, 8, 1, 2, 3, 4, 9, 10]
-    assert line["reached"] == chart["left"] + 5 * chart["cell"]
-
-
-def test_search_that_passes_nothing_marks_no_level():
-    (chart,) = charts.searches([row(level=0, search={"5": False, "2": False, "1": False})])
-    assert chart["lines"][0]["reached"] is None
-
-
 def test_warnings_name_what_failed_and_where():
     rows = [
         row(level=0, search={"1": False}),
@@ -440,17 +246,3 @@ def test_unknown_metrics_and_terrains_go_by_their_names(stress):
     page = Page(render(results))
     assert "heart rate" in page.text
     assert "gravel pit" in page.text
-
-
-def test_curves_have_round_ticks_and_leave_out_what_is_not_finite():
-    """Of a frame from (46, 8) to (470, 222)."""
-    data = charts.curves({"a": [([0.0, 4.0], [-1.0, 3.0])], "b": [([1.0, 2.0, 3.0], [1.0, math.nan, 2.0])]})
-    assert data["frame"] == (46.0, 470.0, 8.0, 222.0)
-    assert [line["points"] for line in data["lines"]] == [
-        [(46.0, 222.0), (470.0, 8.0)],
-        [(152.0, 115.0), (364.0, 61.5)],
-    ]
-    assert [(line["label"], line["turn"]) for line in data["lines"]] == [("a", 0), ("b", 1)]
-    assert [t["label"] for t in data["x_ticks"]] == ["0", "1", "2", "3", "4"]
-    assert [t["label"] for t in data["y_ticks"]] == ["−1", "0", "1", "2", "3"]
-    assert charts.curves({"none": []})["lines"] == []

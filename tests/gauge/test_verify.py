@@ -7,7 +7,7 @@ from gaitgauge.gauge.comparison import ComparisonError
 from gaitgauge.gauge.evaluate import Request, file_digest, identity, prepare
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.gauge.verify import CardError, check_coverage, judge, load_card, prepare_replay, with_fresh_seeds
-from test_report import sample
+from sample_results import sample
 
 
 @pytest.fixture

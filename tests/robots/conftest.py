@@ -4,9 +4,10 @@ from pathlib import Path
 import pytest
 from gaitgauge.robots import JointParameters, Robot
 
-# The unseen robot is shared by several test files.
+# The robots are shared by several test files.
 sys.path.insert(0, str(Path(__file__).parent))
 
+from hopper import HOPPER, HOPPER_MJCF
 from unseen_robot import LEGS, write_unseen
 
 
@@ -45,3 +46,22 @@ def unseen(tmp_path_factory):
         parameters={"gauge": motors},
         command_limits=(1.5, 0.7, 1.5),
     )
+
+
+@pytest.fixture
+def write_hopper(tmp_path):
+    """Writes a user's robot, with pieces of text replaced, and returns the path of its robot.toml."""
+
+    def write(*changes: tuple[str, str], mjcf: tuple[str, str] = ("", "")) -> Path:
+        description = HOPPER
+        for old, new in changes:
+            assert old in description
+            description = description.replace(old, new)
+        assert mjcf[0] in HOPPER_MJCF
+        (tmp_path / "model").mkdir(exist_ok=True)
+        (tmp_path / "model" / "hopper.xml").write_text(HOPPER_MJCF.replace(*mjcf) if mjcf[0] else HOPPER_MJCF)
+        path = tmp_path / "robot.toml"
+        path.write_text(description)
+        return path
+
+    return write

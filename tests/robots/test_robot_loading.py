@@ -3,85 +3,12 @@
 import subprocess
 import sys
 from dataclasses import replace
-from importlib.metadata import EntryPoint
-from pathlib import Path
 
 import pytest
-from gaitgauge.files import plugins as plugins_module
-from gaitgauge.robots import JointParameters, Robot, RobotError, check_robot, checking, load_robot, robot_names
+from gaitgauge.robots import JointParameters, RobotError, check_robot, checking, load_robot, robot_names
 from gaitgauge.robots.loading import robot_digest
 
 LEGS = ("FL", "FR", "RL", "RR")
-
-HOPPER_MJCF = """
-<mujoco>
-  <compiler angle="radian"/>
-  <worldbody>
-    <body name="trunk">
-      <freejoint/>
-      <geom name="chest" type="box" size="0.1 0.1 0.05" mass="3"/>
-      <site name="imu"/>
-      <body name="upper" pos="0 0 -0.05">
-        <joint name="hip" axis="0 1 0" range="-1 1"/>
-        <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.5"/>
-        <body name="lower" pos="0 0 -0.2">
-          <joint name="left_knee_joint" axis="0 1 0" range="-2 0"/>
-          <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.015" mass="0.3"/>
-          <geom name="foot" type="sphere" size="0.02" pos="0 0 -0.2"/>
-          <site name="foot" pos="0 0 -0.2"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position joint="hip"/>
-    <position joint="left_knee_joint"/>
-  </actuator>
-</mujoco>
-"""
-
-HOPPER = """
-name = "hopper"
-title = "One leg"
-mjcf = "model/hopper.xml"
-joint_names = ["hip", "left_knee_joint"]
-default_joint_position = [0.3, -0.6]
-base_body = "trunk"
-foot_names = ["foot"]
-collision_bodies = ["trunk", "upper", "lower"]
-trunk_shapes = ["chest"]
-imu_site = "imu"
-stand_height = 0.5
-command_limits = [0.5, 0, 1]
-default_parameters = "soft"
-
-[parameters.soft]
-stiffness = 30
-damping = { hip = 1.0, knee = 2.0 }
-torque_limit = [40, 50]
-armature = 0.01
-joint_damping = 0
-friction_loss = 0.1
-"""
-
-
-@pytest.fixture
-def write_hopper(tmp_path):
-    """Writes a user's robot, with pieces of text replaced, and returns the path of its robot.toml."""
-
-    def write(*changes: tuple[str, str], mjcf: tuple[str, str] = ("", "")) -> Path:
-        description = HOPPER
-        for old, new in changes:
-            assert old in description
-            description = description.replace(old, new)
-        assert mjcf[0] in HOPPER_MJCF
-        (tmp_path / "model").mkdir(exist_ok=True)
-        (tmp_path / "model" / "hopper.xml").write_text(HOPPER_MJCF.replace(*mjcf) if mjcf[0] else HOPPER_MJCF)
-        path = tmp_path / "robot.toml"
-        path.write_text(description)
-        return path
-
-    return write
 
 
 def test_go2_description():
@@ -298,88 +225,6 @@ def test_description_that_the_model_contradicts(write_hopper, changes, mjcf, mes
         load_robot(path)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-GO2 = load_robot("go2")
-PLUGIN_PATH = ""
-
-
-def plugin_robot() -> Robot:
-    return replace(GO2, name="plugged")
-
-
-def plugin_nonsense() -> int:
-    return 3
-
-
-def plugin_that_exits() -> Robot:
-    raise SystemExit(3)
-
-
-def plugin_that_raises() -> Robot:
-    raise KeyError("x")
-
-
-def plugin_out_of_range() -> Robot:
-    return replace(GO2, name="plugged", stand_height=-1)
-
-
-@pytest.fixture
-def install_plugin(monkeypatch):
-    """Pretends that a package with one entry point is installed."""
-
-    def install(name: str, value: str) -> None:
-        monkeypatch.setitem(sys.modules, "robot_plugin", sys.modules[__name__])
-        found = [EntryPoint(name=name, value=value, group="gaitgauge.robots")]
-        monkeypatch.setattr(plugins_module, "entry_points", lambda group: [e for e in found if e.group == group])
-
-    return install
-
-
-def test_plugin_callable(install_plugin):
-    install_plugin("plugged", "robot_plugin:plugin_robot")
-    assert robot_names() == ["anymal_c", "go1", "go2", "plugged"]
-    assert load_robot("plugged") == plugin_robot()
-
-
-def test_plugin_path(install_plugin, write_hopper, monkeypatch):
-    monkeypatch.setattr(sys.modules[__name__], "PLUGIN_PATH", str(write_hopper()))
-    install_plugin("hopper", "robot_plugin:PLUGIN_PATH")
-    assert load_robot("hopper").title == "One leg"
-
-
-def test_plugin_does_not_replace_an_own_robot(install_plugin):
-    install_plugin("go2", "robot_plugin:plugin_robot")
-    assert robot_names() == ["anymal_c", "go1", "go2"]
-    assert load_robot("go2") == GO2
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        (
-            "plugged",
-            "no_such_module_anywhere:robot",
-            "failed: ModuleNotFoundError: No module named 'no_such_module_anywhere'",
-        ),
-        ("plugged", "robot_plugin:no_such_attribute", "failed: AttributeError"),
-        ("plugged", "robot_plugin:plugin_that_exits", "failed: SystemExit: 3; mend or uninstall it"),
-        ("plugged", "robot_plugin:plugin_that_raises", "failed: KeyError: 'x'"),
-        ("plugged", "robot_plugin:plugin_out_of_range", "stand_height is -1; it must be greater than 0"),
-        ("plugged", "not an entry point", "failed: AttributeError"),
-        ("plugged", "robot_plugin:plugin_nonsense", "gave int; it must be a path or a callable"),
-        (
-            "other",
-            "robot_plugin:plugin_robot",
-            "a robot named 'plugged'; entry point and robot must bear the same name",
-        ),
-    ],
-)
-def test_broken_plugin(install_plugin, name, value, message):
-    install_plugin(name, value)
-    with pytest.raises(RobotError) as caught:
-        load_robot(name)
-    assert message in str(caught.value)
 
 
 def test_listing_and_loading_import_no_engine():

@@ -1,0 +1,120 @@
+"""Results as ``evaluate`` writes them, from synthetic records, and a page taken apart."""
+
+import math
+import zlib
+from copy import deepcopy
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+
+import numpy as np
+from gaitgauge.gauge.coverage import coverage
+from gaitgauge.gauge.episodes import Record
+from gaitgauge.gauge.pipelines import make_environments
+from gaitgauge.gauge.plan import PlanRules, environment_result, plan
+from gaitgauge.gauge.results import fold, health
+from gaitgauge.gauge.suite import load_suite
+
+HOSTILE = 'a/<img src="http://evil.example/x.png" onerror=alert(1)></script><script>alert(2)</script>&"\'.pt'
+
+
+REACH = {"slope_fd": 7, "slope_bd": 6, "stairs_fd": 9, "stairs_bd": 4, "wave": 8, "obstacle": 3}
+
+
+def ended(suite, episode, generator, reached):
+    """A record of random but plausible samples, worse on harder ground and slippery floors; a target met up to a level."""
+    if episode.stage == "search":
+        return Record(episode=episode, success=episode.level <= reached)
+    names = [*suite.metrics.weights, "quality"]
+    centre = 0.82 - 0.03 * episode.level - 0.15 * (episode.friction < 0.35)
+    by_metric = np.array([0.12 * math.sin(zlib.crc32(n.encode())) for n in names])
+    samples = np.clip(centre + by_metric + 0.12 * generator.standard_normal((120, len(names))), 0, 1).astype(np.float32)
+    return Record(
+        episode=episode,
+        falls=int(generator.random() < 0.04),
+        columns=tuple(names),
+        samples=samples,
+        goal_index=np.repeat([0, 1], 60).astype(np.int16),
+        part_index=np.tile(np.repeat(np.arange(6), 10), 2).astype(np.int16),
+    )
+
+
+def sample(pipeline="stress", suite="robogauge-1.1", resamples=10, **choices):
+    """What ``evaluate`` would write, from synthetic records; a copy for the test to change."""
+    return deepcopy(_sample(pipeline, suite, resamples, **choices))
+
+
+@cache
+def _sample(pipeline, suite, resamples, reach=None, **choices):
+    suite = load_suite(suite)
+    suite = replace(suite, scoring=replace(suite.scoring, bootstrap=resamples))
+    generator = np.random.default_rng(0)
+    chosen = {"terrains": suite.matrix.terrains, "frictions": None, "payloads": None, "level": None, **choices}
+    rules = PlanRules(suite=suite, seeds=suite.matrix.seeds, quality=pipeline != "level")
+    environments = []
+    for environment in make_environments(suite, **chosen):
+        handicap = round(6 * max(0.0, 0.4 - environment.friction) + max(0.0, environment.payload))
+        reached = (REACH.get(environment.terrain, 0) if reach is None else reach) - 2 * handicap
+        records = {}
+        while required := plan(environment, records, rules).required:
+            records |= {e: ended(suite, e, generator, reached) for e in required}
+        environments.append(environment_result(environment, records, rules))
+    results = fold(suite, environments, (*suite.metrics.weights, "quality"))
+    policy = {"path": "policies/go2_cts.pt", "contract_hash": "ab" * 32, "file_sha256": "cd" * 32}
+    covered = coverage(suite, make_environments(suite, **chosen), suite.matrix.seeds, pipeline=pipeline)
+    return results | {
+        "coverage": covered,
+        "policy": policy | {"provenance": {"adapter": "TorchScript", "steps": 5}},
+        "pipeline": pipeline,
+        "backend": "mujoco",
+        "robot": "go2",
+        "health": dict(health(environments)),
+        "provenance": {
+            "versions": {"python": "3.11.2", "gaitgauge": "0.1.0", "mujoco": "3.17.0", "torch": "2.13.0"},
+            "command": "gaitgauge evaluate policies/go2_cts.pt --suite robogauge-1.1",
+            "date": "2026-01-02T03:04:05+00:00",
+            "host": "lab",
+            "machine": "x86_64, 2 CPUs, Linux 6.1",
+            "device": "cpu",
+            "threads": 2,
+            "seconds": 152.5,
+            "physics_steps": 1_234_567,
+        },
+    }
+
+
+PIPELINES = {
+    "base": {"terrains": ("flat",), "frictions": (0.6,), "payloads": (0.0,)},
+    "multi": {"terrains": ("slope_fd", "wave"), "frictions": (0.4, 0.6), "payloads": (0.0, 2.0), "level": 5},
+    "level": {"terrains": tuple(REACH)},
+    "stress": {},
+}
+
+
+class Page(HTMLParser):
+    """Collects tags with their attributes, and text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.words, self.open = [], [], []
+        self.feed(text)
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in ("meta", "input", "img", "link", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag, f"</{tag}> closes nothing"
+
+    def handle_data(self, data):
+        if self.open[-1:] not in (["style"], ["script"]):
+            self.words.append(data)
+
+    def count(self, tag):
+        return sum(t == tag for t, _ in self.tags)
+
+
+def row(terrain="wave", friction=0.6, payload=0.0, level=5, **more):
+    return {"terrain": terrain, "friction": friction, "payload": payload, "level": level, **more}
