@@ -55,6 +55,7 @@ def commands(page: Path) -> list[list[str]]:
     return lines
 
 
+COMMANDS = typer.main.get_command(app)
 SHOWN = [(page.name, words) for page in PAGES for words in commands(page)]
 
 
@@ -64,7 +65,7 @@ def test_pages_show_commands():
 
 @pytest.mark.parametrize(("page", "words"), SHOWN, ids=[f"{page}: {' '.join(words)}"[:100] for page, words in SHOWN])
 def test_every_command_that_is_shown_exists_with_these_options(page, words):
-    group = typer.main.get_command(app)
+    group = COMMANDS
     context = group.make_context("gaitgauge", [], resilient_parsing=True)
     if words[0].startswith("-"):
         group.make_context("gaitgauge", list(words), resilient_parsing=True)
