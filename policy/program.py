@@ -15,6 +15,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from torch._guards import TracingContext, tracing
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.nn import functional
@@ -212,7 +214,10 @@ class Program:
         return [observation, *(value.expand(num_episodes, *value.shape).clone() for value in self.initial)]
 
     def _many(self, num_episodes: int, width: int) -> GraphModule:
-        return _with_layers(make_fx(torch.vmap(lambda *one: self._step(*one)))(*self._inputs(num_episodes, width)))
+        many = make_fx(torch.vmap(lambda *one: self._step(*one)))
+        # Without a mode to share, the recorder makes one for every operation, which takes half its time.
+        with tracing(TracingContext(FakeTensorMode(allow_fallback_kernels=True))):
+            return _with_layers(many(*self._inputs(num_episodes, width)))
 
 
 def _without_actions(flat: GraphModule) -> GraphModule:
