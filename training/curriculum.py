@@ -101,7 +101,7 @@ class Levels:
         """Remember how far the robots came, and how far they should have come."""
         memory.farthest.copy_(torch.maximum(memory.farthest, inputs.distance))
         forward, lateral = memory.command[:, :1], memory.command[:, 1:2]
-        heading_xy = inputs.heading_xy
+        heading_xy = inputs.commanded_heading_xy
         left_xy = torch.stack((-heading_xy[:, 1], heading_xy[:, 0]), dim=1)
         memory.commanded_way.add_((forward * heading_xy + lateral * left_xy) * inputs.period)
         memory.commanded_farthest.copy_(torch.maximum(memory.commanded_farthest, memory.commanded_way.norm(dim=1)))
@@ -146,7 +146,7 @@ def next_level(
         level: present level from 0, (N,) int64.
         num_levels: L.
         farthest: largest distance from the tile's middle in the episode [m], (N,).
-        commanded: largest distance that the commands would have led to, at the robot's own headings [m], (N,).
+        commanded: largest distance that the commands would have led to, at the commanded headings [m], (N,).
         fallen: whether the episode ended by a fall, (N,) bool.
         uniform: numbers in [0, 1), (N,).
 

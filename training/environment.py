@@ -31,6 +31,7 @@ from .domain_randomization import BodyParameters, draw_bodies
 from .environment_configuration import EnvironmentConfiguration
 from .environment_memory import fitting
 from .events import EpisodeStart
+from .height_scan import heading
 from .observations import Observations
 from .own_terms import resolve_own
 from .step import EnvironmentStep, StepResult
@@ -162,7 +163,8 @@ class TrainingEnvironment(VecEnv):
             memory.push_phase.random_(self.parts.pushes.steps, generator=self._generator)
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self.parts.uniform.draw()
-        start = self.parts.begin_episodes(everyone, torch.zeros_like(everyone), self.parts.progress())
+        nobody, headings = torch.zeros_like(everyone), memory.commanded_heading
+        start = self.parts.begin_episodes(everyone, nobody, self.parts.progress(), headings)
         self._reset(start)
         self._read(AFTER_STEP)
         self._observations = self.parts.observe().clone()
@@ -314,7 +316,9 @@ class TrainingEnvironment(VecEnv):
             self._begin_from(state)
             return
         parts, now = self.parts, self.backend.state
-        parts.memory.restore(state["memory"])
+        # A run from before the commanded heading was remembered begins with the robots' own.
+        headings = heading(state["physics"]["base_quaternion_w"])
+        parts.memory.restore({"commanded_heading": headings, **state["memory"]})
         self._require_below(parts.memory.level, self.palette.num_levels, "level")
         self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")
         parts.motors.restore(state["motors"])

@@ -161,6 +161,10 @@ class RewardConfiguration:
     progress: float = 0.0
     """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an
     obstacle."""
+    progress_along: Literal["command", "base"] = "command"
+    """Heading at which ``progress``, being stuck and the commanded way to the next level count: ``command`` for the robot's own
+    when the command was drawn, turned by the yaw rate commanded since; ``base`` for whichever it has now, with which turning away
+    from a step costs nothing."""
     vertical_velocity: Ramp = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
     """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
     roll_pitch_rate: float = -0.05

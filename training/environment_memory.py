@@ -59,11 +59,14 @@ class EnvironmentMemory:
     farthest: torch.Tensor
     """Largest distance from the tile's middle in this episode, larger of |x| and |y| [m], (N,)."""
     commanded_way: torch.Tensor
-    """Where the commands of this episode would have led, at the robot's own headings [m], (N, 2)."""
+    """Where the commands of this episode would have led, at the commanded headings [m], (N, 2)."""
     commanded_farthest: torch.Tensor
     """Largest distance of ``commanded_way`` from its start [m], (N,)."""
     command: torch.Tensor
     """Present command, (N, 3)."""
+    commanded_heading: torch.Tensor
+    """Where the robot should be heading: its own heading when the command was drawn, turned by the yaw rate commanded since; unit
+    vector in the world's xy plane, (N, 2)."""
     command_steps: torch.Tensor
     """Control steps until the next draw, (N,) int64."""
     command_extreme: torch.Tensor
@@ -152,6 +155,7 @@ class EnvironmentMemory:
             terrain_index=counts(num_envs),
             moves_level=flags(),
             command=numbers(num_envs, 3),
+            commanded_heading=numbers(num_envs, 2),
             command_steps=counts(num_envs),
             command_extreme=flags(),
             just_reset=flags(),
@@ -160,6 +164,13 @@ class EnvironmentMemory:
             last_log=numbers(terms + ends + metrics),
             diverged_total=counts(),
         )
+
+    def turn_commanded_heading(self, period: float) -> None:
+        """Turn it by what the present command asks for in a control period [s]."""
+        angle = self.command[:, 2] * period
+        cos, sin = torch.cos(angle), torch.sin(angle)
+        x, y = self.commanded_heading.unbind(1)
+        self.commanded_heading.copy_(torch.stack((cos * x - sin * y, sin * x + cos * y), dim=1))
 
     def remember(self, inputs: StepInputs) -> None:
         """Keep what the next step compares itself with."""

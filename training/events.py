@@ -32,6 +32,8 @@ class EpisodeStart:
     """World frame [m], (N, 3)."""
     base_quaternion: torch.Tensor
     """wxyz, (N, 4)."""
+    heading_xy: torch.Tensor
+    """Unit vector of the base's x axis in the world's xy plane, (N, 2)."""
     base_linear_velocity: torch.Tensor
     """World frame [m/s], (N, 3)."""
     base_angular_velocity: torch.Tensor
@@ -91,6 +93,7 @@ class EpisodeStarts:
             worlds=worlds,
             base_position=torch.cat((xy, ground[:, None] + self._clearance), dim=1),
             base_quaternion=from_yaw(yaw),
+            heading_xy=direction,
             base_linear_velocity=twist[:, :3],
             base_angular_velocity=twist[:, 3:],
             joint_position=torch.clamp(joints, self._lower, self._upper),

@@ -34,16 +34,21 @@ def yaw_tracking(inputs: StepInputs) -> torch.Tensor:
 
 
 def progress(inputs: StepInputs) -> torch.Tensor:
-    """Velocity along the commanded direction over the commanded speed, within ±1; 0 below ``SLOWEST_COMMAND``."""
+    """Velocity along the commanded direction, seen from the commanded heading, over the commanded speed, within ±1; 0 below
+    ``SLOWEST_COMMAND``.
+    """
     return torch.where(commanded_to_move(inputs.command), progress_share(inputs), 0.0)
 
 
 def progress_share(inputs: StepInputs) -> torch.Tensor:
     """Share of the commanded speed that the robot has along the command, within ±1; without a meaning below
-    ``SLOWEST_COMMAND``.
+    ``SLOWEST_COMMAND``. A robot that turned away from the commanded heading has to make its way from where it is.
     """
-    command = inputs.command[:, :2]
-    along = (inputs.base_linear_velocity_b[:, :2] * command).sum(dim=1)
+    command, wanted = inputs.command[:, :2], inputs.commanded_heading_xy
+    (forward, lateral), (x, y) = inputs.base_linear_velocity_b[:, :2].unbind(1), inputs.heading_xy.unbind(1)
+    # Cosine and sine of the angle from the commanded heading to the robot's own.
+    cos, sin = x * wanted[:, 0] + y * wanted[:, 1], y * wanted[:, 0] - x * wanted[:, 1]
+    along = (cos * forward - sin * lateral) * command[:, 0] + (sin * forward + cos * lateral) * command[:, 1]
     return torch.clamp(along / command.square().sum(dim=1).clamp_min(SLOWEST_COMMAND**2), -1.0, 1.0)
 
 

@@ -161,6 +161,7 @@ class EnvironmentStep:
         memory = self.memory
         memory.step.add_(1)
         memory.episode_length.add_(1)
+        memory.turn_commanded_heading(self.configuration.physics.control_period)
         progress = self.progress()
         inputs = self.read(self.inputs, memory, self.action, progress)
         ends = self.terminations(inputs)
@@ -171,21 +172,27 @@ class EnvironmentStep:
         self.levels.follow(memory, inputs)
         push = self.pushes(done, self.inputs, memory, self.uniform)
         # A diverged world is the engine's failure: it moves no level.
-        start = self.begin_episodes(done, ends.failed & ~inputs.diverged, progress)
+        start = self.begin_episodes(done, ends.failed & ~inputs.diverged, progress, inputs.heading_xy)
         return StepResult(reward=rewards.sum(dim=1), done=done, time_out=ends.time_out, start=start, push=push)
 
-    def begin_episodes(self, worlds: torch.Tensor, failed: torch.Tensor, progress: torch.Tensor) -> EpisodeStart:
+    def begin_episodes(
+        self, worlds: torch.Tensor, failed: torch.Tensor, progress: torch.Tensor, heading_xy: torch.Tensor
+    ) -> EpisodeStart:
         """Draw the next episode of the masked worlds, and new commands where they are due; the memory is updated in
-        place.
+        place. ``heading_xy`` are the headings at which the other worlds' episodes go on, (N, 2).
         """
         memory, uniform = self.memory, self.uniform
         self.levels.move(memory, uniform, worlds, failed)
         memory.begin_episode(worlds)
-        self._new_commands(worlds, progress)
+        due = self._new_commands(worlds, progress)
         self.motors.redraw(uniform.span(MOTOR_COLUMNS[0], MOTOR_COLUMNS[-1]), worlds)
-        return self.starts(worlds, memory, uniform)
+        start = self.starts(worlds, memory, uniform)
+        own = torch.where(worlds[:, None], start.heading_xy, heading_xy)
+        torch.where(due[:, None], own, memory.commanded_heading, out=memory.commanded_heading)
+        return start
 
-    def _new_commands(self, begun: torch.Tensor, progress: torch.Tensor) -> None:
+    def _new_commands(self, begun: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
+        """Draw new commands where they are due, and return where, (N,) bool."""
         memory = self.memory
         memory.command_steps.sub_(1)
         due = begun | (memory.command_steps <= 0)
@@ -202,6 +209,7 @@ class EnvironmentStep:
         torch.where(due, drawn.steps, memory.command_steps, out=memory.command_steps)
         torch.where(due, drawn.extreme, memory.command_extreme, out=memory.command_extreme)
         memory.issued.add_(drawn.command[:, :2] * due[:, None])
+        return due
 
     def observe(self) -> Observations:
         """Observations of the present state, which is fresh for worlds that were just reset or pushed."""

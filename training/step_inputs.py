@@ -113,6 +113,9 @@ class StepInputs:
     """Fraction of the run, scalar."""
     heading_xy: torch.Tensor
     """Unit vector of the base's x axis in the world's xy plane, (N, 2)."""
+    commanded_heading_xy: torch.Tensor
+    """Where the robot should be heading, as ``heading_xy``: its heading when the command was drawn, turned by the yaw rate
+    commanded since, (N, 2)."""
     period: float
     """Control period [s]."""
     state: PhysicsState

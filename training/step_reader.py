@@ -158,6 +158,7 @@ class StepReader:
             diverged=diverged,
             progress=progress,
             heading_xy=heading_xy,
+            commanded_heading_xy=memory.commanded_heading if settings.progress_along == "command" else heading_xy,
             period=self._period,
             state=state,
             failed=diverged,

@@ -148,19 +148,6 @@ def test_episodes_spread_over_the_tile_do_not_move_levels():
     assert torch.equal(environment.parts.memory.level, level)
 
 
-def test_commanded_way_follows_the_robot_s_heading():
-    environment = make(4, script=gliding(0.0, 0.0, 4.0))
-    memory = environment.parts.memory
-    memory.command.copy_(torch.tensor([1.0, 0.0, 0.0]).expand(4, 3))
-    memory.command_steps.fill_(1000)
-    idle(environment, 39)
-    # Half a turn at 4 rad/s and 1 m/s: a half circle of radius 0.25 m.
-    assert memory.commanded_way.norm(dim=1).tolist() == pytest.approx([0.5] * 4, abs=0.02)
-    idle(environment, 39)
-    assert memory.commanded_way.norm(dim=1).tolist() == pytest.approx([0.0] * 4, abs=0.03)
-    assert memory.commanded_farthest.tolist() == pytest.approx([0.5] * 4, abs=0.02)
-
-
 def walking(speed_share, command):
     """A script in which each base has that share of the commanded speed, (N,), along the command."""
 

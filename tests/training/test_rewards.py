@@ -49,6 +49,7 @@ def quiet():
         diverged=torch.zeros(2, dtype=torch.bool),
         progress=torch.tensor(0.5),
         heading_xy=torch.tensor([[1.0, 0.0]] * 2),
+        commanded_heading_xy=torch.tensor([[1.0, 0.0]] * 2),
         period=0.02,
         state=None,
         failed=torch.zeros(2, dtype=torch.bool),
@@ -181,6 +182,7 @@ def test_weights_follow_progress(quiet):
 def test_every_weight_names_a_term():
     settings = {"tracking_sigma", "dynamic_sigma", "sigma_linear_range", "sigma_yaw_range", "base_height_target"}
     settings |= {"foot_height_scale", "foot_height_over", "collision_force", "soft_limit", "own", "trunk_area"}
+    settings |= {"progress_along"}
     assert {f.name for f in fields(RewardConfiguration)} - settings == set(REWARD_TERMS)
 
 
@@ -197,3 +199,26 @@ def test_every_weight_names_a_term():
 def test_progress_is_the_share_of_the_commanded_speed(quiet, command, velocity, expected):
     inputs = replace(quiet, command=one_world(command, 3), base_linear_velocity_b=one_world(velocity, 3))
     assert float(REWARD_TERMS["progress"](inputs)[0]) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("turned", "velocity", "expected"),
+    [
+        (0.0, [0.5, 0.0], 1.0),
+        (math.pi / 2, [0.5, 0.0], 0.0),
+        (math.pi / 2, [0.0, -0.5], 1.0),
+        (math.pi, [0.5, 0.0], -1.0),
+        (-math.pi / 3, [0.5, 0.0], 0.5),
+    ],
+)
+@pytest.mark.parametrize("wanted", [0.0, 2.0])
+def test_who_turns_away_makes_no_progress(quiet, turned, velocity, expected, wanted):
+    """A robot commanded straight ahead at 0.5 m/s whose heading is ``turned`` from the commanded one, whichever that is."""
+    inputs = replace(
+        quiet,
+        command=one_world([0.5, 0.0], 3),
+        base_linear_velocity_b=one_world(velocity, 3),
+        heading_xy=torch.tensor([[math.cos(wanted + turned), math.sin(wanted + turned)]] * 2),
+        commanded_heading_xy=torch.tensor([[math.cos(wanted), math.sin(wanted)]] * 2),
+    )
+    assert float(REWARD_TERMS["progress"](inputs)[0]) == pytest.approx(expected, abs=1e-6)

@@ -1,0 +1,85 @@
+"""The heading that commands ask for: what progress and the commanded way are measured along."""
+
+import pytest
+import torch
+from gaitgauge.backends.fake import FakeScript
+from gaitgauge.training.environment_configuration import RewardConfiguration
+from gaitgauge.training.height_scan import heading
+from small_environment import gliding, idle, make
+
+
+def commanded(environment, forward, yaw):
+    """Command the same to all worlds for good, and return where they head."""
+    memory = environment.parts.memory
+    memory.command.copy_(torch.tensor([forward, 0.0, yaw]).expand(environment.num_envs, 3))
+    memory.command_steps.fill_(1000)
+    return memory, memory.commanded_heading.clone()
+
+
+def test_who_turns_away_is_still_led_straight_ahead():
+    environment = make(4, script=gliding(0.0, 0.0, 4.0))
+    memory, ahead = commanded(environment, 1.0, 0.0)
+    idle(environment, 39)
+    assert torch.allclose(memory.commanded_heading, ahead)
+    assert not torch.allclose(heading(environment.backend.state.base_quaternion_w).float(), ahead, atol=1.0)
+    assert torch.allclose(memory.commanded_way, 0.78 * ahead, atol=1e-3)
+    assert memory.commanded_farthest.tolist() == pytest.approx([0.78] * 4, abs=1e-3)
+
+
+@pytest.mark.parametrize("turns", [0.0, 4.0])
+def test_an_arc_leads_round_whether_the_robot_turns_or_not(turns):
+    environment = make(4, script=gliding(0.0, 0.0, turns))
+    memory, ahead = commanded(environment, 1.0, 4.0)
+    idle(environment, 39)
+    # Half a turn at 4 rad/s and 1 m/s: a half circle of radius 0.25 m.
+    assert torch.allclose(memory.commanded_heading, -ahead, atol=0.03)
+    assert memory.commanded_way.norm(dim=1).tolist() == pytest.approx([0.5] * 4, abs=0.02)
+    idle(environment, 39)
+    assert memory.commanded_way.norm(dim=1).tolist() == pytest.approx([0.0] * 4, abs=0.03)
+    assert memory.commanded_farthest.tolist() == pytest.approx([0.5] * 4, abs=0.02)
+
+
+def test_a_new_command_sets_out_from_the_robot_s_own_heading():
+    environment = make(4, script=gliding(0.0, 0.0, 4.0))
+    memory, ahead = commanded(environment, 1.0, 0.0)
+    idle(environment, 20)
+    memory.command_steps.copy_(torch.tensor([1, 1, 1000, 1000]))
+    idle(environment)
+    own = heading(environment.backend.state.base_quaternion_w).float()
+    assert torch.allclose(memory.commanded_heading[:2], own[:2], atol=1e-5)
+    assert torch.allclose(memory.commanded_heading[2:], ahead[2:])
+
+
+def test_an_episode_sets_out_from_the_heading_of_its_start():
+    fall = torch.tensor([0.1, float("inf")], dtype=torch.float64)
+    environment = make(2, script=FakeScript(fall_time=fall))
+    memory, ahead = environment.parts.memory, environment.parts.memory.commanded_heading.clone()
+    assert torch.allclose(ahead, heading(environment.backend.state.base_quaternion_w).float(), atol=1e-5)
+    memory.command.zero_()
+    memory.command_steps.fill_(1000)
+    while not idle(environment)[2].any():
+        pass
+    own = heading(environment.backend.state.base_quaternion_w).float()
+    assert torch.allclose(memory.commanded_heading, own, atol=1e-5)
+    assert not torch.allclose(memory.commanded_heading[0], ahead[0], atol=1e-3)
+
+
+def test_progress_may_be_counted_along_whichever_way_the_robot_heads():
+    along = {}
+    for frame in ("command", "base"):
+        environment = make(4, script=gliding(0.0, 0.0, 4.0), rewards=RewardConfiguration(progress_along=frame))
+        memory, _ = commanded(environment, 1.0, 0.0)
+        idle(environment, 39)
+        along[frame] = float(memory.commanded_way.norm(dim=1)[0])
+    assert along["command"] == pytest.approx(0.78, abs=0.01)
+    assert along["base"] == pytest.approx(0.5, abs=0.02), "half a circle"
+
+
+def test_a_run_from_before_headings_were_remembered_goes_on():
+    environment = make(4)
+    idle(environment, 5)
+    saved = environment.state_dict()
+    del saved["memory"]["commanded_heading"]
+    environment.load_state_dict(saved)
+    own = heading(environment.backend.state.base_quaternion_w).float()
+    assert torch.allclose(environment.parts.memory.commanded_heading, own, atol=1e-5)
