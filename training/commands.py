@@ -27,6 +27,8 @@ class CommandDraw:
     """Control steps for which the command holds, (N,) int64, at least 1."""
     extreme: torch.Tensor
     """Whether the command is an extreme one, (N,) bool."""
+    holds_heading: torch.Tensor
+    """Whether it is a straight one, whose heading is to be held, (N,) bool."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +190,19 @@ class CommandGenerator:
         drawn = torch.where(is_extreme[:, None], extremes, torch.cat((linear, yaw), dim=1))
         drawn = torch.where(is_opposite[:, None], opposite, drawn)
         steps = torch.where(is_stationary, stationary_steps, self._interval)
-        return CommandDraw(command=drawn, steps=steps, extreme=is_extreme)
+        holds_heading = straight & ~is_stationary & ~is_extreme
+        return CommandDraw(command=drawn, steps=steps, extreme=is_extreme, holds_heading=holds_heading)
+
+    def held_yaw_rate(self, off: torch.Tensor, *, kind: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
+        """Yaw rates that lead back to the commanded heading [rad/s], (N,).
+
+        Args:
+            off: angle from the robot's own heading to the commanded one [rad], (N,).
+            kind: kind of terrain, (N,) int64.
+            progress: fraction of the run, scalar.
+        """
+        ranges = self.ranges(kind, progress)
+        return torch.clamp(off * self._configuration.heading_gain, ranges.low[:, 2], ranges.high[:, 2])
 
     def _uniform(
         self,

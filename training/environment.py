@@ -316,9 +316,10 @@ class TrainingEnvironment(VecEnv):
             self._begin_from(state)
             return
         parts, now = self.parts, self.backend.state
-        # A run from before the commanded heading was remembered begins with the robots' own.
+        # A run from before headings were remembered goes on with the robots' own.
         headings = heading(state["physics"]["base_quaternion_w"])
-        parts.memory.restore({"commanded_heading": headings, **state["memory"]})
+        older = {"commanded_heading": headings, "holds_heading": torch.zeros_like(parts.memory.holds_heading)}
+        parts.memory.restore({**older, **state["memory"]})
         self._require_below(parts.memory.level, self.palette.num_levels, "level")
         self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")
         parts.motors.restore(state["motors"])

@@ -264,6 +264,9 @@ class CommandConfiguration:
     straight_probability: Share = 0.3
     """Share of the uniform draws with zero yaw rate. Published: 0; the gauge's commands are all straight or a pure
     turn."""
+    heading_gain: NotNegative = 0.0
+    """Yaw rate commanded in straight draws for each radian by which the robot is off the heading it had when the command was drawn
+    [1/s], within the range: a robot that turned away is told to turn back. 0 commands no yaw there."""
     extreme_probability: Share = 0.2
     """Share of draws with every axis at a limit or zero."""
     extreme_zero_probability: tuple[float, float, float] = (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)

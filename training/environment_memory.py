@@ -71,6 +71,8 @@ class EnvironmentMemory:
     """Control steps until the next draw, (N,) int64."""
     command_extreme: torch.Tensor
     """Whether the present command is an extreme one, (N,) bool."""
+    holds_heading: torch.Tensor
+    """Whether the present command is a straight one, which leaves the commanded heading as it is, (N,) bool."""
     issued: torch.Tensor
     """Sum of the linear commands issued in this episode [m/s], (N, 2)."""
     shortfall: torch.Tensor
@@ -158,6 +160,7 @@ class EnvironmentMemory:
             commanded_heading=numbers(num_envs, 2),
             command_steps=counts(num_envs),
             command_extreme=flags(),
+            holds_heading=flags(),
             just_reset=flags(),
             history=numbers(num_envs, history, frame),
             push_phase=counts(num_envs),
@@ -167,7 +170,7 @@ class EnvironmentMemory:
 
     def turn_commanded_heading(self, period: float) -> None:
         """Turn it by what the present command asks for in a control period [s]."""
-        angle = self.command[:, 2] * period
+        angle = (self.command[:, 2] * period).masked_fill(self.holds_heading, 0.0)
         cos, sin = torch.cos(angle), torch.sin(angle)
         x, y = self.commanded_heading.unbind(1)
         self.commanded_heading.copy_(torch.stack((cos * x - sin * y, sin * x + cos * y), dim=1))

@@ -189,7 +189,16 @@ class EnvironmentStep:
         start = self.starts(worlds, memory, uniform)
         own = torch.where(worlds[:, None], start.heading_xy, heading_xy)
         torch.where(due[:, None], own, memory.commanded_heading, out=memory.commanded_heading)
+        if self.configuration.commands.heading_gain > 0:
+            self._hold_heading(own, progress)
         return start
+
+    def _hold_heading(self, own: torch.Tensor, progress: torch.Tensor) -> None:
+        """Command yaw rates that lead straight commands back to their heading; ``own`` are the robots' headings, (N, 2)."""
+        memory, wanted = self.memory, self.memory.commanded_heading
+        off = torch.atan2(own[:, 0] * wanted[:, 1] - own[:, 1] * wanted[:, 0], (own * wanted).sum(dim=1))
+        yaw = self.commands.held_yaw_rate(off, kind=self.kind, progress=progress)
+        memory.command[:, 2].copy_(torch.where(memory.holds_heading, yaw, memory.command[:, 2]))
 
     def _new_commands(self, begun: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
         """Draw new commands where they are due, and return where, (N,) bool."""
@@ -208,6 +217,7 @@ class EnvironmentStep:
         torch.where(due[:, None], drawn.command, memory.command, out=memory.command)
         torch.where(due, drawn.steps, memory.command_steps, out=memory.command_steps)
         torch.where(due, drawn.extreme, memory.command_extreme, out=memory.command_extreme)
+        torch.where(due, drawn.holds_heading, memory.holds_heading, out=memory.holds_heading)
         memory.issued.add_(drawn.command[:, :2] * due[:, None])
         return due
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from gaitgauge.backends.fake import FakeScript
-from gaitgauge.training.environment_configuration import RewardConfiguration
+from gaitgauge.training.environment_configuration import CommandConfiguration, CommandStage, Ramp, RewardConfiguration
 from gaitgauge.training.height_scan import heading
 from small_environment import gliding, idle, make
 
@@ -79,7 +79,44 @@ def test_a_run_from_before_headings_were_remembered_goes_on():
     environment = make(4)
     idle(environment, 5)
     saved = environment.state_dict()
-    del saved["memory"]["commanded_heading"]
+    del saved["memory"]["commanded_heading"], saved["memory"]["holds_heading"]
     environment.load_state_dict(saved)
     own = heading(environment.backend.state.base_quaternion_w).float()
     assert torch.allclose(environment.parts.memory.commanded_heading, own, atol=1e-5)
+
+
+def straight(gain, share=1.0):
+    """Commands that are all 0.5 m/s straight ahead, or arcs."""
+    return CommandConfiguration(
+        stages=(CommandStage(begin=0.0, forward=(0.5, 0.5), lateral=(0.0, 0.0), yaw=(-0.6, 0.6)),),
+        dynamic=False,
+        straight_probability=share,
+        extreme_probability=0.0,
+        stationary_probability=Ramp(start=0.0, end=0.0),
+        heading_gain=gain,
+    )
+
+
+@pytest.mark.parametrize(
+    ("turns", "steps", "expected"), [(0.5, 40, -0.8), (-0.5, 10, 0.2), (2.0, 40, -1.2), (0.0, 9, 0.0)]
+)
+def test_straight_commands_lead_back_to_their_heading(turns, steps, expected):
+    """Who turned by 0.4 rad is told to turn back at twice that rate, and at no more than the range of 0.6 rad/s allows."""
+    environment = make(4, script=gliding(0.0, 0.0, turns), commands=straight(2.0))
+    memory = environment.parts.memory
+    ahead = memory.commanded_heading.clone()
+    idle(environment, steps)
+    assert memory.command[:, 2].tolist() == pytest.approx([max(min(expected, 0.6), -0.6)] * 4, abs=0.03)
+    assert torch.allclose(memory.commanded_heading, ahead), "what leads back does not turn the heading itself"
+    seen = environment.get_observations()["policy"][:, 8]
+    assert torch.allclose(seen, 0.25 * memory.command[:, 2], atol=1e-5), "the policy is told"
+
+
+def test_arcs_and_straight_commands_without_a_gain_are_left_alone():
+    environment = make(16, script=gliding(0.0, 0.0, 0.5), commands=straight(2.0, share=0.0))
+    before = environment.parts.memory.command.clone()
+    idle(environment, 20)
+    assert torch.equal(environment.parts.memory.command, before) and before[:, 2].abs().min() > 0
+    environment = make(4, script=gliding(0.0, 0.0, 0.5), commands=straight(0.0))
+    idle(environment, 20)
+    assert environment.parts.memory.command[:, 2].tolist() == [0.0] * 4
