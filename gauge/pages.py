@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import jinja2
+
+from ..files.parsing import edited, read_results
+from ..files.writing import write_atomically
+from .store import StoreError
 
 
 @cache
@@ -27,6 +32,34 @@ def page_template(name: str, **filters: Callable[..., object]) -> jinja2.Templat
     )
     environment.filters |= {"fixed": fixed} | filters
     return environment.get_template(name)
+
+
+def page_of(source: Path, name: str, render: Callable[[dict[str, Any]], str], *, command: str) -> Path:
+    """Write the page of a finished run beside the file that it shows, all or nothing.
+
+    Args:
+        source: what the run found, JSON.
+        name: of the page's file.
+        render: makes HTML of the content.
+        command: of ``gaitgauge`` that writes ``source``, for who lacks it.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        StoreError: the folder holds no such file, or a damaged one, or one of another version.
+    """
+    folder = source.parent
+    if not source.exists():
+        raise StoreError(f"{folder} holds no {source.name}; run gaitgauge {command} with --out {folder} first")
+    try:
+        results = read_results(source, "results", StoreError)
+        with edited(str(source), StoreError, jinja2.TemplateError):
+            text = render(results)
+    except StoreError as error:
+        raise StoreError(f"{error}; run gaitgauge {command} again with --resume") from error
+    write_atomically(folder / name, text, StoreError)
+    return folder / name
 
 
 def fixed(value: float | None, digits: int = 4) -> str:

@@ -8,15 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
-import jinja2
-
-from ..files.parsing import edited, read_results, shown
-from ..files.writing import write_atomically
+from ..files.parsing import shown
 from . import charts
 from .breakdown import breakdown
 from .charts import FLAT, Row, number, terrain_label
 from .coverage import coverage_of, notes, score_label, suite_label
-from .pages import page_template
+from .pages import page_of, page_template
 from .references import references_for
 from .results import SCHEMA
 from .store import StoreError
@@ -58,18 +55,8 @@ def write_report(folder: Path) -> Path:
     Raises:
         StoreError: the folder holds no results, or damaged ones, or some of another version.
     """
-    source = folder / "results.json"
-    if not source.exists():
-        raise StoreError(f"{folder} holds no results.json; run gaitgauge evaluate with --out {folder} first")
-    try:
-        results = read_results(source, "results", StoreError)
-        with edited(str(source), StoreError, jinja2.TemplateError):
-            text = render(results, _clip(folder))
-    except StoreError as error:
-        raise StoreError(f"{error}; run gaitgauge evaluate again with --resume") from error
-    page = folder / "report.html"
-    write_atomically(page, text, StoreError)
-    return page
+    clip = _clip(folder)
+    return page_of(folder / "results.json", "report.html", lambda found: render(found, clip), command="evaluate")
 
 
 def _clip(folder: Path) -> bytes | None:

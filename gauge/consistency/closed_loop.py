@@ -22,6 +22,7 @@ from ..dispatcher import Dispatcher, Speculation, play
 from ..episodes import QUALITY, Episode, Record
 from ..goals import TARGET
 from ..plan import Records, plan_list
+from ..results import environment_weights
 from ..scoring import run_statistics
 from ..segments import count_segments
 from ..suite import Suite
@@ -34,7 +35,6 @@ from .statistics import (
     effect_size,
     outcome_agreement,
     paired_mean,
-    terrain_weights,
 )
 from .variants import MakeBackend, Variant
 
@@ -207,7 +207,7 @@ class Design:
     def mean(self, values: Array, rows: Sequence[int] | None = None) -> float:
         """The same mean without its interval."""
         chosen = list(range(len(self.cells)) if rows is None else rows)
-        return float(terrain_weights([self.cells[i].terrain for i in chosen]) @ values[chosen].mean(1))
+        return float(environment_weights([self.cells[i].terrain for i in chosen]) @ values[chosen].mean(1))
 
 
 def compare(

@@ -6,12 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
-import jinja2
-
-from ...files.parsing import edited, read_results, shown
-from ...files.writing import write_atomically
+from ...files.parsing import shown
 from ..charts import number, terrain_label
-from ..pages import page_template
+from ..pages import page_of, page_template
 from ..report import metric_label
 from ..store import StoreError
 from . import charts
@@ -50,18 +47,7 @@ def write_page(folder: Path) -> Path:
     Raises:
         StoreError: the folder holds no study, or a damaged one, or one of another version.
     """
-    source = folder / "consistency.json"
-    if not source.exists():
-        raise StoreError(f"{folder} holds no consistency.json; run gaitgauge consistency with --out {folder} first")
-    try:
-        results = read_results(source, "study", StoreError)
-        with edited(str(source), StoreError, jinja2.TemplateError):
-            text = render(results)
-    except StoreError as error:
-        raise StoreError(f"{error}; run gaitgauge consistency again with --resume") from error
-    page = folder / "consistency.html"
-    write_atomically(page, text, StoreError)
-    return page
+    return page_of(folder / "consistency.json", "consistency.html", render, command="consistency")
 
 
 def render(results: Mapping[str, Any]) -> str:

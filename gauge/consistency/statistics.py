@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from ..results import environment_weights
+
 Array = NDArray[np.float64]
 
 CONFIDENCE = 0.95
@@ -43,20 +45,6 @@ class Estimate:
     def plain(self) -> dict[str, float | list[float]]:
         """As plain data."""
         return {"value": self.value, "interval": [self.low, self.high]}
-
-
-def terrain_weights(terrains: Sequence[str]) -> Array:
-    """Weight of each environment in the overall mean: every terrain counts the same, and so does every environment of it.
-
-    Args:
-        terrains: terrain of each environment.
-
-    Returns:
-        Weights that add up to one, (E,).
-    """
-    names, counts = np.unique(np.asarray(terrains), return_counts=True)
-    share = {str(n): 1.0 / (len(names) * c) for n, c in zip(names, counts, strict=True)}
-    return np.array([share[t] for t in terrains])
 
 
 def spread_of_mean(values: Array, weights: Array, *, shared: bool) -> tuple[float, float]:
@@ -141,7 +129,7 @@ def paired_mean(
     """
     if values.shape[1] < 2:
         raise ValueError(f"an interval needs at least 2 seeds, not {values.shape[1]}")
-    weights = terrain_weights(terrains)
+    weights = environment_weights(terrains)
     mean = float(weights @ values.mean(1))
     error, freedom = spread_of_mean(values, weights, shared=shared)
     draws = replicates(values, weights, shared=shared, resamples=resamples, name=name)

@@ -16,8 +16,8 @@ from gaitgauge.gauge.consistency.statistics import (
     sign_flip,
     spread_of_mean,
     tail_probability,
-    terrain_weights,
 )
+from gaitgauge.gauge.results import environment_weights
 from scipy import stats
 
 
@@ -28,7 +28,7 @@ def estimate(values, terrains=None, *, shared=False, resamples=4000):
 
 
 def test_every_terrain_weighs_the_same_whatever_its_environments():
-    assert terrain_weights(["flat", "wave", "wave", "wave"]) == pytest.approx([1 / 2, 1 / 6, 1 / 6, 1 / 6])
+    assert environment_weights(["flat", "wave", "wave", "wave"]) == pytest.approx([1 / 2, 1 / 6, 1 / 6, 1 / 6])
     found = estimate([[1.0, 1.0], [4.0, 4.0], [4.0, 4.0]], ["flat", "wave", "wave"])
     assert found.value == pytest.approx(2.5)
     assert (found.low, found.high) == pytest.approx((2.5, 2.5))
