@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..backends.base import PhysicsState, Randomization, ResetState, Scene
+from ..backends.base import PhysicsState, Randomization, Scene
 from ..backends.registry import make_backend
 from ..gauge.goals import target_command, target_offset
 from ..gauge.motors import joint_parameters
 from ..gauge.suite import Suite
+from ..gauge.walking import Walk
 from ..policy.adapters import assumptions
 from ..policy.base import Policy
-from ..policy.observation import ObservationBuilder
 from ..robots import Robot
 from ..robots.geometry import model_joint_order
 from ..robots.rotation import from_yaw, yaw_of
@@ -112,7 +112,7 @@ class PlaySettings:
 
 
 class PlaySession:
-    """The loop: observation, action, physics; starts again after a fall and at the target."""
+    """A robot that walks until it is told to stop: it starts again after a fall and at the target."""
 
     def __init__(
         self, policy: Policy, robot: Robot, terrain: Terrain, settings: PlaySettings, label: str = "policy"
@@ -126,10 +126,9 @@ class PlaySession:
                 parameters.
         """
         suite = settings.suite
-        physics = suite.physics
         period = policy.contract.control_period
-        self.substeps = round(period / physics.timestep)
-        if abs(self.substeps * physics.timestep - period) > 1e-9:
+        physics = replace(suite.physics, substeps=max(1, round(period / suite.physics.timestep)))
+        if abs(physics.control_period - period) > 1e-9:
             raise UserError(
                 f"the policy's control period is {period:g} s, no multiple of the physics step of {physics.timestep:g} s"
             )
@@ -153,12 +152,9 @@ class PlaySession:
             physics=physics,
         )
         self.backend = make_backend(settings.backend, scene, device=settings.device)
-        device = self.backend.device
+        self._walk = Walk(policy, self.backend, session=policy.session(1, device=str(self.backend.device)))
         self.set_friction(settings.friction)
-        self._builder = ObservationBuilder(policy.contract, robot, 1, device)
-        self._network = policy.session(1, device=str(device))
         self._random = np.random.default_rng(settings.seed)
-        self._action = torch.zeros(1, robot.num_joints, device=device)
         self.time = 0.0
         """Simulated time in all [s]."""
         self.falls = 0
@@ -173,26 +169,14 @@ class PlaySession:
     def set_friction(self, friction: float) -> None:
         """Change the ground's friction coefficient."""
         self.friction = friction
-        values = torch.tensor([friction], device=self.backend.device, dtype=self.backend.dtype)
-        self.backend.randomize(Randomization(friction=values))
+        self.backend.randomize(Randomization(friction=self._walk.tensor([friction])))
 
     def reset(self) -> None:
         """Put the robot back to the start, turned a little at random."""
         pose = self.terrain.spawns["level_search"]
-        device, dtype = self.backend.device, self.backend.dtype
         x, y, z = pose.position
-        yaw = torch.tensor([pose.yaw + self._random.uniform(-0.05, 0.05)], device=device, dtype=dtype)
-        held = torch.tensor([self.robot.default_joint_position], device=device, dtype=dtype)
-        self.backend.reset(
-            ResetState(
-                base_position=torch.tensor([[x, y, z + self.robot.stand_height]], device=device, dtype=dtype),
-                base_quaternion=from_yaw(yaw),
-                held_target=held,
-            )
-        )
-        self._builder.reset()
-        self._network.reset()
-        self._action.zero_()
+        yaw = self._walk.tensor([pose.yaw + self._random.uniform(-0.05, 0.05)])
+        self._walk.reset(self._walk.tensor([[x, y, z + self.robot.stand_height]]), from_yaw(yaw))
         self.since_reset = 0.0
         """Simulated time since the robot was put to the start [s]."""
         self._down = 0.0
@@ -203,12 +187,7 @@ class PlaySession:
         if self.since_reset < _SETTLE:
             command = (0.0, 0.0, 0.0)
         limited = self._told = clip(command, self.limits)
-        device, dtype = self.backend.device, self.backend.dtype
-        observation = self._builder.build(self.state, torch.tensor([limited], device=device, dtype=dtype), self._action)
-        self._action = self._network.act(observation)
-        if not bool(torch.isfinite(self._action).all()):
-            raise UserError(f"the policy '{self.policy.path}' gave an action that is not finite")
-        self.backend.step(self._builder.targets(self._action).to(dtype), substeps=self.substeps)
+        self._walk.step(self._walk.tensor([limited]))
         self.time += self.period
         self.since_reset += self.period
         self._measure()
@@ -281,9 +260,7 @@ class PlaySession:
     def autopilot(self) -> Command:
         """To the target where there is one, else a tour that shows every direction."""
         if self.terrain.target is not None:
-            state = self.state
-            target = torch.tensor([self.terrain.target], device=self.backend.device, dtype=self.backend.dtype)
-            offset = target_offset(state, target, "horizontal")
+            offset = target_offset(self.state, self._walk.tensor([self.terrain.target]), "horizontal")
             command = target_command(
                 offset,
                 torch.tensor([self.terrain.backward], device=offset.device),

@@ -1,7 +1,7 @@
 """Robots of one policy side by side that are told at every control step what to do; an episode gives each its noise and latency.
 
-The loop of what is no evaluation: field trials and looks inside a policy. Observation, network, latency and noise are those of
-the gauge's rollout; goals, settling and samples are the caller's affair.
+The loop of what is no evaluation: field trials, looks inside a policy, and watching one. Observation, network, latency and noise
+are those of the gauge's rollout; goals, settling and samples are the caller's affair.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Walk:
         self,
         policy: Policy,
         backend: PhysicsBackend,
-        noise: Noise,
-        episodes: Sequence[Episode],
+        noise: Noise | None = None,
+        episodes: Sequence[Episode] = (),
         *,
-        steps: int,
+        steps: int = 0,
         session: PolicySession | None = None,
     ) -> None:
         """Prepare the robots; ``reset`` puts them to their start.
@@ -37,9 +37,9 @@ class Walk:
         Args:
             policy: who walks.
             backend: one world for each robot.
-            noise: how noisy and late everything is.
-            episodes: one for each robot, whose stream of random numbers it has.
-            steps: control steps that are not exceeded.
+            noise: how noisy and late everything is; None for nothing of it.
+            episodes: with noise, one for each robot, whose stream of random numbers it has.
+            steps: with noise, control steps that are not exceeded.
             session: the policy at work, where it is not to be an ordinary one.
 
         Raises:
@@ -52,8 +52,10 @@ class Walk:
             session = steady_session(policy, count)[0] if on_cpu else policy.session(count, device=str(device))
         self._session = session
         self._builder = ObservationBuilder(policy.contract, robot, count, device)
-        self._noise = NoiseReader(make_stream(noise, robot.num_joints, count, device), count, device)
-        self._noise.begin(range(count), episodes, [0] * count, steps)
+        self._noise: NoiseReader | None = None
+        if noise is not None:
+            self._noise = NoiseReader(make_stream(noise, robot.num_joints, count, device), count, device)
+            self._noise.begin(range(count), episodes, [0] * count, steps)
         self._action = torch.zeros(count, robot.num_joints, device=device)
 
     @property
@@ -83,7 +85,7 @@ class Walk:
         Raises:
             PolicyError: the policy's output is not finite.
         """
-        noise, delay = self._noise.next()
+        noise, delay = (None, None) if self._noise is None else self._noise.next()
         observation = self._builder.build(self.state, command, self._action, noise)
         action = self._session.act(observation)
         if worlds is not None:

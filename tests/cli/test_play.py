@@ -41,8 +41,8 @@ def test_standing_policy_stands(session):
 def test_world_is_that_of_the_suite(session, tmp_path):
     suite = tmp_path / "coarse.toml"
     suite.write_text('extends = "gaitgauge-1"\nname = "coarse"\nphysics = { timestep = 0.005 }\n')
-    assert session().substeps == 0.02 / load_suite("gaitgauge-1").physics.timestep
-    assert session(suite=str(suite)).substeps == 4
+    assert session().backend.scene.physics.substeps == 0.02 / load_suite("gaitgauge-1").physics.timestep
+    assert session(suite=str(suite)).backend.scene.physics.substeps == 4
 
 
 def test_fallen_robot_is_shown_and_starts_again(session):
