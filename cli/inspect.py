@@ -245,7 +245,7 @@ def _policies() -> Table:
 
 def _iteration(path: Path) -> int:
     number = path.stem.removeprefix("model_")
-    return int(number) if number.isdigit() else -1
+    return int(number) if number.isdecimal() else -1
 
 
 def _policy_row(path: Path) -> tuple[str, str, str, str]:

@@ -12,7 +12,7 @@ import reprlib
 import tomllib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
@@ -262,6 +262,18 @@ def build(kind: type[Kind], data: object, source: str, error: type[Exception]) -
         return checker.validate_json(text)[0]
     except ValidationError as problem:
         raise _error(problem, kind, source, error) from problem
+
+
+def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
+    """A dataclass from the entries of a table that bear its fields' names.
+
+    Raises:
+        error: as ``build``.
+    """
+    if not isinstance(data, Mapping):
+        raise error(f"{source} is {shown(data)}; it must be a table")
+    own = {f.name: data[f.name] for f in fields(kind) if f.name in data}  # type: ignore[arg-type]
+    return build(kind, own, source, error)
 
 
 def check_fields(instance: Any, source: str, error: type[Exception]) -> None:

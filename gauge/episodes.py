@@ -107,6 +107,8 @@ class Record:
             RecordError: the file is damaged.
         """
         try:
+            if not path.is_file():  # a pipe never ends, nor does a link to /dev/zero
+                raise RecordError("it is no file")
             with zipfile.ZipFile(path) as archive:
                 if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
                     raise RecordError(f"it unpacks to more than {_LARGEST / 1e6:g} MB")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from ..files.parsing import Kind, Name, Seed, Text, build, one_line, shown
+from ..files.parsing import Name, Seed, Text, one_line, shown, take
 from .intervals import ChanceRules
 from .results import environment_weights
 
@@ -156,14 +156,3 @@ def chance_rules_of(data: Mapping[str, Any], source: str, error: type[Exception]
             f"{MOST_REPLICATES:,} replicates in all are allowed"
         )
     return rules
-
-
-def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
-    """A dataclass from the entries of a table that bear its fields' names.
-
-    Raises:
-        error: as ``build``.
-    """
-    if not isinstance(data, Mapping):
-        raise error(f"{source} is {shown(data)}; it must be a table")
-    return build(kind, {f.name: data[f.name] for f in fields(kind) if f.name in data}, source, error)  # type: ignore[arg-type]

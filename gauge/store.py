@@ -31,11 +31,17 @@ class RunFolder:
             resume: go on with a run that is already there.
 
         Raises:
-            StoreError: the folder belongs to another run, holds a run and ``resume`` is not asked for, or is in use.
+            StoreError: the folder belongs to another run, holds a run and ``resume`` is not asked for, is in use, or
+                its episodes are a link to another place.
         """
         self._episodes = folder / "episodes"
         wanted = json.loads(json.dumps(request))
         present = _present_request(folder, wanted, resume=resume)
+        if self._episodes.is_symlink():  # records are removed and set aside there: of whom?
+            raise StoreError(
+                f"'{one_line(self._episodes)}' is a link, and a run writes to its own folder alone; "
+                "put the episodes there in place of the link, or give another folder with --out"
+            )
         make_folder(self._episodes, StoreError)
         self._lock = lock_folder(folder, StoreError)
         try:

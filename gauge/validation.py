@@ -13,6 +13,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..files.parsing import did_you_mean, one_line, read_text, shown
 
 COMMANDS: Mapping[str, tuple[str, ...]] = {
@@ -31,6 +33,10 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 
 EXAMPLES = Path(__file__).parent / "validation_examples"
 AVERAGE = "average"
+MOST: Mapping[str, int] = {"rows": 100_000, "columns": 100, "policies": 1000, "motions": 100}
+"""Of a table; what is compared grows with the square of the policies."""
+LARGEST = 1e12
+"""Magnitude of a value."""
 _LONE = "the policy"
 """Name of the policy in tables without a column for it."""
 
@@ -98,6 +104,9 @@ def read_measurements(path: Path) -> Measurements:
         raise ValidationError(
             f"{one_line(path)} needs a column 'motion', a column for each metric, and a row for each trial"
         )
+    for what, count in (("rows", len(rows)), ("columns", len(names))):
+        if count > MOST[what]:
+            raise ValidationError(f"{one_line(path)} has {count:,} {what}; at most {MOST[what]:,} are compared")
     if len(set(reader.fieldnames or ())) < len(reader.fieldnames or ()):
         raise ValidationError(f"{one_line(path)} has two columns of one name")
     sums: dict[str, dict[str, list[list[float]]]] = {}
@@ -110,6 +119,14 @@ def read_measurements(path: Path) -> Measurements:
         sums.setdefault(policy, {}).setdefault(motion, []).append(values)
         if "command" in row and commands.setdefault(motion, row["command"]) != row["command"]:
             raise ValidationError(f"line {number} of {one_line(path)} gives motion {shown(motion)} another command")
+        if AVERAGE in (motion, row.get("command")):
+            raise ValidationError(
+                f"line {number} of {one_line(path)} has a motion or command '{AVERAGE}', as the average of all is "
+                "called; give it another name"
+            )
+    for what, found in (("policies", sums), ("motions", {motion for of in sums.values() for motion in of})):
+        if len(found) > MOST[what]:
+            raise ValidationError(f"{one_line(path)} has {len(found):,} {what}; at most {MOST[what]:,} are compared")
     return Measurements(
         name=path.stem,
         values={
@@ -129,8 +146,8 @@ def _number(text: str | None, where: str) -> float:
         value = float(text or "")
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise ValidationError(f"{where} is {shown(text)}; a number is needed")
+    if not abs(value) <= LARGEST:
+        raise ValidationError(f"{where} is {shown(text)}; a number is needed, from -{LARGEST:g} to {LARGEST:g}")
     return value
 
 
@@ -204,11 +221,10 @@ def rank_agreement(real: Sequence[float], predicted: Sequence[float]) -> RankAgr
             f"ranks need at least two policies with both values, not {min(len(real), len(predicted))}"
         )
     tau = float(kendalltau(real, predicted).statistic)
-    worst = [
-        max(abs(r - s) if (p < q) != (r < s) else 0.0 for s, q in zip(real, predicted, strict=True))
-        for r, p in zip(real, predicted, strict=True)
-    ]
-    return RankAgreement(tau=None if math.isnan(tau) else tau, violation=_mean(worst))
+    measured, told = np.array(real), np.array(predicted)
+    wrong = (told[:, None] < told) != (measured[:, None] < measured)
+    worst = np.where(wrong, np.abs(measured[:, None] - measured), 0.0).max(axis=1)
+    return RankAgreement(tau=None if math.isnan(tau) else tau, violation=float(worst.mean()))
 
 
 def validate(real: Measurements, simulators: Sequence[Measurements], *, ranks_only: bool = False) -> dict[str, Any]:
@@ -226,6 +242,8 @@ def validate(real: Measurements, simulators: Sequence[Measurements], *, ranks_on
     Raises:
         ValidationError: one sentence.
     """
+    if ranks_only and len(real.values) < 2:
+        raise ValidationError(f"ranks need at least two policies; '{one_line(real.name)}' has one")
     found: dict[str, Any] = {}
     for simulator in simulators:
         for policy in dict.fromkeys((*real.values, *simulator.values)):

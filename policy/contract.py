@@ -207,7 +207,10 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
         ContractError: another robot, or joint names that are not those of the robot in some order.
     """
     if contract.robot != robot.name:
-        raise ContractError(f"the policy is for robot '{contract.robot}', not for '{robot.name}'")
+        raise ContractError(
+            f"the policy is for robot '{contract.robot}', not for '{robot.name}'; leave --robot out, or give a "
+            f"policy for '{robot.name}'"
+        )
     if sorted(contract.joint_names) != sorted(robot.joint_names):
         raise ContractError(
             f"the policy's joints are not those of robot '{robot.name}': "

@@ -20,11 +20,12 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
-from ..files.parsing import Count, Text, build, edited, shown
+from ..files.parsing import Count, Text, build, edited, one_line, shown
 from ..files.writing import replacing
 from ..policy.base import PolicyError
 from ..policy.contract import PolicyContract
 from ..policy.fence.archive import read_limited
+from ..policy.loading import file_kind
 from ..policy.native import FORMAT, ForeignFile, StoredNetwork, checksum, is_policy, load_entries, read_policy
 from ..policy.native import VERSION as POLICY_VERSION
 
@@ -116,40 +117,41 @@ def rank_file(path: Path, rank: int) -> Path:
     return path.with_suffix(f".rank{rank}{path.suffix}")
 
 
-def read_checkpoint(path: str | Path, *, training_state: bool = True) -> dict[str, Any]:
+def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: str = "resume from") -> dict[str, Any]:
     """Read a training checkpoint onto the CPU.
 
     Args:
         path: the file.
         training_state: whether it must hold what training needs to continue; otherwise a policy file will do.
+        purpose: what it is read for, in the sentences on what is wrong.
 
     Raises:
         CheckpointError: no such file, damaged, no policy of this project, or a policy without what training needs.
     """
-    entries = _load(Path(path))
+    cannot = f"Cannot {purpose} '{one_line(path)}': it"
+    entries = _load(Path(path), purpose)
     training = entries.get("training")
     policy = is_policy(entries)
     if policy:
-        _check_policy(entries, str(path))
+        _check_policy(entries, str(path), purpose)
     if not training_state and training is None and policy:
         return entries
+    if not training_state and not policy:
+        raise CheckpointError(
+            f"{cannot} holds no networks of this project; give a model_<iteration>.pt of a training run or a .gauge.pt."
+        )
     if not policy or not isinstance(training, Mapping):
-        raise CheckpointError(
-            f"Cannot resume from '{path}': it holds no training state; give a model_<iteration>.pt of a training run."
-        )
+        raise CheckpointError(f"{cannot} holds no training state; give a model_<iteration>.pt of a training run.")
     if training_state and "num_envs" not in training:
-        raise CheckpointError(
-            f"Cannot resume from '{path}': it holds networks only; begin a new run with them: --init-from {path}."
-        )
+        raise CheckpointError(f"{cannot} holds networks only; begin a new run with them: --init-from {path}.")
     version = training.get("version")
     if type(version) is not int or version != TRAINING_VERSION:
         raise CheckpointError(
-            f"Cannot resume from '{path}': its training state has version {shown(version)}, this gaitgauge reads "
-            f"{TRAINING_VERSION}."
+            f"{cannot}s training state has version {shown(version)}, this gaitgauge reads {TRAINING_VERSION}."
         )
     progress = training.get("progress", 1.0)
     if not isinstance(progress, int | float) or not progress >= 0.0:
-        raise CheckpointError(f"Cannot resume from '{path}': its progress is {shown(progress)}, no share of a run.")
+        raise CheckpointError(f"{cannot}s progress is {shown(progress)}, no share of a run.")
     return entries
 
 
@@ -187,25 +189,33 @@ def read_rank(path: Path, rank: int) -> dict[str, Any]:
     Raises:
         CheckpointError: the file is missing, damaged or holds more than tensors and plain data.
     """
-    return _load(rank_file(path, rank))
+    return _load(rank_file(path, rank), "resume from")
 
 
-def _load(file: Path) -> dict[str, Any]:
+def _load(file: Path, purpose: str) -> dict[str, Any]:
     try:
-        return dict(load_entries(read_limited(file), source=str(file)))
+        data = read_limited(file)
+        kind = file_kind(data, str(file))
+        entries = dict(load_entries(data, source=str(file))) if kind == "torch" else None
     except PolicyError as error:
-        raise CheckpointError(f"Cannot resume: {error}.") from error
+        raise CheckpointError(f"Cannot {purpose.partition(' ')[0]}: {error}.") from error
+    if entries is None:
+        raise CheckpointError(
+            f"Cannot {purpose} '{one_line(file)}': it is a program ({kind}), and training takes weights of this project: a "
+            "model_<iteration>.pt of a run, or a .gauge.pt."
+        )
+    return entries
 
 
-def _check_policy(entries: Mapping[str, Any], source: str) -> None:
+def _check_policy(entries: Mapping[str, Any], source: str, purpose: str) -> None:
     """Refuse a checkpoint whose policy is damaged, or a program: training goes on with weights."""
     try:
         network = read_policy(entries, source=source).network
     except PolicyError as error:
-        raise CheckpointError(f"Cannot resume: {error}.") from error
+        raise CheckpointError(f"Cannot {purpose.partition(' ')[0]}: {error}.") from error
     if isinstance(network, ForeignFile):
         raise CheckpointError(
-            f"Cannot start from '{source}': it carries a program ({network.kind}), not weights, which is all that training "
+            f"Cannot {purpose} '{one_line(source)}': it carries a program ({network.kind}), not weights, which is all that training "
             "takes; --trust changes nothing in that."
         )
 
@@ -239,7 +249,7 @@ def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False)
     Raises:
         CheckpointError: ``source`` is no training checkpoint, or the destination cannot be written.
     """
-    entries = read_checkpoint(source)
+    entries = read_checkpoint(source, purpose="use")
     with edited(f"Cannot use '{source}': it", CheckpointError, RuntimeError):
         _trim(entries, Path(destination), raw=raw)
 

@@ -17,7 +17,7 @@ from ..files.parsing import build, shown
 from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
 from ..policy.contract import PolicyContract
-from ..policy.finding import find_policy
+from ..policy.finding import find_policy, shipped_policies
 from ..policy.its_robot import robot_for
 from ..robots.registry import lasting
 from .algorithms.symmetry import build_mirror
@@ -37,6 +37,7 @@ from .run_directory import (
     find_checkpoint,
     new_run_directory,
     read_run_json,
+    refuse_links,
     update_run_json,
     write_parameters,
 )
@@ -149,6 +150,8 @@ def prepare(request: TrainRequest) -> TrainPlan:
         ).absolute()
         # A checkpoint carried here without its run directory continues in a new one.
         run = checkpoint.parent if read_run_json(checkpoint.parent).get("task") == request.task else None
+        if run is not None:
+            refuse_links(run)
         kept, kept_backend = _kept(checkpoint, request.task)
         backend = request.backend or kept_backend
         named, task = task, kept.with_overrides(own)
@@ -249,7 +252,7 @@ def _going_on(task: Task, weights: Path) -> list[str]:
     exploration noise gets little.
     """
     return [
-        f"environment.schedule.begin={reached(read_checkpoint(weights, training_state=False)):g}",
+        f"environment.schedule.begin={reached(read_checkpoint(weights, training_state=False, purpose='start from')):g}",
         f"environment.terrain.highest_start_level={task.environment.terrain.levels - 1}",
         *(f"{key}={value}" for key, value in _GOING_ON.items()),
     ]
@@ -263,9 +266,12 @@ def _first_weights(request: TrainRequest, task: Task) -> Path:
         CheckpointError: there is none.
     """
     assert request.init_from is not None
-    if request.init_from == "pretrained":
+    shipped = shipped_policies()
+    if request.init_from in shipped:
         return find_policy(request.init_from)
-    return find_checkpoint(request.init_from, experiment=task.training.run.experiment, root=request.log_root)
+    return find_checkpoint(
+        request.init_from, experiment=task.training.run.experiment, root=request.log_root, others=tuple(shipped)
+    )
 
 
 def _own_overrides(request: TrainRequest) -> list[str]:

@@ -159,7 +159,7 @@ def begin_with(runner: TrainingRunner, path: Path) -> None:
     Raises:
         CheckpointError: damaged, of other joints or another observation, or of other networks.
     """
-    entries = read_checkpoint(path, training_state=False)
+    entries = read_checkpoint(path, training_state=False, purpose="start from")
     with edited(f"Cannot start from '{path}': it", CheckpointError, RuntimeError):
         _begin(runner, path, entries)
 

@@ -6,15 +6,18 @@ the gauge's score), ``params/env.yaml`` and ``params/agent.yaml``, ``run.json`` 
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
+from pydantic import Field
 
-from ..files.parsing import read_results
+from ..files.parsing import NotNegative, Text, one_line, read_results, take
 from ..files.provenance import provenance
 from ..files.writing import json_text, make_folder, write_atomically
 from ..policy.contract import PolicyContract
@@ -22,6 +25,7 @@ from .checkpoint import CheckpointError
 from .configuration import to_plain
 
 LOG_ROOT = Path("logs/rsl_rl")
+_Number = Annotated[int, Field(ge=0, lt=2**53)]
 
 
 def new_run_directory(root: Path, experiment: str, run_name: str = "", now: datetime | None = None) -> Path:
@@ -52,13 +56,16 @@ def latest_checkpoint(run: Path) -> Path | None:
     numbered = [
         (int(f.stem.removeprefix("model_")), f)
         for f in run.glob("model_*.pt")
-        if f.stem.removeprefix("model_").isdigit()
+        if f.stem.removeprefix("model_").isdecimal()
     ]
     return max(numbered)[1] if numbered else None
 
 
-def find_checkpoint(choice: str, *, experiment: str, task: str = "", root: Path = LOG_ROOT) -> Path:
-    """The checkpoint that ``--resume`` names: ``latest`` (of the experiment), a run directory (its last), or a file.
+def find_checkpoint(
+    choice: str, *, experiment: str, task: str = "", root: Path = LOG_ROOT, others: Sequence[str] = ()
+) -> Path:
+    """The checkpoint that ``--resume`` or ``--init-from`` names: ``latest`` (of the experiment), a run directory (its last), or a
+    file; ``others`` are the names that the option takes besides.
 
     Raises:
         CheckpointError: there is none.
@@ -73,18 +80,15 @@ def find_checkpoint(choice: str, *, experiment: str, task: str = "", root: Path 
         for run in sorted(runs, key=lambda r: r.name, reverse=True):
             if found := latest_checkpoint(run):
                 return found
-        raise CheckpointError(
-            f"There is nothing to resume: no run in '{root / experiment}' has a model_<iteration>.pt."
-        )
+        raise CheckpointError(f"There is no checkpoint: no run in '{root / experiment}' has a model_<iteration>.pt.")
     path = Path(choice)
     if path.is_dir():
         if found := latest_checkpoint(path):
             return found
-        raise CheckpointError(f"There is nothing to resume: '{choice}' has no model_<iteration>.pt.")
+        raise CheckpointError(f"There is no checkpoint: '{one_line(choice)}' has no model_<iteration>.pt.")
     if not path.is_file():
-        raise CheckpointError(
-            f"There is no checkpoint '{choice}'; give 'latest', a run directory or a model_<iteration>.pt."
-        )
+        known = ", ".join(["latest", *others, "a run directory"])
+        raise CheckpointError(f"There is no checkpoint '{one_line(choice)}'; give {known} or a model_<iteration>.pt.")
     return path
 
 
@@ -115,6 +119,20 @@ def describe_run(
     } | provenance(command=sys.argv, device=device)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Noted:
+    """What readers of a ``run.json`` take for granted."""
+
+    task: Text = ""
+    outcome: Text = ""
+    iteration: _Number = 0
+    environment_steps: _Number | None = None
+    training_seconds: NotNegative | None = None
+    best_score: float | None = None
+    best_iteration: _Number | None = None
+    resumed: tuple[Any, ...] = ()
+
+
 def read_run_json(run: Path) -> dict[str, Any]:
     """Entries of a run directory's ``run.json``, none if there is no such file.
 
@@ -125,10 +143,24 @@ def read_run_json(run: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     found = read_results(path, "run description", CheckpointError)
-    score = (found.get("best_score"), found.get("best_iteration"))
-    if not isinstance(found.get("resumed", []), list) or not all(s is None or type(s) in (int, float) for s in score):
-        raise CheckpointError(f"'{path}' was edited or is damaged: resumed, best_score or best_iteration")
+    take(_Noted, found, f"run description '{one_line(path)}'", CheckpointError)
     return found
+
+
+def refuse_links(run: Path) -> None:
+    """Refuse to go on in a run directory that leads elsewhere: training writes to its folders, whoever made them.
+
+    Raises:
+        CheckpointError: there is a link to a folder, or a link in one of its folders.
+    """
+    for place, folders, files in os.walk(run):
+        below = [*folders] if Path(place) == run else [*folders, *files]
+        for path in (Path(place, name) for name in below):
+            if path.is_symlink():
+                raise CheckpointError(
+                    f"Cannot resume in '{one_line(run)}': '{one_line(path.relative_to(run))}' is a link, and a run "
+                    "writes to its own folder alone; put there what it leads to."
+                )
 
 
 def update_run_json(run: Path, changes: Mapping[str, Any]) -> None:

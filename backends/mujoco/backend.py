@@ -75,7 +75,10 @@ class MujocoBackend(PhysicsBackend):
         self._terrain = np.asarray(scene.terrain_index, dtype=np.int64)
         nominal = self._palette[0]
         self._models = [copy.copy(self._palette[t]) for t in self._terrain]
-        self._batch = mujoco.batch.Batch(nominal, n, threads, True)
+        try:
+            self._batch = mujoco.batch.Batch(nominal, n, threads, True)
+        except ValueError as error:
+            raise BackendError(f"MuJoCo cannot make {n} worlds: {error}; ask for fewer") from error
         self._batch.set_models(self._models)
         self.engine_seconds: float = 0.0
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")

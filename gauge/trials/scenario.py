@@ -30,6 +30,12 @@ _Spread = Annotated[float, Field(ge=0.0, le=10.0)]
 _Number = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
+LONGEST = 3600.0
+"""Of all commands together [s]."""
+MOST_PULLS = 1000
+"""Of one force."""
+
+
 class ScenarioError(ValueError):
     """A scenario that does not exist, is malformed, or could never be decided."""
 
@@ -148,7 +154,7 @@ class Scenario:
     """What it stands for, and what had to be assumed."""
     friction: Friction
     """Sliding friction coefficient of every contact."""
-    repeats: Annotated[int, Field(ge=1, le=10_000)] = 20
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 20
     """Robots, where no other number is asked for."""
     suite: Text = "gaitgauge-1"
     """Suite whose physics, sensor noise and latency act."""
@@ -244,6 +250,8 @@ def _check(scenario: Scenario, source: str) -> None:
     load_suite(scenario.suite)
     ground, start, success = scenario.ground, scenario.start, scenario.success
     seconds = scenario.seconds
+    if seconds > LONGEST:
+        raise ScenarioError(f"{source}: the commands last {seconds:g} s; at most {LONGEST:g} s are possible")
     if ground.terrain is None and ground.level is not None:
         raise ScenarioError(
             f"{source}: ground.level is {ground.level} of no terrain; give ground.terrain, or leave it out"
@@ -267,6 +275,24 @@ def _check(scenario: Scenario, source: str) -> None:
                 f"{source}: forces[{number}] may begin after {force.begin[1]:g} s, when the commands, of {seconds:g} s, are "
                 "over; let it begin sooner"
             )
+        if force.every is not None and seconds / force.every > MOST_PULLS:
+            raise ScenarioError(
+                f"{source}: forces[{number}] pulls every {force.every:g} s of {seconds:g} s; at most "
+                f"{MOST_PULLS:,} pulls are possible"
+            )
+    for number, found in enumerate(scenario.reported):
+        successes, trials = found.successes, found.trials
+        if successes is not None and trials is not None and (successes > trials or trials == 0):
+            raise ScenarioError(
+                f"{source}: reported[{number}] has {successes} successes in {trials} trials; there "
+                "cannot be more of them than trials, nor no trials"
+            )
+    first = scenario.commands[0].until_x
+    if first is not None and first <= start.x + start.spread[0]:
+        raise ScenarioError(
+            f"{source}: commands[0].until_x is x = {first:g} m, and robots start at up to "
+            f"{start.x + start.spread[0]:g} m, where it is over before it begins; let it lead on, or leave it out"
+        )
     if not success.survive and success.beyond is None and success.speed is None:
         raise ScenarioError(
             f"{source}: nothing says what success is, so it can never be decided; give beyond, speed or survive = true "

@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from gaitgauge.backends.base import PhysicsOptions, PhysicsState, ResetState, Scene
+from gaitgauge.backends.base import BackendError, PhysicsOptions, PhysicsState, ResetState, Scene
 from gaitgauge.backends.mujoco import MujocoBackend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains import make_terrain
@@ -94,6 +94,15 @@ def test_a_step_is_eventful_exactly_where_a_flag_is_set(scene: Scene, cause: str
     others = torch.arange(WORLDS) != 2
     backend.step(pose, worlds=others)
     assert not backend.eventful, "the world with the event did not step"
+
+
+def test_more_worlds_than_the_memory_holds_are_one_sentence(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*arguments: object) -> None:
+        raise ValueError("Could not allocate memory")
+
+    monkeypatch.setattr("mujoco.batch.Batch", refuse)
+    with pytest.raises(BackendError, match="MuJoCo cannot make 5 worlds: Could not allocate memory; ask for fewer"):
+        MujocoBackend(scene)
 
 
 def test_targets_that_are_not_finite_leave_the_old_ones_in_force(scene: Scene):

@@ -141,7 +141,7 @@ def test_time_limit_ends_with_success(run, tmp_path):
         (("go2-flat", "--time", "0"), ("'0'", "longer")),
         (("go2-flat", "--device", "cpu", "--backend", "fake", "--capture"), ("--capture", "cpu")),
         (("go2-flat", "--score-suite", "quik", "--backend", "fake"), ("'quik'", "'quick'")),
-        (("go2-flat", "--resume", "latest", "--backend", "fake"), ("nothing to resume", "go2_flat")),
+        (("go2-flat", "--resume", "latest", "--backend", "fake"), ("no checkpoint", "go2_flat")),
         (("go2-flat", "--resume", "nowhere.pt"), ("'nowhere.pt'", "latest")),
         (("go2-flat", "--init-from", "nowhere.pt"), ("'nowhere.pt'",)),
         (("go2-flat", "--resume", "latest", "--init-from", "x.pt"), ("--resume", "--init-from")),
@@ -176,8 +176,28 @@ def test_damaged_checkpoint(refused, trained, tmp_path, damage, option):
     whole = (trained / "model_2.pt").read_bytes()
     content = {"empty": b"", "truncated": whole[: len(whole) // 2], "text": b"once upon a time\n"}[damage]
     (tmp_path / "model_9.pt").write_bytes(content)
-    assert "model_9.pt" in refused("train", "go2-flat", "--backend", "fake", option, tmp_path / "model_9.pt")
+    message = refused("train", "go2-flat", "--backend", "fake", option, tmp_path / "model_9.pt")
+    assert message.startswith(f"Cannot {'resume' if option == '--resume' else 'start'}: ") and "model_9.pt" in message
     assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("kind", ["torchscript", "tensors"])
+def test_what_a_run_cannot_begin_with_is_not_resumed(refused, tmp_path, kind):
+    path = tmp_path / "walk.pt"
+    if kind == "torchscript":
+        torch.jit.script(torch.nn.Identity()).save(str(path))
+    else:
+        torch.save({"a": 1}, path)
+    message = refused("train", "go2-flat", *FAKE, "--init-from", path)
+    assert message.startswith(f"Cannot start from '{path}': ") and ".gauge.pt" in message
+    assert "esume" not in message
+    assert refused("import", "--trainable", path, tmp_path / "x.pt").startswith(f"Cannot use '{path}': ")
+
+
+def test_a_run_can_begin_with_any_policy_that_ships(refused):
+    """Only the first of them had a name here; the other's robot does not fit, which is said of its file."""
+    assert "go1.gauge.pt" in refused("train", "go2-flat", *FAKE, "--init-from", "pretrained-go1")
+    assert "pretrained-go1" in refused("train", "go2-flat", *FAKE, "--init-from", "nowhere.pt")
 
 
 def test_resume_with_another_number_of_environments(refused, trained):

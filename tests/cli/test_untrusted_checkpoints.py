@@ -1,5 +1,6 @@
 """Checkpoints of training that somebody else wrote: what they may say of a run, and what a command alone decides."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -53,6 +54,16 @@ def test_what_the_command_line_names_needs_no_trust(trained, tmp_path, monkeypat
     plan = prepare(request)
     assert plan.task.environment.commands.generator == "mine:Own" and plan.needs_trust
     assert not prepare(TrainRequest(task="go2-flat", device="cpu", resume=str(trained))).needs_trust
+
+
+def test_a_run_directory_that_leads_elsewhere_is_refused(refused, trained, tmp_path):
+    """Scores and videos are written into its folders under names that can be known before."""
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    (tmp_path / "precious").mkdir()
+    (run / "gauge").symlink_to(tmp_path / "precious")
+    assert "'gauge' is a link" in refused("train", "go2-flat", "--resume", run, *RESUME)
+    assert not list((tmp_path / "precious").iterdir())
 
 
 @pytest.mark.parametrize(

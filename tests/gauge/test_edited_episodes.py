@@ -1,6 +1,7 @@
 """Episode files that somebody edited or damaged: each is one sentence, and a folder of them loses the damaged ones alone."""
 
 import json
+import os
 import zipfile
 
 import numpy as np
@@ -107,3 +108,18 @@ def test_one_damaged_episode_is_set_aside_and_the_others_stay(tmp_path):
     assert list(found) == [EPISODE]
     assert [d.read_bytes() for d in damaged] == [b"half"]
     assert read_records(tmp_path)[1] == []
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link", "folder"])
+def test_what_is_no_file_is_set_aside(tmp_path, kind):
+    """A pipe was waited for without an end, and /dev/zero read until the memory was full."""
+    path = tmp_path / f"{EPISODE.key}.npz"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "link":
+        path.symlink_to("/dev/zero")
+    else:
+        path.mkdir()
+    with pytest.raises(RecordError, match="is damaged"):
+        Record.load(path)
+    assert read_records(tmp_path) == ({}, [path.with_name(f"{path.name}.damaged")])

@@ -80,6 +80,29 @@ def test_unknown_names_are_refused_with_those_that_are_near():
         ("friction = 0.6", "frictoin = 0.6", "unknown field 'frictoin'; did you mean 'friction'"),
         ("friction = 0.6", 'friction = 0.6\nsuite = "nonesuch"', "there is no suite 'nonesuch'"),
         ("[success]", "[ground]\nlevel = 3\n[success]", "ground.level is 3 of no terrain"),
+        (
+            "velocity = [1.0",
+            "until_x = -5.0\nvelocity = [1.0",
+            r"commands\[0\].until_x is x = -5 m.* over before it begins",
+        ),
+        (
+            "friction = 0.6",
+            "friction = 0.6\nrepeats = 10000",
+            "repeats is 10000; it must be less than or equal to 1000",
+        ),
+        (
+            "[success]",
+            "[[commands]]\nseconds = 600.0\nvelocity = [1.0, 0.0, 0.0]\n" * 6 + "[success]",
+            "the commands last 3602 s; at most 3600 s",
+        ),
+        (
+            "[success]",
+            '[[forces]]\ndirection = "left"\nnewtons = [1.0, 2.0]\nbegin = [0.0, 1.0]\nseconds = [1.0, 1.0]\n'
+            "every = 1e-300\n[success]",
+            r"forces\[0\] pulls every 1e-300 s of 2 s; at most 1,000 pulls",
+        ),
+        ("[success]", '[[reported]]\nwho = "a"\nsuccesses = 3\ntrials = 2\n[success]', "3 successes in 2 trials"),
+        ("[success]", '[[reported]]\nwho = "a"\nsuccesses = 0\ntrials = 0\n[success]', "0 successes in 0 trials"),
         ("[success]", '[ground]\nterrain = "moon"\n[success]', "unknown terrain 'moon'"),
         ("[success]", '[ground]\nterrain = "wave"\n[success]', "terrain 'wave' needs a level"),
         (

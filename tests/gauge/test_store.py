@@ -194,3 +194,16 @@ def test_an_empty_folder_and_one_that_is_not_there_will_do(tmp_path):
     opened(tmp_path / "empty", resume=True)
     opened(tmp_path / "a" / "b")
     assert json.loads((tmp_path / "a" / "b" / "request.json").read_text()) == REQUEST
+
+
+def test_episodes_in_another_place_are_left_alone(tmp_path):
+    """Records that cannot be read are set aside: a stranger's run folder led to a folder of one's own."""
+    precious = tmp_path / "own" / "data.npz"
+    precious.parent.mkdir()
+    precious.write_text("years of work")
+    opened(tmp_path / "run")
+    (tmp_path / "run" / "episodes").rmdir()
+    (tmp_path / "run" / "episodes").symlink_to(precious.parent)
+    with pytest.raises(StoreError, match=r"episodes' is a link"):
+        opened(tmp_path / "run", resume=True)
+    assert [p.name for p in precious.parent.iterdir()] == ["data.npz"]

@@ -129,11 +129,24 @@ def test_errors_of_several_policies_are_averaged_and_their_ranks_compared(tmp_pa
         ("motion,m,m\nwalk,1,2\n", "two columns of one name"),
         ("motion,command,m\na,x,1\na,y,1\n", "line 3 of .* gives motion 'a' another command"),
         ('motion,m\n"walk,1\n', "is not valid CSV"),
+        ("motion,m\nwalk,1e308\n", "is '1e308'; a number is needed, from -1e"),
+        ("motion,m\naverage,1\n", "has a motion or command 'average'"),
+        ("motion,command,m\na,average,1\n", "has a motion or command 'average'"),
+        ("policy,motion,m\n" + "".join(f"p{i},a,1\n" for i in range(1001)), "has 1,001 policies; at most 1,000"),
+        ("motion,m\n" + "".join(f"m{i},1\n" for i in range(101)), "has 101 motions; at most 100"),
+        (",".join(["motion", *(f"m{i}" for i in range(101))]) + "\na" + ",1" * 101, "has 101 columns; at most 100"),
     ],
 )
 def test_what_is_wrong_with_a_table_is_one_sentence(tmp_path, text, words):
     with pytest.raises(ValidationError, match=words):
         read_measurements(write(tmp_path / "table.csv", text))
+
+
+def test_ranks_of_one_policy_are_refused(tmp_path):
+    """Nothing was printed at all."""
+    alone = read_measurements(write(tmp_path / "a.csv", "motion,m\nwalk,1\n"))
+    with pytest.raises(ValidationError, match="ranks need at least two policies; 'a' has one"):
+        validate(alone, [alone], ranks_only=True)
 
 
 def test_policies_that_one_side_lacks_are_named(tmp_path):

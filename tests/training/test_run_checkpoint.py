@@ -19,6 +19,7 @@ from gaitgauge.training.run_directory import (
     find_checkpoint,
     latest_checkpoint,
     new_run_directory,
+    refuse_links,
     update_run_json,
     write_parameters,
 )
@@ -85,7 +86,7 @@ def test_run_directories(tmp_path):
     second = new_run_directory(tmp_path, "go2", "trial", now)
     assert first == tmp_path / "go2" / "2026-01-02_03-04-05_trial"
     assert second.name == "2026-01-02_03-04-06_trial"
-    with pytest.raises(CheckpointError, match="nothing to resume"):
+    with pytest.raises(CheckpointError, match="There is no checkpoint: no run in"):
         find_checkpoint("latest", experiment="go2", root=tmp_path)
     for iteration in (900, 1000):
         (first / f"model_{iteration}.pt").touch()
@@ -104,6 +105,26 @@ def test_run_directories(tmp_path):
     assert find_checkpoint(str(first), experiment="other", root=tmp_path) == first / "model_1000.pt"
     with pytest.raises(CheckpointError, match=r"There is no checkpoint 'none\.pt'"):
         find_checkpoint("none.pt", experiment="go2", root=tmp_path)
+
+
+def test_a_name_that_python_takes_for_a_number_is_no_checkpoint(tmp_path):
+    """Python says that a superscript is a digit, and makes no number of it."""
+    (tmp_path / "model_\u00b2.pt").touch()
+    assert latest_checkpoint(tmp_path) is None
+    (tmp_path / "model_7.pt").touch()
+    assert latest_checkpoint(tmp_path).name == "model_7.pt"
+
+
+@pytest.mark.parametrize("link", ["gauge", "params", "gauge/quick/model_1.json"])
+def test_a_run_directory_that_leads_elsewhere_is_refused(tmp_path, link):
+    run, outside = tmp_path / "run", tmp_path / "outside"
+    outside.mkdir()
+    (run / link).parent.mkdir(parents=True)
+    (run / "latest.pt").symlink_to("model_1.pt")  # a file of the run's own is nobody else's
+    refuse_links(run)
+    (run / link).symlink_to(outside)
+    with pytest.raises(CheckpointError, match=f"'{link}' is a link"):
+        refuse_links(run)
 
 
 def test_parameters_are_safe_yaml(tmp_path):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from gaitgauge.training.checkpoint import CheckpointError
 from gaitgauge.training.sweep.curves import by_figure, curves_csv
 from gaitgauge.training.sweep.file import Sweep, SweepEntry, SweepError, load_sweep
 from gaitgauge.training.sweep.folding import across_seeds, fold_sweep
@@ -51,6 +52,10 @@ def write(folder: Path, text: str) -> Path:
         (
             "name = 'a'\ntitle = 'b'" + "\n[[entry]]\nname = 'C'\ntask = 'd'\n[[entry]]\nname = 'c'\ntask = 'd'",
             "several",
+        ),
+        (
+            f"name = 'a'\ntitle = 'b'\nseeds = {list(range(1001))}\n[[entry]]\nname = 'c'\ntask = 'd'",
+            "1,001 trainings",
         ),
         ("name =", "not valid TOML"),
     ],
@@ -104,6 +109,26 @@ def test_without_a_gpu_only_engines_of_the_cpu_start(tmp_path):
     assert [run.label for run in runs] == ["cpu, seed 0"] and not runs[0].on_gpu
     assert "this machine has none" in refused["one"]
     assert plan_runs(replace(sweep, entry=(replace(ENTRY, device="cpu"),)), tmp_path / "other")[1] == {}
+
+
+@pytest.mark.parametrize("note", [{"more": 1}, {"\x1b[31m": 1}, {"seed": 9}])
+def test_a_note_that_was_edited_is_refused(tmp_path, note):
+    ((run,), _) = plan_runs(SWEEP, tmp_path)
+    path = run.folder / "entry.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | note))
+    ((), refused) = plan_runs(SWEEP, tmp_path)
+    assert "holds a training with another" in refused["one"] and refused["one"].isprintable()
+
+
+@pytest.mark.parametrize("noted", [{"iteration": "5"}, {"iteration": None}, {"iteration": []}, {"outcome": 5}])
+def test_a_run_description_that_was_edited_is_one_sentence(tmp_path, noted):
+    ((run,), _) = plan_runs(SWEEP, tmp_path)
+    made = run.folder / "logs" / "go2_cts" / "2026-01-01"
+    made.mkdir(parents=True)
+    (made / "model_1.pt").touch()
+    (made / "run.json").write_text(json.dumps({"outcome": "finished"} | noted))
+    with pytest.raises(CheckpointError, match=rf"run.json': {next(iter(noted))} is"):
+        _ = run.trained
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path):

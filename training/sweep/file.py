@@ -10,6 +10,8 @@ from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read
 from ..launch import DEFAULT_BACKEND
 
 NO_SUITE = "none"
+MOST_RUNS = 1000
+"""Trainings of a sweep."""
 
 
 class SweepError(ValueError):
@@ -68,6 +70,9 @@ class Sweep:
                 raise ValueError(f"has seeds {list(seeds)}; give at least one, and each once")
         if self.checkpoint == "best" and self.training_suite == NO_SUITE:
             raise ValueError("has checkpoint 'best', which training_suite chooses; give a suite, or checkpoint 'last'")
+        runs = sum(len(self.seeds if e.seeds is None else e.seeds) for e in self.entry)
+        if runs > MOST_RUNS:
+            raise ValueError(f"has {runs:,} trainings; at most {MOST_RUNS:,} are possible")
 
 
 def load_sweep(path: Path) -> Sweep:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...backends.base import BackendError
-from ...files.parsing import read_results
+from ...files.parsing import one_line, read_results
 from ...files.writing import json_text, make_folder, write_atomically
 from ...gauge.suite import SuiteError, load_suite
 from ..checkpoint import CheckpointError
@@ -120,9 +120,9 @@ class SweepRun:
             make_folder(self.folder, SweepError)
             write_atomically(note, json_text(dict(mine)), SweepError)
         elif (found := read_results(note, "sweep's note", SweepError)) != mine:
-            changed = next(name for name in mine if found.get(name) != mine[name])
+            changed = next(name for name in {**mine, **found} if found.get(name) != mine.get(name))
             raise SweepError(
-                f"'{self.folder}' holds a training with another {changed}; give another folder with --out, or take this one "
+                f"'{self.folder}' holds a training with another {one_line(changed, 80)}; give another folder with --out, or take this one "
                 "away"
             )
 
