@@ -48,7 +48,12 @@ def examine_policy(
 
     Returns:
         Whether nothing looks wrong.
+
+    Raises:
+        UserError: ``out`` is no ``.toml``, or cannot be written.
     """
+    if out is not None and out.suffix != ".toml":
+        raise UserError(f"--out is '{out}'; give a file that ends in .toml")
     asked = None if robot is None else load_robot(robot)
     policy = load_policy(policy_file(choice), asked, trust=trust, contract_file=contract)
     body = robot_for(policy.contract, robot)

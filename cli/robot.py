@@ -16,7 +16,7 @@ from ..robots import Robot, RobotError, load_robot
 from ..robots.drafting import draft_robot
 from ..robots.examining import Finding, examine
 from ..robots.loading import ROBOT_FILE, load_robot_file
-from .console import Terminal
+from .console import Terminal, shell_command
 from .errors import UserError
 from .picture import Picture, choose_renderer
 
@@ -27,32 +27,36 @@ _EVERYTHING = "everything"
 
 
 def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -> None:
-    """Write a first description, and print what was guessed. What cannot be described leaves nothing behind.
+    """Write a first description, and print what was guessed. What cannot be described leaves everything as it was.
 
     Raises:
-        UserError: there is a description already.
+        UserError: there is a description, or a model with names, already.
         RobotError: the model is no legged robot, or a file cannot be written.
     """
     folder = out or model.parent
     description = folder / ROBOT_FILE
-    if description.exists() and not force:
-        raise UserError(f"'{description}' already exists; give another folder (--out), or replace it with --force")
-    draft = draft_robot(model, name, folder=folder)
     own = folder / f"{model.stem}-named.xml"
+    _refuse_existing(description, force)
+    draft = draft_robot(model, name, folder=folder)
+    if draft.model:
+        _refuse_existing(own, force)
     made = not folder.exists()
     make_folder(folder, RobotError)
-    written: list[Path] = []
+    before: dict[Path, bytes | None] = {}
+    mjcf = own.name if draft.model else os.path.relpath(model.resolve(), folder.resolve())
     try:
-        if draft.model:
-            write_atomically(own, draft.model, RobotError)
-            written.append(own)
-        mjcf = own.name if draft.model else os.path.relpath(model.resolve(), folder.resolve())
-        write_atomically(description, draft.text(mjcf), RobotError)
-        written.append(description)
+        for path, text in ((own, draft.model), (description, draft.text(mjcf))):
+            if text:
+                earlier = path.read_bytes() if path.is_file() else None
+                write_atomically(path, text, RobotError)
+                before[path] = earlier
         robot = load_robot_file(description)
     except RobotError:
-        for path in written:
-            path.unlink(missing_ok=True)
+        for path, earlier in before.items():
+            if earlier is None:
+                path.unlink(missing_ok=True)
+            else:
+                write_atomically(path, earlier, RobotError)
         if made:
             folder.rmdir()
         raise
@@ -63,7 +67,12 @@ def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -
     console.say("guessed, so look at it:")
     for guess in draft.guesses:
         console.say(f"  {guess}")
-    console.say(f"next:\n  gaitgauge robot check {description}")
+    console.say(f"next:\n  {shell_command(['robot', 'check', str(description)])}")
+
+
+def _refuse_existing(path: Path, force: bool) -> None:
+    if path.exists() and not force:
+        raise UserError(f"'{path}' already exists; give another folder (--out), or replace it with --force")
 
 
 def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_output: bool) -> bool:

@@ -70,7 +70,7 @@ class Draft:
                 lines += ["", f"[{group}]"]
                 table = group
             if entry.remark:
-                lines.append(f"# {entry.remark}")
+                lines.append(f"# {one_line(entry.remark)}")
             lines.append(f"{key} = {_toml(mjcf if key == 'mjcf' else entry.value)}")
         return "\n".join(lines) + "\n"
 
@@ -174,4 +174,4 @@ def _toml(value: Any) -> str:
         return "\n".join(["[", *lines, "]"])
     if isinstance(value, float):
         return repr(value)
-    return json.dumps(value, ensure_ascii=False)
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from .. import completion
-from ..errors import report_errors
+from ..errors import UserError, report_errors
 from ..options import (
     BackendOption,
     ClusterOption,
@@ -215,6 +215,8 @@ def board(
     from ...gauge.board import write_board
     from ..console import Terminal
 
+    if out is not None and out.suffix.lower() != ".html":
+        raise UserError(f"--out is '{out}'; give a file that ends in .html")
     Terminal().say(str(write_board(folder, out or folder / "board.html")))
 
 

@@ -41,6 +41,13 @@ def test_it_names_the_mistake_and_the_lines_to_change(run, backwards, tmp_path):
     assert PolicyContract.from_dict(data).hash == load_policy("pretrained").contract.hash
 
 
+def test_the_policy_is_not_written_over(refused, backwards):
+    """The description of how a policy is run took the policy's place."""
+    before = backwards.read_bytes()
+    assert "ends in .toml" in refused("doctor", backwards, "--out", backwards)
+    assert backwards.read_bytes() == before
+
+
 @pytest.mark.usefixtures("few")
 def test_json_holds_it_all(run):
     result = run("doctor", "pretrained", "--seconds", 1, "--threads", 1, "--json")

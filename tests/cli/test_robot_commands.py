@@ -2,6 +2,7 @@
 
 import json
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,35 @@ def test_new_and_check(run, model):
     assert rows["standing"]["sentence"].startswith("stands in its default pose: after 2 s its base is 0.38")
     assert [name for name, row in rows.items() if not row["passed"]] == ["SDK order"]
     assert rows["SDK order"]["needed_for"] == "export of a deploy.yaml"
+
+
+def test_nothing_that_was_there_is_lost(refused, run, model):
+    """The model with names replaced another file, and a failure took the earlier description with it."""
+    text = model.read_text()
+    model.write_text(text.replace('name="sole of hind_left"', ""))
+    named = model.with_name(f"{model.stem}-named.xml")
+    named.write_text("years of work")
+    assert f"'{named}' already exists" in refused("robot", "new", model)
+    assert named.read_text() == "years of work" and not (model.parent / "robot.toml").exists()
+    (model.parent / "robot.toml").write_text("more years of work")
+    model.write_text(text.replace('name="sole of hind_left"', "").replace("unseen", "un&#10;seen"))
+    assert "title is 'un\\nseen'" in refused("robot", "new", model, "--force")
+    assert named.read_text() == "years of work"
+    assert (model.parent / "robot.toml").read_text() == "more years of work"
+    model.write_text(text)
+    assert run("robot", "new", model, "--force").exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["home&#10;imu_site = &quot;x&quot;&#10;#", "home\u2028", "home\x7f"])
+def test_a_keyframe_s_name_is_no_line_of_the_description(run, model, name):
+    """Where the pose comes from stands in a comment, which a line's end ends."""
+    pose = "0 0 0.4 1 0 0 0" + " 0" * 12
+    key = f'<keyframe><key name="{name}" qpos="{pose}"/></keyframe></mujoco>'
+    model.write_text(model.read_text().replace("</mujoco>", key))
+    made = run("robot", "new", model, "--out", "mine")
+    assert made.exit_code == 0, made.stderr
+    assert "imu_site" not in tomllib.loads(Path("mine/robot.toml").read_text())
+    assert "keyframe 'home" in Path("mine/robot.toml").read_text()
 
 
 def test_a_description_is_not_replaced_unasked(refused, run, model):

@@ -44,7 +44,7 @@ def test_control_characters_are_escaped():
 @pytest.mark.parametrize("name", [b"\xff", b"\x1b[31m"])
 def test_a_page_whose_name_is_no_text_is_named(run, tmp_path, name):
     shutil.copy(Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json", tmp_path / "card.json")
-    page = os.fsdecode(name)
+    page = os.fsdecode(name) + ".html"
     for arguments in (("board", ".", "--out", page), ("compare", "card.json", "card.json", "--out", page + "s")):
         result = run(*arguments)
         assert result.exit_code == 0, result.exception

@@ -3,12 +3,14 @@
 import json
 
 import pytest
+from gaitgauge.cli.main import app
 from gaitgauge.gauge.board import board_data, render_board, write_board
 from gaitgauge.gauge.comparison import ComparisonError
 from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.gauge.verify import CardError
 from sample_results import HOSTILE, Page, sample
+from typer.testing import CliRunner
 
 
 def card(
@@ -95,6 +97,13 @@ def test_a_folder_becomes_a_page_and_what_is_no_card_is_named(tmp_path):
     with pytest.raises(ComparisonError, match=r"other.json"):
         write_board(tmp_path, tmp_path / "second.html")
     assert not (tmp_path / "second.html").exists()
+
+
+def test_a_card_is_not_written_over(tmp_path):
+    (tmp_path / "one.json").write_text(text := json.dumps(card(0.5)))
+    done = CliRunner().invoke(app, ["board", str(tmp_path), "--out", str(tmp_path / "one.json")])
+    assert done.exit_code == 2 and "ends in .html" in done.stderr
+    assert (tmp_path / "one.json").read_text() == text
 
 
 def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(tmp_path):
