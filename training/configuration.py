@@ -175,9 +175,9 @@ class RunConfiguration:
     """Appended to the date in the run directory's name."""
     seed: Seed = 0
     """Seed of every random generator; rank r of a multi-GPU run uses seed + r."""
-    steps_per_iteration: int = 24
+    steps_per_iteration: Annotated[int, Field(le=1_000_000)] = 24
     """Environment steps of every environment between two updates."""
-    iterations: int = 10_000
+    iterations: Annotated[int, Field(le=1_000_000_000)] = 10_000
     """Updates of the whole run."""
     save_interval: int = 500
     """Updates between two checkpoints."""
@@ -222,6 +222,11 @@ class RunConfiguration:
             raise ConfigurationError(f"experiment is {self.experiment!r}; it must be a plain folder name.")
         if self.run_name and PurePath(self.run_name).name != self.run_name:
             raise ConfigurationError(f"run_name is {self.run_name!r}; it must be a part of a folder's name.")
+        for name in ("experiment", "run_name"):
+            if not getattr(self, name).isprintable():
+                raise ConfigurationError(
+                    f"{name} is {getattr(self, name)!r}; it must be printable, without line ends and control characters."
+                )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,6 +37,7 @@ def new_run_directory(root: Path, experiment: str, run_name: str = "", now: date
     stamp = (now or datetime.now()).replace(microsecond=0)
     suffix = f"_{run_name}" if run_name else ""
     try:
+        str(root).encode()
         (root / experiment).mkdir(parents=True, exist_ok=True)
         for second in range(60):
             moment = datetime.fromtimestamp(stamp.timestamp() + second)
@@ -46,6 +47,11 @@ def new_run_directory(root: Path, experiment: str, run_name: str = "", now: date
                 return run
     except OSError as error:
         raise CheckpointError(f"Cannot create a run directory in '{root / experiment}': {error.strerror}.") from error
+    except UnicodeEncodeError as error:
+        raise CheckpointError(
+            f"Cannot create a run directory in '{one_line(root)}': TensorBoard takes no path that is no UTF-8; choose "
+            "another --log-root."
+        ) from error
     raise CheckpointError(
         f"Cannot create a run directory in '{root / experiment}': the names of the next minute are all taken."
     )

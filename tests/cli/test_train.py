@@ -163,6 +163,24 @@ def test_no_gpu(refused, tmp_path):
     assert not (tmp_path / "logs").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--run-name", "a\nb"), "run_name is 'a\\nb'; it must be printable"),
+        (("--run-name", "\x1b[31m"), "run_name is '\\x1b[31m'"),
+        (("--run-name", "\udcff"), "run_name is '\\udcff'"),
+        (("training.run.experiment=\u202ex",), "experiment is '\\u202ex'"),
+        (
+            ("--iterations", 10**20),
+            "iterations' is '100000000000000000000'; it must be less than or equal to 1000000000",
+        ),
+    ],
+)
+def test_what_cannot_be_a_run_leaves_no_folder(refused, tmp_path, arguments, named):
+    assert named in refused("train", "go2-flat", *FAKE, "--log-root", tmp_path / "logs", *arguments)
+    assert not (tmp_path / "logs").exists()
+
+
 def test_checkpoint_of_another_task(refused, trained, tmp_path):
     message = refused("train", "go2-cts", "--resume", trained, "--device", "cpu")
     assert "'go2-flat'" in message

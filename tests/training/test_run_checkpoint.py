@@ -1,3 +1,4 @@
+import os
 import random
 import resource
 import signal
@@ -105,6 +106,13 @@ def test_run_directories(tmp_path):
     assert find_checkpoint(str(first), experiment="other", root=tmp_path) == first / "model_1000.pt"
     with pytest.raises(CheckpointError, match=r"There is no checkpoint 'none\.pt'"):
         find_checkpoint("none.pt", experiment="go2", root=tmp_path)
+
+
+def test_a_place_whose_name_is_no_text_is_refused_before_it_is_made(tmp_path):
+    root = tmp_path / os.fsdecode(b"\xff")
+    with pytest.raises(CheckpointError, match=r"TensorBoard takes no path that is no UTF-8; choose another --log-root"):
+        new_run_directory(root, "go2")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_name_that_python_takes_for_a_number_is_no_checkpoint(tmp_path):
