@@ -1,14 +1,8 @@
-"""From a request to results: what is refused, what a killed run leaves, and that it ends with the very same results."""
+"""From a request to results, and what is refused."""
 
 import csv
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import textwrap
-import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -16,14 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends import make_backend
-from gaitgauge.backends.base import BackendError
-from gaitgauge.backends.fake import FakeScript
-from gaitgauge.files.provenance import commit, versions
-from gaitgauge.gauge import evaluate as evaluation
-from gaitgauge.gauge.episodes import Record
-from gaitgauge.gauge.evaluate import Request, identity, prepare
-from gaitgauge.gauge.store import RunFolder, StoreError
+from gaitgauge.files.provenance import commit
+from gaitgauge.gauge.evaluate import prepare
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
@@ -32,98 +20,7 @@ from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import RobotError
 from gaitgauge.terrains.registry import TerrainError
 from scripted_gauge import GO2, Puppet
-
-TINY = """
-extends = "{base}"
-name = "tiny"
-version = "1.0.0"
-goals = [
-  {{ name = "diagonal_velocity", phases = [0.04, 0.02] }},
-  {{ name = "max_velocity", phases = [0.04, 0.02] }},
-  {{ name = "target_pos_velocity", phases = [] }},
-]
-
-[physics]
-timestep = 0.01
-substeps = 2
-
-[matrix]
-terrains = ["flat", "slope_fd"]
-frictions = [0.6]
-payloads = [0.0]
-seeds = [0, 1]
-search_seeds = [100, 101, 102]
-
-[commands]
-target_radius = 0.5
-target_time = {{ slope = 0.3 }}
-target_speed = {{ slope = 1.0 }}
-
-[noise]
-latency = 1
-
-[settling]
-shortest = 0.02
-longest = 0.2
-
-[metrics]
-interval = 2
-
-[scoring]
-levels = 3
-pass_rate = 0.6
-bootstrap = 20
-"""
-
-
-def gliding(backend):
-    """Robots rush up gentle slopes once they have settled, and never move on level 3."""
-    level = torch.tensor([t.level for t in backend.scene.terrains])[backend.terrain_index]
-    linear = torch.zeros(backend.num_worlds, 3, dtype=torch.float64)
-    linear[:, 0] = 20.0 * (backend.state.time.ge(0.045) & level.ge(1) & level.le(2))
-    return linear, torch.zeros_like(linear)
-
-
-def puppets(name, scene, *, device="cpu", threads=1):
-    return Puppet(scene, script=FakeScript(motion=gliding))
-
-
-def evaluate(request, folder, *, make=None, **options):
-    """An evaluation, on the engine without physics where a request names that."""
-    make = make or (puppets if getattr(request, "backend", "fake") == "fake" else make_backend)
-    return evaluation.evaluate(request, folder, make=make, **options)
-
-
-@pytest.fixture
-def request_for(tmp_path, monkeypatch):
-    """Makes requests for a tiny suite on an engine without physics."""
-    torch.manual_seed(0)
-    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
-    network = MlpNetwork(**arguments)
-    policy = tmp_path / "policy.gauge.pt"
-    stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
-    save_policy(policy, standard_contract(GO2), stored)
-    monkeypatch.setattr(evaluation, "_WATCH_INTERVAL", 0.0)
-
-    def make(base="gaitgauge-1", **choices):
-        suite = tmp_path / f"{base}.toml"
-        suite.write_text(TINY.format(base=base))
-        return Request(**{"policy": str(policy), "suite": str(suite), "backend": "fake", **choices})
-
-    return make
-
-
-def without_provenance(folder):
-    results = json.loads((folder / "results.json").read_text())
-    del results["provenance"]
-    return json.dumps(results)
-
-
-class Killed(BaseException):
-    pass
-
-
-# ---- results --------------------------------------------------------------------------------------------------------
+from tiny_runs import SMALL, TINY, evaluate, without_provenance
 
 
 @pytest.mark.parametrize("base", ["robogauge-1.1", "gaitgauge-1"])
@@ -166,11 +63,12 @@ def test_a_whole_run(request_for, tmp_path, base):
     assert sum(int(r["physics_steps"]) for r in rows) > 0
 
 
-def test_the_same_request_gives_the_same_results(request_for, tmp_path):
-    evaluate(request_for(), tmp_path / "a")
-    evaluate(request_for(threads=2), tmp_path / "b")
-    assert without_provenance(tmp_path / "a") == without_provenance(tmp_path / "b")
-    assert (tmp_path / "a" / "episodes.csv").read_bytes() == (tmp_path / "b" / "episodes.csv").read_bytes()
+def test_the_same_request_gives_the_same_results(whole_run, tmp_path):
+    request, once = whole_run
+    again = tmp_path / "run"
+    evaluate(replace(request, threads=2), again)
+    assert without_provenance(again) == without_provenance(once)
+    assert (again / "episodes.csv").read_bytes() == (once / "episodes.csv").read_bytes()
 
 
 def test_a_level_run_has_levels_and_no_score(request_for, tmp_path):
@@ -213,81 +111,6 @@ def test_the_progress_lists_every_episode_once_and_counts_down(request_for, tmp_
     assert all(b.remaining_work <= a.remaining_work for a, b in steady)
 
 
-# ---- interruption ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("counts", [(0, 3, 7), pytest.param(range(9), marks=pytest.mark.slow)])
-def test_a_run_killed_after_any_episode_ends_with_the_very_same_results(request_for, tmp_path, monkeypatch, counts):
-    request, puts = request_for("robogauge-1.1"), []
-    put = RunFolder.put
-    monkeypatch.setattr(RunFolder, "put", lambda self, record: (puts.append(record.episode.key), put(self, record)))
-    evaluate(request, tmp_path / "whole")
-    episodes = sorted(puts)
-    assert len(set(episodes)) == len(episodes) == 8
-    for count in counts:
-        folder = tmp_path / f"killed-{count}"
-        puts.clear()
-
-        def watch(status, count=count):
-            if status.done >= count:
-                raise Killed
-
-        with pytest.raises(Killed):
-            evaluate(request, folder, watch=watch)
-        assert not (folder / "results.json").exists()
-        assert len(puts) >= count
-        evaluate(request, folder, resume=True)
-        assert sorted(puts) == episodes, "an episode was played twice or never"
-        assert without_provenance(folder) == without_provenance(tmp_path / "whole")
-        assert (folder / "episodes.csv").read_bytes() == (tmp_path / "whole" / "episodes.csv").read_bytes()
-
-
-def test_speculative_episodes_that_nothing_asked_for_are_gone_at_the_end(request_for, tmp_path):
-    """A killed run may leave some: they are no part of results, whatever they say."""
-    evaluate(request_for(), tmp_path / "whole")
-    evaluate(request_for(), tmp_path / "run")
-    (tmp_path / "run" / "results.json").unlink()
-    with RunFolder(tmp_path / "run", identity(prepare(request_for())), resume=True) as folder:
-        counted = next(e for e in folder.records if e.stage == "search")
-        extra = Record(episode=replace(counted, level=1), success=False)
-        assert extra.episode not in folder.records
-        folder.put(extra)
-    evaluate(request_for(), tmp_path / "run", resume=True)
-    assert without_provenance(tmp_path / "run") == without_provenance(tmp_path / "whole")
-    files = [{p.name: p.read_bytes() for p in (tmp_path / n / "episodes").iterdir()} for n in ("run", "whole")]
-    assert files[0] == files[1]
-
-
-def test_two_processes_cannot_use_one_folder(request_for, tmp_path, monkeypatch):
-    monkeypatch.setattr("gaitgauge.files.writing._PATIENCE", 0.1)
-    with (
-        RunFolder(tmp_path / "run", identity(prepare(request_for())), resume=False),
-        pytest.raises(StoreError, match="another process is writing to"),
-    ):
-        evaluate(request_for(), tmp_path / "run", resume=True)
-
-
-def test_a_finished_run_resumes_to_itself_without_playing(request_for, tmp_path, monkeypatch):
-    evaluate(request_for(), tmp_path / "run")
-    before = without_provenance(tmp_path / "run")
-    monkeypatch.setattr(Puppet, "step", lambda *_, **__: pytest.fail("an episode was played again"))
-    evaluate(request_for(), tmp_path / "run", resume=True)
-    assert without_provenance(tmp_path / "run") == before
-
-
-def test_a_damaged_episode_is_set_aside_and_played_again(request_for, tmp_path):
-    evaluate(request_for(), tmp_path / "run")
-    before = without_provenance(tmp_path / "run")
-    file = next((tmp_path / "run" / "episodes").glob("eval-flat*s1*"))
-    whole = file.read_bytes()
-    file.write_bytes(whole[:100])
-    results = evaluate(request_for(), tmp_path / "run", resume=True)
-    assert without_provenance(tmp_path / "run") == before
-    assert file.read_bytes() == whole
-    assert results["provenance"]["set_aside"] == [file.name + ".damaged"]
-    assert file.with_name(file.name + ".damaged").read_bytes() == whole[:100]
-
-
 def test_results_are_written_whatever_the_provenance_holds(request_for, tmp_path):
     contract = replace(
         standard_contract(GO2), provenance={"note": float("nan"), "name": "\ud800", "[/x]": [float("inf")]}
@@ -300,18 +123,6 @@ def test_results_are_written_whatever_the_provenance_holds(request_for, tmp_path
     assert written["score"] == results["score"]
     assert written["policy"]["provenance"] == {"note": "nan", "name": "\\ud800", "[/x]": ["inf"]}
     assert written["provenance"]["command"] == "gaitgauge 'a b' '\\udcff'"
-
-
-def test_a_run_does_not_go_on_with_another_robot(request_for, tmp_path):
-    folder = tmp_path / "robot"
-    shutil.copytree(GO2.mjcf.parent, folder)
-    request = request_for(robot=str(folder))
-    evaluate(request, tmp_path / "run")
-    evaluate(request, tmp_path / "run", resume=True)
-    file = folder / "robot.toml"
-    file.write_text(file.read_text().replace("stiffness = 20.0", "stiffness = 20.5", 1))
-    with pytest.raises(StoreError, match=r"belongs to another run \(robot_digest differs\)"):
-        evaluate(request, tmp_path / "run", resume=True)
 
 
 def test_a_robot_with_its_feet_in_the_ground_is_not_judged(request_for, tmp_path):
@@ -327,42 +138,11 @@ def test_a_robot_with_its_feet_in_the_ground_is_not_judged(request_for, tmp_path
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_does_not_go_on_with_another_engine_version(request_for, tmp_path, monkeypatch):
-    evaluate(request_for(), tmp_path / "run")
-    monkeypatch.setattr(evaluation, "versions", lambda: {**versions(), "mujoco": "0.0"})
-    with pytest.raises(StoreError, match=r"versions.mujoco was '[0-9.]+', now '0.0'"):
-        evaluate(request_for(), tmp_path / "run", resume=True)
-
-
-@pytest.mark.parametrize(
-    "changes", [{"seeds": (0,)}, {"frictions": (0.5,)}, {"pipeline": "level"}, {"base": "robogauge-1.1"}]
-)
-def test_the_folder_of_another_request_is_refused(request_for, tmp_path, changes):
-    evaluate(request_for(), tmp_path / "run")
-    before = (tmp_path / "run" / "results.json").read_bytes()
-    with pytest.raises(StoreError, match="belongs to another run"):
-        evaluate(request_for(**changes), tmp_path / "run", resume=True)
-    assert (tmp_path / "run" / "results.json").read_bytes() == before
-
-
-def test_a_suite_that_changed_under_its_name_is_another_run(request_for, tmp_path):
-    request = request_for()
-    evaluate(request, tmp_path / "run")
-    suite = Path(request.suite)
-    suite.write_text(suite.read_text().replace("interval = 2", "interval = 4"))
-    with pytest.raises(StoreError, match="belongs to another run"):
-        evaluate(request, tmp_path / "run", resume=True)
-
-
 def test_a_policy_that_answers_nonsense_leaves_what_was_finished(request_for, tmp_path):
     request = request_for(pipeline="multi")
-    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
-    broken = {k: torch.full_like(v, torch.nan) for k, v in MlpNetwork(**arguments).state_dict().items()}
-    save_policy(
-        request.policy,
-        standard_contract(GO2),
-        StoredNetwork(architecture="mlp", arguments=arguments, state_dict=broken),
-    )
+    broken = {k: torch.full_like(v, torch.nan) for k, v in MlpNetwork(**SMALL).state_dict().items()}
+    stored = StoredNetwork(architecture="mlp", arguments=SMALL, state_dict=broken)
+    save_policy(request.policy, standard_contract(GO2), stored)
     with pytest.raises(
         PolicyError,
         match="returned nan for a finite observation at control step 0 of diagonal_velocity, sub-command 1, of episode eval-flat",
@@ -430,133 +210,3 @@ def test_a_single_run_takes_the_suites_own_ground(request_for, tmp_path, pipelin
         prepare(request)
     (environment,) = prepare(replace(request, level=2)).environments
     assert environment.key == "slope_fd-f0.3-m0"
-
-
-# ---- real kills and real physics --------------------------------------------------------------------------------------------
-
-CHILD = """
-import sys
-sys.path.insert(0, {tests!r})
-import test_evaluate_runs as runs
-from gaitgauge.gauge.evaluate import Request
-from pathlib import Path
-runs.evaluate(Request(policy={policy!r}, suite={suite!r}, backend="fake"), Path({folder!r}), resume=True)
-"""
-
-
-@pytest.mark.slow
-def test_a_process_killed_by_the_system_resumes(request_for, tmp_path):
-    request = request_for()
-    evaluate(request, tmp_path / "whole")
-    for wanted in (0, 1, 3, 5):
-        folder = tmp_path / f"killed-{wanted}"
-        child = CHILD.format(
-            tests=str(Path(__file__).parent), policy=request.policy, suite=request.suite, folder=str(folder)
-        )
-        process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(child)])
-        deadline = time.monotonic() + 120
-        while time.monotonic() < deadline and process.poll() is None:
-            if (folder / "episodes").exists() and len(list((folder / "episodes").glob("*.npz"))) >= wanted:
-                break
-            time.sleep(0.002)
-        if process.poll() is None:
-            os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-        assert process.returncode in (0, -signal.SIGKILL)
-        evaluate(request, folder, resume=True)
-        assert without_provenance(folder) == without_provenance(tmp_path / "whole")
-
-
-@pytest.fixture
-def real_request(request_for, monkeypatch):
-    """A request for real terrains and contacts, a random policy that stumbles and falls, short goals."""
-    monkeypatch.undo()
-    request = request_for()
-    text = Path(request.suite).read_text()
-    text = text.replace("timestep = 0.01\nsubsteps = 2", "").replace("interval = 2", "interval = 10")
-    text = text.replace("[0.04, 0.02]", "[0.4, 0.2]").replace("slope = 0.3", "slope = 2.0").replace("latency = 1", "")
-    Path(request.suite).write_text(text)
-    return replace(request, backend="mujoco")
-
-
-def test_threads_change_no_bit_of_the_results_in_mujoco(real_request, tmp_path):
-    for threads in (1, 2):
-        evaluate(replace(real_request, threads=threads), tmp_path / f"threads-{threads}")
-    provenance = [json.loads((tmp_path / f"threads-{n}" / "results.json").read_text())["provenance"] for n in (1, 2)]
-    assert [p["processes"] for p in provenance] == [1, 2]
-    assert json.loads((tmp_path / "threads-1" / "results.json").read_text())["solver"]["iterations"] == 100
-    assert provenance[0]["physics_steps"] == provenance[1]["physics_steps"]
-    assert all(0.0 < p["engine_seconds"] < p["processes"] * p["seconds"] for p in provenance)
-    one, two = (without_provenance(tmp_path / f"threads-{n}") for n in (1, 2))
-    assert one == two
-    assert 0.0 < json.loads(one)["score"] < 1.0
-    episodes = [{f.name: f.read_bytes() for f in (tmp_path / f"threads-{n}" / "episodes").iterdir()} for n in (1, 2)]
-    assert episodes[0] == episodes[1]
-
-
-def test_an_error_in_a_process_is_the_runs_error(real_request, tmp_path):
-    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
-    network = MlpNetwork(**arguments)
-    network.network[-1].bias.data.fill_(float("nan"))
-    stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=network.state_dict())
-    save_policy(Path(real_request.policy), standard_contract(GO2), stored)
-    with pytest.raises(PolicyError, match="returned nan"):
-        evaluate(replace(real_request, threads=2), tmp_path / "run")
-
-
-@pytest.mark.slow
-def test_a_process_that_is_killed_costs_nothing_that_was_finished(real_request, tmp_path):
-    request = replace(real_request, threads=2)
-    evaluate(request, tmp_path / "whole")
-    killed = []
-
-    def kill(status):
-        if status.done and not killed:
-            (child, *_) = children()
-            os.kill(child, signal.SIGKILL)
-            killed.append(child)
-
-    with pytest.raises(BackendError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
-        evaluate(request, tmp_path / "run", watch=kill)
-    assert children() == []
-    evaluate(request, tmp_path / "run", resume=True)
-    assert without_provenance(tmp_path / "run") == without_provenance(tmp_path / "whole")
-
-
-ORPHANS = """
-from gaitgauge.gauge import evaluate as evaluation
-from pathlib import Path
-evaluation.evaluate(evaluation.Request(policy={policy!r}, suite={suite!r}, backend="mujoco", threads=2), Path({folder!r}))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="reads /proc")
-def test_processes_end_with_the_one_that_started_them(real_request, tmp_path):
-    code = ORPHANS.format(policy=real_request.policy, suite=real_request.suite, folder=str(tmp_path / "run"))
-    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)])
-    deadline = time.monotonic() + 60
-    workers: list[int] = []
-    while time.monotonic() < deadline and len(workers) < 2:
-        workers = children(process.pid)
-        time.sleep(0.01)
-    assert len(workers) == 2
-    process.kill()
-    process.wait()
-    while time.monotonic() < deadline and any(map(at_work, workers)):
-        time.sleep(0.05)
-    assert not any(map(at_work, workers))
-
-
-def at_work(process):
-    """Whether a process exists and has not ended."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def children(process=None):
-    """Process ids of a process's children, this one's if none is given, from /proc."""
-    tasks = Path(f"/proc/{process or os.getpid()}/task").glob("*/children")
-    return [int(number) for task in tasks for number in task.read_text().split()]

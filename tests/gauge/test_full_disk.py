@@ -12,28 +12,17 @@ import textwrap
 from pathlib import Path
 
 import pytest
-import torch
 from gaitgauge.gauge.episodes import RecordError
-from gaitgauge.gauge.evaluate import Request
 from gaitgauge.gauge.report import write_report
 from gaitgauge.gauge.store import StoreError
-from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import MlpNetwork
-from scripted_gauge import GO2
-from test_evaluate_runs import TINY, evaluate, without_provenance
+from tiny_runs import evaluate, tiny_request, without_provenance
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A request, the folder of its run on a disk with room, and the names of what was written, in order."""
     folder = tmp_path_factory.mktemp("whole")
-    torch.manual_seed(0)
-    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
-    stored = StoredNetwork(architecture="mlp", arguments=arguments, state_dict=MlpNetwork(**arguments).state_dict())
-    save_policy(folder / "policy.gauge.pt", standard_contract(GO2), stored)
-    (folder / "tiny.toml").write_text(TINY.format(base="gaitgauge-1"))
-    request = Request(policy=str(folder / "policy.gauge.pt"), suite=str(folder / "tiny.toml"), backend="fake")
+    request = tiny_request(folder)
     with pytest.MonkeyPatch.context() as patch:
         written = failing(patch, 99, errno.ENOSPC)
         evaluate(request, folder / "run")
@@ -139,7 +128,7 @@ def test_an_output_path_that_is_no_text(whole, tmp_path):
 ON_A_DISK = """
 import sys
 sys.path.insert(0, {tests!r})
-import test_evaluate_runs as runs
+import tiny_runs as runs
 from gaitgauge.gauge.evaluate import Request
 from pathlib import Path
 try:

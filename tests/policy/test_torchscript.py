@@ -3,6 +3,7 @@ import json
 import os
 import warnings
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -162,11 +163,23 @@ BATCHED = (*REBUILT, "recurrent")
 COPIED = ("counting",)
 
 
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory, cts_network):
+    """A file of each kind and its policy; each is written and loaded once."""
+    folder = tmp_path_factory.mktemp("modules")
+
+    @cache
+    def load(name):
+        path = save(modules(cts_network)[name], folder / f"{name}.pt")
+        return path, load_policy(path)
+
+    return load
+
+
 @pytest.mark.parametrize("name", BATCHED + COPIED)
-def test_batch_equals_single_modules(tmp_path, cts_network, observations, name, run):
+def test_batch_equals_single_modules(loaded, observations, name, run):
     """The reference is the exported module itself, loaded anew for each episode and for each reset."""
-    path = save(modules(cts_network)[name], tmp_path / "policy.pt")
-    policy = load_policy(path)
+    path, policy = loaded(name)
     session = policy.session(EPISODES)
     assert policy.batched == session.batched == (name in BATCHED)
     assert isinstance(policy, RebuiltPolicy) == (name in REBUILT)
@@ -189,8 +202,8 @@ def test_what_is_not_rebuilt_is_said(tmp_path, cts_network, caplog):
 
 
 @pytest.mark.parametrize("name", ["history", "recurrent", "fixed", "counting"])
-def test_reset_rows_and_repeat(tmp_path, cts_network, observations, name, run):
-    policy = load_policy(save(modules(cts_network)[name], tmp_path / "policy.pt"))
+def test_reset_rows_and_repeat(loaded, observations, name, run):
+    _, policy = loaded(name)
     session = policy.session(EPISODES)
     first = run(session, observations)
     assert torch.equal(run(session, observations), first)
@@ -202,8 +215,8 @@ def test_reset_rows_and_repeat(tmp_path, cts_network, observations, name, run):
     assert not torch.equal(undisturbed[RESET_STEP, RESET_ROW], first[RESET_STEP, RESET_ROW])
 
 
-def test_rows_do_not_influence_each_other(tmp_path, cts_network, observations, run):
-    policy = load_policy(save(WithHistory(cts_network), tmp_path / "policy.pt"))
+def test_rows_do_not_influence_each_other(loaded, observations, run):
+    _, policy = loaded("history")
     poisoned = observations.clone()
     poisoned[3:, 1] = float("inf")
     others = torch.arange(EPISODES) != 1
@@ -211,8 +224,8 @@ def test_rows_do_not_influence_each_other(tmp_path, cts_network, observations, r
     assert torch.equal(a[:, others], b[:, others])
 
 
-def test_torchscript_and_native_agree(tmp_path, cts_network, cts_file, observations, run):
-    foreign = load_policy(save(WithHistory(cts_network), tmp_path / "policy.pt"))
+def test_torchscript_and_native_agree(loaded, cts_file, observations, run):
+    _, foreign = loaded("history")
     own = load_policy(cts_file)
     np.testing.assert_allclose(
         run(foreign.session(EPISODES), observations), run(own.session(EPISODES), observations), atol=1e-5
@@ -321,9 +334,9 @@ def test_nan_is_handed_on(tmp_path):
     assert action.isnan().all()
 
 
-def test_wrong_batch_is_refused(tmp_path, cts_network):
+def test_wrong_batch_is_refused(loaded):
     for name in ("history", "fixed"):
-        session = load_policy(save(modules(cts_network)[name], tmp_path / "policy.pt")).session(3)
+        session = loaded(name)[1].session(3)
         with pytest.raises(PolicyError, match=r"\(3, 45\)"):
             session.act(torch.zeros(2, 45))
 
