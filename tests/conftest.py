@@ -1,10 +1,21 @@
 """What all tests share."""
 
+import gc
+import os
 from collections.abc import Iterator
 from functools import cache
 
+# Two workers with two threads each wait for each other on two cores; to be said before anything imports torch.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import pytest
 import typer
+
+
+def pytest_collection_finish() -> None:
+    """Leave what the packages made when they were imported out of every later search for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

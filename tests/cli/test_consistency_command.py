@@ -9,6 +9,8 @@ extends = "robogauge-1.1"
 name = "tiny"
 title = "a second"
 goals = [{ name = "max_velocity", phases = [0.2, 0.1] }, { name = "target_pos_velocity", phases = [] }]
+[matrix]
+frictions = [0.6, 0.8]
 [settling]
 longest = 0.2
 [scoring]

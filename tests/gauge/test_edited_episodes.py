@@ -6,6 +6,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from gaitgauge.gauge import episodes
 from gaitgauge.gauge.episodes import Episode, Record, RecordError, read_records
 
 EPISODE = Episode(
@@ -87,16 +88,18 @@ def test_a_head_that_is_no_table_is_one_sentence(edited, tmp_path, head):
         Record.load(path)
 
 
-def test_an_archive_that_unpacks_to_gigabytes_is_refused(edited):
+def test_an_archive_that_unpacks_to_more_than_a_record_is_refused(edited, monkeypatch):
+    """A thousandth of what it unpacks to; the limit is a tenth of the real one."""
+    monkeypatch.setattr(episodes, "_LARGEST", 10**8)
     path = edited()
     with (
         zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive,
         archive.open("more.npy", "w", force_zip64=True) as entry,
     ):
-        for _ in range(110):
+        for _ in range(11):
             entry.write(bytes(10**7))
-    assert path.stat().st_size < 2e6
-    with pytest.raises(RecordError, match="more than 1000 MB"):
+    assert path.stat().st_size < 2e5
+    with pytest.raises(RecordError, match="more than 100 MB"):
         Record.load(path)
 
 
