@@ -1,3 +1,4 @@
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,9 @@ from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import CtsNetwork
 from gaitgauge.robots import Robot, load_robot
+
+# The foreign programs are shared by several test files.
+sys.path.insert(0, str(Path(__file__).parent))
 
 SMALL_CTS = {"latent_width": 8, "encoder_hidden": [32, 16], "actor_hidden": [32, 16]}
 

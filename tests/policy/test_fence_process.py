@@ -1,0 +1,269 @@
+"""Programs that never end, give what is no action, or ask for all memory: each ends in one sentence, in a process of its own."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import torch
+from foreign_programs import Plain, refused, script
+from gaitgauge.policy.base import PolicyError
+from gaitgauge.policy.fence import child as fence_child
+from gaitgauge.policy.fenced import FencedPolicy
+from gaitgauge.policy.loading import load_policy
+from torch import nn
+
+
+def test_linear_layers_with_weights_of_eight_bits_are_run(tmp_path):
+    torch.manual_seed(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        module = torch.ao.quantization.quantize_dynamic(
+            nn.Sequential(nn.Linear(45, 12)), {nn.Linear}, dtype=torch.qint8
+        )
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(module))
+    observation = torch.randn(1, 45)
+    assert torch.equal(load_policy(path).session(1).act(observation), module(observation))
+
+
+class Sparse(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(1, 12).to_sparse()
+
+
+class Meta(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(1, 12, device="meta")
+
+
+class Complex(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.complex(self.layer(observation), self.layer(observation))
+
+
+class Quantized(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.quantize_per_tensor(self.layer(observation), 0.1, 0, torch.qint8)
+
+
+class Text(Plain):
+    def forward(self, observation: torch.Tensor) -> str:
+        return "left leg first"
+
+
+class Huge(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(2147483648, 12).sum(0, keepdim=True) + self.layer(observation)
+
+
+class Deep(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        texts = ["x"]
+        for _ in range(60):
+            texts.extend(texts)
+        return self.layer(observation) + float(len(texts))
+
+
+class WrongSizes(Plain):
+    """Gives an LSTM fewer hidden states than rows: some implementations write outside of memory then."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weights = [torch.ones(8, 2), torch.ones(8, 2), torch.ones(8), torch.ones(8)]
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        state = [torch.zeros(1, 1, 2), torch.zeros(1, 1, 2)]
+        out = torch.lstm(torch.ones(3, 50, 2), state, self.weights, True, 1, 0.0, False, False, False)
+        return self.layer(observation) + out[0].sum()
+
+
+class Raising(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        if observation.size(0) > 0:
+            raise RuntimeError("left\x1b[31m\nleg")
+        return self.layer(observation)
+
+
+@pytest.mark.parametrize(
+    ("module", "named"),
+    [
+        (Sparse, "sparse"),
+        (Meta, "meta"),
+        (Complex, "complex"),
+        (Quantized, "quantize"),
+        (Text, "str"),
+        (Huge, "memory|allocate"),
+        pytest.param(Deep, "memory|alloc|crashed|took over", marks=pytest.mark.slow),
+        (Raising, "leg"),
+        (WrongSizes, "shape"),
+    ],
+)
+def test_what_is_no_action_ends_in_one_sentence(tmp_path, module, named):
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(module()))
+    assert refused(path, named).isprintable()
+
+
+class Endless(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        while bool(observation.sum() > -1e9):
+            observation = observation + 1.0
+        return self.layer(observation)
+
+
+class EndlessLoading(Plain):
+    @torch.jit.export
+    def __getstate__(self) -> tuple[int, bool]:
+        return 0, self.training
+
+    @torch.jit.export
+    def __setstate__(self, state: tuple[int, bool]) -> None:
+        self.training = state[1]
+        number = state[0]
+        while number >= 0:
+            number += 1
+
+
+class LaterEndless(Plain):
+    """Only from its hundredth step on, after all that loading tries."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("steps", torch.zeros(1, 1))
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        self.steps = self.steps + 1.0
+        while bool(self.steps.max() > 100.0):
+            observation = observation + 1.0
+        return self.layer(observation)
+
+
+@pytest.mark.parametrize("module", [Endless, pytest.param(EndlessLoading, marks=pytest.mark.slow)])
+def test_a_program_without_an_end_is_ended(tmp_path, monkeypatch, module):
+    monkeypatch.setattr(fence_child, "STEP_SECONDS", 1)
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(module()))
+    refused(path, "took over 1 s")
+
+
+@pytest.mark.slow
+def test_a_program_that_finds_no_end_later_is_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(fence_child, "STEP_SECONDS", 1)
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(LaterEndless()))
+    session = load_policy(path).session(4)
+    with pytest.raises(PolicyError, match="took over 1 s"):
+        for _ in range(101):
+            session.act(torch.zeros(4, 45))
+    with pytest.raises(PolicyError):  # and stays away
+        session.act(torch.zeros(4, 45))
+
+
+def test_ctrl_c_ends_a_program_without_an_end(tmp_path):
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(Endless()))
+    # a shell that runs the tests in the background has the signal ignored, and so would Python
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    ready = "from gaitgauge.policy import fenced, loading; print('ready', flush=True)"
+    code = f"{heard}; {ready}; loading.load_policy({str(path)!r})"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        until = time.monotonic() + (30.0 if children.exists() else 2.0)
+        while time.monotonic() < until and not (children.exists() and children.read_text()):
+            time.sleep(0.02)
+        errors = b""
+        for _ in range(8):  # Python ignores one that comes while it forks
+            time.sleep(0.3)
+            process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                _, errors = process.communicate(timeout=1.0)
+                break
+    assert b"KeyboardInterrupt" in errors
+
+
+def test_the_process_ends_with_its_policy(tmp_path, contract):
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(LaterEndless()))
+    policy = load_policy(path)
+    session = policy.session(2)
+    number = policy._child._process.pid
+    os.kill(number, 0)
+    del policy
+    session.act(torch.zeros(2, 45))
+    del session
+    with pytest.raises(ProcessLookupError):
+        os.kill(number, 0)
+
+
+class Remembering(Plain):
+    """Acts on what it was given a step ago, which it keeps without a copy."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last = torch.zeros(1, 45)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        action = self.layer(self.last)
+        self.last = observation
+        return action
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch) -> FencedPolicy:
+    """A program that is run although its network could be rebuilt."""
+    monkeypatch.setattr("gaitgauge.policy.loading.rebuilt", lambda policy: policy)
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(Remembering()))
+    policy = load_policy(path)
+    assert isinstance(policy, FencedPolicy)
+    return policy
+
+
+def test_a_program_may_keep_what_it_is_given(program):
+    session, observations = program.session(3), torch.randn(4, 3, 45)
+    actions = [session.act(observation) for observation in observations]
+    expected = [program.session(3).act(torch.zeros(3, 45))]  # what it remembers at first
+    for observation in observations[:3]:
+        other = program.session(3)
+        other.act(observation)
+        expected.append(other.act(torch.zeros(3, 45)))
+    assert torch.allclose(torch.stack(actions), torch.stack(expected), atol=1e-6)
+
+
+def test_sessions_of_one_program_do_not_meet(program):
+    small, large = program.session(2), program.session(5)
+    kept = small.act(torch.zeros(2, 45))
+    before = kept.clone()
+    large.act(torch.randn(5, 45))
+    large.reset(torch.tensor([True, False, True, False, True]))
+    large.act(torch.randn(5, 45))
+    assert torch.equal(kept, before) and torch.equal(small.act(torch.zeros(2, 45)), before)
+
+
+def test_more_numbers_than_there_is_room_for(program, monkeypatch):
+    monkeypatch.setattr(fence_child, "_ROOM", 24 * 4 * (45 + 12) + 24)
+    assert program.session(24).act(torch.zeros(24, 45)).shape == (24, 12)
+    with pytest.raises(PolicyError, match="those of 25 episodes are more"):
+        program.session(25)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="only where processes are forked")
+def test_a_copy_of_its_owner_does_not_ask_it(program):
+    session = program.session(1)
+    process = os.fork()
+    if process == 0:
+        try:
+            session.act(torch.zeros(1, 45))
+        except PolicyError as error:
+            os._exit(7 if "load it in the one that asks" in str(error) else 1)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 7
+    assert session.act(torch.zeros(1, 45)).shape == (1, 12)
