@@ -1,154 +1,206 @@
 """What it costs that a stranger's program runs in a locked process of its own.
 
-    python benchmarks/fence_cost.py [POLICY] [--suite demo] [--terrain NAME …] [--repeat 3]
+    python benchmarks/fence_cost.py [POLICY …] [--suite demo] [--terrain NAME …] [--repeat 3]
 
-Plays part of a suite with one worker, in turn with the program of a TorchScript or ONNX file behind the fence and in the worker
-itself, and prints wall times, their medians and the median of the pairs' ratios. Without POLICY it is the shipped one as
-TorchScript. Files whose networks are known are rebuilt from their weights and need no fence; here they are run with their own
-code all the same, since that is what the fence is for. Both must give the same score. For an idle machine of two cores or more:
-worker and program take turns, but on one core each would wait for the other to be put aside. Runs of a few seconds differ by more
-than the fence costs: the last line is of control steps alone, measured in turn.
+Plays part of a suite with one worker. At every control step the program of a TorchScript or ONNX file is asked twice, behind the
+fence and in the worker itself. Both must give the same action to the last bit; they take turns in who is asked first, and only
+that one's time counts, since it finds the caches as physics left them. So one run compares thousands of steps a few milliseconds
+apart, whatever else the machine has to do. A run with either takes what the rest of it took, so many control steps, and loading.
+
+Without POLICY it is the shipped one, as TorchScript and as ONNX. Files whose networks are known are rebuilt from their weights and
+need no fence; here they are run with their own code all the same, since that is what the fence is for. Linux only. Processor time
+is that of all processes; wall time means something on an idle machine of two cores or more alone.
 """
 
 from __future__ import annotations
 
 import argparse
-import gc
-import resource
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
 import torch
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.policy.base import PolicySession
-from gaitgauge.policy.export import export_torchscript
-from gaitgauge.policy.fence.child import Program
-from gaitgauge.policy.fenced import FencedPolicy
+from gaitgauge.policy.export import export_onnx, export_torchscript
+from gaitgauge.policy.fence.child import Child, Program
+from gaitgauge.policy.fenced import FencedPolicy, FencedSession
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.policy.steady import ROWS
 from gaitgauge.robots import load_robot
-
-STEPS = 500
-"""Control steps of which the processor time is measured alone."""
 
 
 class Unfenced:
     """A program in this process, in the place of ``policy.fence.child.Child``."""
 
     def __init__(self, make: Callable[[bytes, str], Program], data: bytes, *, source: str) -> None:
-        self._program = make(data, source)
+        self.program = make(data, source)
 
     def ask(self, do: str, **details: Any) -> dict[str, Any]:
         """See ``Child``."""
-        return dict(self._program.answer({"do": do, **details}))
-
-    def session(self, rows: int, width: int, joints: int, *, rowwise: bool) -> UnfencedSession:
-        """See ``Child``."""
-        return UnfencedSession(self._program.session(rows, rowwise=rowwise))
+        return dict(self.program.answer({"do": do, **details}))
 
 
-class UnfencedSession:
-    """In the place of ``policy.fence.child.ChildSession``."""
+@dataclass(frozen=True)
+class Times:
+    """What something takes [s]."""
 
-    acted = 0
+    processor: float
+    """Of this process and of the program's."""
+    wall: float
 
-    def __init__(self, session: PolicySession) -> None:
-        self._session, self.batched = session, session.batched
+    def __add__(self, other: Times) -> Times:
+        return Times(self.processor + other.processor, self.wall + other.wall)
 
-    def act(self, observation: np.ndarray, forget: np.ndarray | None) -> np.ndarray:
-        """See ``ChildSession``."""
-        UnfencedSession.acted += 1
-        if forget is not None:
-            self._session.reset(torch.from_numpy(forget))
-        return self._session.act(torch.from_numpy(observation)).numpy()
+    def __sub__(self, other: Times) -> Times:
+        return Times(self.processor - other.processor, self.wall - other.wall)
 
-
-def processor_seconds() -> float:
-    """Processor time of this process and of its children that have ended, user and system."""
-    return sum(
-        used.ru_utime + used.ru_stime
-        for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    )
+    def __mul__(self, number: int) -> Times:
+        return Times(self.processor * number, self.wall * number)
 
 
-def run(request: Request) -> tuple[float, float, float]:
-    """Wall time, processor time and score of one run."""
-    with tempfile.TemporaryDirectory() as folder:
-        began, used = time.perf_counter(), processor_seconds()
-        results = evaluate(request, Path(folder) / "run")
-        wall = time.perf_counter() - began
-        gc.collect()  # a program's process ends, and is counted, with what refers to it
-        return wall, processor_seconds() - used, results["score"]
+def now(child: Child | None = None) -> Times:
+    """What this process, and that of a program, have used since they began, and the time."""
+    used = time.process_time()
+    if child is not None:
+        # the clock of that process, as clock_getcpuclockid gives it
+        used += time.clock_gettime(((~child._process.pid) << 3) | 2)
+    return Times(used, time.perf_counter())
 
 
-def step_seconds(policy: str) -> tuple[float, float]:
-    """Processor time of one action of all rows behind the fence and in this process: medians of calls in turn.
+class InTurn(PolicySession):
+    """A program behind the fence and in this process: both get everything, and who is first takes turns."""
 
-    Something else is calculated between them, as physics is in a run. Linux only.
-    """
+    def __init__(self, fenced: PolicySession, alone: PolicySession, child: Child) -> None:
+        self._sessions, self._child = (fenced, alone), child
+        self.batched = fenced.batched
+        self.first: tuple[list[Times], list[Times]] = ([], [])
+        """Of the steps in which each was first."""
+        self.second = Times(0.0, 0.0)
+        """Of all that was second."""
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """See ``PolicySession``."""
+        for session in self._sessions:
+            session.reset(episodes)
+
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
+        """See ``PolicySession``."""
+        turn = len(self.first[0]) > len(self.first[1])
+        began = now(self._child)
+        action = self._sessions[turn].act(observation, rows)
+        between = now(self._child)
+        same = torch.equal(action, self._sessions[not turn].act(observation, rows))
+        self.second += now(self._child) - between
+        self.first[turn].append(between - began)
+        if not same:
+            raise SystemExit("actions differ behind the fence and without")
+        return action
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What a run takes."""
+
+    rest: Times
+    """Without the policy's steps and without loading it."""
+    number: int
+    """Of control steps."""
+    steps: tuple[Times, Times]
+    """One of them behind the fence, and in the worker: processor time on average, the median of wall times."""
+    loading: tuple[Times, Times]
+    """Of the policy behind the fence, and in the worker."""
+
+    def shares(self) -> tuple[float, float]:
+        """What the fence adds to a run: as a share of its processor time, and of its wall time."""
+        fenced, alone = (
+            self.rest + step * self.number + load for step, load in zip(self.steps, self.loading, strict=True)
+        )
+        return fenced.processor / alone.processor - 1.0, fenced.wall / alone.wall - 1.0
+
+    def __str__(self) -> str:
+        step, load = ([times.processor for times in pair] for pair in (self.steps, self.loading))
+        shares = self.shares()
+        return (
+            f"a control step takes {1e6 * step[0]:.0f} µs of processor time behind the fence, {1e6 * step[1]:.0f} µs in the "
+            f"worker; {self.number} of them, {self.rest.processor:.1f} s for all else, {load[0]:.2f} and {load[1]:.2f} s to load: "
+            f"{100 * shares[0]:.1f} % of a run's processor time, {100 * shares[1]:.1f} % of its wall time"
+        )
+
+
+def load_both(policy: str) -> tuple[FencedPolicy, Program, tuple[Times, Times]]:
+    """A policy behind the fence, its program in this process, and what it took to load each."""
+    began = now()
     fenced = load_policy(policy)
     assert isinstance(fenced, FencedPolicy)
+    behind = now(fenced._child) - began
+    began = now()
     with patch("gaitgauge.policy.fence.child.Child", Unfenced):
-        alone = load_policy(policy)
-    child = ((~fenced._child._process.pid) << 3) | 2  # the clock of that process, as clock_getcpuclockid gives it
-    other, observation = np.random.rand(1_000_000), torch.randn(ROWS, fenced.contract.observation_width)
-    sessions = fenced.session(ROWS), alone.session(ROWS)
-    used: tuple[list[float], list[float]] = ([], [])
-    with torch.inference_mode():
-        for _ in range(STEPS):
-            for session, seconds in zip(sessions, used, strict=True):
-                for _ in range(8):
-                    other.sum()
-                began = time.thread_time() + time.clock_gettime(child)
-                session.act(observation)
-                seconds.append(time.thread_time() + time.clock_gettime(child) - began)
-    return statistics.median(used[0]), statistics.median(used[1])
+        alone: Any = load_policy(policy)
+    return fenced, alone._child.program, (behind, now() - began)
+
+
+def run(request: Request) -> Cost:
+    """Play both."""
+    fenced, program, loading = load_both(str(request.policy))
+    sessions: list[InTurn] = []
+
+    def session(child: Child, rows: int, *given: Any, rowwise: bool = False, **options: Any) -> PolicySession:
+        behind = FencedSession(child, rows, *given, rowwise=rowwise, **options)
+        sessions.append(InTurn(behind, program.session(rows, rowwise=rowwise), child))
+        return sessions[-1]
+
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        patch("gaitgauge.policy.fenced.FencedSession", session),
+        patch("gaitgauge.gauge.evaluate.load_policy", lambda *_, **__: fenced),
+    ):
+        began = now(fenced._child)
+        evaluate(request, Path(folder) / "run")
+        rest = now(fenced._child) - began
+    first: tuple[list[Times], list[Times]] = ([], [])
+    for made in sessions:
+        rest = rest - sum(made.first[0] + made.first[1], Times(0.0, 0.0)) - made.second
+        for all_of_them, its in zip(first, made.first, strict=True):
+            all_of_them.extend(its)
+    steps = [
+        Times(statistics.mean(t.processor for t in times), statistics.median(t.wall for t in times)) for times in first
+    ]
+    return Cost(rest=rest, number=len(first[0]) + len(first[1]), steps=(steps[0], steps[1]), loading=loading)
 
 
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policy", nargs="?")
+    parser.add_argument("policies", nargs="*", metavar="POLICY")
     parser.add_argument("--suite", default="demo")
     parser.add_argument("--terrain", nargs="*", default=[])
     parser.add_argument("--repeat", type=int, default=3)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder, patch("gaitgauge.policy.loading.rebuilt", lambda policy: policy):
-        policy = arguments.policy or f"{folder}/policy.pt"
-        if arguments.policy is None:
-            export_torchscript(load_policy("pretrained", load_robot("go2")), policy)
-        request = Request(policy=policy, suite=arguments.suite, terrains=tuple(arguments.terrain), threads=1)
-        ratios, steps = [], step_seconds(policy)
-        print("        fenced [s]       in the worker [s]          ratio")
-        print("    wall processor       wall   processor    wall processor   score", flush=True)
-        for _ in range(arguments.repeat):
-            wall, used, score = run(request)
-            with patch("gaitgauge.policy.fence.child.Child", Unfenced):
-                before = UnfencedSession.acted
-                wall_alone, used_alone, same = run(request)
-                counted = UnfencedSession.acted - before
-            if score != same:
-                raise SystemExit(f"scores differ: {score} behind the fence, {same} without")
-            ratios.append((wall / wall_alone, used / used_alone))
+        policies = arguments.policies
+        if not policies:
+            shipped = load_policy("pretrained", load_robot("go2"))
+            policies = [f"{folder}/pretrained.pt", f"{folder}/pretrained.onnx"]
+            export_torchscript(shipped, policies[0])
+            export_onnx(shipped, policies[1])
+        for policy in policies:
+            request = Request(policy=policy, suite=arguments.suite, terrains=tuple(arguments.terrain), threads=1)
+            shares = []
+            for _ in range(arguments.repeat):
+                cost = run(request)
+                shares.append(cost.shares())
+                print(f"{Path(policy).name}: {cost}", flush=True)
+            processor, wall = (100 * statistics.median(column) for column in zip(*shares, strict=True))
             print(
-                f"{wall:8.2f} {used:9.2f}  {wall_alone:9.2f}   {used_alone:9.2f}  "
-                f"{ratios[-1][0]:6.3f} {ratios[-1][1]:9.3f}  {score:.4f}",
+                f"{Path(policy).name}: medians {processor:.1f} % of the processor time, {wall:.1f} % of the wall time",
                 flush=True,
             )
-    medians = [statistics.median(column) for column in zip(*ratios, strict=True)]
-    print(f"medians of the ratios: wall {medians[0]:.3f}, processor {medians[1]:.3f}")
-    extra = steps[0] - steps[1]
-    print(
-        f"one control step of {ROWS} robots, processor time: {1e6 * steps[0]:.0f} µs fenced, {1e6 * steps[1]:.0f} µs in the "
-        f"worker; {counted} of them in a run: {100 * extra * counted / used_alone:.1f} % of its processor time"
-    )
 
 
 if __name__ == "__main__":

@@ -94,9 +94,11 @@ class FencedSession(PolicySession):
         device: torch.device,
         rowwise: bool = False,
     ) -> None:
+        self._child = child
         self._session = child.session(num_episodes, contract.observation_width, contract.num_joints, rowwise=rowwise)
         self.batched = self._session.batched
-        self._contract, self._source, self._device = contract, source, device
+        self._contract, self._source = contract, source
+        self._device = None if device.type == "cpu" else device
         self._num_episodes = num_episodes
         self._forget: torch.Tensor | None = None
 
@@ -109,6 +111,6 @@ class FencedSession(PolicySession):
         """See ``PolicySession``."""
         check_observation(observation, self._num_episodes, self._contract, self._source)
         forget = None if self._forget is None else self._forget.numpy()
-        action = torch.from_numpy(self._session.act(observation.numpy(force=True), forget))
+        action = torch.from_numpy(self._child.act(self._session, observation.numpy(force=True), forget))
         self._forget = None
-        return action if self._device.type == "cpu" else action.to(self._device)
+        return action if self._device is None else action.to(self._device)

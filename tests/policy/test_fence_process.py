@@ -14,7 +14,7 @@ import torch
 from foreign_programs import Plain, refused, script
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.fence import child as fence_child
-from gaitgauge.policy.fenced import FencedPolicy
+from gaitgauge.policy.fenced import FencedPolicy, FencedSession, script_program
 from gaitgauge.policy.loading import load_policy
 from torch import nn
 
@@ -267,3 +267,77 @@ def test_a_copy_of_its_owner_does_not_ask_it(program):
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 7
     assert session.act(torch.zeros(1, 45)).shape == (1, 12)
+
+
+class Changing(Plain):
+    """Changes what it remembers in place."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen = torch.zeros(1, 45)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        self.seen.mul_(0.5).add_(observation)
+        return self.layer(self.seen)
+
+
+@pytest.mark.parametrize("module", [Remembering, Changing])
+@pytest.mark.parametrize("inference", [True, False])
+def test_a_program_acts_to_the_last_bit_as_in_its_owner(contract, module, inference):
+    data = script(module())
+    child, here = fence_child.Child(script_program, data, source="policy"), script_program(data, "policy")
+    details = {"contract": contract.to_json(), "attributes": ["last", "seen"]}
+    assert child.ask("prepare", **details) == here.answer({"do": "prepare", **details}) == {"batched": True}
+    fenced, alone = FencedSession(child, 5, contract, "policy", device=torch.device("cpu")), here.session(5)
+    with torch.inference_mode(inference):
+        for step, observation in enumerate(torch.randn(8, 5, 45)):
+            if step % 3 == 2:
+                fenced.reset(torch.arange(5) % 2 == 0)
+                alone.reset(torch.arange(5) % 2 == 0)
+            assert torch.equal(fenced.act(observation), alone.act(observation))
+
+
+class Choosy(Plain):
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        if bool(observation.max() > 100.0):
+            raise RuntimeError("left leg")
+        return self.layer(observation)
+
+
+def test_a_step_that_fails_is_one_sentence_and_the_next_one_is_played(tmp_path):
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(Choosy()))
+    session = load_policy(path).session(2)
+    action = session.act(torch.zeros(2, 45))
+    for _ in range(2):
+        with pytest.raises(PolicyError, match="left leg"):
+            session.act(torch.full((2, 45), 200.0))
+        assert torch.equal(session.act(torch.zeros(2, 45)), action)
+
+
+def test_a_process_that_is_killed_is_missed(program):
+    session = program.session(2)
+    os.kill(program._child._process.pid, signal.SIGKILL)
+    for named in ("SIGKILL", "policy.pt"):
+        with pytest.raises(PolicyError, match=named):
+            session.act(torch.zeros(2, 45))
+
+
+def test_a_step_is_not_waited_for_without_an_end(tmp_path, monkeypatch):
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(LaterEndless()))
+    session = load_policy(path).session(4)
+    monkeypatch.setattr(fence_child, "_WALL_SECONDS", 1)
+    with pytest.raises(PolicyError, match="took over 1 s for one step"):
+        for _ in range(101):
+            session.act(torch.zeros(4, 45))
+
+
+def test_no_semaphores_are_one_sentence(tmp_path, monkeypatch):
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(fence_child.CONTEXT, "Semaphore", full)
+    path = tmp_path / "policy.pt"
+    path.write_bytes(script(Plain()))
+    refused(path, "No space left on device")
