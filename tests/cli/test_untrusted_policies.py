@@ -79,7 +79,7 @@ def test_no_command_opens_the_file(run, refused, tmp_path, contract, kind, insid
             assert not victim.exists(), command
     for trust in ([], ["--trust"]):  # weights alone are taken, whatever is trusted
         message = refused("train", "go2-flat", "--backend", "fake", "--device", "cpu", "--init-from", path, *trust)
-        assert ("carries a program (torchscript), not weights" if inside else "more than tensors") in message
+        assert ("carries a program (torchscript), not weights" if inside else "is a program (torchscript)") in message
         assert not victim.exists()
     refused("compare", path, path)
     run_folder = tmp_path / "logs" / "rsl_rl" / "go2_flat" / "2026-01-01_00-00-00"
