@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
@@ -18,6 +20,22 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def check_host(host: str) -> None:
+    """Refuse what is no interface of this machine: the viewer's server would wait for it, and an empty name is every one.
+
+    Raises:
+        OSError: it is none.
+    """
+    if not host:
+        raise OSError(errno.EINVAL, "an empty name would be every interface of this machine")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+    except UnicodeError as error:
+        raise OSError(errno.EINVAL, "it is no name of a machine") from error
+    with socket.socket(family, kind, protocol) as probe:
+        probe.bind(address)
 
 
 def is_own_request(headers: Any, host: str) -> bool:

@@ -12,12 +12,13 @@ import numpy as np
 import viser
 
 from ..backends.base import BackendError
+from ..files.parsing import one_line
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError
 from ..policy.finding import find_policy, shipped_policies
 from ..terrains.gauge_terrains import LEVELS
 from ..terrains.registry import TerrainError, gauge_terrain_names
-from .browser_access import is_loopback, own_requests_only
+from .browser_access import check_host, is_loopback, own_requests_only
 from .browser_stage import Stage, distance_between
 from .console import Terminal
 from .errors import UserError
@@ -276,13 +277,14 @@ def serve(
         UserError: the port is taken, or the host is none of this machine's.
     """
     try:
+        check_host(host)
         with own_requests_only(host):
             server = viser.ViserServer(host=host, port=port, verbose=False)
     except OSError as error:
         for session in sessions:
             session.close()
         raise UserError(
-            f"port {port} of {host} cannot be used: {error.strerror or error}; choose another --port or --host"
+            f"port {port} of '{one_line(host)}' cannot be used: {error.strerror or error}; choose another --port or --host"
         ) from error
     server.scene.set_up_direction("+z")
     server.scene.add_grid("/floor", width=40.0, height=40.0, cell_size=1.0, section_size=5.0)

@@ -9,6 +9,7 @@ import pytest
 from gaitgauge.cli.browser_access import is_own_request
 from gaitgauge.cli.browser_stage import Stage, distance_between, geom_color, geom_mesh
 from gaitgauge.cli.browser_viewer import Choice, Panel, serve
+from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.play_session import PlaySession
 from gaitgauge.cli.worlds import WorldMaker
 from gaitgauge.policy.base import PolicyError
@@ -28,6 +29,15 @@ def show(sessions: list[PlaySession], *, port: int, seconds: float = 0.1) -> Non
     """Serve robots that stand."""
     chosen = Choice(terrain="flat", level=None, policies=tuple(str(s.policy.path) for s in sessions))
     serve(sessions, MAKER, chosen, command=(0.0, 0.0, 0.0), seconds=seconds, port=port, host="127.0.0.1")
+
+
+@pytest.mark.parametrize("host", ["", "/dev/zero", "a\nb", "\udcff", "x" * 500, "192.0.2.1"])
+def test_what_is_no_interface_of_this_machine_is_refused(session, host):
+    """An empty name was every interface, and the others were waited for without an end."""
+    chosen = Choice(terrain="flat", level=None, policies=("latest",))
+    with pytest.raises(UserError, match=r"cannot be used: .*; choose another --port or --host") as caught:
+        serve([session()], MAKER, chosen, command=None, seconds=0.1, port=free_port(), host=host)
+    assert str(caught.value).isprintable()
 
 
 def test_surfaces_of_geoms():
