@@ -4,7 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: install demo test test-slow test-gpu cpp fuzz torture check docs format clean
+# Tests and guides start the package in many processes, which find it compiled.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: install demo test test-slow test-gpu cpp fuzz torture check docs docs-pages docs-site format clean
 
 install: $(READY)
 
@@ -50,9 +53,13 @@ check: install
 	mkdir -p build/types && ln -sfn ../.. build/types/gaitgauge
 	$(BIN)/mypy
 
-# The site, with strict links; what its pages show is run first.
-docs: install
-	$(BIN)/python -m pytest -m 'slow or not slow' tests/docs
+# What the pages show is run, and the site is built with strict links; with `-j 2` at once.
+docs: docs-pages docs-site
+
+docs-pages: install
+	$(BIN)/python -m pytest -n auto --dist worksteal -m 'slow or not slow' tests/docs
+
+docs-site: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 
 format: install
