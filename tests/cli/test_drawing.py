@@ -59,29 +59,32 @@ def test_camera_follows_a_walk_and_does_not_fly_back_to_the_start():
     assert follower.follow(position, 0.04)[0] == -5.0
 
 
-@pytest.mark.slow
-def test_several_processes_draw_what_one_draws_and_one_that_dies_is_a_sentence(monkeypatch):
+@pytest.fixture
+def drawn(monkeypatch):
+    """Runs a script that draws in a process of its own, because MuJoCo chooses the renderer when it is imported; its output."""
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     try:
         choose_renderer()
     except UserError as error:
         pytest.skip(str(error))
-    # In a process of its own: MuJoCo chooses the renderer when it is imported.
-    done = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert "a process that draws was ended" in done.stdout
+
+    def run(script: str) -> str:
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[-3000:]
+        return done.stdout
+
+    return run
 
 
 @pytest.mark.slow
-def test_plain_pictures_keep_the_robots_shadow_and_leave_out_that_of_the_ground(monkeypatch):
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    try:
-        choose_renderer()
-    except UserError as error:
-        pytest.skip(str(error))
-    done = subprocess.run([sys.executable, "-c", _SHADOWS], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
+def test_several_processes_draw_what_one_draws_and_one_that_dies_is_a_sentence(drawn):
+    assert "a process that draws was ended" in drawn(_SCRIPT)
+
+
+@pytest.mark.slow
+def test_plain_pictures_keep_the_robots_shadow_and_leave_out_that_of_the_ground(drawn):
+    drawn(_SHADOWS)
 
 
 _SHADOWS = """
