@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,6 +68,39 @@ class Results:
         return f"{self.data['suite']['name']} {self.data['suite']['version']}"
 
 
+class ArgumentError(TypeError):
+    """An argument of another type than it must have; the message names it."""
+
+
+def _need(kind: str, **given: Any) -> None:
+    """Check types by the words of ``_KINDS``.
+
+    Raises:
+        ArgumentError: one does not fit.
+    """
+    from .files.parsing import shown
+
+    for name, value in given.items():
+        several = kind.startswith("several ")
+        if several and (isinstance(value, str | bytes) or not isinstance(value, Iterable)):
+            raise ArgumentError(f"{name} is {shown(value)}; give a list, such as {name}=[{shown(value)}]")
+        for one in value if several else (value,):
+            if not isinstance(one, _KINDS[kind]):
+                raise ArgumentError(f"{name} is {shown(value)}; it must be {kind}")
+
+
+_KINDS: Mapping[str, tuple[type, ...]] = {
+    "a path": (str, os.PathLike),
+    "a path or None": (str, os.PathLike, type(None)),
+    "a text": (str,),
+    "a text or None": (str, type(None)),
+    "a whole number or None": (Integral, type(None)),
+    "several texts": (str,),
+    "several numbers": (Real,),
+    "a path, or what evaluate returned": (str, os.PathLike, Results),
+}
+
+
 def load_results(path: str | Path) -> Results:
     """Read the results of an evaluation.
 
@@ -76,12 +110,17 @@ def load_results(path: str | Path) -> Results:
     Raises:
         ResultsError: there are none, or the file is damaged.
     """
-    file = Path(path)
-    file = file / "results.json" if file.is_dir() else file
-    from .files.parsing import edited, read_results
+    from .files.parsing import edited, one_line, read_results
 
-    if not file.exists():
-        raise ResultsError(f"there are no results at '{path}'; give a folder that 'gaitgauge evaluate' wrote")
+    _need("a path", path=path)
+    file = Path(path)
+    try:
+        file = file / "results.json" if file.is_dir() else file
+        there = file.exists()
+    except OSError as error:
+        raise ResultsError(f"'{one_line(path)}' cannot be read: {error.strerror}") from error
+    if not there:
+        raise ResultsError(f"there are no results at '{one_line(path)}'; give a folder that 'gaitgauge evaluate' wrote")
     data = read_results(file, "results", ResultsError)
     if not {"suite", "score", "terrains", "metrics"} <= data.keys():
         raise ResultsError(f"'{file}' holds no results of an evaluation; give the results.json that it wrote")
@@ -106,6 +145,8 @@ def load_policy(policy: str | Path, *, robot: str | None = None, trust: bool = F
     Raises:
         PolicyError, ContractError, RobotError: one sentence on what is wrong.
     """
+    _need("a path", policy=policy)
+    _need("a text or None", robot=robot)
     from .policy.loading import load_policy as load
     from .robots import load_robot
 
@@ -159,6 +200,13 @@ def evaluate(
     from .gauge.evaluate import evaluate as run
     from .gauge.report import write_report
 
+    _need("a path", policy=policy, suite=suite)
+    _need("a path or None", out=out)
+    _need("a text", pipeline=pipeline, backend=backend)
+    _need("a text or None", device=device, robot=robot)
+    _need("several texts", terrains=terrains)
+    _need("several numbers", frictions=frictions, payloads=payloads, seeds=seeds)
+    _need("a whole number or None", level=level, threads=threads)
     folder = Path(out) if out is not None else Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
     request = Request(
         policy=str(policy),
@@ -192,6 +240,8 @@ def compare(*results: Results | str | Path) -> Comparison:
     from .gauge.comparison import compare as run
     from .gauge.comparison import load_result
 
+    for result in results:
+        _need("a path, or what evaluate returned", result=result)
     return run([load_result(r.path if isinstance(r, Results) else Path(r)) for r in results])
 
 

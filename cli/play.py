@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 VIEWERS = ("native", "viser", "video")
 MOST = 4
 """Policies side by side."""
+_FASTEST = 100.0
+"""Speed that is told at most [m/s, rad/s]."""
 _SHORTEST, _LONGEST = 0.1, 3600.0
 _LONGEST_CLIP = 60.0
 """The encoder of a GIF keeps all its pictures in memory [s]."""
@@ -145,6 +147,9 @@ def _check(asked: PlayRequest) -> str:
         )
     if not 0.0 < asked.friction <= 10.0:
         raise UserError(f"--friction is {asked.friction:g}; give a coefficient above 0 and at most 10")
+    if asked.command and not all(abs(speed) <= _FASTEST for speed in asked.command):
+        told = " ".join(f"{speed:g}" for speed in asked.command)
+        raise UserError(f"--command is {told}; give speeds from -{_FASTEST:g} to {_FASTEST:g}")
     if len(asked.policies) > MOST:
         raise UserError(f"{len(asked.policies)} policies are given; at most {MOST} are shown side by side")
     for option, (path, endings) in films.items():

@@ -340,3 +340,9 @@ def test_labels_differ():
     assert labels(["pretrained", "runs/a/model_50.pt", "mine.gauge.pt"]) == ["pretrained", "model_50", "mine"]
     assert labels(["runs/a/model_50.pt", "runs/b/model_50.pt"]) == ["a/model_50.pt", "b/model_50.pt"]
     assert labels(["latest", "latest"]) == ["1: latest", "2: latest"]
+
+
+@pytest.mark.parametrize("speed", ["nan", "inf", "1e300"])
+def test_a_speed_that_is_none_is_refused(refused, policy, speed):
+    message = refused("play", policy, "--video", "a.mp4", "--command", speed, "0", "0")
+    assert message.startswith("--command is ") and "from -100 to 100" in message

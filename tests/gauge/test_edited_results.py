@@ -7,7 +7,8 @@ import re
 from pathlib import Path
 
 import pytest
-from gaitgauge.api import ResultsError, load_results
+from gaitgauge.api import ArgumentError, ResultsError, evaluate, load_policy, load_results
+from gaitgauge.api import compare as compare_results
 from gaitgauge.gauge.board import write_board
 from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
 from gaitgauge.gauge.comparison_report import write_comparison
@@ -143,3 +144,30 @@ def test_policies_measured_in_other_motions_do_not_compare():
     with pytest.raises(ValidationError, match="every policy needs the same motions") as caught:
         validate(table, [table])
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: load_results(None), "path is None; it must be a path"),
+        (lambda: compare_results([SEED, SEED]), r"result is \[.*; it must be a path, or what evaluate returned"),
+        (lambda: evaluate(5), "policy is 5; it must be a path"),
+        (lambda: evaluate("pretrained", suite=b"x"), "suite is b'x'; it must be a path"),
+        (
+            lambda: evaluate("pretrained", terrains="flat"),
+            r"terrains is 'flat'; give a list, such as terrains=\['flat'\]",
+        ),
+        (lambda: evaluate("pretrained", frictions=0.5), r"frictions is 0.5; give a list, such as frictions=\[0.5\]"),
+        (lambda: evaluate("pretrained", seeds=["a"]), r"seeds is \['a'\]; it must be several numbers"),
+        (lambda: evaluate("pretrained", level=2.5), "level is 2.5; it must be a whole number"),
+        (lambda: load_policy(["a"]), r"policy is \['a'\]; it must be a path"),
+    ],
+)
+def test_an_argument_of_another_type_is_named(call, named):
+    with pytest.raises(ArgumentError, match=named):
+        call()
+
+
+def test_a_name_that_no_system_takes_is_one_sentence():
+    with pytest.raises(ResultsError, match="cannot be read: File name too long"):
+        load_results("x" * 5000)
