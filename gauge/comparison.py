@@ -23,6 +23,8 @@ from .intervals import CONFIDENCE, Array, Chance, Evidence
 from .result_check import chance_rules_of, check_result, robot_digest_of
 from .results import ONE_SEED, SCHEMA, environment_weights
 
+_LABEL = 80
+"""Characters of a policy's short name."""
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
 """What is compared, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
 sub-commands are compared as measured, in the environments where both policies were measured at the same level; all else counts
@@ -364,10 +366,6 @@ def _sweep(rows: Sequence[Mapping[str, Any]], axis: str, other: str) -> Iterator
 
 def _key(row: Mapping[str, Any]) -> tuple[str, float, float]:
     return row["terrain"], row["friction"], row["payload"]
-
-
-_LABEL = 80
-"""Characters of a policy's short name."""
 
 
 def _labels(results: Sequence[Mapping[str, Any]]) -> list[str]:

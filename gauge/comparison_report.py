@@ -17,9 +17,9 @@ from .pages import page_template
 from .report import metric_label
 
 _TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}", "\\": r"\textbackslash{}"}
+_TEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", "–": "--"}
 _LONGEST = 100_000
 """Characters of a line of LaTeX: a line's end would end a comment, too."""
-_TEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", "–": "--"}
 
 
 def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:

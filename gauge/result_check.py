@@ -20,6 +20,7 @@ MOST_REPLICATES = 20_000_000
 """Environments times replicates of the level searches, which are done again when results are compared."""
 _ROUNDING = 2e-6
 """Of a score and of those that it is the mean of."""
+_BY_HAND = "it was changed by hand, so ask its maker for the results.json of the run"
 _Words = Annotated[str, Field(max_length=4096)]
 _Score = Annotated[float, Field(ge=0.0, le=1001.0)]
 """A level weighs at most 1, and there are at most 1000."""
@@ -138,9 +139,6 @@ def _check_score(data: Mapping[str, Any], source: str, error: type[Exception]) -
     mean = float(environment_weights([row["terrain"] for row in rows]) @ np.array(scores))
     if abs(mean - score) > _ROUNDING:
         raise error(f"{source}: score is {score:g}, but that of its environments is {mean:.6f}; {_BY_HAND}")
-
-
-_BY_HAND = "it was changed by hand, so ask its maker for the results.json of the run"
 
 
 def chance_rules_of(data: Mapping[str, Any], source: str, error: type[Exception]) -> ChanceRules:

@@ -1,25 +1,17 @@
 """Networks followed from a TorchScript file's code act as the file does, each robot for itself; what is not understood is named."""
 
 import io
-import warnings
 import zipfile
 from itertools import pairwise
 
 import pytest
 import torch
+from foreign_programs import script
 from gaitgauge.policy.program import NotUnderstoodError, ProgramSession
 from gaitgauge.policy.torchscript_program import torchscript_program
 from torch import nn
 
 EPISODES = 5
-
-
-def script(module: nn.Module) -> bytes:
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.jit.save(torch.jit.script(module.eval()), buffer)
-    return buffer.getvalue()
 
 
 def layers(*widths: int, last: nn.Module | None = None) -> nn.Sequential:
