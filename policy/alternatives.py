@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, get_args
 
 from ..robots import Robot, RobotError
 from ..robots.body_plan import BodyPlan, body_plan
-from .contract import TERM_WIDTH, HistoryOrder, ObservationTerm, PolicyContract
+from .contract import TERM_WIDTH, ContractError, HistoryOrder, ObservationTerm, PolicyContract
 
 _SCALES: dict[str, tuple[tuple[float, ...], ...]] = {
     "base_linear_velocity_b": ((1.0,), (2.0,)),
@@ -168,12 +169,14 @@ def _action_scales(contract: PolicyContract, robot: Robot) -> Iterator[Alternati
 
     yield made("sign of actions", "turned round", [-v for v in own])
     for factor in (0.5, 2.0):
-        yield made("action scale", f"{factor:g} times what is said", [v * factor for v in own])
+        with suppress(ContractError):  # larger than any
+            yield made("action scale", f"{factor:g} times what is said", [v * factor for v in own])
     for value in _ACTION_SCALES:
         yield made("action scale", f"{value:g} rad for all joints", [value] * len(own))
     for factor in (0.5, 2.0):
         scaled = [v * factor if hip else v for v, hip in zip(own, hips, strict=True)]
-        yield made("action scale", f"{factor:g} times what is said at the hips", scaled)
+        with suppress(ContractError):
+            yield made("action scale", f"{factor:g} times what is said at the hips", scaled)
 
 
 def _gains(contract: PolicyContract, robot: Robot) -> Iterator[Alternative]:
@@ -184,12 +187,13 @@ def _gains(contract: PolicyContract, robot: Robot) -> Iterator[Alternative]:
         changed = replace(contract, stiffness=stiffness, damping=damping)
         yield Alternative(kind="gains", text=f"those of robot '{robot.name}', set '{name}'", contract=changed)
     for kp, kd in _GAINS:
-        changed = replace(
-            contract,
-            stiffness=tuple(v * kp for v in contract.stiffness),
-            damping=tuple(v * kd for v in contract.damping),
-        )
-        yield Alternative(kind="gains", text=f"kp × {kp:g}, kd × {kd:g}", contract=changed)
+        with suppress(ContractError):
+            changed = replace(
+                contract,
+                stiffness=tuple(v * kp for v in contract.stiffness),
+                damping=tuple(v * kd for v in contract.damping),
+            )
+            yield Alternative(kind="gains", text=f"kp × {kp:g}, kd × {kd:g}", contract=changed)
 
 
 def _poses(contract: PolicyContract, robot: Robot) -> Iterator[Alternative]:

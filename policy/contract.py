@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ..files.parsing import LARGEST, Text, build, check_fields, parse_json, shown
-from ..robots.base import Robot
+from ..robots.base import Angle, Damping, Robot, Speed, Stiffness
 
 SCHEMA_VERSION: Literal[1] = 1
 HistoryOrder = Literal["frame-major", "term-major", "frame-major-newest-first"]
@@ -41,9 +41,13 @@ class ContractError(ValueError):
     """A contract is malformed, or does not fit the robot, suite or policy at hand."""
 
 
-_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
-_Numbers = Annotated[tuple[_Number, ...], Field(min_length=1, max_length=1000)]
+_MOST = 1000
+"""Joints."""
+_ActionScale = Annotated[float, Field(strict=True, ge=-100.0, le=100.0)]
+_Factor = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
+_Clip = Annotated[float, Field(strict=True, gt=0.0, le=1e9)]
+_Target = Annotated[float, Field(strict=True, ge=-1_000.0, le=1_000.0)]
+_Period = Annotated[float, Field(strict=True, ge=0.0005, le=1.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +58,9 @@ class ObservationTerm:
 
     name: Text
     """A key of ``TERM_WIDTH``."""
-    scale: _Numbers
+    scale: Annotated[tuple[_Factor, ...], Field(min_length=1, max_length=_MOST)]
     """Factor per entry; one entry stands for all."""
-    clip: _Positive | _Numbers | None = None
+    clip: _Clip | Annotated[tuple[_Clip, ...], Field(min_length=1, max_length=_MOST)] | None = None
     """Largest magnitude after scaling, for all entries or per entry; None for no clipping."""
 
     def __post_init__(self) -> None:
@@ -96,25 +100,25 @@ class PolicyContract:
 
     robot: Text
     """Robot registry name."""
-    joint_names: Annotated[tuple[Text, ...], Field(min_length=1, max_length=1000)]
+    joint_names: Annotated[tuple[Text, ...], Field(min_length=1, max_length=_MOST)]
     """Joints in the policy's own order, for observations and actions."""
-    default_joint_position: _Numbers
+    default_joint_position: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=_MOST)]
     """[rad], in the policy's joint order."""
-    action_scale: _Numbers
-    """[rad] per unit of network output, per joint."""
-    action_clip: _Positive | None = None
+    action_scale: Annotated[tuple[_ActionScale, ...], Field(min_length=1, max_length=_MOST)]
+    """[rad] per unit of network output, per joint; negative where the network's joint turns the other way."""
+    action_clip: _Clip | None = None
     """Largest magnitude of the raw action, None for no clipping."""
-    target_range: tuple[tuple[_Number, _Number], ...] | None = None
+    target_range: tuple[tuple[_Target, _Target], ...] | None = None
     """Lowest and highest joint target per joint [rad], None for no limit."""
-    stiffness: _Numbers
+    stiffness: Annotated[tuple[Stiffness, ...], Field(min_length=1, max_length=_MOST)]
     """Motor kp the policy was made for [N·m/rad]."""
-    damping: _Numbers
+    damping: Annotated[tuple[Damping, ...], Field(min_length=1, max_length=_MOST)]
     """Motor kd the policy was made for [N·m·s/rad]."""
-    control_period: _Positive
+    control_period: _Period
     """[s]."""
     observation: Annotated[tuple[ObservationTerm, ...], Field(min_length=1)]
     history: History = History()
-    command_limits: tuple[_Number, _Number, _Number]
+    command_limits: tuple[Speed, Speed, Speed]
     """Largest forward, lateral [m/s] and yaw [rad/s] command the policy was made for."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Where the policy comes from (training run, file, adapter); not part of the hash."""
@@ -129,6 +133,11 @@ class PolicyContract:
             entries = getattr(self, name)
             if entries is not None and len(entries) != joints:
                 raise ContractError(f"contract: {name} has {len(entries)} entries; {joints} are needed")
+        for joint, (low, high) in zip(names, self.target_range or (), strict=False):
+            if low > high:
+                raise ContractError(
+                    f"contract: target_range of {shown(joint)} is {low:g} to {high:g} rad; it must rise"
+                )
         terms = [t.name for t in self.observation]
         if len(set(terms)) != len(terms):
             raise ContractError(f"contract: observation has a term twice: {', '.join(terms)}")

@@ -9,11 +9,27 @@ from typing import Annotated
 
 from pydantic import Field
 
-from ..files.parsing import Name, NotNegative, Text
+from ..files.parsing import Name, Text
 
-_Angle = Annotated[float, Field(ge=-12.6, le=12.6)]
-_Speed = Annotated[float, Field(ge=0.0, le=100.0)]
-_PerJoint = Annotated[tuple[NotNegative, ...], Field(min_length=1)]
+Angle = Annotated[float, Field(strict=True, ge=-12.6, le=12.6)]
+"""Of a joint [rad]."""
+Speed = Annotated[float, Field(strict=True, ge=0.0, le=100.0)]
+"""A command's limit [m/s, rad/s]."""
+Stiffness = Annotated[float, Field(strict=True, ge=0.0, le=10_000.0)]
+"""kp [N·m/rad]."""
+Damping = Annotated[float, Field(strict=True, ge=0.0, le=1_000.0)]
+"""kd, or of a joint itself [N·m·s/rad]."""
+Torque = Annotated[float, Field(strict=True, ge=0.0, le=10_000.0)]
+"""[N·m]."""
+Inertia = Annotated[float, Field(strict=True, ge=0.0, le=100.0)]
+"""Of a rotor, seen at the joint [kg·m²]."""
+_ActionScale = Annotated[float, Field(ge=0.0, le=100.0)]
+_JointSpeed = Annotated[float, Field(ge=0.0, le=1_000.0)]
+_Stiffnesses = Annotated[tuple[Stiffness, ...], Field(min_length=1)]
+_Dampings = Annotated[tuple[Damping, ...], Field(min_length=1)]
+_Torques = Annotated[tuple[Torque, ...], Field(min_length=1)]
+_Inertias = Annotated[tuple[Inertia, ...], Field(min_length=1)]
+_JointSpeeds = Annotated[tuple[_JointSpeed, ...], Field(min_length=1)]
 _Names = Annotated[tuple[Text, ...], Field(min_length=1, max_length=1000)]
 
 
@@ -26,23 +42,23 @@ class JointParameters:
     in the direction of motion falls from ``driving_torque_limit`` at ``full_torque_speed`` to zero at ``no_load_speed``.
     """
 
-    stiffness: _PerJoint
+    stiffness: _Stiffnesses
     """Proportional gain kp of the motor [N·m/rad]."""
-    damping: _PerJoint
+    damping: _Dampings
     """Derivative gain kd of the motor [N·m·s/rad]."""
-    torque_limit: _PerJoint
+    torque_limit: _Torques
     """Largest motor torque [N·m]."""
-    armature: _PerJoint
+    armature: _Inertias
     """Rotor inertia seen at the joint [kg·m²]."""
-    joint_damping: _PerJoint
+    joint_damping: _Dampings
     """Passive viscous damping of the joint [N·m·s/rad]."""
-    friction_loss: _PerJoint
+    friction_loss: _Torques
     """Dry friction of the joint [N·m]."""
-    driving_torque_limit: _PerJoint | None = None
+    driving_torque_limit: _Torques | None = None
     """Largest motor torque in the direction of motion [N·m]; None where it is ``torque_limit``, as against it."""
-    full_torque_speed: _PerJoint | None = None
+    full_torque_speed: _JointSpeeds | None = None
     """Joint speed up to which the driving torque is there [rad/s]; None where it is not known."""
-    no_load_speed: _PerJoint | None = None
+    no_load_speed: _JointSpeeds | None = None
     """Joint speed from which the motor drives no more [rad/s]; None where it is not known."""
 
 
@@ -56,7 +72,7 @@ class Robot:
     mjcf: Path
     """MuJoCo model of the robot alone: one free base, hinge joints, no ground."""
     joint_names: _Names
-    default_joint_position: tuple[_Angle, ...]
+    default_joint_position: tuple[Angle, ...]
     """Standing pose [rad]."""
     base_body: Text
     """Body that carries the free joint; its origin is the base position."""
@@ -75,12 +91,12 @@ class Robot:
     """Name of the parameter set used where none is asked for."""
     parameters: Annotated[Mapping[Name, JointParameters], Field(min_length=1)]
     """Named parameter sets (``gauge``, ``training`` …)."""
-    command_limits: tuple[_Speed, _Speed, _Speed]
+    command_limits: tuple[Speed, Speed, Speed]
     """Largest commanded forward, lateral [m/s] and yaw [rad/s] speed that the robot is meant for."""
     sdk_joint_names: _Names | None = None
     """The joints in the order in which the maker's SDK numbers the motors, which a ``deploy.yaml`` refers to; None where it
     is not known."""
-    action_scale: _PerJoint | None = None
+    action_scale: Annotated[tuple[_ActionScale, ...], Field(min_length=1)] | None = None
     """How far an output of 1 of a standard policy moves a joint's target [rad]; None for 0.25."""
     foot_shapes: _Names | None = None
     """Collision geom of each foot; None where they bear the feet's names."""

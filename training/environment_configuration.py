@@ -7,17 +7,35 @@ every difference from the published code and its reason.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from ..backends.base import TRAINING_PHYSICS, PhysicsOptions
 from ..files.parsing import Count, NotNegative, Positive, Seed, Share
+from ..robots.base import Angle, Damping, Inertia, Torque
 from .terrain_configuration import TRAINING_TERRAIN, TerrainConfiguration
 
 Range = tuple[float, float]
+_Factor = Annotated[float, Field(ge=0.0, le=100.0)]
+_Friction = Annotated[float, Field(ge=0.0, le=10.0)]
+_Kilograms = Annotated[float, Field(ge=-1_000.0, le=1_000.0)]
+_Shift = Annotated[float, Field(ge=-10.0, le=10.0)]
+_Delay = Annotated[float, Field(ge=0.0, le=1.0)]
 _Metres = Annotated[float, Field(gt=0.0, le=100.0)]
+
+
+def _check_rising(configuration: object, *names: str) -> None:
+    """Refuse ranges that end below their beginning.
+
+    Raises:
+        ValueError: one sentence.
+    """
+    for name in names:
+        low, high = getattr(configuration, name)
+        if low > high:
+            raise ValueError(f"{name} is {low:g} to {high:g}; it must rise")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,11 +70,11 @@ class JointConfiguration:
 
     parameters: str = "training"
     """Name of the robot's parameter set."""
-    armature: float | None = None
+    armature: Inertia | None = None
     """Rotor inertia of every joint [kg·m²]; None keeps the set's."""
-    joint_damping: float | None = None
+    joint_damping: Damping | None = None
     """Passive damping of every joint [N·m·s/rad]; None keeps the set's."""
-    friction_loss: float | None = None
+    friction_loss: Torque | None = None
     """Dry friction of every joint [N·m]; None keeps the set's. 0 spares the solver twelve constraints per world."""
 
 
@@ -226,6 +244,9 @@ class RewardConfiguration:
     own: tuple[OwnReward, ...] = ()
     """Terms of one's own."""
 
+    def __post_init__(self) -> None:
+        _check_rising(self, "sigma_linear_range", "sigma_yaw_range")
+
 
 @dataclass(frozen=True, kw_only=True)
 class CommandStage:
@@ -239,6 +260,9 @@ class CommandStage:
     """Lateral velocity [m/s]."""
     yaw: Range
     """Yaw rate [rad/s]."""
+
+    def __post_init__(self) -> None:
+        _check_rising(self, "forward", "lateral", "yaw")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,29 +326,35 @@ class ResetConfiguration:
     footprint: tuple[float, float] = (0.5, 0.4)
     """Length and width of what counts as below the robot there [m]."""
 
+    def __post_init__(self) -> None:
+        _check_rising(self, "joint_scale")
+
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfiguration:
     """Ranges of what differs between worlds (paper, domain randomization table), uniform."""
 
-    friction: Range = (0.2, 1.25)
+    friction: tuple[_Friction, _Friction] = (0.2, 1.25)
     """Effective sliding friction, once per world. Published: 0.5 to 1.5; the gauge judges 0.2 to 1.0."""
-    base_mass: Range = (-1.0, 1.0)
+    base_mass: tuple[_Kilograms, _Kilograms] = (-1.0, 1.0)
     """Added to the base's mass [kg], once per world."""
-    link_mass: Range = (0.9, 1.1)
+    link_mass: tuple[_Factor, _Factor] = (0.9, 1.1)
     """Factor on the mass of each other body, once per world."""
-    base_com: Range = (-0.03, 0.03)
+    base_com: tuple[_Shift, _Shift] = (-0.03, 0.03)
     """Shift of the base's centre of mass per axis [m], once per world."""
-    stiffness: Range = (0.9, 1.1)
+    stiffness: tuple[_Factor, _Factor] = (0.9, 1.1)
     """Factor on kp per joint, every reset."""
-    damping: Range = (0.9, 1.1)
+    damping: tuple[_Factor, _Factor] = (0.9, 1.1)
     """Factor on kd per joint, every reset."""
-    motor_offset: Range = (-0.035, 0.035)
+    motor_offset: tuple[Angle, Angle] = (-0.035, 0.035)
     """Added to the motor's position error per joint [rad], every reset."""
-    motor_strength: Range = (0.8, 1.2)
+    motor_strength: tuple[_Factor, _Factor] = (0.8, 1.2)
     """Factor on the torque per joint after its limit, every reset."""
-    delay: Range = (0.0, 0.02)
+    delay: tuple[_Delay, _Delay] = (0.0, 0.02)
     """Time for which the previous target still acts [s], in whole substeps, every control step."""
+
+    def __post_init__(self) -> None:
+        _check_rising(self, *(f.name for f in fields(self)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -106,6 +106,8 @@ def test_longest_key_wins(write_hopper):
             "armature = -0.01",
             "parameters.soft.armature[0] is -0.01; it must be greater than or equal to 0",
         ),
+        ("armature = 0.01", "armature = 1e300", "parameters.soft.armature[0] is 1e+300; it must be less than or equal"),
+        ("[40, 50]", "[40, 1e9]", "parameters.soft.torque_limit[1] is 1000000000.0; it must be less than or equal to"),
         ("[40, 50]", "[40, 50, 60]", "parameters.soft.torque_limit has 3 values but there are 2 joints"),
         (
             "armature = 0.01",

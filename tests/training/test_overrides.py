@@ -92,6 +92,25 @@ def test_mistakes_are_named(override, message):
         apply_overrides(Car(), [override])
 
 
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("environment.randomization.stiffness=-1,1", r"'environment.randomization.stiffness' is '-1'"),
+        ("environment.randomization.damping=0.5,1e300", r"'environment.randomization.damping' is '1e300'"),
+        ("environment.randomization.friction=2,1", r"friction is 2 to 1; it must rise"),
+        ("environment.randomization.delay=-0.1,0", r"'environment.randomization.delay' is '-0.1'"),
+        ("environment.commands.stages.0.forward=1,-1", r"forward is 1 to -1; it must rise"),
+        ("environment.reset.joint_scale=2,1", r"joint_scale is 2 to 1; it must rise"),
+        ("environment.rewards.sigma_linear_range=2,1", r"sigma_linear_range is 2 to 1; it must rise"),
+        ("environment.joints.armature=-1", r"'environment.joints.armature' is '-1'; .*, or none"),
+        ("environment.joints.friction_loss=1e300", r"'environment.joints.friction_loss' is '1e300'"),
+    ],
+)
+def test_no_motor_is_impossible(override, message):
+    with pytest.raises(TaskError, match=message):
+        find_task("go2-cts", [override])
+
+
 def test_every_key_can_be_set_to_what_it_is():
     task = TASKS["go2-moe-cts"]
     for key in override_keys(task):
