@@ -19,7 +19,6 @@ _OWN = {
     "mujoco": ".mujoco:MujocoBackend",
     "mujoco-warp": ".mujoco_warp:MujocoWarpBackend",
     "newton": ".newton:NewtonBackend",
-    "fake": ".fake:FakeBackend",
 }
 
 
@@ -54,8 +53,8 @@ _ABOUT: dict[str, tuple[str, tuple[str, ...], str]] = {
 
 
 def backend_names() -> list[str]:
-    """Names of all engines that can be asked for, the project's own first; ``fake`` is for tests and left out."""
-    return [n for n in _OWN if n != "fake"] + sorted(set(plugins(GROUP)) - set(_OWN))
+    """Names of all engines that can be asked for, the project's own first."""
+    return list(_OWN) + sorted(set(plugins(GROUP)) - set(_OWN))
 
 
 def list_backends() -> list[BackendListing]:

@@ -4,7 +4,7 @@
 
 Trains a task for some iterations on the first GPU, on the first two, and so on; prints environment steps a second of the
 iterations after ``--skip`` (compiling and CUDA graphs are behind them), as the median over iterations, how much that is of the
-first line, and where the time of an iteration goes. ``--device cpu --backend fake`` tries it on a machine without a GPU.
+first line, and where the time of an iteration goes. ``--device cpu --backend mujoco`` tries it on a machine without a GPU.
 """
 
 from __future__ import annotations

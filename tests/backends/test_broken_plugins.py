@@ -5,11 +5,11 @@ from importlib.metadata import EntryPoint
 
 import pytest
 from gaitgauge.backends import BackendError, Scene, backend_class, make_backend
-from gaitgauge.backends.fake import FakeBackend
 from gaitgauge.backends.registry import find_backend, list_backends
 from gaitgauge.files import plugins as plugins_module
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.registry import make_terrain
+from gaitgauge_fake_engine import FakeBackend
 
 GO2 = load_robot("go2")
 

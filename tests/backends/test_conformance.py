@@ -7,7 +7,7 @@ import pytest
 import torch
 from gaitgauge.backends import BackendError, PhysicsBackend
 from gaitgauge.backends.conformance import Outcome, all_checks, make_bench, run_check, run_conformance
-from gaitgauge.backends.fake import FakeBackend
+from gaitgauge_fake_engine import FakeBackend
 
 CHECKS = {check.name: check for check in all_checks()}
 # What a scripted engine cannot keep of the contract: physics.

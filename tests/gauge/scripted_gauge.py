@@ -6,7 +6,6 @@ from dataclasses import fields, replace
 import torch
 from gaitgauge.backends import Scene
 from gaitgauge.backends.base import PhysicsState
-from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.episodes import Episode, Record
 from gaitgauge.gauge.rollout import Rollout
 from gaitgauge.gauge.suite import Goal, Suite, load_suite
@@ -14,6 +13,7 @@ from gaitgauge.policy.base import Policy, PolicySession
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Pose, Terrain
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 
 GO2 = load_robot("go2")
 DIAGONAL, MAXIMUM, TARGET = "diagonal_velocity", "max_velocity", "target_pos_velocity"

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.backends.base import BackendError
-from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.consistency import open_loop
 from gaitgauge.gauge.consistency.attribution import choose_factors
 from gaitgauge.gauge.consistency.closed_loop import Design, make_cells
@@ -23,6 +22,7 @@ from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
 from gaitgauge.robots import load_robot
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 
 GO2 = load_robot("go2")
 SUITE = """

@@ -4,12 +4,12 @@ import pytest
 import torch
 from gaitgauge.backends import ResetState, Scene
 from gaitgauge.backends.base import BackendError, PhysicsOptions
-from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.consistency.errors import ConsistencyError
 from gaitgauge.gauge.consistency.variants import Variant, parse_variant, place
 from gaitgauge.gauge.consistency.wrapping import PerturbedBackend, RetimedBackend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.registry import make_terrain
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 
 GO2 = load_robot("go2")
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge import control_step, recording
 from gaitgauge.gauge.recording import StepRecording
 from gaitgauge.gauge.rollout import Rollout
 from gaitgauge.policy.base import PolicyError
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 from scripted_gauge import (
     DIAGONAL,
     MAXIMUM,

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeScript
 from gaitgauge.gauge import noise
 from gaitgauge.policy.base import PolicyError
+from gaitgauge_fake_engine import FakeScript
 from scripted_gauge import (
     DIAGONAL,
     GO2,

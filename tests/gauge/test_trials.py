@@ -6,13 +6,13 @@ from functools import partial
 
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.gauge.consistency.statistics import wilson_interval
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.gauge.trials.running import Trial, draws, run_scenario
 from gaitgauge.gauge.trials.scenario import Failure, Force, Ground, Leg, Scenario, Start, Success
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.terrains.course import Stretch
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 from scripted_gauge import GO2, ScriptedPolicy
 
 STAND = Leg(seconds=0.2, velocity=(0.0, 0.0, 0.0))

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import torch
-from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
     EnvironmentConfiguration,
@@ -12,6 +11,7 @@ from gaitgauge.training.environment_configuration import (
     TerminationConfiguration,
 )
 from gaitgauge.training.terrain_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 
 torch.set_num_threads(1)  # small tensors: threads only get in each other's way
 

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeScript
 from gaitgauge.training.environment_configuration import CommandConfiguration, CommandStage, Ramp, RewardConfiguration
 from gaitgauge.training.height_scan import heading
+from gaitgauge_fake_engine import FakeScript
 from small_environment import gliding, idle, make
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.robots.geometry import joint_ranges
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
@@ -19,6 +18,7 @@ from gaitgauge.training.environment_configuration import (
     RewardConfiguration,
     TerminationConfiguration,
 )
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 from small_environment import FLAT, STAIRS, gliding, idle, make
 
 NEVER = math.inf

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeScript
 from gaitgauge.terrains import TerrainError
 from gaitgauge.training.curriculum import assign_kinds, build_palette, next_level
 from gaitgauge.training.environment_configuration import (
@@ -15,6 +14,7 @@ from gaitgauge.training.environment_configuration import (
     TerminationConfiguration,
 )
 from gaitgauge.training.terrain_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration, TileConfiguration
+from gaitgauge_fake_engine import FakeScript
 from small_environment import STAIRS, gliding, idle, make
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeScript
 from gaitgauge.policy.contract import History
 from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.robots import load_robot
@@ -17,6 +16,7 @@ from gaitgauge.training.environment_configuration import (
 )
 from gaitgauge.training.height_scan import HeightRasters, heading, place_pattern, scan_pattern
 from gaitgauge.training.observations import push_history
+from gaitgauge_fake_engine import FakeScript
 from scipy.spatial.transform import Rotation
 from small_environment import STAIRS, gliding, make
 

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeScript
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment_configuration import (
     CommandConfiguration,
@@ -12,6 +11,7 @@ from gaitgauge.training.environment_configuration import (
     ResetConfiguration,
     ScheduleConfiguration,
 )
+from gaitgauge_fake_engine import FakeScript
 from small_environment import STAIRS, make
 
 BUSY = {

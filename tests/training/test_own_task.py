@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from gaitgauge.backends.fake import FakeBackend, FakeScript
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains import training_tiles
 from gaitgauge.training.algorithms.symmetry import SymmetryError, build_mirror
@@ -23,6 +22,7 @@ from gaitgauge.training.environment_configuration import (
 from gaitgauge.training.own_terms import resolve
 from gaitgauge.training.tasks import TaskError, find_task
 from gaitgauge.training.terrain_configuration import TerrainConfiguration, TileConfiguration
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 from small_environment import idle, make
 
 FOLDER = Path(__file__).parents[2] / "examples" / "own_task"

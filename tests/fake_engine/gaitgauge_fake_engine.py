@@ -1,5 +1,7 @@
 """An engine without physics, for tests of everything above the backends: it does what a script says and nothing else.
 
+It is a plug-in like anybody's: the folder beside this file is what an installation leaves of one.
+
 Bases glide along a prescribed twist, joints are unit inertias on the real motor law (or sit exactly on their targets),
 contact forces are whatever the script says (by default the feet share the weight). Falls, divergence, penetration and
 overflow happen at given times. What the contract says about latency, masks, samples, watches, limits and randomized
@@ -14,8 +16,7 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import torch
-
-from .base import (
+from gaitgauge.backends.base import (
     CAPABILITY_NAMES,
     BackendError,
     Capability,
@@ -26,8 +27,8 @@ from .base import (
     Scene,
     Support,
 )
-from .devices import find_device
-from .motor_law import MotorLimits, motor_torque
+from gaitgauge.backends.devices import find_device
+from gaitgauge.backends.motor_law import MotorLimits, motor_torque
 
 GRAVITY = 9.81
 """[m/s²]; it acts on nothing, it only turns masses into weights."""
