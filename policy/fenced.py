@@ -94,23 +94,22 @@ class FencedSession(PolicySession):
         device: torch.device,
         rowwise: bool = False,
     ) -> None:
-        self._child = child
+        self._ask, self._contract, self._source = child.act, contract, source
         self._session = child.session(num_episodes, contract.observation_width, contract.num_joints, rowwise=rowwise)
         self.batched = self._session.batched
-        self._contract, self._source = contract, source
         self._device = None if device.type == "cpu" else device
-        self._num_episodes = num_episodes
+        self._shape = torch.Size((num_episodes, contract.observation_width))
         self._forget: torch.Tensor | None = None
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """See ``PolicySession``: it is done before the next action."""
-        mask = torch.ones(self._num_episodes, dtype=torch.bool) if episodes is None else episodes.cpu()
+        mask = torch.ones(self._shape[0], dtype=torch.bool) if episodes is None else episodes.cpu()
         self._forget = mask if self._forget is None else self._forget | mask
 
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
-        check_observation(observation, self._num_episodes, self._contract, self._source)
-        forget = None if self._forget is None else self._forget.numpy()
-        action = torch.from_numpy(self._child.act(self._session, observation.numpy(force=True), forget))
+        if observation.shape != self._shape:
+            check_observation(observation, self._shape[0], self._contract, self._source)
+        action = self._ask(self._session, observation, self._forget)
         self._forget = None
         return action if self._device is None else action.to(self._device)

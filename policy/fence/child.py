@@ -1,9 +1,10 @@
 """The process in which a foreign program runs, and how its owner talks with it.
 
-Observations and actions lie in memory that both see, and two semaphores say whose turn it is: physics leaves little else in the
-processor's caches, so that in a control step every further call would be paid for twice. All other messages, and why a step
-failed, go through a connection. What comes back is never unpickled: a word, JSON, or numbers. The process ends when its owner
-does, when it takes too long, and when nothing refers to it any more.
+Observations and actions lie in memory that both see, and two semaphores say whose turn it is. Physics leaves little of either
+process in the processor's caches, so that a line of Python that a control step runs here costs microseconds: what it needs is
+laid out beforehand, and it is done in as few calls as will do. All other messages, and why a step failed, go through a
+connection. What comes back is never unpickled: a word, JSON, or numbers. The process ends when its owner does, when it takes too
+long, and when nothing refers to it any more.
 """
 
 from __future__ import annotations
@@ -13,18 +14,17 @@ import json
 import mmap
 import os
 import signal
-import struct
 import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.heap import Arena
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 
 from ...files.cell import CONTEXT, MEMORY, allow_seconds, enclose
@@ -38,10 +38,13 @@ _LOOK_SECONDS = 0.5  # between two looks at whether it still lives
 _LONGEST_REPLY = 2**28
 _ROOM = 2**26  # of the memory that both see; what is not used takes none
 
-_CALL = struct.Struct("=BBI")  # at its beginning: whether a step is wanted, whether some rows forget first, the session
-_FAILS = _CALL.size  # the byte there that says whether the step failed
-_HEAD = 64
+# Numbers at the beginning of that memory.
+_WANTED, _SESSION, _FAILS, _HEAD = range(4)
+_HEAD_BYTES = 64
+_MESSAGE, _STEP, _STEP_AFTER_RESET = range(3)  # what may be wanted
 _FINE, _FAILED = b"\0", b"\1"
+# What the other process's end looks like; a value: the semaphore has been raised to its most.
+_ENDED = (OSError, EOFError, ValueError)
 
 
 class Program(Protocol):
@@ -58,14 +61,19 @@ class Program(Protocol):
         """Start work on so many episodes, together or each alone."""
 
 
-class _Seats:
-    """Where the numbers of a session lie in the memory that both see: all sessions use the same places in turn."""
+class _Numbers:
+    """The numbers of a session in the memory that both see: all sessions use the same places in turn."""
 
     def __init__(self, memory: Any, rows: int, width: int, joints: int) -> None:
-        numbers = np.frombuffer(memory, np.float32, rows * (width + joints), offset=_HEAD)
-        self.observation = numbers[: rows * width].reshape(rows, width)
-        self.action = numbers[rows * width :].reshape(rows, joints)
-        self.forget = np.frombuffer(memory, np.bool_, rows, offset=_HEAD + numbers.nbytes)
+        with torch.inference_mode(False):  # else they could be changed in that mode alone
+            both = torch.frombuffer(memory, dtype=torch.float32, count=rows * (width + joints), offset=_HEAD_BYTES)
+            self.observation = both[: rows * width].view(rows, width)
+            self.action = both[rows * width :].view(rows, joints)
+            self.forget = torch.frombuffer(memory, dtype=torch.bool, count=rows, offset=_HEAD_BYTES + both.nbytes)
+
+
+def _head(memory: Any) -> memoryview:
+    return memoryview(memory)[: 4 * _HEAD].cast("I")
 
 
 class Child:
@@ -91,6 +99,7 @@ class Child:
             raise PolicyError(f"'{source}' is a program, and no process can be started for it: {error}") from error
         self._connection, theirs = CONTEXT.Pipe()
         self._memory, shared = _shared_memory()
+        self._head = _head(self._memory)
         with theirs:
             self._process = CONTEXT.Process(
                 target=_run,
@@ -131,7 +140,7 @@ class Child:
         dropped, self._dropped = self._dropped, []
         answer = self.ask("session", rows=rows, width=width, joints=joints, rowwise=rowwise, dropped=dropped)
         number = int(answer["number"])
-        session = ChildSession(number, _Seats(self._memory, rows, width, joints), batched=bool(answer["batched"]))
+        session = ChildSession(number, _Numbers(self._memory, rows, width, joints), batched=bool(answer["batched"]))
         weakref.finalize(session, self._dropped_later, number)
         return session
 
@@ -139,7 +148,7 @@ class Child:
         """Forget a session, with the next one that is started: this may be called at any time."""
         self._dropped.append(number)
 
-    def act(self, session: ChildSession, observation: np.ndarray, forget: np.ndarray | None) -> np.ndarray:
+    def act(self, session: ChildSession, observation: torch.Tensor, forget: torch.Tensor | None) -> torch.Tensor:
         """Actions (N, J) float32 for observations (N, W), after those of ``forget`` (N,) bool were reset.
 
         Raises:
@@ -147,50 +156,62 @@ class Child:
         """
         if os.getpid() != self._owner:
             raise PolicyError(f"'{self._source}' runs for another process; load it in the one that asks for actions")
-        seats = session.seats
+        numbers, head = session.numbers, self._head
         with self._busy:
-            seats.observation[:] = observation
-            if forget is not None:
-                seats.forget[:] = forget
-            _CALL.pack_into(self._memory, 0, True, forget is not None, session.number)
-            self._answered(None)
-            return seats.action.copy()
+            numbers.observation.copy_(observation)
+            if forget is None:
+                head[_WANTED] = _STEP
+            else:
+                numbers.forget.copy_(forget)
+                head[_WANTED] = _STEP_AFTER_RESET
+            head[_SESSION] = session.number
+            try:
+                self._asked.release()
+                if not self._done.acquire(True, _LOOK_SECONDS):
+                    self._wait_longer()
+                reply = self._receive() if head[_FAILS] else _FINE
+            except _ENDED as error:
+                raise self._ended(error) from error
+            except BaseException:
+                self._end()  # whoever interrupts it leaves an answer behind that belongs to nobody
+                raise
+            if reply is not _FINE:
+                _content(reply)
+            return numbers.action.clone()
+
+    def _wait_longer(self) -> None:
+        for _ in range(int(_WALL_SECONDS / _LOOK_SECONDS)):
+            if not self._process.is_alive():
+                raise EOFError
+            if self._done.acquire(True, _LOOK_SECONDS):
+                return
+        raise TimeoutError
 
     def _exchange(self, message: bytes) -> bytes:
         with self._busy:
-            _CALL.pack_into(self._memory, 0, False, False, 0)
-            return self._answered(message)
-
-    def _answered(self, message: bytes | None) -> bytes:
-        """The answer to a message; without one nothing, once a control step is done."""
-        try:
-            self._asked.release()
-            if message is None:
-                for _ in range(int(_WALL_SECONDS / _LOOK_SECONDS)):
-                    if self._done.acquire(True, _LOOK_SECONDS):
-                        break
-                    if not self._process.is_alive():
-                        raise EOFError
-                else:
-                    raise TimeoutError
-                if not self._memory[_FAILS]:
-                    return b""
-            else:
+            self._head[_WANTED] = _MESSAGE
+            try:
+                self._asked.release()
                 self._connection.send_bytes(message)
-            if not self._connection.poll(_WALL_SECONDS):
-                raise TimeoutError
-            reply = self._connection.recv_bytes(_LONGEST_REPLY)
-        except TimeoutError as error:
+                reply = self._receive()
+            except _ENDED as error:
+                raise self._ended(error) from error
+            except BaseException:
+                self._end()
+                raise
+            return _content(reply)
+
+    def _receive(self) -> bytes:
+        if not self._connection.poll(_WALL_SECONDS):
+            raise TimeoutError
+        return self._connection.recv_bytes(_LONGEST_REPLY)
+
+    def _ended(self, error: Exception) -> PolicyError:
+        """Why the other process did not answer."""
+        if isinstance(error, TimeoutError):
             self._end()
-            raise PolicyError(f"'{self._source}' took over {_WALL_SECONDS} s for one step and was ended") from error
-        except (OSError, EOFError, ValueError) as error:  # a value: the semaphore has been raised to its most
-            raise PolicyError(f"'{self._source}' {self._how_it_ended()}") from error
-        except BaseException:
-            self._end()  # whoever interrupts it leaves an answer behind that belongs to nobody
-            raise
-        if reply[:1] != _FINE:
-            raise PolicyError(reply[1:].decode("utf-8", errors="replace"))
-        return reply[1:]
+            return PolicyError(f"'{self._source}' took over {_WALL_SECONDS} s for one step and was ended")
+        return PolicyError(f"'{self._source}' {self._how_it_ended()}")
 
     def _how_it_ended(self) -> str:
         until = time.monotonic() + 2.0
@@ -206,21 +227,33 @@ class Child:
         return "ended its own process"
 
 
+def _content(reply: bytes) -> bytes:
+    """What an answer holds.
+
+    Raises:
+        PolicyError: that the program failed.
+    """
+    if reply[:1] != _FINE:
+        raise PolicyError(reply[1:].decode("utf-8", errors="replace"))
+    return reply[1:]
+
+
+@dataclass(frozen=True)
 class ChildSession:
     """A session in the process of a program, as its owner knows it."""
 
-    def __init__(self, number: int, seats: _Seats, *, batched: bool) -> None:
-        self.number, self.seats = number, seats
-        self.batched = batched
-        """Whether one run of the program serves all rows."""
+    number: int
+    numbers: _Numbers
+    batched: bool
+    """Whether one run of the program serves all rows."""
 
 
 def _shared_memory() -> tuple[Any, Any]:
     """Memory that both processes see: for the owner, and as it is handed to the other one."""
     if CONTEXT.get_start_method() == "fork":
-        memory = mmap.mmap(-1, _HEAD + _ROOM)
+        memory = mmap.mmap(-1, _HEAD_BYTES + _ROOM)
         return memory, memory
-    arena = Arena(_HEAD + _ROOM)
+    arena = Arena(_HEAD_BYTES + _ROOM)
     return arena.buffer, arena
 
 
@@ -252,8 +285,9 @@ def _run(
 def _serve(make: Any, connection: Connection, memory: Any, turns: Any, source: str) -> None:
     """Load the program and do what is asked; back if it cannot be loaded."""
     asked, done = turns
+    head = _head(memory)
     program: Program | None = None
-    sessions: dict[int, tuple[PolicySession, _Seats]] = {}
+    sessions: dict[int, tuple[PolicySession, _Numbers]] = {}
     allow_seconds(STEP_SECONDS)
     allowed = time.monotonic()
     while True:
@@ -261,40 +295,50 @@ def _serve(make: Any, connection: Connection, memory: Any, turns: Any, source: s
         if time.monotonic() > allowed + 1.0:  # three system calls, which not every control step has to make
             allow_seconds(STEP_SECONDS + 1)
             allowed = time.monotonic()
-        step, some_forget, number = _CALL.unpack_from(memory)
-        if step:
-            _, reason = _tried(source, _act, *sessions[number], some_forget)
-            memory[_FAILS] = bool(reason)
-            done.release()
-            if reason:
-                connection.send_bytes(_FAILED + reason)
+        wanted = head[_WANTED]
+        if wanted == _MESSAGE:
+            message = connection.recv_bytes()
+            try:
+                if program is None:
+                    program = make(message, source)
+                    answer: Any = None
+                else:
+                    answer = _answer(program, sessions, memory, json.loads(message))
+                reply = _FINE + json.dumps(answer).encode()
+            except Exception as error:  # noqa: BLE001  (whatever it is, the owner has to hear of it)
+                reply = _FAILED + _reason(error, source)
+            connection.send_bytes(reply)
+            if program is None:
+                return
             continue
-        message = connection.recv_bytes()
-        if program is None:
-            program, reason = _tried(source, make, message, source)
-            answer = None
+        session, numbers = sessions[head[_SESSION]]
+        try:
+            if wanted == _STEP_AFTER_RESET:
+                session.reset(numbers.forget.clone())
+            # a copy: a program may keep what it is given
+            numbers.action.copy_(session.act(numbers.observation.clone()))
+        except Exception as error:  # noqa: BLE001  (likewise)
+            head[_FAILS] = True
+            done.release()
+            connection.send_bytes(_FAILED + _reason(error, source))
         else:
-            answer, reason = _tried(source, _answer, program, sessions, memory, json.loads(message))
-        connection.send_bytes(_FAILED + reason if reason else _FINE + json.dumps(answer).encode())
-        if program is None:
-            return
+            head[_FAILS] = False
+            done.release()
 
 
-def _tried(source: str, work: Callable[..., Any], *given: Any) -> tuple[Any, bytes]:
-    """What a work returns, and for the owner why it failed, if it did."""
-    try:
-        return work(*given), b""
-    except PolicyError as error:
+def _reason(error: Exception, source: str) -> bytes:
+    """Why the program failed, for its owner."""
+    if isinstance(error, PolicyError):
         reason = str(error)
-    except MemoryError:
+    elif isinstance(error, MemoryError):
         reason = f"'{source}' needs over {MEMORY // 2**20} MiB of memory, the most that it gets"
-    except Exception as error:  # noqa: BLE001  (whatever it is, the owner has to hear of it)
+    else:
         reason = f"'{source}' failed: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
-    return None, reason.encode(errors="backslashreplace")
+    return reason.encode(errors="backslashreplace")
 
 
 def _answer(
-    program: Program, sessions: dict[int, tuple[PolicySession, _Seats]], memory: Any, request: dict[str, Any]
+    program: Program, sessions: dict[int, tuple[PolicySession, _Numbers]], memory: Any, request: dict[str, Any]
 ) -> Mapping[str, Any]:
     if request["do"] != "session":
         return program.answer(request)
@@ -302,12 +346,5 @@ def _answer(
         sessions.pop(number, None)
     made = program.session(request["rows"], rowwise=request["rowwise"])
     number = max(sessions, default=0) + 1
-    sessions[number] = made, _Seats(memory, request["rows"], request["width"], request["joints"])
+    sessions[number] = made, _Numbers(memory, request["rows"], request["width"], request["joints"])
     return {"number": number, "batched": made.batched}
-
-
-def _act(session: PolicySession, seats: _Seats, some_forget: bool) -> None:
-    if some_forget:
-        session.reset(torch.from_numpy(seats.forget.copy()))
-    # a copy: a program may keep what it is given
-    seats.action[:] = session.act(torch.from_numpy(seats.observation.copy())).numpy()
