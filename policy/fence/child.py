@@ -5,15 +5,20 @@ process in the processor's caches, so that a line of Python that a control step 
 laid out beforehand, and it is done in as few calls as will do. All other messages, and why a step failed, go through a
 connection. What comes back is never unpickled: a word, JSON, or numbers. The process ends when its owner does, when it takes too
 long, and when nothing refers to it any more.
+
+One of the two always waits for the other, so both use one core. On one of its own the program would find the caches of a core
+that has slept since the last step.
 """
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import json
 import mmap
 import os
 import signal
+import sys
 import threading
 import time
 import weakref
@@ -39,12 +44,16 @@ _LONGEST_REPLY = 2**28
 _ROOM = 2**26  # of the memory that both see; what is not used takes none
 
 # Numbers at the beginning of that memory.
-_WANTED, _SESSION, _FAILS, _HEAD = range(4)
+_WANTED, _SESSION, _FAILS, _CORE, _HEAD = range(5)  # the core by its number and one; 0: any
 _HEAD_BYTES = 64
 _MESSAGE, _STEP, _STEP_AFTER_RESET = range(3)  # what may be wanted
 _FINE, _FAILED = b"\0", b"\1"
 # What the other process's end looks like; a value: the semaphore has been raised to its most.
 _ENDED = (OSError, EOFError, ValueError)
+
+_present_core: Callable[[], int] | None = (
+    getattr(ctypes.CDLL(None), "sched_getcpu", None) if sys.platform == "linux" else None
+)
 
 
 class Program(Protocol):
@@ -165,6 +174,7 @@ class Child:
                 numbers.forget.copy_(forget)
                 head[_WANTED] = _STEP_AFTER_RESET
             head[_SESSION] = session.number
+            anywhere = self._stay()
             try:
                 self._asked.release()
                 if not self._done.acquire(True, _LOOK_SECONDS):
@@ -175,9 +185,25 @@ class Child:
             except BaseException:
                 self._end()  # whoever interrupts it leaves an answer behind that belongs to nobody
                 raise
+            finally:
+                if anywhere:
+                    os.sched_setaffinity(0, anywhere)
             if reply is not _FINE:
                 _content(reply)
             return numbers.action.clone()
+
+    def _stay(self) -> set[int] | None:
+        """Stay on the present core and call the other process there; where this thread may run otherwise, if it can be held."""
+        if _present_core is None:
+            return None
+        core = _present_core()
+        try:
+            anywhere = os.sched_getaffinity(0)
+            os.sched_setaffinity(0, (core,))
+        except (OSError, ValueError):  # not every machine lets a process choose; it costs time alone
+            return None
+        self._head[_CORE] = 1 + core
+        return anywhere
 
     def _wait_longer(self) -> None:
         for _ in range(int(_WALL_SECONDS / _LOOK_SECONDS)):
@@ -290,6 +316,7 @@ def _serve(make: Any, connection: Connection, memory: Any, turns: Any, source: s
     sessions: dict[int, tuple[PolicySession, _Numbers]] = {}
     allow_seconds(STEP_SECONDS)
     allowed = time.monotonic()
+    core = 0
     while True:
         asked.acquire()
         if time.monotonic() > allowed + 1.0:  # three system calls, which not every control step has to make
@@ -311,6 +338,10 @@ def _serve(make: Any, connection: Connection, memory: Any, turns: Any, source: s
             if program is None:
                 return
             continue
+        if core != head[_CORE]:
+            core = head[_CORE]
+            with suppress(OSError):
+                os.sched_setaffinity(0, (core - 1,))
         session, numbers = sessions[head[_SESSION]]
         try:
             if wanted == _STEP_AFTER_RESET:

@@ -323,6 +323,40 @@ def test_a_process_that_is_killed_is_missed(program):
             session.act(torch.zeros(2, 45))
 
 
+one_core = pytest.mark.skipif(sys.platform != "linux", reason="only Linux says on which core a process runs")
+
+
+@one_core
+def test_a_program_shares_its_owners_core_and_leaves_it_free(program):
+    session, child = program.session(2), program._child._process.pid
+    cores = os.sched_getaffinity(0)
+    try:
+        for core in sorted(cores)[:2]:
+            os.sched_setaffinity(0, {core})
+            session.act(torch.zeros(2, 45))
+            assert os.sched_getaffinity(child) == {core} == os.sched_getaffinity(0)
+    finally:
+        os.sched_setaffinity(0, cores)
+    session.act(torch.zeros(2, 45))
+    assert os.sched_getaffinity(0) == cores and len(os.sched_getaffinity(child)) == 1
+    os.kill(child, signal.SIGKILL)
+    with pytest.raises(PolicyError, match="SIGKILL"):
+        session.act(torch.zeros(2, 45))
+    assert os.sched_getaffinity(0) == cores
+
+
+@one_core
+def test_where_cores_cannot_be_chosen_a_program_runs_on_any(program, monkeypatch):
+    def forbidden(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    expected = program.session(2).act(torch.zeros(2, 45))
+    other = load_policy(program.path)
+    monkeypatch.setattr(os, "sched_setaffinity", forbidden)
+    assert torch.equal(other.session(2).act(torch.zeros(2, 45)), expected)
+    assert os.sched_getaffinity(other._child._process.pid) == os.sched_getaffinity(0)
+
+
 def test_a_step_is_not_waited_for_without_an_end(tmp_path, monkeypatch):
     path = tmp_path / "policy.pt"
     path.write_bytes(script(LaterEndless()))
