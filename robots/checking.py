@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING
 from ..files.parsing import did_you_mean, one_line
 from .apart import run_apart
 from .base import Robot
-from .loading import RobotError, robot_digest
+from .loading import MOST_PARTS, RobotError, robot_digest
 
 if TYPE_CHECKING:
     import mujoco
 
 _DEPTH_TOLERANCE = 1e-3
 """Depth to which a robot that is put on the ground may reach into it [m]."""
-_MOST_PARTS = 2_000
-"""Of each kind; robots have some hundred."""
 _GRAVITY = (0.0, 0.0, -9.81)
 _checked: set[str] = set()
 """Digests of the robots that this process has found sound."""
@@ -69,7 +67,10 @@ def compiled(mjcf: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
         spec = mujoco.MjSpec.from_file(str(mjcf))
         return spec, spec.compile()
     except (ValueError, RuntimeError, TypeError, MemoryError, OSError, mujoco.FatalError) as error:
-        raise RobotError(f"'{one_line(mjcf)}' is not a model that MuJoCo can compile: {one_line(error)}") from error
+        reason = one_line(error)
+        if "unknown exception" in reason:  # all that MuJoCo says where there is no memory
+            reason = "it may need more memory than there is, or than it may use; make it smaller"
+        raise RobotError(f"'{one_line(mjcf)}' is not a model that MuJoCo can compile: {reason}") from error
 
 
 class ModelChecks:
@@ -112,8 +113,8 @@ class ModelChecks:
         model = self.model
         counts = {"bodies": model.nbody, "geoms": model.ngeom, "sites": model.nsite, "degrees of freedom": model.nv}
         for kind, count in counts.items():
-            if count > _MOST_PARTS:
-                raise self._error(f"{self.robot.mjcf.name} has {count:,} {kind}; at most {_MOST_PARTS:,} are simulated")
+            if count > MOST_PARTS:
+                raise self._error(f"{self.robot.mjcf.name} has {count:,} {kind}; at most {MOST_PARTS:,} are simulated")
         return f"MuJoCo compiles {self.robot.mjcf.name}: {model.nbody - 1} bodies, {model.ngeom} geoms, {model.nv} degrees of freedom"
 
     def base(self) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,12 @@ LARGEST_XML = 4_000_000
 """Size of one file of a model [bytes]."""
 LARGEST_MODEL, MOST_FILES = 512 * 2**20, 2_000
 """Size of a model with all that it names, meshes and textures [bytes], and number of these files."""
+MOST_PARTS = 2_000
+"""Of each kind; robots have some hundred."""
+_PARTS = {"body": "bodies", "geom": "geoms", "site": "sites", "joint": "joints"}
+_MOST_ELEMENTS, _MOST_CELLS = 10_000, 4_000_000
+"""Elements of all files, and points of a height field, a texture or a mesh that MuJoCo makes itself."""
+_CELLS = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "mesh": ("params",)}
 _JOINT_ENDING = "_joint"
 _ADDED_LATER = ("foot_shapes", "action_scale", "imu_site")
 """Fields that count for a robot's digest only where they are set, so that those of older descriptions stay."""
@@ -103,8 +110,8 @@ def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
         within: folder in which all must lie, links followed; None for anywhere.
 
     Raises:
-        RobotError: a file cannot be read, is a pipe or a device, lies elsewhere, is not XML or defines entities, or all of them
-            are too many or too large.
+        RobotError: a file cannot be read, is a pipe or a device, lies elsewhere, is not XML or defines entities, all of them
+            are too many or too large, or what they stand for is.
     """
     try:
         return _model_files(mjcf, within)
@@ -113,7 +120,12 @@ def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
 
 
 def _model_files(mjcf: Path, within: Path | None) -> list[Path]:
-    found, described, size = {mjcf: None}, {mjcf}, 0
+    found, described, size = (
+        {mjcf: None},
+        {mjcf: 1.0},
+        0,
+    )  # the XML files, and how many copies are made of what is in them
+    parts: dict[str, float] = {}
     pending = [mjcf]
     while pending:
         file = pending.pop(0)
@@ -129,41 +141,93 @@ def _model_files(mjcf: Path, within: Path | None) -> list[Path]:
             )
         if file not in described and file.suffix.lower() not in (".xml", ".mjcf", ".urdf"):
             continue
-        elements = _elements(file)
+        elements = _elements(file, described.get(file, 1.0))
+        _count(elements, parts, file)
         folders = [mjcf.parent, file.parent]
         folders += [
             mjcf.parent / value
-            for tag, attributes in elements
+            for tag, attributes, _ in elements
             if tag == "compiler"
             for key, value in attributes.items()
             if key in ("meshdir", "texturedir", "assetdir")
         ]
-        for tag, attributes in elements:
+        for tag, attributes, copies in elements:
             names = [value for key, value in attributes.items() if key.startswith("file")]
             for path in (folder / name for name in names for folder in folders):
                 if path not in found and os.path.exists(path) and not os.path.isdir(path):
                     found[path] = None
                     pending.append(path)
                     if tag in ("include", "model"):  # MuJoCo reads these as XML, whatever their ending
-                        described.add(path)
+                        described[path] = copies
     return list(found)
 
 
-def _elements(file: Path) -> list[tuple[str, dict[str, str]]]:
-    """Tags and attributes of an XML file, in their order."""
+_Element = tuple[str, dict[str, str], float]
+"""Tag, attributes, and how many of it MuJoCo makes."""
+
+
+def _count(elements: list[_Element], parts: dict[str, float], file: Path) -> None:
+    """Add what elements stand for to ``parts``. Before MuJoCo makes them: a line of XML can be a million.
+
+    Raises:
+        RobotError: too many.
+    """
+    for tag, attributes, copies in elements:
+        if tag == "size":
+            copies = _product(attributes.get("nkey", ""))
+        cells = _product(" ".join(attributes.get(key, "") for key in _CELLS.get(tag, ())))
+        if not cells <= _MOST_CELLS:
+            raise RobotError(
+                f"a <{tag}> of '{one_line(file)}' has {_told(cells)} points; at most {_MOST_CELLS:,} are made"
+            )
+        for kind, most in ((_PARTS.get(tag), MOST_PARTS), ("elements", _MOST_ELEMENTS)):
+            if kind is None:
+                continue
+            parts[kind] = parts.get(kind, 0.0) + copies
+            if not parts[kind] <= most:
+                raise RobotError(
+                    f"'{one_line(file)}' has {_told(parts[kind])} {kind} or more; at most {most:,} are simulated of a robot"
+                )
+
+
+def _told(count: float) -> str:
+    return f"{count:,.0f}" if count < 1e12 else f"{count:.0e}"
+
+
+def _product(text: str) -> float:
+    """What several numbers make together, each at least 1; other words are left to MuJoCo."""
+    found = 1.0
+    for word in text.split():
+        with suppress(ValueError):
+            found *= max(abs(float(word)), 1.0)
+    return found
+
+
+def _elements(file: Path, copies: float) -> list[_Element]:
+    """The elements of an XML file of which so many copies are made, in their order."""
     with file.open("rb") as opened:
         data = opened.read(LARGEST_XML + 1)
     if len(data) > LARGEST_XML:
         raise RobotError(
             f"'{one_line(file)}' is larger than {LARGEST_XML // 10**6} MB, the most that is read of a model"
         )
-    found: list[tuple[str, dict[str, str]]] = []
+    found: list[_Element] = []
+    around = [copies]
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        own = attributes.get("count", "") if tag in ("replicate", "composite", "flexcomp") else ""
+        made = around[-1] * _product(own)
+        found.append((tag, attributes, around[-1]) if tag == "replicate" or not own else ("body", attributes, made))
+        around.append(made)
+
+    def end(tag: str) -> None:
+        around.pop()
 
     def entity(*_: object) -> None:  # a few lines of them can stand for gigabytes
         raise RobotError(f"'{one_line(file)}' defines XML entities, which no robot needs; take them out")
 
     parser = expat.ParserCreate()
-    parser.StartElementHandler = lambda tag, attributes: found.append((tag, attributes))
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
     parser.EntityDeclHandler = entity
     try:
         parser.Parse(data, True)
