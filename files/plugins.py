@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, TypeVar
 
 from .parsing import one_line, shown
@@ -38,6 +40,13 @@ def guarded(entry: EntryPoint, error: type[Exception], call: Callable[..., Kind]
     except (Exception, SystemExit) as problem:
         reason = f"{type(problem).__name__}: {one_line(problem)}".rstrip(": ")
         raise error(f"{origin(entry)} failed: {reason}; mend or uninstall it") from problem
+
+
+def raised(error: BaseException) -> str:
+    """What went wrong in somebody's code, and where: ``raised KeyError: 'x' (rewards.py, line 12)``."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__)[1:] if not f.filename.startswith("<frozen")]
+    place = f" ({one_line(Path(frames[-1].filename).name, 80)}, line {frames[-1].lineno})" if frames else ""
+    return f"raised {type(error).__name__}: {one_line(error, 200)}".rstrip(": ") + place
 
 
 def origin(entry: EntryPoint) -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
+from ..files.parsing import shown
 from ..terrains.base import Terrain
 from ..terrains.training_tiles import TILE_KINDS, make_tile
 from .configuration import ConfigurationError
@@ -119,6 +120,11 @@ class Levels:
             fallen=failed,
             uniform=uniform["level"][:, 0],
         )
+        if not isinstance(level, torch.Tensor) or level.shape != memory.level.shape or level.dtype is not torch.int64:
+            raise ConfigurationError(
+                f"terrain.level_rule is {shown(self._settings.level_rule)}, which gave {shown(level)}; it must be a level from 0 "
+                "for each world, (N,) int64"
+            )
         torch.where(worlds & memory.moves_level, level, memory.level, out=memory.level)
         variants = self._index.shape[2]
         variant = (uniform["variant"][:, 0] * variants).long().clamp(max=variants - 1)

@@ -157,7 +157,13 @@ class Observer:
         Raises:
             ConfigurationError: a term of one's own is not there.
         """
-        own = resolve_own(configuration.own, "observations.own", taken=PRIVILEGED_TERMS)
+        own = resolve_own(
+            configuration.own,
+            "observations.own",
+            taken=PRIVILEGED_TERMS,
+            gives=lambda inputs, found: found.ndim == 2 and found.shape[:1] == inputs.frame.shape[:1],
+            rule="it must be numbers for each world, (N, width)",
+        )
         self._terms: list[PrivilegedTerm] = [*PRIVILEGED_TERMS.values(), *own.values()]
         self._settings, self._builder, self._scan, self._rasters = configuration, builder, scan, rasters
         self._torque_limit = torque_limit

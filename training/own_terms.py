@@ -10,10 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
+import torch
+
+from ..files.parsing import one_line, shown
+from ..files.plugins import raised
 from .configuration import ConfigurationError, to_plain
 
+Kind = TypeVar("Kind")
 _PACKAGE = __name__.partition(".")[0]
 
 
@@ -25,32 +30,82 @@ class _Named(Protocol):
 
 
 def resolve(path: str, setting: str) -> Callable[..., Any]:
-    """The function or class at ``module:name``.
+    """The function or class at ``module:name``. What it raises when it is called, and is not of this package, is one sentence.
 
     Args:
         path: what a setting holds.
         setting: the setting's name, for messages.
 
     Raises:
-        ConfigurationError: there is no such module or function.
+        ConfigurationError: there is no such module or function, or importing it fails.
     """
+    found = _found(path, setting)
+    return found if _own(path) else guarded(found, f"{setting} is {shown(path)}")
+
+
+def _found(path: str, setting: str) -> Callable[..., Any]:
+    where = f"{setting} is {shown(path)}"
     module, colon, name = path.partition(":")
     if not colon or not module or not name:
-        raise ConfigurationError(f"{setting} is '{path}'; write module:function, for example my_robot.rewards:airtime")
+        raise ConfigurationError(f"{where}; write module:function, for example my_robot.rewards:airtime")
     try:
         found: Any = import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part, None)
     except ImportError as error:
-        raise ConfigurationError(f"{setting} is '{path}', but {error}; is its folder on PYTHONPATH?") from error
-    for part in name.split("."):
-        found = getattr(found, part, None)
+        raise ConfigurationError(f"{where}, but {one_line(error)}; is its folder on PYTHONPATH?") from error
+    except (Exception, SystemExit) as error:
+        raise ConfigurationError(f"{where}, but importing it {raised(error)}; mend that module") from error
     if not callable(found):
-        raise ConfigurationError(f"{setting} is '{path}', but module '{module}' has no function '{name}'")
+        raise ConfigurationError(f"{where}, but module {shown(module)} has no function {shown(name)}")
     result: Callable[..., Any] = found
     return result
 
 
-def resolve_own(terms: Iterable[_Named], setting: str, taken: Iterable[str] = ()) -> dict[str, Callable[..., Any]]:
+def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> Callable[..., Kind]:
+    """The class at ``module:name``.
+
+    Args:
+        path: what a setting holds.
+        setting: the setting's name, for messages.
+        base: what it must be derived from.
+        methods: what is called of its instances.
+
+    Raises:
+        ConfigurationError: as ``resolve``, or it is no such class.
+    """
+    found, where = _found(path, setting), f"{setting} is {shown(path)}"
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise ConfigurationError(f"{where}; it must be a class derived from {base.__module__}:{base.__name__}")
+    if _own(path):
+        return found
+
+    def make(*arguments: Any, **named: Any) -> Kind:
+        made = guarded(found, where)(*arguments, **named)
+        for method in methods:
+            setattr(made, method, guarded(getattr(made, method), where))
+        return made
+
+    return make
+
+
+def resolve_own(
+    terms: Iterable[_Named],
+    setting: str,
+    taken: Iterable[str] = (),
+    *,
+    gives: Callable[[Any, Any], bool] | None = None,
+    rule: str = "",
+) -> dict[str, Callable[..., Any]]:
     """The functions of all terms by name.
+
+    Args:
+        terms: of one's own.
+        setting: the setting that holds them, for messages.
+        taken: names that they cannot have.
+        gives: whether a function's result is what it must be, from its first argument and the result; None where nothing is
+            looked at.
+        rule: how a sentence says that.
 
     Raises:
         ConfigurationError: a name is used twice, or a function is not there.
@@ -58,9 +113,50 @@ def resolve_own(terms: Iterable[_Named], setting: str, taken: Iterable[str] = ()
     functions: dict[str, Callable[..., Any]] = {}
     for term in terms:
         if term.name in functions or term.name in taken:
-            raise ConfigurationError(f"{setting} has '{term.name}', a name that is taken; choose another")
-        functions[term.name] = resolve(term.function, f"{setting}.{term.name}.function")
+            raise ConfigurationError(f"{setting} has {shown(term.name)}, a name that is taken; choose another")
+        where = f"{setting}.{one_line(term.name, 80)}.function"
+        functions[term.name] = _checked(
+            resolve(term.function, where), f"{where} is {shown(term.function)}", gives, rule
+        )
     return functions
+
+
+def _checked(
+    function: Callable[..., Any], where: str, gives: Callable[[Any, Any], bool] | None, rule: str
+) -> Callable[..., Any]:
+    """A function whose results are looked at."""
+    if gives is None:
+        return function
+
+    def checked(first: Any, *others: Any) -> Any:
+        found = function(first, *others)
+        if not isinstance(found, torch.Tensor) or not gives(first, found):
+            shape = (
+                f"a tensor of {tuple(found.shape)}, {found.dtype}" if isinstance(found, torch.Tensor) else shown(found)
+            )
+            raise ConfigurationError(f"{where}, which gave {shape}; {rule}")
+        return found
+
+    return checked
+
+
+def guarded(call: Callable[..., Any], where: str) -> Callable[..., Any]:
+    """Somebody's code, of which whatever it raises, its wish to end the program included, is one sentence.
+
+    Args:
+        call: a function or a class.
+        where: the beginning of the sentence.
+    """
+
+    def called(*arguments: Any, **named: Any) -> Any:
+        try:
+            return call(*arguments, **named)
+        except ConfigurationError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise ConfigurationError(f"{where}, which {raised(error)}; mend it") from error
+
+    return called
 
 
 def foreign_functions(settings: Any, known: Any) -> list[str]:
@@ -90,6 +186,6 @@ def _own(path: str) -> bool:
         return False
     try:
         found = getattr(import_module(module), name, None)
-    except (ImportError, ValueError):
+    except (ImportError, ValueError, TypeError):
         return False
     return getattr(found, "__module__", None) == module

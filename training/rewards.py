@@ -201,7 +201,13 @@ class RewardFunction:
         Raises:
             ConfigurationError: a term of one's own is not there.
         """
-        own = resolve_own(configuration.own, "rewards.own", taken=REWARD_TERMS)
+        own = resolve_own(
+            configuration.own,
+            "rewards.own",
+            taken=REWARD_TERMS,
+            gives=lambda inputs, found: found.shape == inputs.command.shape[:1],
+            rule="it must be one number for each world, (N,)",
+        )
         weights: dict[str, Ramp | float] = {name: getattr(configuration, name) for name in REWARD_TERMS}
         weights |= {term.name: term.weight for term in configuration.own}
         used = {name: weight for name, weight in weights.items() if weight != 0.0}

@@ -17,7 +17,7 @@ from ..backends.base import PhysicsState
 from ..policy.contract import PolicyContract
 from ..policy.observation import ObservationBuilder
 from ..robots.base import JointParameters, Robot
-from .commands import COMMAND_COLUMNS
+from .commands import COMMAND_COLUMNS, CommandGenerator
 from .curriculum import Levels, TrainingPalette
 from .domain_randomization import MOTOR_COLUMNS, MotorParameters
 from .environment_configuration import EnvironmentConfiguration
@@ -26,7 +26,7 @@ from .episode_log import METRICS, EpisodeLog
 from .events import EpisodeStart, EpisodeStarts, Latency, Push, Pushes
 from .height_scan import HeightRasters, scan_pattern
 from .observations import Observations, Observer
-from .own_terms import resolve
+from .own_terms import resolve_class
 from .randomness import UniformColumns
 from .rewards import RewardFunction
 from .step_reader import StepReader
@@ -94,7 +94,10 @@ class EnvironmentStep:
         self.read = StepReader(configuration, robot=robot, palette=palette, kind=kind, scan=self.scan, rasters=rasters)
         self.rewards = RewardFunction(configuration.rewards, period, device)
         self.terminations = Terminations(configuration.termination)
-        self.commands = resolve(configuration.commands.generator, "commands.generator")(
+        make_commands = resolve_class(
+            configuration.commands.generator, "commands.generator", CommandGenerator, "draw", "held_yaw_rate"
+        )
+        self.commands = make_commands(
             configuration.commands,
             terrain_limits=[tile.command_limits for tile in palette.tiles],
             control_period=period,

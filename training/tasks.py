@@ -8,6 +8,8 @@ from difflib import get_close_matches
 from importlib import import_module
 from types import MappingProxyType
 
+from ..files.parsing import one_line, shown
+from ..files.plugins import raised
 from ..robots import load_robot
 from ..robots.loading import robot_digest
 from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
@@ -263,9 +265,11 @@ def _own_task(path: str) -> Task:
     try:
         found = getattr(import_module(module), attribute, None)
     except (ImportError, ValueError) as error:
-        raise TaskError(f"task '{path}': {error}; is its folder on PYTHONPATH?") from error
+        raise TaskError(f"task {shown(path)}: {one_line(error)}; is its folder on PYTHONPATH?") from error
+    except (Exception, SystemExit) as error:
+        raise TaskError(f"task {shown(path)}: importing it {raised(error)}; mend that module") from error
     if not isinstance(found, Task):
-        raise TaskError(f"task '{path}': module '{module}' has no Task of the name '{attribute}'")
+        raise TaskError(f"task {shown(path)}: module {shown(module)} has no Task of the name {shown(attribute)}")
     return replace(found, name=path)
 
 
@@ -295,7 +299,7 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
     else:
         near = get_close_matches(name, TASKS, n=3, cutoff=0.3)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
-        raise TaskError(f"unknown task '{name}'; {hint}the tasks are: {', '.join(TASKS)}")
+        raise TaskError(f"unknown task '{one_line(name, 80)}'; {hint}the tasks are: {', '.join(TASKS)}")
     chosen = list(overrides)
     named = [o for o in chosen if o.split("=", 1)[0].strip() == "environment.robot"]
     if named and robot is not None:

@@ -105,7 +105,13 @@ class Terminations:
         """
         self._settings = configuration
         used = {name: t for name, t in TERMINATIONS.items() if getattr(configuration, name, True) not in (None, False)}
-        own = resolve_own(configuration.own, "termination.own", taken=TERMINATIONS)
+        own = resolve_own(
+            configuration.own,
+            "termination.own",
+            taken=TERMINATIONS,
+            gives=lambda inputs, found: found.shape == inputs.command.shape[:1] and found.dtype is torch.bool,
+            rule="it must be true or false for each world, (N,) bool",
+        )
         used |= {t.name: Termination(rule=own[t.name], time_out=t.time_out) for t in configuration.own}
         # Time-outs first, so that each sort is neighbouring columns.
         self.names: tuple[str, ...] = tuple(sorted(used, key=lambda name: not used[name].time_out))

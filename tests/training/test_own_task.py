@@ -14,6 +14,8 @@ from gaitgauge.training.curriculum import build_palette
 from gaitgauge.training.environment import TrainingEnvironment, training_contract
 from gaitgauge.training.environment_configuration import (
     EnvironmentConfiguration,
+    OwnEvent,
+    OwnObservation,
     OwnReward,
     OwnTermination,
     RewardConfiguration,
@@ -23,7 +25,7 @@ from gaitgauge.training.own_terms import resolve
 from gaitgauge.training.tasks import TaskError, find_task
 from gaitgauge.training.terrain_configuration import TerrainConfiguration, TileConfiguration
 from gaitgauge_fake_engine import FakeBackend, FakeScript
-from small_environment import idle, make
+from small_environment import FLAT, idle, make
 
 FOLDER = Path(__file__).parents[2] / "examples" / "own_task"
 
@@ -79,6 +81,114 @@ def test_an_own_reward_is_weighted_like_any_other(example):
 def test_functions_that_are_not_there(function, message):
     with pytest.raises(ConfigurationError, match=message):
         make(2, rewards=RewardConfiguration(own=(OwnReward(name="mine", function=function, weight=1.0),)))
+
+
+BROKEN = """import sys, torch
+def fails(*_, **__): return {}["missing"]
+def ends(*_, **__): sys.exit(3)
+def nothing(*_, **__): pass
+def number(*_, **__): return 1.0
+def wide(*_, **__): return torch.zeros(2, 7)
+def long(*_, **__): return torch.zeros(99)
+class Plain: pass
+from gaitgauge.training.commands import CommandGenerator
+class Late(CommandGenerator):
+    def draw(self, *_, **__): raise OSError("\\x1b[31mno\\nline")
+class Strict(CommandGenerator):
+    def __init__(self): pass
+"""
+ENDING = {"raising": "raise ValueError('[/x]')", "leaving": "import sys; sys.exit('bye')", "wrong": "def ("}
+
+
+@pytest.fixture
+def broken(tmp_path, monkeypatch):
+    """Modules of somebody's that do what they must not."""
+    for name, text in {"broken": BROKEN, **ENDING}.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield
+    for name in ("broken", *ENDING):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.usefixtures("broken")
+@pytest.mark.parametrize("setting", ["rewards", "termination", "observations", "events", "generator", "level_rule"])
+@pytest.mark.parametrize(
+    "function",
+    [
+        *(
+            "broken:fails",
+            "broken:ends",
+            "broken:nothing",
+            "broken:number",
+            "broken:wide",
+            "broken:long",
+            "broken:Plain",
+        ),
+        *(
+            "broken:Late",
+            "broken:Strict",
+            "broken:sys",
+            "broken:fails.x",
+            "raising:f",
+            "leaving:f",
+            "wrong:f",
+            "os:system",
+        ),
+        *(
+            ".a:f",
+            "a..b:f",
+            "a\0:f",
+            "a:",
+            ":",
+            "x" * 300 + ":f",
+            "\ud800:f",
+            "json:loads",
+            "../a:f",
+            "[/x]:f",
+            "builtins:len",
+        ),
+    ],
+)
+def test_what_somebody_s_function_does_is_one_sentence(setting, function):
+    settings = EnvironmentConfiguration()
+    own = {
+        "rewards": lambda: {"rewards": RewardConfiguration(own=(OwnReward(name="m", function=function, weight=1.0),))},
+        "termination": lambda: {
+            "termination": TerminationConfiguration(own=(OwnTermination(name="m", function=function),))
+        },
+        "observations": lambda: {
+            "observations": replace(settings.observations, own=(OwnObservation(name="m", function=function),))
+        },
+        "events": lambda: {"events": (OwnEvent(name="m", function=function),)},
+        "generator": lambda: {"commands": replace(settings.commands, generator=function)},
+        "level_rule": lambda: {"terrain": replace(FLAT, level_rule=function)},
+    }[setting]()
+    if setting == "events" and function in ("broken:nothing", "broken:number", "broken:wide", "broken:long"):
+        pytest.skip("what an event returns is not looked at")
+    if (setting, function) == ("observations", "broken:wide"):
+        pytest.skip("these are observations")
+    with pytest.raises(ConfigurationError, match=setting) as caught:
+        idle(make(2, **own), 2)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    "name", ["raising:TASK", "leaving:TASK", "wrong:TASK", ".a:b", ":", "broken:fails", "\ud800:x"]
+)
+@pytest.mark.usefixtures("broken")
+def test_a_task_of_somebody_s_that_is_none(name):
+    with pytest.raises(TaskError, match="task ") as caught:
+        find_task(name)
+    assert str(caught.value).isprintable()
+
+
+def test_the_line_is_named(broken):
+    mine = OwnReward(name="m", function="broken:fails", weight=1.0)
+    with pytest.raises(
+        ConfigurationError, match=r"is 'broken:fails', which raised KeyError: 'missing' \(broken.py, line 2\)"
+    ):
+        idle(make(2, rewards=RewardConfiguration(own=(mine,))))
 
 
 def test_a_name_that_is_taken():
