@@ -315,18 +315,24 @@ def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
     if not own and name not in suite_names():
         hint = did_you_mean(name, suite_names())
         known = ", ".join(suite_names())
+        if behind:
+            raise SuiteError(
+                f"suite file {one_line(behind[-1])}: extends is {shown(name)}; it must be one of {known}, or a .toml file{hint}"
+            )
         raise SuiteError(f"there is no suite '{one_line(name, 80)}'{hint}; choose one of {known}, or give a .toml file")
     source = f"suite file {one_line(path)}"
     data = parse_toml(read_text(path, "suite file", SuiteError), source, SuiteError)
     base = data.pop("extends", None)
     if base is None:
         return path, data
+    if not isinstance(base, str):
+        raise SuiteError(f"{source}: extends is {shown(base)}; it must be a suite's name or the path of a .toml file")
     here = path.resolve()
     if here in behind or len(behind) >= _LONGEST_CHAIN:
         raise SuiteError(f"{source} extends itself, or through too many others; let 'extends' name another suite")
     if "name" not in data and here.parent != SUITE_FOLDER.resolve():
         raise SuiteError(f"{source} is called as the suite that it extends; {_OWN_NAME}")
-    whole = _tables(str(base), (*behind, here))[1]
+    whole = _tables(base, (*behind, here))[1]
     for key, value in data.items():
         under = whole.get(key)
         whole[key] = {**under, **value} if isinstance(under, dict) and isinstance(value, dict) else value

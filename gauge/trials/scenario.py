@@ -16,7 +16,7 @@ from ...terrains.base import Box, Terrain
 from ...terrains.course import Stretch, course_boxes
 from ...terrains.registry import TerrainError, make_terrain
 from ..commands import Phase
-from ..suite import Friction, load_suite
+from ..suite import Friction, SuiteError, load_suite
 
 SCENARIO_FOLDER = Path(__file__).parents[1] / "scenarios"
 
@@ -217,8 +217,7 @@ def load_scenario(name: str) -> Scenario:
     """Load a scenario by name, or from a TOML file of the user's own (a path that ends in ``.toml``).
 
     Raises:
-        ScenarioError: no such scenario, a malformed file, or a scenario that could never be decided.
-        SuiteError: its suite does not exist.
+        ScenarioError: no such scenario, a malformed file, its suite, or a scenario that could never be decided.
     """
     own = name.endswith(".toml")
     if not own and name not in scenario_names():
@@ -245,9 +244,11 @@ def _check(scenario: Scenario, source: str) -> None:
 
     Raises:
         ScenarioError: one sentence.
-        SuiteError: the suite does not exist.
     """
-    load_suite(scenario.suite)
+    try:
+        load_suite(scenario.suite)
+    except SuiteError as error:
+        raise ScenarioError(f"{source}: {error}") from error
     ground, start, success = scenario.ground, scenario.start, scenario.success
     seconds = scenario.seconds
     if seconds > LONGEST:

@@ -86,7 +86,7 @@ def run_trials(
                     f"'{name}' is called '{scenario.name}' as another one of these scenarios; rename it"
                 )
             scenarios[scenario.name] = scenario
-        except (ScenarioError, SuiteError) as error:
+        except ScenarioError as error:
             refused.append(Refused(what=name, reason=str(error)))
     entries = [_about(scenario) for scenario in scenarios.values()]
     turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]

@@ -78,7 +78,11 @@ def test_unknown_names_are_refused_with_those_that_are_near():
         ("friction = 0.6", "friction = 0.0", "friction is 0.0; it must be greater than 0"),
         ("seconds = 2.0", "seconds = -1.0", r"commands\[0\].seconds is -1.0"),
         ("friction = 0.6", "frictoin = 0.6", "unknown field 'frictoin'; did you mean 'friction'"),
-        ("friction = 0.6", 'friction = 0.6\nsuite = "nonesuch"', "there is no suite 'nonesuch'"),
+        (
+            "friction = 0.6",
+            'friction = 0.6\nsuite = "nonesuch"',
+            r"scenario file .*own\.toml: there is no suite 'nonesuch'",
+        ),
         ("[success]", "[ground]\nlevel = 3\n[success]", "ground.level is 3 of no terrain"),
         (
             "velocity = [1.0",

@@ -238,6 +238,29 @@ def test_suites_that_extend_each_other_are_refused(suite_file):
         load_suite(path)
 
 
+@pytest.mark.parametrize(
+    ("base", "sentence"),
+    [
+        ("5", "extends is 5; it must be a suite's name or the path of a .toml file"),
+        ('["a"]', r"extends is \['a'\]; it must be a suite's name"),
+        ("true", "extends is True; it must be a suite's name"),
+        ("{ a = 1 }", "extends is {'a': 1}; it must be a suite's name"),
+        ('""', r"mine\.toml: extends is ''; it must be one of demo, .*, or a .toml file"),
+        ('"../.."', r"mine\.toml: extends is '../..'; it must be one of demo"),
+        ('"DEMOS"', r"mine\.toml: extends is 'DEMOS'; it must be one of demo"),
+        ('"gaitgauge-2"', "did you mean 'gaitgauge-1'"),
+        ('"\\u0000.toml"', "suite file '.*' (does not exist|cannot be read)"),
+        ('"/etc/none.toml"', "suite file '/etc/none.toml' does not exist"),
+        ('"mine.toml"', "extends itself"),
+        ('"./../suites/mine.toml"', "does not exist|extends itself"),
+    ],
+)
+def test_what_a_suite_cannot_extend_is_named(suite_file, base, sentence):
+    with pytest.raises(SuiteError, match=sentence) as caught:
+        load_suite(suite_file(f'extends = {base}\nname = "mine"'))
+    assert str(caught.value).isprintable()
+
+
 def test_an_unknown_suite_is_refused_with_a_hint(tmp_path):
     with pytest.raises(SuiteError, match="there is no suite 'gaitguage-1'; did you mean 'gaitgauge-1'"):
         load_suite("gaitguage-1")
