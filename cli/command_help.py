@@ -13,8 +13,8 @@ from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "What is played": (
-        "pipeline", "suite", "scenario", "terrain", "level", "friction", "payload", "seed", "seeds", "repeats", "robots", "robot",
-        "command", "seconds", "quick", "factor", "attribution", "margin",
+        "pipeline", "suite", "scenarios", "terrain", "terrains", "level", "levels", "friction", "frictions", "payloads", "seed",
+        "seeds", "repeats", "robots", "robot", "command", "seconds", "quick", "factors", "attribution", "margin",
     ),
     "Where it runs": ("backend", "backends", "reference", "device", "threads", "num_envs", "capture", "fuse", "cluster"),
     "How it is watched": ("viewer", "port", "host", "gamepad"),

@@ -19,6 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import typer
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.text import Text
@@ -45,6 +46,18 @@ class Finding:
     found: str
     advice: str = ""
     """What to do, where it is not ok."""
+
+
+def run_doctor(*, policy: str | None, json_output: bool, **choices: Any) -> None:
+    """Examine this machine, or a policy as ``diagnosis.examine_policy`` does; exit code 1 where something is wrong."""
+    if policy is None:
+        well = examine(json_output=json_output)
+    else:
+        from .diagnosis import examine_policy
+
+        well = examine_policy(policy, json_output=json_output, **choices)
+    if not well:
+        raise typer.Exit(1)
 
 
 def examine(*, json_output: bool = False) -> bool:

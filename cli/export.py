@@ -61,15 +61,7 @@ _ABOUT = {
 LAYOUTS = ("plain", "unitree")
 
 
-def run_export(
-    choice: str,
-    *,
-    out: Path | None,
-    form: str,
-    layout: str = "plain",
-    trust: bool = False,
-    robot_name: str | None = None,
-) -> None:
+def run_export(*, policy: str, out: Path | None, form: str, layout: str, trust: bool, robot: str | None) -> None:
     """Export, and print each file with its check against the policy.
 
     Raises:
@@ -84,28 +76,28 @@ def run_export(
         raise UserError(f"there is no layout '{layout}'; choose one of: {', '.join(LAYOUTS)} (--layout)")
     if layout == "unitree" and form != "all":
         raise UserError(f"--layout unitree always writes ONNX and deploy.yaml; leave out --format {form}")
-    path = policy_file(choice)
-    policy = load_policy(path, None if robot_name is None else load_robot(robot_name), trust=trust)
-    robot = robot_for(policy.contract, robot_name)
+    path = policy_file(policy)
+    loaded = load_policy(path, None if robot is None else load_robot(robot), trust=trust)
+    body = robot_for(loaded.contract, robot)
     # Beside the checkpoint of a run, where users of Isaac Lab look for it.
     folder = out or (path.parent if (path.parent / "run.json").is_file() else Path()) / (
         "unitree" if layout == "unitree" else "exported"
     )
     make_folder(folder, ExportError)
     console = Terminal()
-    console.say(f"policy {path}, contract {policy.contract.hash[:12]}")
+    console.say(f"policy {path}, contract {loaded.contract.hash[:12]}")
     export = export_unitree if layout == "unitree" else FORMATS[form]
-    if export is export_policy and robot.sdk_joint_names is None:
+    if export is export_policy and body.sdk_joint_names is None:
         export = _without_deploy
         console.say(
-            f"no deploy.yaml: it numbers joints as the maker's SDK does, which robot '{robot.name}' does not say "
+            f"no deploy.yaml: it numbers joints as the maker's SDK does, which robot '{body.name}' does not say "
             "(sdk_joint_names in its robot.toml)"
         )
-    for written, largest in export(policy, folder, robot).items():
+    for written, largest in export(loaded, folder, body).items():
         actions = f"actions differ by at most {largest:.1e}" if largest else "actions are the same"
         check = "reads back the same" if written.suffix == ".yaml" else actions
         console.say(f"{written}  {written.stat().st_size / 1e6:.2f} MB  {_ABOUT[written.suffix]}; {check}")
     if layout == "unitree":
         console.say(f"point the controller's policy_dir at {folder.resolve()}")
-        if sentence := first_steps(policy):
+        if sentence := first_steps(loaded):
             console.say(sentence)

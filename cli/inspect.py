@@ -28,11 +28,11 @@ def import_file(
     destination: Path,
     *,
     force: bool,
-    trainable: bool = False,
-    raw: bool = False,
-    trust: bool = False,
-    contract: Path | None = None,
-    robot: str | None = None,
+    trainable: bool,
+    raw: bool,
+    trust: bool,
+    contract: Path | None,
+    robot: str | None,
 ) -> None:
     """Write a foreign policy as the project's own file, and print the contract that it got.
 
@@ -41,7 +41,7 @@ def import_file(
         destination: the file to write; it appears whole or not at all.
         force: replace the destination if it exists.
         trainable: keep the teacher and the critic of a training checkpoint.
-        raw: with ``trainable``, the weights after the last update instead of their average.
+        raw: the same with the weights after the last update instead of their average.
         trust: run the program that a file of the project's own format carries inside.
         contract: a ``contract.toml`` that says how a TorchScript or ONNX file is to be run.
         robot: name or path of the robot that the policy is for; None for what the file says, else the Go2.
@@ -57,6 +57,7 @@ def import_file(
         )
     if destination.exists() and not force:
         raise UserError(f"'{destination}' already exists; give another name, or replace it with --force")
+    trainable = trainable or raw
     if trainable and contract is not None:
         raise UserError("a training checkpoint has its contract inside; leave out --contract")
     if trainable:

@@ -54,19 +54,19 @@ RobotOption = Annotated[
 ]
 TerrainsOption = Annotated[
     list[str] | None,
-    typer.Option(help="Terrain; repeatable. Default: the suite's.", autocompletion=completion.terrains),
+    typer.Option("--terrain", help="Terrain; repeatable. Default: the suite's.", autocompletion=completion.terrains),
 ]
 LevelOption = Annotated[
     int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")
 ]
 FrictionsOption = Annotated[
-    list[float] | None, typer.Option(help="Friction coefficient; repeatable. Default: the suite's.")
+    list[float] | None, typer.Option("--friction", help="Friction coefficient; repeatable. Default: the suite's.")
 ]
 PayloadsOption = Annotated[
-    list[float] | None, typer.Option(help="Mass on the base [kg]; repeatable. Default: the suite's.")
+    list[float] | None, typer.Option("--payload", help="Mass on the base [kg]; repeatable. Default: the suite's.")
 ]
 SeedsOption = Annotated[
-    list[int] | None, typer.Option(help="Seed of the quality episodes; repeatable. Default: the suite's.")
+    list[int] | None, typer.Option("--seed", help="Seed of the quality episodes; repeatable. Default: the suite's.")
 ]
 FirstSeedOption = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first robot; the others' follow it.")

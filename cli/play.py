@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .console import Terminal
 from .errors import UserError
@@ -51,17 +51,21 @@ class PlayRequest:
     host: str
     gamepad: bool
     trust: bool
-    robot: str | None = None
-    suite: str = "gaitgauge-1"
+    robot: str | None
+    suite: str
 
 
-def run_play(asked: PlayRequest) -> None:
+def run_play(**choices: Any) -> None:
     """Load, build, and hand over to the viewer.
+
+    Args:
+        choices: fields of ``PlayRequest``.
 
     Raises:
         UserError: an option that makes no sense, or a viewer that this machine has no display for.
         PolicyError, ContractError, TerrainError, BackendError: one sentence on what is wrong.
     """
+    asked = PlayRequest(**choices)
     viewer = _check(asked)
     quality = choose_renderer() if viewer == "video" else None  # before MuJoCo is imported
     from .play_session import beyond

@@ -1,4 +1,4 @@
-"""``gaitgauge train --list-settings TASK``: every setting with its default, its unit and its meaning."""
+"""``gaitgauge train``, as ``train`` does it, or with ``--list-settings`` every setting with its default, its unit and its meaning."""
 
 from __future__ import annotations
 
@@ -16,6 +16,18 @@ from ..training.tasks import find_task
 from .console import Terminal
 
 _WIDTH = 80
+
+
+def run_training_or_settings(
+    *, list_settings: bool, overrides: Sequence[str], score: bool, score_suite: str, **choices: Any
+) -> None:
+    """Print the settings of a task and end, or train it, with checkpoints that are scored or not."""
+    if list_settings:
+        print_settings(choices["task"], overrides, choices["robot"])
+        return
+    from .train import run_training
+
+    run_training(overrides=overrides, score_suite=score_suite if score else None, **choices)
 
 
 def print_settings(task: str, overrides: Sequence[str], robot: str | None = None) -> None:

@@ -28,7 +28,7 @@ def run_warmup(
 
     Args:
         architectures: such as ``sm_90``; none for the GPU of this machine.
-        backends: engines on Warp.
+        backends: engines on Warp; none for mujoco-warp.
         robot: name or path; its numbers of joints and feet are part of the kernels.
         cache: folder of the kernels, None for Warp's own.
         threads: compilations at a time, None for all cores.
@@ -36,6 +36,7 @@ def run_warmup(
     Raises:
         UserError: no architecture and no GPU, or an engine without kernels.
     """
+    backends = backends or ("mujoco-warp",)
     for name in backends:
         if name.partition(":")[0] not in _ENGINES:
             raise UserError(

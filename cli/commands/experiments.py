@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from .. import completion
-from ..errors import report_errors
 from ..options import (
     DeviceOption,
     FirstSeedOption,
@@ -18,6 +17,7 @@ from ..options import (
     ThreadsOption,
     TrustOption,
 )
+from ..running import runs
 
 app = typer.Typer()
 
@@ -33,12 +33,13 @@ EngineOption = Annotated[
 
 
 @app.command()
-@report_errors
+@runs("trial:run_trial")
 def trial(
     policies: PoliciesArgument,
-    scenario: Annotated[
+    scenarios: Annotated[
         list[str] | None,
         typer.Option(
+            "--scenario",
             help="Scenario (see 'gaitgauge list scenarios'), a .toml file, or all; repeatable. Default: all.",
             autocompletion=completion.scenarios,
         ),
@@ -61,30 +62,17 @@ def trial(
       gaitgauge trial pretrained --repeats 20
       gaitgauge trial latest walk.onnx --scenario all
     """
-    from ..trial import run_trial
-
-    run_trial(
-        policies=policies,
-        scenarios=tuple(scenario or ()),
-        repeats=repeats,
-        seed=seed,
-        backend=backend,
-        device=device,
-        robot=robot,
-        threads=threads,
-        out=out,
-        json_output=json_output,
-        trust=trust,
-    )
 
 
 @app.command()
-@report_errors
+@runs("latent:run_latent")
 def latent(
     policies: PoliciesArgument,
-    terrain: Annotated[
+    terrains: Annotated[
         list[str] | None,
-        typer.Option(help="Terrain; repeatable. Default: the gauge's seven.", autocompletion=completion.terrains),
+        typer.Option(
+            "--terrain", help="Terrain; repeatable. Default: the gauge's seven.", autocompletion=completion.terrains
+        ),
     ] = None,
     level: Annotated[int, typer.Option(min=1, help="Level of the terrains that have levels.")] = 5,
     friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.8,
@@ -108,21 +96,3 @@ def latent(
       gaitgauge latent pretrained
       gaitgauge latent latest --terrain flat --terrain wave --seconds 3
     """
-    from ..latent import run_latent
-
-    run_latent(
-        policies=policies,
-        terrains=tuple(terrain or ()),
-        level=level,
-        friction=friction,
-        suite=suite,
-        seconds=seconds,
-        robots=robots,
-        seed=seed,
-        backend=backend,
-        robot=robot,
-        threads=threads,
-        out=out,
-        json_output=json_output,
-        trust=trust,
-    )

@@ -25,12 +25,13 @@ from ..options import (
     ThreadsOption,
     TrustOption,
 )
+from ..running import runs
 
 app = typer.Typer()
 
 
 @app.command()
-@report_errors
+@runs("evaluate:run_evaluation")
 def evaluate(
     policy: PolicyArgument,
     pipeline: Annotated[
@@ -44,11 +45,11 @@ def evaluate(
     backend: BackendOption = "mujoco",
     device: DeviceOption = None,
     robot: RobotOption = None,
-    terrain: TerrainsOption = None,
+    terrains: TerrainsOption = None,
     level: LevelOption = None,
-    friction: FrictionsOption = None,
-    payload: PayloadsOption = None,
-    seed: SeedsOption = None,
+    frictions: FrictionsOption = None,
+    payloads: PayloadsOption = None,
+    seeds: SeedsOption = None,
     threads: ThreadsOption = None,
     cluster: ClusterOption = None,
     out: Annotated[
@@ -68,32 +69,10 @@ def evaluate(
       gaitgauge evaluate latest --terrain stairs_fd --terrain stairs_bd --threads 8
       gaitgauge evaluate walk.onnx --pipeline multi --level 5 --friction 0.6
     """
-    from ..evaluate import run_evaluation
-
-    run_evaluation(
-        policy=policy,
-        pipeline=pipeline,
-        suite=suite,
-        backend=backend,
-        device=device,
-        robot=robot,
-        terrains=tuple(terrain or ()),
-        level=level,
-        frictions=tuple(friction or ()),
-        payloads=tuple(payload or ()),
-        seeds=tuple(seed or ()),
-        threads=threads,
-        cluster=cluster,
-        out=out,
-        resume=resume,
-        clip=clip,
-        json_output=json_output,
-        trust=trust,
-    )
 
 
 @app.command()
-@report_errors
+@runs("compare:run_comparison")
 def compare(
     contestants: Annotated[
         list[str],
@@ -114,11 +93,11 @@ def compare(
     backend: BackendOption = "mujoco",
     device: DeviceOption = None,
     robot: RobotOption = None,
-    terrain: TerrainsOption = None,
+    terrains: TerrainsOption = None,
     level: LevelOption = None,
-    friction: FrictionsOption = None,
-    payload: PayloadsOption = None,
-    seed: SeedsOption = None,
+    frictions: FrictionsOption = None,
+    payloads: PayloadsOption = None,
+    seeds: SeedsOption = None,
     threads: ThreadsOption = None,
     out: Annotated[
         Path | None,
@@ -135,28 +114,10 @@ def compare(
       gaitgauge compare old.gauge.pt new.gauge.pt --pipeline multi --level 3
       gaitgauge compare results/a results/b
     """
-    from ..compare import run_comparison
-
-    run_comparison(
-        contestants=contestants,
-        pipeline=pipeline,
-        suite=suite,
-        backend=backend,
-        device=device,
-        robot=robot,
-        terrains=tuple(terrain or ()),
-        level=level,
-        frictions=tuple(friction or ()),
-        payloads=tuple(payload or ()),
-        seeds=tuple(seed or ()),
-        threads=threads,
-        out=out,
-        json_output=json_output,
-    )
 
 
 @app.command()
-@report_errors
+@runs("verify:run_verification")
 def verify(
     card: Annotated[
         Path, typer.Argument(help="A score card: results.json, a copy of it, or its folder.", metavar="CARD")
@@ -185,20 +146,6 @@ def verify(
       gaitgauge verify card.json --policy walk.gauge.pt
       gaitgauge verify card.json --quick --fresh 4711
     """
-    from ..verify import run_verification
-
-    run_verification(
-        card=card,
-        policy=policy,
-        suite=suite,
-        device=device,
-        threads=threads,
-        quick=quick,
-        fresh=fresh,
-        out=out,
-        json_output=json_output,
-        trust=trust,
-    )
 
 
 @app.command()
@@ -221,7 +168,7 @@ def board(
 
 
 @app.command()
-@report_errors
+@runs("validate:run_validation")
 def validate(
     tables: Annotated[
         list[Path] | None,
@@ -229,9 +176,11 @@ def validate(
             help="The measured table, then one for each simulator (CSV; docs/validate.md).", metavar="REAL SIM..."
         ),
     ] = None,
-    example: Annotated[
+    example_name: Annotated[
         str | None,
-        typer.Option(help="Tables that ship with the project: paper.", autocompletion=completion.of("paper")),
+        typer.Option(
+            "--example", help="Tables that ship with the project: paper.", autocompletion=completion.of("paper")
+        ),
     ] = None,
     ranks_only: Annotated[
         bool, typer.Option("--ranks-only", help="Values are on different scales: compare the order of policies alone.")
@@ -244,13 +193,10 @@ def validate(
       gaitgauge validate --example paper
       gaitgauge validate real.csv mujoco.csv newton.csv
     """
-    from ..validate import run_validation
-
-    run_validation(tables=tables or [], example_name=example, ranks_only=ranks_only, json_output=json_output)
 
 
 @app.command()
-@report_errors
+@runs("consistency:run_consistency")
 def consistency(
     policies: PoliciesArgument,
     backends: Annotated[
@@ -271,18 +217,23 @@ def consistency(
     ] = None,
     suite: SuiteOption = "robogauge-1.1",
     robot: RobotOption = None,
-    terrain: TerrainsOption = None,
-    friction: Annotated[
+    terrains: TerrainsOption = None,
+    frictions: Annotated[
         list[float] | None,
-        typer.Option(help="Friction coefficient; repeatable. Default: the nominal one; on a GPU the suite's."),
+        typer.Option(
+            "--friction", help="Friction coefficient; repeatable. Default: the nominal one; on a GPU the suite's."
+        ),
     ] = None,
-    level: Annotated[
-        list[int] | None, typer.Option(help="Level (1-10) of the terrains that have levels; repeatable. Default: 3.")
+    levels: Annotated[
+        list[int] | None,
+        typer.Option("--level", help="Level (1-10) of the terrains that have levels; repeatable. Default: 3."),
     ] = None,
     seeds: Annotated[int | None, typer.Option(help="Number of seeds, at least 2. Default: 3; on a GPU 10.")] = None,
-    factor: Annotated[
+    factors: Annotated[
         list[str] | None,
-        typer.Option(help="Factor that the attribution switches; repeatable. Default: all (docs/consistency.md)."),
+        typer.Option(
+            "--factor", help="Factor that the attribution switches; repeatable. Default: all (docs/consistency.md)."
+        ),
     ] = None,
     margin: Annotated[
         float,
@@ -303,25 +254,3 @@ def consistency(
       gaitgauge consistency pretrained --backends mujoco,mujoco-warp --device cpu --seeds 2
       gaitgauge consistency latest --terrain flat --backends mujoco,mujoco@timestep=0.005
     """
-    from ..consistency import run_consistency
-
-    run_consistency(
-        policies=policies,
-        backends=backends,
-        reference=reference,
-        device=device,
-        suite=suite,
-        robot=robot,
-        terrains=tuple(terrain or ()),
-        frictions=tuple(friction or ()),
-        levels=tuple(level or ()),
-        seeds=seeds,
-        margin=margin,
-        factors=tuple(factor or ()),
-        attribution=attribution,
-        threads=threads,
-        out=out,
-        resume=resume,
-        json_output=json_output,
-        trust=trust,
-    )

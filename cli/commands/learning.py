@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 
 from .. import completion
-from ..errors import report_errors
 from ..options import ClusterOption
+from ..running import runs
 
 app = typer.Typer()
 
 
 @app.command()
-@report_errors
+@runs("settings:run_training_or_settings")
 def train(
     task: Annotated[
         str,
@@ -125,41 +125,10 @@ def train(
       gaitgauge train go2-moe-cts --init-from pretrained environment.push.linear=0.6
       gaitgauge train go2-moe-cts --resume latest
     """
-    if list_settings:
-        from ..settings import print_settings
-
-        print_settings(task, tuple(overrides or ()), robot)
-        return
-    from ..train import run_training
-
-    run_training(
-        task=task,
-        overrides=tuple(overrides or ()),
-        backend=backend,
-        device=device,
-        num_envs=num_envs,
-        robot=robot,
-        seed=seed,
-        iterations=iterations,
-        time=time,
-        resume=resume,
-        trust=trust,
-        init_from=init_from,
-        run_name=run_name,
-        log_root=log_root,
-        capture=capture,
-        fuse=fuse,
-        threads=threads,
-        logger=logger,
-        video_every=video_every,
-        score_suite=score_suite if score else None,
-        score_every=score_every,
-        score_threads=score_threads,
-    )
 
 
 @app.command()
-@report_errors
+@runs("sweep:run_sweep")
 def sweep(
     file: Annotated[
         Path, typer.Argument(help="A list of trainings (.toml), such as benchmarks/sweeps/*.toml.", metavar="FILE")
@@ -181,6 +150,3 @@ def sweep(
       gaitgauge sweep benchmarks/sweeps/methods.toml
       gaitgauge sweep trainings.toml --report
     """
-    from ..sweep import run_sweep
-
-    run_sweep(file=file, out=out, threads=threads, cluster=cluster, time=time, report=report, json_output=json_output)

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from .. import completion
-from ..errors import report_errors
 from ..options import RobotOption, ThreadsOption, TrustOption
+from ..running import runs
 
 app = typer.Typer()
 
@@ -18,7 +18,7 @@ LISTS = ("robots", "terrains", "backends", "suites", "scenarios", "policies", "t
 
 
 @app.command("list")
-@report_errors
+@runs("inspect:list_things")
 def list_command(
     what: Annotated[
         str,
@@ -34,13 +34,10 @@ def list_command(
       gaitgauge list suites
       gaitgauge list policies
     """
-    from ..inspect import list_things
-
-    list_things(what)
 
 
 @app.command()
-@report_errors
+@runs("doctor:run_doctor")
 def doctor(
     policy: Annotated[
         str | None,
@@ -69,37 +66,21 @@ def doctor(
       gaitgauge doctor policy.onnx
       gaitgauge doctor policy.onnx --contract contract.toml --out mended.toml
     """
-    if policy is None:
-        from ..doctor import examine
-
-        well = examine(json_output=json_output)
-    else:
-        from ..diagnosis import examine_policy
-
-        well = examine_policy(
-            policy,
-            contract=contract,
-            robot=robot,
-            seconds=seconds,
-            threads=threads,
-            out=out,
-            json_output=json_output,
-            trust=trust,
-        )
-    if not well:
-        raise typer.Exit(1)
 
 
 @app.command()
-@report_errors
+@runs("warmup:run_warmup")
 def warmup(
-    arch: Annotated[
-        list[str] | None,
-        typer.Option(help="GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU."),
-    ] = None,
-    backend: Annotated[
+    architectures: Annotated[
         list[str] | None,
         typer.Option(
+            "--arch", help="GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU."
+        ),
+    ] = None,
+    backends: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--backend",
             help="mujoco-warp or newton; repeatable. Default: mujoco-warp.",
             autocompletion=completion.warp_backends,
         ),
@@ -116,12 +97,3 @@ def warmup(
       gaitgauge warmup
       gaitgauge warmup --arch sm_90 --cache kernels
     """
-    from ..warmup import run_warmup
-
-    run_warmup(
-        architectures=tuple(arch or ()),
-        backends=tuple(backend or ("mujoco-warp",)),
-        robot=robot,
-        cache=cache,
-        threads=threads,
-    )

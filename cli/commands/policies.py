@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 
 from .. import completion
-from ..errors import report_errors
 from ..options import LARGEST_SEED, BackendOption, DeviceOption, RobotOption, TrustOption
+from ..running import runs
 
 app = typer.Typer()
 
 
 @app.command()
-@report_errors
+@runs("export:run_export")
 def export(
     policy: Annotated[
         str,
@@ -52,13 +52,10 @@ def export(
       gaitgauge export latest --out exported
       gaitgauge export pretrained --layout unitree --out unitree
     """
-    from ..export import run_export
-
-    run_export(policy, out=out, form=form, layout=layout, trust=trust, robot_name=robot)
 
 
 @app.command()
-@report_errors
+@runs("play:run_play")
 def play(
     policies: Annotated[
         list[str],
@@ -119,34 +116,10 @@ def play(
       gaitgauge play latest --viewer viser --command 1 0 0
       gaitgauge play old.gauge.pt new.gauge.pt --out walk.mp4
     """
-    from ..play import PlayRequest, run_play
-
-    run_play(
-        PlayRequest(
-            policies=tuple(policies),
-            terrain=terrain,
-            level=level,
-            backend=backend,
-            device=device,
-            viewer=viewer,
-            out=out,
-            gif=gif,
-            seconds=seconds,
-            command=command,
-            friction=friction,
-            seed=seed,
-            port=port,
-            host=host,
-            gamepad=gamepad,
-            trust=trust,
-            robot=robot,
-            suite=suite,
-        )
-    )
 
 
 @app.command("import")
-@report_errors
+@runs("inspect:import_file")
 def import_command(
     source: Annotated[
         str,
@@ -178,15 +151,3 @@ def import_command(
       gaitgauge import policy.onnx walk.gauge.pt
       gaitgauge import policy.pt walk.gauge.pt --contract contract.toml
     """
-    from ..inspect import import_file
-
-    import_file(
-        source,
-        destination,
-        force=force,
-        trainable=trainable or raw,
-        raw=raw,
-        trust=trust,
-        contract=contract,
-        robot=robot,
-    )

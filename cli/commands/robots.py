@@ -9,6 +9,7 @@ import typer
 
 from .. import completion
 from ..errors import report_errors
+from ..running import runs
 
 app = typer.Typer()
 robot = typer.Typer(no_args_is_help=True, help="Describe a robot of your own, and check it.")
@@ -16,7 +17,7 @@ app.add_typer(robot, name="robot")
 
 
 @robot.command()
-@report_errors
+@runs("robot:new_robot")
 def new(
     model: Annotated[Path, typer.Argument(help="MuJoCo model of the robot alone.", metavar="MODEL.xml")],
     out: Annotated[Path | None, typer.Option(help="Folder of the robot.toml. Default: the model's.")] = None,
@@ -28,9 +29,6 @@ def new(
     Examples:
       gaitgauge robot new mine/mine.xml
     """
-    from ..robot import new_robot
-
-    new_robot(model, out=out, name=name, force=force)
 
 
 @robot.command()

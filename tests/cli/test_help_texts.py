@@ -97,7 +97,7 @@ def completed(command: str, parameter: str, incomplete: str = "") -> list[str]:
     ("command", "parameter", "incomplete", "offered"),
     [
         ("evaluate", "suite", "gait", ["gaitgauge-1"]),
-        ("evaluate", "terrain", "stairs", ["stairs_bd", "stairs_fd"]),
+        ("evaluate", "terrains", "stairs", ["stairs_bd", "stairs_fd"]),
         ("evaluate", "backend", "mujoco-", ["mujoco-warp"]),
         ("evaluate", "pipeline", "s", ["stress"]),
         ("evaluate", "robot", "go2", ["go2"]),
