@@ -70,9 +70,22 @@ def test_a_sweep_that_is_not_there(tmp_path):
         load_sweep(tmp_path / "none.toml")
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks" / "sweeps").glob("*.toml")), ids=lambda p: p.stem)
-def test_the_paper_s_tables_are_sweeps_whose_entries_fit(path):
+SHIPPED = sorted((ROOT / "benchmarks" / "sweeps").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
+def test_shipped_sweeps_could_start(tmp_path, path):
     sweep = load_sweep(path)
+    assert sweep.name == path.stem
+    runs, refused = plan_runs(
+        replace(sweep, entry=tuple(replace(entry, device="cpu") for entry in sweep.entry)), tmp_path
+    )
+    assert refused == {} and len(runs) == len(sweep.entry) * len(sweep.seeds)
+
+
+@pytest.mark.parametrize("name", ["baselines", "moe-ablation", "strategies"])
+def test_the_paper_s_tables_are_sweeps_as_long_as_needed(name):
+    sweep = load_sweep(ROOT / "benchmarks" / "sweeps" / f"{name}.toml")
     assert len(sweep.entry) >= 4 and len(sweep.seeds) >= 2
     for entry in sweep.entry:
         task = find_task(entry.task, (*sweep.settings, *entry.settings))
@@ -156,6 +169,16 @@ def test_a_training_begins_or_goes_on(tmp_path):
     ]
     (directory / "best.pt").touch()
     assert run.policy(SWEEP).name == "model_5.pt" and run.policy(BEST).name == "best.pt"
+
+
+def test_a_training_may_begin_with_a_shipped_policy_or_a_checkpoint(tmp_path):
+    going_on = replace(SWEEP, entry=(replace(ENTRY, task="go2-moe-cts"),), init_from="pretrained")
+    (run,), _ = plan_runs(going_on, tmp_path)
+    begins = run.training_command(going_on, seconds=None, score_threads=2)
+    assert begins[begins.index("--init-from") + 1] == "pretrained"
+    other = replace(going_on, entry=(replace(ENTRY, init_from="none.pt"),))
+    assert "none.pt" in plan_runs(other, tmp_path / "other")[1]["one"]
+    assert "with another init_from" in plan_runs(replace(going_on, init_from=None), tmp_path)[1]["one"]
 
 
 def test_a_gauging_is_played_where_it_is_told(tmp_path):

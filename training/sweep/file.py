@@ -34,6 +34,8 @@ class SweepEntry:
     """Physics engine; None for that of the sweep."""
     device: Literal["cpu", "cuda"] | None = None
     """Where it is trained; None for what the engine is made for."""
+    init_from: Text | None = None
+    """Shipped policy or checkpoint whose networks it begins with; None for that of the sweep."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +54,8 @@ class Sweep:
     """``key=value`` each, of all entries."""
     backend: Text = DEFAULT_BACKEND
     """Physics engine of the trainings."""
+    init_from: Text | None = None
+    """Shipped policy or checkpoint whose networks the trainings begin with; None for nothing."""
     suite: Text = "gaitgauge-1"
     """Suite that gauges each run at its end, on MuJoCo."""
     training_suite: Text = "quick"

@@ -37,6 +37,8 @@ class SweepRun:
     """Updates of the whole run."""
     folder: Path
     """Where its run directory and its gauging go."""
+    init_from: str | None = None
+    """What it begins with; None for nothing."""
 
     @property
     def label(self) -> str:
@@ -94,6 +96,7 @@ class SweepRun:
             # The settings are those of the checkpoint; given again, functions that they name need no --trust.
             return [*_PROGRAM, "train", self.entry.task, *self.settings, "--resume", str(run), *options]
         options += ["--backend", self.backend, "--seed", str(self.seed), "--log-root", str(self.folder / "logs")]
+        options += [] if self.init_from is None else ["--init-from", self.init_from]
         return [*_PROGRAM, "train", self.entry.task, *self.settings, *options]
 
     def gauging_command(self, sweep: Sweep, *, where: Sequence[str]) -> list[str]:
@@ -114,7 +117,7 @@ class SweepRun:
             "settings": list(self.settings),
             "seed": self.seed,
             "backend": self.backend,
-        }
+        } | ({} if self.init_from is None else {"init_from": self.init_from})
         note = self.folder / "entry.json"
         if not note.exists():
             make_folder(self.folder, SweepError)
@@ -139,8 +142,14 @@ def plan_runs(sweep: Sweep, folder: Path) -> tuple[list[SweepRun], dict[str, str
     refused: dict[str, str] = {}
     for entry in sweep.entry:
         settings, backend = (*sweep.settings, *entry.settings), entry.backend or sweep.backend
+        init_from = sweep.init_from if entry.init_from is None else entry.init_from
         request = TrainRequest(
-            task=entry.task, overrides=settings, backend=backend, device=entry.device, score_suite=None
+            task=entry.task,
+            overrides=settings,
+            backend=backend,
+            device=entry.device,
+            init_from=init_from,
+            score_suite=None,
         )
         try:
             plan = prepare(request)
@@ -153,6 +162,7 @@ def plan_runs(sweep: Sweep, folder: Path) -> tuple[list[SweepRun], dict[str, str
                     backend=backend,
                     on_gpu=plan.device.startswith("cuda"),
                     iterations=plan.task.training.run.iterations,
+                    init_from=init_from,
                     folder=folder / "runs" / entry.name / f"seed-{seed}",
                 )
                 run.claim()
