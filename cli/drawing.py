@@ -12,15 +12,12 @@ from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from .errors import UserError
-from .picture import PLAIN, Picture, Quality
-
-if TYPE_CHECKING:
-    import mujoco
+from .picture import PLAIN, Picture, Quality, Tile
 
 Note = TypeVar("Note")
 
@@ -30,20 +27,6 @@ _WORTH = 50
 """Pictures for which it is worth to start another process."""
 _AHEAD = 3
 """Pictures that are asked for ahead of time, for each process."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tile:
-    """One robot of a picture."""
-
-    model: mujoco.MjModel
-    """What ``scenery.visual_model`` made."""
-    heading: float
-    """Of the robot at the start [rad]."""
-    leg_length: float
-    """Of the robot [m]."""
-    ground_shadows: bool = True
-    """Whether the ground casts shadows too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,16 +94,7 @@ class _Artist:
     """All tiles of one process."""
 
     def __init__(self, tiles: Sequence[Tile], size: tuple[int, int]) -> None:
-        self._pictures = [
-            Picture(
-                tile.model,
-                size=size,
-                heading=tile.heading,
-                leg_length=tile.leg_length,
-                ground_shadows=tile.ground_shadows,
-            )
-            for tile in tiles
-        ]
+        self._pictures = [Picture(tile, size=size) for tile in tiles]
 
     def draw(self, poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         drawn = [picture.draw(*pose) for picture, pose in zip(self._pictures, poses, strict=True)]

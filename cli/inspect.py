@@ -225,7 +225,7 @@ def _tasks() -> Table:
 
 def _policies() -> Table:
     from ..policy.base import PolicyError
-    from ..policy.finding import LOG_ROOT, find_policy, policy_names
+    from ..policy.finding import LOG_ROOT, find_policy, latest_checkpoint, policy_names
 
     table = make_table("policies (a name, or any policy file)", "name", "file", "robot", "contract", "saved")
     for column in table.columns:
@@ -238,15 +238,9 @@ def _policies() -> Table:
             continue
         table.add_row(name, *_policy_row(path))
     for run in sorted((r for r in LOG_ROOT.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True):
-        checkpoints = sorted(run.glob("model_*.pt"), key=_iteration)
-        for path in [*checkpoints[-1:], *run.glob("best.pt")]:
+        for path in filter(None, (latest_checkpoint(run), *run.glob("best.pt"))):
             table.add_row("", *_policy_row(path))
     return table
-
-
-def _iteration(path: Path) -> int:
-    number = path.stem.removeprefix("model_")
-    return int(number) if number.isdecimal() else -1
 
 
 def _policy_row(path: Path) -> tuple[str, str, str, str]:

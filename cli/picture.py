@@ -129,6 +129,20 @@ class Follower:
         return self._at
 
 
+@dataclass(frozen=True, kw_only=True)
+class Tile:
+    """One robot of a picture."""
+
+    model: mujoco.MjModel
+    """What ``scenery.visual_model`` made."""
+    heading: float
+    """Of the robot at the start [rad]."""
+    leg_length: float
+    """Of the robot [m]."""
+    ground_shadows: bool = True
+    """Whether the ground casts shadows too."""
+
+
 class Picture:
     """Draws a robot on its ground."""
 
@@ -138,35 +152,20 @@ class Picture:
     DISTANCE = 4.46
     """Of the camera, in lengths of the robot's legs."""
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        *,
-        size: tuple[int, int],
-        heading: float,
-        leg_length: float,
-        ground_shadows: bool = True,
-    ) -> None:
-        """Prepare the renderer.
-
-        Args:
-            model: what ``scenery.visual_model`` made.
-            size: width and height of the picture [pixels].
-            heading: of the robot at the start [rad].
-            leg_length: of the robot [m].
-            ground_shadows: whether the ground casts shadows too.
-        """
+    def __init__(self, tile: Tile, *, size: tuple[int, int]) -> None:
+        """Prepare the renderer of a picture of this width and height [pixels]."""
         import mujoco
 
+        model = tile.model
         self._model, self._data = model, mujoco.MjData(model)
         self._renderer = mujoco.Renderer(model, size[1], size[0])
         self._camera = mujoco.MjvCamera()
-        self._camera.azimuth = np.degrees(heading) + self.AZIMUTH
-        self._camera.elevation, self._camera.distance = self.ELEVATION, self.DISTANCE * leg_length
+        self._camera.azimuth = np.degrees(tile.heading) + self.AZIMUTH
+        self._camera.elevation, self._camera.distance = self.ELEVATION, self.DISTANCE * tile.leg_length
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = 1
         self._options.sitegroup[:] = 0
-        self._ground_shadows = ground_shadows
+        self._ground_shadows = tile.ground_shadows
 
     def draw(self, position: np.ndarray, looks_at: np.ndarray) -> np.ndarray:
         """The picture of a pose (7 + J,) from a camera that looks at a point (3,) [m]; (height, width, 3) uint8."""

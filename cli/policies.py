@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..policy.finding import find_policy
-from ..training.run_directory import latest_checkpoint
+from ..policy.finding import find_policy, latest_checkpoint
 from .errors import UserError
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from PIL import Image
 
 from ..robots.body_plan import body_plan
-from .drawing import Shot, Tile, draw, processes_for
+from .drawing import Shot, draw, processes_for
 from .overlay import annotate
-from .picture import Follower, Quality
+from .picture import Follower, Quality, Tile
 from .play_session import Command, PlaySession, Readout
 from .scenery import visual_model
 from .video import Film

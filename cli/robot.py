@@ -18,7 +18,7 @@ from ..robots.examining import Finding, examine
 from ..robots.loading import ROBOT_FILE, load_robot_file
 from .console import Terminal, shell_command
 from .errors import UserError
-from .picture import Picture, choose_renderer
+from .picture import Picture, Tile, choose_renderer
 
 if TYPE_CHECKING:
     from .picture import Quality
@@ -147,7 +147,7 @@ def _draw(robot: Robot, quality: Quality, path: Path) -> None:
     plan = body_plan(robot)
     position[2] = plan.standing_height
     model = visual_model(robot, make_terrain("flat"), quality)
-    picture = Picture(model, size=quality.size, heading=0.0, leg_length=plan.leg_length)
+    picture = Picture(Tile(model=model, heading=0.0, leg_length=plan.leg_length), size=quality.size)
     try:
         imageio.v3.imwrite(path, np.ascontiguousarray(picture.draw(position, position[:3])))
     except OSError as error:

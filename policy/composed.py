@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from torch import nn
 
-from .layers import Experts, mixed, multilayer_perceptron, unit
+from .layers import EncoderNetwork, Experts, mixed, multilayer_perceptron, unit
 
 _LEAST_LOG_STD, _LARGEST_LOG_STD = -5.0, 2.0
 _LEAST_VARIANCE = 1e-9
@@ -83,7 +82,7 @@ class CompositeActor(Experts):
         return variance * (precision * mean).sum(dim=0), variance.sqrt()
 
 
-class _ComposedNetwork(nn.Module):
+class _ComposedNetwork(EncoderNetwork):
     """An encoder of the history to a unit latent, and an actor of experts on the latent and the current frame."""
 
     actor: GatedActor | CompositeActor
@@ -102,23 +101,16 @@ class _ComposedNetwork(nn.Module):
         **actor: Any,
     ) -> None:
         """``actor``: what ``make_actor`` takes beside the common widths."""
-        super().__init__()
-        self.history_length = history_length
-        self.frame_width = frame_width
-        self.encoder = multilayer_perceptron(
-            (frame_width * history_length, *encoder_hidden, latent_width), activation=activation
-        )
-        self.actor = make_actor(
+        inputs = frame_width * history_length
+        encoder = multilayer_perceptron((inputs, *encoder_hidden, latent_width), activation=activation)
+        made = make_actor(
             inputs=latent_width + frame_width,
             num_actions=num_actions,
             num_experts=num_experts,
             activation=activation,
             **actor,
         )
-
-    def forward(self, history: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for ``history`` (N, H, F)."""
-        return self.explained(history)[0]
+        super().__init__(encoder, made, history_length=history_length, frame_width=frame_width)
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Unit latent (N, L) and weights of the actor's experts (N, K) for ``history`` (N, H, F)."""

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import nn
 
-from .layers import multilayer_perceptron, unit
+from .layers import EncoderNetwork, multilayer_perceptron, unit
 
 VELOCITY = 3
 """Entries of an estimate that are the base's velocity, its first, in the scale of the training's privileged observation."""
 
 
-class _EstimatorNetwork(nn.Module):
+class _EstimatorNetwork(EncoderNetwork):
     """An encoder of the history, and an actor on the estimate and the current frame.
 
     State dict: ``encoder.<layer>.*`` and ``actor.<layer>.*``; the actor's input is velocity, latent, then the current frame.
@@ -33,30 +32,13 @@ class _EstimatorNetwork(nn.Module):
         actor_hidden: Sequence[int] = (512, 256, 128),
         activation: str = "elu",
     ) -> None:
-        super().__init__()
-        self.history_length = history_length
-        self.frame_width = frame_width
-        self.latent_width = latent_width
-        self.encoder = multilayer_perceptron(
-            (frame_width * history_length, *encoder_hidden, VELOCITY + self.latents * latent_width),
-            activation=activation,
-        )
-        self.actor = multilayer_perceptron(
+        inputs, outputs = frame_width * history_length, VELOCITY + self.latents * latent_width
+        encoder = multilayer_perceptron((inputs, *encoder_hidden, outputs), activation=activation)
+        actor = multilayer_perceptron(
             (VELOCITY + latent_width + frame_width, *actor_hidden, num_actions), activation=activation
         )
-
-    def forward(self, history: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for ``history`` (N, H, F)."""
-        return self.explained(history)[0]
-
-    def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Actions (N, J) and the estimate behind them (N, 3 + L)."""
-        estimate = self.encode(history)[0]
-        return self.actor(torch.cat((estimate, history[:, -1]), dim=-1)), estimate
-
-    def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Velocity and latent, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
-        raise NotImplementedError
+        super().__init__(encoder, actor, history_length=history_length, frame_width=frame_width)
+        self.latent_width = latent_width
 
 
 class DreamwaqNetwork(_EstimatorNetwork):

@@ -62,6 +62,12 @@ def find_policy(path_or_name: str | Path, *, log_root: Path = LOG_ROOT) -> Path:
     return path
 
 
+def latest_checkpoint(run: Path) -> Path | None:
+    """The ``model_<iteration>.pt`` of the highest iteration in a run directory, None if there is none."""
+    numbered = [(int(m.group(1)), f) for f in run.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", f.name))]
+    return max(numbered)[1] if numbered else None
+
+
 def _shipped(name: str) -> tuple[Path | None, str]:
     """The file, and what is to be said if there is none."""
     path = shipped_policies()[name]
@@ -75,8 +81,7 @@ def _of_runs(name: str, log_root: Path) -> tuple[Path | None, str]:
     for run in runs:
         if name == "best" and (run / "best.pt").is_file():
             return run / "best.pt", ""
-        checkpoints = [(int(m.group(1)), f) for f in run.iterdir() if (m := re.fullmatch(r"model_(\d+)\.pt", f.name))]
-        if name == "latest" and checkpoints:
-            return max(checkpoints)[1], ""
+        if name == "latest" and (last := latest_checkpoint(run)) is not None:
+            return last, ""
     wanted = "best.pt" if name == "best" else "model_<iteration>.pt"
     return None, f"there is no policy '{name}': no run in '{log_root}/<experiment>/<run>/' has a {wanted}"

@@ -54,6 +54,34 @@ def unit(latent: torch.Tensor) -> torch.Tensor:
     return latent / torch.linalg.vector_norm(latent, dim=-1, keepdim=True).clamp_min(1e-12)
 
 
+class EncoderNetwork(nn.Module):
+    """A network that acts on what an encoder makes of the history, and on the current frame; see ``networks.py``.
+
+    State dict: ``encoder.*`` and ``actor.*``; the actor's input is what the encoder gives, then the current frame.
+    """
+
+    def __init__(self, encoder: nn.Module, actor: nn.Module, *, history_length: int, frame_width: int) -> None:
+        super().__init__()
+        self.history_length = history_length
+        self.frame_width = frame_width
+        self.encoder = encoder
+        self.actor = actor
+
+    def forward(self, history: torch.Tensor) -> torch.Tensor:
+        """Actions (N, J) for ``history`` (N, H, F)."""
+        return self.explained(history)[0]
+
+    def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """What the actor is given of ``history`` (N, H, F), (N, L), and weights of the experts (N, K), None without experts."""
+        raise NotImplementedError
+
+    def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Actions (N, J), what the encoder gives (N, L) and, with experts, their weights (N, K)."""
+        latent, weights = self.encode(history)
+        actions = self.actor(torch.cat((latent, history[:, -1]), dim=-1))
+        return (actions, latent) if weights is None else (actions, latent, weights)
+
+
 class Experts(nn.Module):
     """Several experts as one shared trunk, whose last layer is a block of private features for each, and a linear head for each.
 

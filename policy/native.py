@@ -128,17 +128,9 @@ def save_policy(
     Raises:
         PolicyError: ``extra`` uses a name of the format, or the network does not fit the contract.
     """
-    entries: dict[str, Any] = {"format": FORMAT, "version": VERSION, "contract": contract.to_json()}
     if isinstance(network, StoredNetwork):
         build_network(network, contract, source=str(path))
-        arguments = json.dumps(dict(network.arguments))
-        entries["network"] = {"kind": "native", "architecture": network.architecture, "arguments": arguments}
-        entries["state_dict"] = {name: value.detach().to("cpu") for name, value in network.state_dict.items()}
-    else:
-        entries["network"] = {
-            "kind": network.kind,
-            "bytes": torch.frombuffer(bytearray(network.data), dtype=torch.uint8),
-        }
+    entries = policy_entries(contract, network)
     entries["checksum"] = checksum(entries)
     taken = entries.keys() & (extra or {}).keys()
     if taken:
@@ -150,6 +142,18 @@ def save_policy(
     # Given a path, torch would write its name into the file: equal policies, unequal bytes.
     with replacing(target, PolicyError) as partial, partial.open("wb") as file:
         torch.save({**entries, **(extra or {})}, file)
+
+
+def policy_entries(contract: PolicyContract, network: StoredNetwork | ForeignFile) -> dict[str, Any]:
+    """What a policy file holds, but for its checksum."""
+    entries: dict[str, Any] = {"format": FORMAT, "version": VERSION, "contract": contract.to_json()}
+    if isinstance(network, StoredNetwork):
+        arguments = json.dumps(dict(network.arguments))
+        described = {"kind": "native", "architecture": network.architecture, "arguments": arguments}
+        state = {name: value.detach().to("cpu") for name, value in network.state_dict.items()}
+        return entries | {"network": described, "state_dict": state}
+    data = torch.frombuffer(bytearray(network.data), dtype=torch.uint8)
+    return entries | {"network": {"kind": network.kind, "bytes": data}}
 
 
 def checksum(entries: Mapping[str, Any]) -> str:

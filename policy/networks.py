@@ -29,7 +29,7 @@ from torch import nn
 
 from .composed import AcMoeNetwork, McpNetwork
 from .estimators import DreamwaqNetwork, HimNetwork
-from .layers import ACTIVATIONS, Experts, Perceptron, mixed, multilayer_perceptron, unit
+from .layers import ACTIVATIONS, EncoderNetwork, Experts, Perceptron, mixed, multilayer_perceptron, unit
 from .trot import TrotController
 
 
@@ -70,7 +70,7 @@ class MlpNetwork(nn.Module):
         return self.network(features)
 
 
-class CtsNetwork(nn.Module):
+class CtsNetwork(EncoderNetwork):
     """The student of concurrent teacher-student training: an encoder of the history, and an actor on its unit latent
     (paper, method).
 
@@ -88,28 +88,14 @@ class CtsNetwork(nn.Module):
         actor_hidden: Sequence[int] = (512, 256, 128),
         activation: str = "elu",
     ) -> None:
-        super().__init__()
-        self.history_length = history_length
-        self.frame_width = frame_width
-        self.encoder = multilayer_perceptron(
-            (frame_width * history_length, *encoder_hidden, latent_width), activation=activation
-        )
-        self.actor = multilayer_perceptron(
-            (latent_width + frame_width, *actor_hidden, num_actions), activation=activation
-        )
-
-    def forward(self, history: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for ``history`` (N, H, F)."""
-        return self.explained(history)[0]
+        inputs = frame_width * history_length
+        encoder = multilayer_perceptron((inputs, *encoder_hidden, latent_width), activation=activation)
+        actor = multilayer_perceptron((latent_width + frame_width, *actor_hidden, num_actions), activation=activation)
+        super().__init__(encoder, actor, history_length=history_length, frame_width=frame_width)
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Unit latent (N, L) for ``history`` (N, H, F); there are no experts."""
         return unit(self.encoder(history.flatten(1))), None
-
-    def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Actions (N, J) and latent (N, L)."""
-        latent = self.encode(history)[0]
-        return self.actor(torch.cat((latent, history[:, -1]), dim=-1)), latent
 
 
 class ExpertMixture(Experts):
@@ -159,7 +145,7 @@ class ExpertMixture(Experts):
         return mixed(weights, self.opinions(seen.flatten(1))), weights
 
 
-class MoeCtsNetwork(nn.Module):
+class MoeCtsNetwork(EncoderNetwork):
     """CTS with a mixture of experts as the student's encoder: the paper's policy, and its published predecessors.
 
     The predecessors differ by ``expert_width=128``, ``shared_head=True`` and ``expert_blind_to=(6, 7, 8)``: their
@@ -183,10 +169,7 @@ class MoeCtsNetwork(nn.Module):
         expert_blind_to: Sequence[int] = (),
         activation: str = "elu",
     ) -> None:
-        super().__init__()
-        self.history_length = history_length
-        self.frame_width = frame_width
-        self.encoder = ExpertMixture(
+        encoder = ExpertMixture(
             frame_width=frame_width,
             history_length=history_length,
             latent_width=latent_width,
@@ -198,23 +181,13 @@ class MoeCtsNetwork(nn.Module):
             expert_blind_to=expert_blind_to,
             activation=activation,
         )
-        self.actor = multilayer_perceptron(
-            (latent_width + frame_width, *actor_hidden, num_actions), activation=activation
-        )
-
-    def forward(self, history: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for ``history`` (N, H, F)."""
-        return self.explained(history)[0]
+        actor = multilayer_perceptron((latent_width + frame_width, *actor_hidden, num_actions), activation=activation)
+        super().__init__(encoder, actor, history_length=history_length, frame_width=frame_width)
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Unit latent (N, L) and weights of the experts (N, K) for ``history`` (N, H, F)."""
         mixture, weights = self.encoder(history)
         return unit(mixture), weights
-
-    def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Actions (N, J), latent (N, L) and weights of the experts (N, K)."""
-        latent, weights = self.encode(history)
-        return self.actor(torch.cat((latent, history[:, -1]), dim=-1)), latent, weights
 
 
 ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {

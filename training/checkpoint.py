@@ -9,7 +9,6 @@ only and is read without the ability to run code.
 from __future__ import annotations
 
 import io
-import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -26,8 +25,16 @@ from ..policy.base import PolicyError
 from ..policy.contract import PolicyContract
 from ..policy.fence.archive import read_limited
 from ..policy.loading import file_kind
-from ..policy.native import FORMAT, ForeignFile, StoredNetwork, checksum, is_policy, load_entries, read_policy
-from ..policy.native import VERSION as POLICY_VERSION
+from ..policy.native import (
+    FORMAT,
+    ForeignFile,
+    StoredNetwork,
+    checksum,
+    is_policy,
+    load_entries,
+    policy_entries,
+    read_policy,
+)
 
 TRAINING_VERSION = 1
 
@@ -43,17 +50,7 @@ def checkpoint_entries(contract: PolicyContract, network: StoredNetwork, extra: 
         CheckpointError: ``extra`` holds something other than tensors and plain data, or takes a name of the policy
         format.
     """
-    entries: dict[str, Any] = {
-        "format": FORMAT,
-        "version": POLICY_VERSION,
-        "contract": contract.to_json(),
-        "network": {
-            "kind": "native",
-            "architecture": network.architecture,
-            "arguments": json.dumps(dict(network.arguments)),
-        },
-        "state_dict": {name: value.detach().to("cpu") for name, value in network.state_dict.items()},
-    }
+    entries = policy_entries(contract, network)
     if taken := entries.keys() & extra.keys():
         raise CheckpointError(
             f"A checkpoint entry cannot be named {', '.join(sorted(taken))}: the policy format uses these names."

@@ -21,10 +21,10 @@ from ..files.parsing import NotNegative, Text, one_line, read_results, take
 from ..files.provenance import provenance
 from ..files.writing import json_text, make_folder, write_atomically
 from ..policy.contract import PolicyContract
+from ..policy.finding import LOG_ROOT, latest_checkpoint
 from .checkpoint import CheckpointError
 from .configuration import to_plain
 
-LOG_ROOT = Path("logs/rsl_rl")
 _Number = Annotated[int, Field(ge=0, lt=2**53)]
 
 
@@ -55,16 +55,6 @@ def new_run_directory(root: Path, experiment: str, run_name: str = "", now: date
     raise CheckpointError(
         f"Cannot create a run directory in '{root / experiment}': the names of the next minute are all taken."
     )
-
-
-def latest_checkpoint(run: Path) -> Path | None:
-    """The ``model_<iteration>.pt`` of the highest iteration in a run directory, None if there is none."""
-    numbered = [
-        (int(f.stem.removeprefix("model_")), f)
-        for f in run.glob("model_*.pt")
-        if f.stem.removeprefix("model_").isdecimal()
-    ]
-    return max(numbered)[1] if numbered else None
 
 
 def find_checkpoint(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ...terrains.base import Box, Terrain
-from .bench import Bench, expect, expect_close
+from .bench import Bench, expect
 from .contact import back_height
 from .kinematics import base_up
 from .reference import Reference, level_stance
-from .stepping import MOTION_FIELDS, stand, wave
+from .stepping import expect_same_motion, stand, wave
 from .suite import check
 
 BLOCK = Terrain(
@@ -103,10 +103,7 @@ def divergence(bench: Bench) -> str:
             not state.diverged[~broken].any(), f"diverged is {state.diverged}, but nothing happened to worlds 2 and 3"
         )
         tolerance = worlds.precision(1e-9, 2e-3)
-        for name in MOTION_FIELDS:
-            factor = 20.0 if "velocity" in name else 1.0
-            found, wanted = getattr(state, name)[~broken], getattr(expected, name)[~broken]
-            expect_close(f"{name} beside diverged worlds", found, wanted, factor * tolerance)
+        expect_same_motion("beside diverged worlds", state, expected, tolerance, ~broken)
         stand(bench, worlds)
         stand(bench, untouched)
         expect(not worlds.read().diverged.any(), "diverged is not cleared by a reset")
@@ -115,9 +112,7 @@ def divergence(bench: Bench) -> str:
             each.step()
         state, expected = worlds.read(), untouched.read()
         expect(not state.diverged.any(), "a healed world diverges again")
-        for name in MOTION_FIELDS:
-            factor = 20.0 if "velocity" in name else 1.0
-            expect_close(f"{name} of healed worlds", getattr(state, name), getattr(expected, name), factor * tolerance)
+        expect_same_motion("of healed worlds", state, expected, tolerance)
     return "2 of 4 worlds"
 
 

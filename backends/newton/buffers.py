@@ -38,23 +38,11 @@ def structure(kind: Any, **values: Any) -> Any:
 
 def layout_structure(layout: WorldLayout, device: wp.Device) -> Any:
     """Where things are in a world, as the kernels see it."""
-    return structure(
-        kernels.Layout,
-        coordinates=layout.coordinates,
-        dofs=layout.dofs,
-        bodies=layout.bodies,
-        shapes=layout.shapes,
-        base=layout.base,
-        joint_q=ints(layout.joint_q, device),
-        joint_v=ints(layout.joint_v, device),
-        foot_body=ints(layout.foot_body, device),
-        foot_center=wp.array(layout.foot_center, dtype=wp.vec3, device=device),
-        shape_foot=ints(layout.shape_foot, device),
-        shape_body=ints(layout.shape_body, device),
-        shape_trunk=ints(layout.shape_trunk, device),
-        shape_ground=ints(layout.shape_ground, device),
-        shape_slot=ints(layout.shape_slot, device),
-    )
+    numbers = {name: getattr(layout, name) for name in ("coordinates", "dofs", "bodies", "shapes", "base")}
+    shapes = ("shape_foot", "shape_body", "shape_trunk", "shape_ground", "shape_slot")
+    tables = {name: ints(getattr(layout, name), device) for name in ("joint_q", "joint_v", "foot_body", *shapes)}
+    center: wp.array = wp.array(layout.foot_center, dtype=wp.vec3, device=device)
+    return structure(kernels.Layout, foot_center=center, **numbers, **tables)
 
 
 def palette_structure(slots: SlotTables, device: wp.Device) -> Any:
@@ -69,19 +57,9 @@ def palette_structure(slots: SlotTables, device: wp.Device) -> Any:
 
 def contact_structure(contacts: newton.Contacts, force: Any, shape_body: Any) -> Any:
     """Newton's contacts, as the kernels see them."""
-    return structure(
-        kernels.ContactArrays,
-        count=contacts.rigid_contact_count,
-        shape0=contacts.rigid_contact_shape0,
-        shape1=contacts.rigid_contact_shape1,
-        point0=contacts.rigid_contact_point0,
-        point1=contacts.rigid_contact_point1,
-        margin0=contacts.rigid_contact_margin0,
-        margin1=contacts.rigid_contact_margin1,
-        normal=contacts.rigid_contact_normal,
-        force=force,
-        shape_body=shape_body,
-    )
+    names = ("count", "shape0", "shape1", "point0", "point1", "margin0", "margin1", "normal")
+    found = {name: getattr(contacts, f"rigid_contact_{name}") for name in names}
+    return structure(kernels.ContactArrays, force=force, shape_body=shape_body, **found)
 
 
 class MassTensors:

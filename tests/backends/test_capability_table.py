@@ -1,14 +1,10 @@
 """The table in the documentation is what the engines declare."""
 
-from pathlib import Path
-
 import pytest
+from capability_table import BEGIN, DOCUMENT, END, ENGINES, capability_table, update_document
 from gaitgauge.backends.base import CAPABILITY_NAMES
-from gaitgauge.backends.capability_table import BEGIN, END, ENGINES, capability_table, update_document
 from gaitgauge.backends.newton.solvers import SOLVERS
 from gaitgauge.backends.registry import backend_names
-
-DOCUMENT = Path(__file__).parents[2] / "docs" / "backends.md"
 
 
 def test_every_engine_and_capability_is_there():

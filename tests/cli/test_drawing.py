@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 from gaitgauge.cli import drawing
-from gaitgauge.cli.drawing import Shot, Tile, draw, processes_for
+from gaitgauge.cli.drawing import Shot, draw, processes_for
 from gaitgauge.cli.errors import UserError
-from gaitgauge.cli.picture import PLAIN, RICH, Follower, choose_renderer
+from gaitgauge.cli.picture import PLAIN, RICH, Follower, Tile, choose_renderer
 
 TILES = [Tile(model=None, heading=0.0, leg_length=0.4), Tile(model=None, heading=1.0, leg_length=0.4)]
 
@@ -22,7 +22,7 @@ def test_tiles_stand_side_by_side_and_pictures_are_drawn_as_they_are_needed(monk
     closed, taken = [], []
 
     class Flat:
-        def __init__(self, model, *, size, heading, leg_length, ground_shadows):
+        def __init__(self, tile, *, size):
             self.size = size
 
         def draw(self, position, looks_at):
@@ -89,14 +89,14 @@ def test_plain_pictures_keep_the_robots_shadow_and_leave_out_that_of_the_ground(
 
 _SHADOWS = """
 import numpy as np
-from gaitgauge.cli.picture import PLAIN, Picture
+from gaitgauge.cli.picture import PLAIN, Picture, Tile
 from gaitgauge.cli.scenery import visual_model
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains import make_terrain
 robot = load_robot("go2")
 model = visual_model(robot, make_terrain("obstacle", 5), PLAIN)
 def drawn(ground_shadows):
-    picture = Picture(model, size=(480, 270), heading=0.0, leg_length=0.4, ground_shadows=ground_shadows)
+    picture = Picture(Tile(model=model, heading=0.0, leg_length=0.4, ground_shadows=ground_shadows), size=(480, 270))
     position = np.array([-1.0, 0.0, 0.4, 1.0, 0.0, 0.0, 0.0, *robot.default_joint_position])
     image = picture.draw(position, np.array([-0.5, 0.0, 0.2])).astype(int).sum(axis=2)
     picture.close()
@@ -112,9 +112,9 @@ assert (robots - all_of_them > 30).sum() > 100, "obstacles have one too where it
 _SCRIPT = """
 import multiprocessing, os, signal
 import numpy as np
-from gaitgauge.cli.drawing import Shot, Tile, draw
+from gaitgauge.cli.drawing import Shot, draw
 from gaitgauge.cli.errors import UserError
-from gaitgauge.cli.picture import PLAIN
+from gaitgauge.cli.picture import PLAIN, Tile
 from gaitgauge.cli.scenery import visual_model
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.registry import make_terrain

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from ...files.writing import csv_text
 
 Curve = tuple[list[float], list[float]]
 """Environment steps [millions] and values."""
@@ -45,13 +45,11 @@ def learning_curves(run: Path) -> dict[str, Curve]:
 
 def curves_csv(curves: Mapping[tuple[str, int], Mapping[str, Curve]]) -> str:
     """A row for each point: entry, seed, figure, environment steps and value."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("entry", "seed", "figure", "environment_steps_millions", "value"))
+    rows: list[Sequence[object]] = [("entry", "seed", "figure", "environment_steps_millions", "value")]
     for (entry, seed), figures in curves.items():
         for figure, points in figures.items():
-            writer.writerows((entry, seed, figure, f"{x:.6g}", f"{y:.6g}") for x, y in zip(*points, strict=True))
-    return text.getvalue()
+            rows += [(entry, seed, figure, f"{x:.6g}", f"{y:.6g}") for x, y in zip(*points, strict=True)]
+    return csv_text(rows)
 
 
 def by_figure(

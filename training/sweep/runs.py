@@ -12,11 +12,12 @@ from ...backends.base import BackendError
 from ...files.parsing import one_line, read_results
 from ...files.writing import json_text, make_folder, write_atomically
 from ...gauge.suite import SuiteError, load_suite
+from ...policy.finding import latest_checkpoint
 from ..checkpoint import CheckpointError
 from ..configuration import ConfigurationError
 from ..launch import TrainRequest, prepare
 from ..overrides import TaskError
-from ..run_directory import latest_checkpoint, read_run_json
+from ..run_directory import read_run_json
 from .file import NO_SUITE, Sweep, SweepEntry, SweepError
 
 _PROGRAM = (sys.executable, "-m", f"{__name__.partition('.')[0]}.cli.main")

@@ -1,11 +1,16 @@
-"""The table of capabilities in ``docs/backends.md``, made from what the engines declare."""
+"""The table of capabilities in ``docs/backends.md``, made from what the engines declare.
+
+python tests/backends/capability_table.py
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from .base import CAPABILITY_NAMES, Support
-from .registry import find_backend
+from gaitgauge.backends.base import CAPABILITY_NAMES, Support
+from gaitgauge.backends.registry import find_backend
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "backends.md"
 
 BEGIN, END = "<!-- capabilities: begin -->", "<!-- capabilities: end -->"
 """The table's place in the document."""
@@ -57,3 +62,7 @@ def update_document(path: Path) -> bool:
     if new != text:
         path.write_text(new, encoding="utf-8")
     return new != text
+
+
+if __name__ == "__main__":
+    update_document(DOCUMENT)
