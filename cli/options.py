@@ -27,6 +27,9 @@ PoliciesArgument = Annotated[
 LARGEST_SEED = 2**63 - 2**32
 """Commands count on from a seed."""
 
+MOST_THREADS = 1024
+"""More than any machine has use for."""
+
 TrustOption = Annotated[
     bool,
     typer.Option("--trust", help="Run the program that a policy file of the project's own format carries inside."),
@@ -72,7 +75,8 @@ FirstSeedOption = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first robot; the others' follow it.")
 ]
 ThreadsOption = Annotated[
-    int | None, typer.Option(min=1, help="CPU threads; results do not depend on them. Default: all cores.")
+    int | None,
+    typer.Option(min=1, max=MOST_THREADS, help="CPU threads; results do not depend on them. Default: all cores."),
 ]
 ClusterOption = Annotated[
     str | None,

@@ -16,7 +16,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from .parsing import one_line
+from .parsing import one_line, shown
 
 LOCK = ".lock"
 _PATIENCE = 3.0
@@ -76,6 +76,8 @@ def make_folder(folder: Path, error: type[Exception], *, option: str = "--out") 
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise error(write_failure(folder, problem, f"choose another {option}")) from problem
+    except ValueError as problem:  # a null character, or half of a surrogate pair
+        raise error(f"{shown(str(folder))} is no name that a folder can have; choose another {option}") from problem
 
 
 def _no_file(path: Path) -> str | None:

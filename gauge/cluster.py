@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import pickle
 import re
 import socket
@@ -33,7 +34,7 @@ from .workers import (
     Stop,
 )
 
-_ADDRESS = re.compile(r"auto|(ray://)?(?P<host>[\w.-]+|\[[\da-fA-F:]+\]):(?P<port>\d{1,5})")
+_ADDRESS = re.compile(r"auto|(ray://)?(?P<host>[\w.-]{1,253}|\[[\da-fA-F:]{1,45}\]):(?P<port>\d{1,5})", re.ASCII)
 _CONNECTING = 5.0
 """Longest wait for the cluster's port to answer [s]."""
 _ARRIVING = 60.0
@@ -48,6 +49,8 @@ _MOST_STARTS = 60
 """How often in a row a worker may die before its first answer: Ray starts some on a dead node until it knows."""
 _PAUSE = 2.0
 """Time from such a death to the next start [s]."""
+_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
+"""What a client of gRPC says first: the preface of HTTP/2 and empty settings. A server's first words are its own settings."""
 _KEPT = "what had finished is kept: go on with --resume"
 
 
@@ -82,10 +85,10 @@ class Cluster:
         self._ray = _ray()
         try:
             if address != "auto":
-                _knock(address)  # Ray itself would try for a minute
+                _knock(address, greet=True)  # Ray itself would try for a minute or more
             self._ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
             self._head = address if "://" in address else self._ray.get_runtime_context().gcs_address
-        except (OSError, ValueError, RuntimeError) as error:
+        except Exception as error:  # Ray raises errors of many classes, some of them its own
             raise ClusterError(
                 f"no Ray cluster can be used at {address} ({_first_sentence(error)}); start one with 'ray start --head', run "
                 "this on one of its nodes or give its ray:// address (--cluster)"
@@ -354,15 +357,25 @@ def _ray() -> Any:
         ) from error
 
 
-def _knock(address: str) -> None:
+def _knock(address: str, *, greet: bool = False) -> None:
     """See whether anybody listens at an address.
 
+    Args:
+        address: with its port.
+        greet: see whether they speak gRPC, too, as Ray does (unless it is told to use TLS).
+
     Raises:
-        OSError: nobody, or the port is none.
+        OSError: nobody, the port is none, or something else listens there.
     """
     host, _, port = address.rpartition("://")[2].rpartition(":")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECTING).close()
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECTING) as connection:
+            if not greet or os.environ.get("RAY_USE_TLS", "0").lower() in ("1", "true"):
+                return
+            connection.sendall(_PREFACE)
+            frame = connection.recv(9, socket.MSG_WAITALL)
+            if len(frame) < 9 or frame[3] != 4:
+                raise OSError("something else than Ray answers there")
     except OverflowError as error:
         raise OSError(str(error)) from error
 

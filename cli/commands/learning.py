@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from .. import completion
-from ..options import ClusterOption
+from ..options import MOST_THREADS, ClusterOption
 from ..running import runs
 
 app = typer.Typer()
@@ -88,7 +88,9 @@ def train(
     fuse: Annotated[
         bool, typer.Option("--fuse/--no-fuse", help="Compile the environment's torch parts; faster, starts slower.")
     ] = False,
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads of an engine that runs on the CPU.")] = 1,
+    threads: Annotated[
+        int, typer.Option(min=1, max=MOST_THREADS, help="CPU threads of an engine that runs on the CPU.")
+    ] = 1,
     logger: Annotated[
         str | None,
         typer.Option(
@@ -114,7 +116,8 @@ def train(
         str, typer.Option(help="Suite of the scores, or a suite's .toml file.", autocompletion=completion.suites)
     ] = "quick",
     score_threads: Annotated[
-        int | None, typer.Option(min=1, help="CPU threads of the side process. Default: half of the machine.")
+        int | None,
+        typer.Option(min=1, max=MOST_THREADS, help="CPU threads of the side process. Default: half of the machine."),
     ] = None,
 ) -> None:
     """Train a policy; Ctrl-C or SIGTERM writes a checkpoint and says how to go on.
@@ -135,7 +138,7 @@ def sweep(
     ],
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: results/sweep-<name>.")] = None,
     threads: Annotated[
-        int | None, typer.Option(min=1, help="CPU threads of the gauge. Default: half of the cores.")
+        int | None, typer.Option(min=1, max=MOST_THREADS, help="CPU threads of the gauge. Default: half of the cores.")
     ] = None,
     cluster: ClusterOption = None,
     time: Annotated[str | None, typer.Option(help="Stop after this wall-clock time: seconds, 9m, 2h or 1h30m.")] = None,

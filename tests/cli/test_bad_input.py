@@ -268,3 +268,11 @@ def test_whole_process_ends_with_one_line(tmp_path):
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert done.stderr.startswith("gaitgauge: ")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "trial", "latent", "doctor"])
+@pytest.mark.parametrize(("threads", "limit"), [("1000000", "1024"), ("9" * 400, "1024"), ("0", "1"), ("-1", "1")])
+def test_no_machine_has_so_many_threads(run, command, threads, limit):
+    result = run(command, "pretrained", "--threads", threads)
+    assert result.exit_code == 2
+    assert f"than or equal to {limit} " in result.stderr

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from gaitgauge.files.writing import csv_text, json_text, lock_folder, replacing, write_atomically
+from gaitgauge.files.writing import csv_text, json_text, lock_folder, make_folder, replacing, write_atomically
 
 
 class WriteError(RuntimeError):
@@ -42,6 +42,14 @@ def test_impossible_places_are_one_sentence(tmp_path, name):
     with pytest.raises(WriteError, match="cannot write '") as caught:
         write_atomically(tmp_path / name, "text", WriteError)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "\ud800", "x" * 300, "file/b"])
+def test_a_folder_that_cannot_be_is_one_sentence(tmp_path, name):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(WriteError, match="choose another --out") as caught:
+        make_folder(tmp_path / name, WriteError)
+    assert str(caught.value).isprintable()
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "/", "a\0b", "pipe"])

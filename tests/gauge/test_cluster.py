@@ -5,6 +5,7 @@ import pickle
 import shutil
 import socket
 import sys
+import threading
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ import pytest
 import torch
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge import cluster, cluster_node
-from gaitgauge.gauge.cluster import ClusterError, check_address
+from gaitgauge.gauge.cluster import Cluster, ClusterError, check_address
 from gaitgauge.gauge.cluster_node import Arrived, NodeWorker, fingerprint
 from gaitgauge.gauge.dispatcher import Speculation, play
 from gaitgauge.gauge.evaluate import Request, evaluate, prepare
@@ -43,7 +44,19 @@ def with_ray(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "address", ["", "local", "10.0.0.1", "10.0.0.1:port", "http://10.0.0.1:6379", "a b:1", "[1:6379"]
+    "address",
+    [
+        "",
+        "local",
+        "10.0.0.1",
+        "10.0.0.1:port",
+        "http://10.0.0.1:6379",
+        "a b:1",
+        "[1:6379",
+        "h" * 254 + ":1",
+        "h:\u0663",
+        "a\x1b:1",
+    ],
 )
 def test_what_is_no_address_is_said(with_ray, address):
     with pytest.raises(ClusterError, match=r"is no address of a Ray cluster; give auto .*HOST:PORT"):
@@ -70,6 +83,51 @@ def test_an_address_where_nobody_listens_is_one_sentence(with_ray, address, tmp_
     ):
         evaluate(Request(policy="pretrained", suite="demo", cluster=address), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello", "something else than Ray answers there"),
+        (b"-ERR unknown command\r\n", "something else than Ray answers there"),
+        (b"", "something else than Ray answers there"),
+        (None, "timed out"),
+    ],
+    ids=["web", "redis", "closes", "silent"],
+)
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_where_somebody_else_listens_is_one_sentence(with_ray, monkeypatch, scheme, words, reason):
+    """Ray itself waits for a minute or more, or for ever."""
+    monkeypatch.setattr(cluster, "_CONNECTING", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            connection, _ = server.accept()
+            with connection:
+                connection.recv(100)
+                if words is None:
+                    connection.recv(100)
+                else:
+                    connection.sendall(words)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(ClusterError, match=rf"no Ray cluster can be used at .* \({reason}\); start one"):
+            Cluster(f"{scheme}127.0.0.1:{server.getsockname()[1]}")
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    "error", [AssertionError(), ImportError("no grpc"), KeyError("x"), Exception("[/x]\n\x1b[31m")]
+)
+def test_whatever_ray_raises_is_one_sentence(monkeypatch, error):
+    def init(**_: object) -> None:
+        raise error
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
+    with pytest.raises(ClusterError, match=r"no Ray cluster can be used at auto \(.+\)") as caught:
+        Cluster("auto")
+    assert str(caught.value).isprintable()
 
 
 # ---- what travels to a node -------------------------------------------------------------------------------------------
