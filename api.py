@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -193,9 +193,11 @@ def evaluate(
         watch: called a few times a second with a ``Status``.
 
     Raises:
-        SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, StoreError: one sentence.
+        ArgumentError, SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, StoreError: one sentence.
     """
     from .backends.registry import choose_device
+    from .files import MOST_THREADS
+    from .files.parsing import shown
     from .gauge.evaluate import Request
     from .gauge.evaluate import evaluate as run
     from .gauge.report import write_report
@@ -207,6 +209,8 @@ def evaluate(
     _need("several texts", terrains=terrains)
     _need("several numbers", frictions=frictions, payloads=payloads, seeds=seeds)
     _need("a whole number or None", level=level, threads=threads)
+    if threads is not None and not 1 <= threads <= MOST_THREADS:
+        raise ArgumentError(f"threads is {shown(threads)}; it must be 1 to {MOST_THREADS}")
     folder = Path(out) if out is not None else Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
     request = Request(
         policy=str(policy),
@@ -216,11 +220,11 @@ def evaluate(
         device=choose_device(backend, device),
         robot=robot,
         terrains=tuple(terrains),
-        level=level,
-        frictions=tuple(frictions),
-        payloads=tuple(payloads),
-        seeds=tuple(seeds),
-        threads=threads or os.cpu_count() or 1,
+        level=None if level is None else int(level),  # numpy's numbers, too, have to be written into results
+        frictions=tuple(map(float, frictions)),
+        payloads=tuple(map(float, payloads)),
+        seeds=tuple(int(s) if isinstance(s, Integral) else s for s in seeds),
+        threads=os.cpu_count() or 1 if threads is None else int(threads),
         trust=trust,
     )
     run(request, folder, resume=resume, watch=watch)
@@ -258,10 +262,15 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
         How it ended, and the run directory.
 
     Raises:
-        TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.
+        ArgumentError, TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.
     """
     from .training.launch import TrainRequest, prepare
     from .training.launch import train as run
 
+    _need("a text", task=task)
+    _need("several texts", settings=settings)
+    known = [f.name for f in fields(TrainRequest) if f.name not in ("task", "overrides", "seconds")]
+    if unknown := sorted(set(options) - set(known)):
+        raise ArgumentError(f"there is no option {unknown[0]}; choose from {', '.join(known)}")
     plan = prepare(TrainRequest(task=task, overrides=settings, seconds=seconds, **options))
     return run(plan, began=time.monotonic())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ..files.parsing import one_line
+from ..files.parsing import one_line, shown
 from .base import BackendError
 
 
@@ -22,9 +22,9 @@ def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
     try:
         device = torch.device(name)
     except RuntimeError as error:
-        raise BackendError(f"there is no device '{name}'; give cpu, cuda or cuda:N (--device)") from error
+        raise BackendError(f"there is no device {shown(name)}; give cpu, cuda or cuda:N (--device)") from error
     if device.type not in ("cpu", "cuda"):
-        raise BackendError(f"device '{name}' is not supported; give cpu, cuda or cuda:N (--device)")
+        raise BackendError(f"device {shown(name)} is not supported; give cpu, cuda or cuda:N (--device)")
     if device.type == "cpu":
         return torch.device("cpu")
     if not gpu:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from ..files import MOST_THREADS
 from . import completion
 
 PolicyArgument = Annotated[
@@ -26,9 +27,6 @@ PoliciesArgument = Annotated[
 ]
 LARGEST_SEED = 2**63 - 2**32
 """Commands count on from a seed."""
-
-MOST_THREADS = 1024
-"""More than any machine has use for."""
 
 TrustOption = Annotated[
     bool,

@@ -212,8 +212,12 @@ def load_result(path: Path) -> dict[str, Any]:
     Raises:
         ComparisonError: there is none, or it is damaged, or too old to compare.
     """
-    file = path / "results.json" if path.is_dir() else path
-    if not file.exists():
+    try:
+        file = path / "results.json" if path.is_dir() else path
+        there = file.exists()
+    except OSError as error:
+        raise ComparisonError(f"'{one_line(path)}' cannot be read: {error.strerror}") from error
+    if not there:
         raise ComparisonError(f"there are no results at '{one_line(path)}'; give a folder of 'gaitgauge evaluate'")
     found = read_results(file, "results", ComparisonError)
     if (schema := found.get("schema")) != SCHEMA or "environments" not in found:

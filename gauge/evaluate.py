@@ -22,7 +22,7 @@ import torch
 from ..backends.base import PhysicsBackend
 from ..backends.mujoco import MujocoBackend
 from ..backends.registry import find_backend, make_backend
-from ..files.parsing import shown
+from ..files.parsing import one_line, shown
 from ..files.provenance import plugins, provenance, source_digest, versions
 from ..files.writing import json_text, write_atomically
 from ..policy.contract import kind_of_observations
@@ -182,7 +182,9 @@ def _robot_and_policy(request: Request) -> tuple[Robot, FilePolicy]:
 def _terrains(request: Request, suite: Suite) -> list[str]:
     """The terrains of a request, in the suite's order."""
     if request.pipeline not in PIPELINES:
-        raise SuiteError(f"there is no pipeline '{request.pipeline}'; choose one of {', '.join(PIPELINES)}")
+        raise SuiteError(
+            f"there is no pipeline '{one_line(request.pipeline, 80)}'; choose one of {', '.join(PIPELINES)}"
+        )
     for name in request.terrains:
         if name not in terrain_names():
             make_terrain(name)  # raises with the nearest names

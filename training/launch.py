@@ -9,11 +9,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 
-from ..files.parsing import build, shown
+from ..files import MOST_THREADS
+from ..files.parsing import build, check_fields, shown
 from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
 from ..policy.contract import PolicyContract
@@ -71,7 +73,7 @@ class TrainRequest:
     """Physics engine; None for mujoco-warp."""
     device: str | None = None
     """None for the GPU if the engine is made for one, else the CPU."""
-    threads: int = 1
+    threads: Annotated[int, Field(ge=1, le=MOST_THREADS)] = 1
     """CPU threads of engines that use them."""
     num_envs: int | None = None
     """Worlds, in each process of a run on several GPUs."""
@@ -80,7 +82,7 @@ class TrainRequest:
     seed: int | None = None
     iterations: int | None = None
     """Of the whole run, what a resumed run has done before included."""
-    seconds: float | None = None
+    seconds: Annotated[float, Field(ge=0.0)] | None = None
     """Wall-clock limit [s] since ``began``."""
     resume: str | None = None
     """``latest``, a run directory or a checkpoint to continue."""
@@ -102,8 +104,11 @@ class TrainRequest:
     """Suite that scores checkpoints in a side process, None for no scores."""
     score_every: int | None = None
     """Iterations between two scores."""
-    score_threads: int | None = None
+    score_threads: Annotated[int, Field(ge=1, le=MOST_THREADS)] | None = None
     """CPU threads of the side process, None for half of the machine."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "what is to be trained", ConfigurationError)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
+from ...files import MOST_THREADS
 from .. import completion
-from ..options import MOST_THREADS, ClusterOption
+from ..options import ClusterOption
 from ..running import runs
 
 app = typer.Typer()

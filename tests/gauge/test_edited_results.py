@@ -6,15 +6,21 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
-from gaitgauge.api import ArgumentError, ResultsError, evaluate, load_policy, load_results
+from gaitgauge.api import ArgumentError, ResultsError, evaluate, load_policy, load_results, train
 from gaitgauge.api import compare as compare_results
+from gaitgauge.backends.base import BackendError
 from gaitgauge.gauge.board import write_board
 from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
 from gaitgauge.gauge.comparison_report import write_comparison
 from gaitgauge.gauge.result_check import MOST_ROWS, chance_rules_of
+from gaitgauge.gauge.store import StoreError
+from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.gauge.validation import Measurements, ValidationError, validate
 from gaitgauge.gauge.verify import CardError, load_card
+from gaitgauge.policy.base import PolicyError
+from gaitgauge.training.configuration import ConfigurationError
 
 SEED = Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json"
 TRUE = json.loads(SEED.read_text())
@@ -171,3 +177,43 @@ def test_an_argument_of_another_type_is_named(call, named):
 def test_a_name_that_no_system_takes_is_one_sentence():
     with pytest.raises(ResultsError, match="cannot be read: File name too long"):
         load_results("x" * 5000)
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: train(None), "task is None; it must be a text"),
+        (lambda: train(["go2-flat"]), r"task is \['go2-flat'\]; it must be a text"),
+        (lambda: train("go2-flat", 3), r"settings is \(3,\); it must be several texts"),
+        (lambda: train("go2-flat", treads=3), "there is no option treads; choose from backend, device, threads"),
+        (lambda: train("go2-flat", threads=0), "threads is 0; it must be greater than or equal to 1"),
+        (lambda: train("go2-flat", threads=10**9), "threads is 1000000000; it must be less than or equal to 1024"),
+        (lambda: train("go2-flat", seconds=float("nan")), "seconds is nan; it must be a finite number"),
+        (lambda: train("go2-flat", iterations="many"), "iterations is 'many'; it must be a whole number"),
+        (lambda: compare_results("x" * 300, "y"), "File name too long"),
+        (lambda: evaluate("pretrained", threads=0), "threads is 0; it must be 1 to 1024"),
+        (lambda: evaluate("pretrained", threads=10**300), "threads is 10+…?.*; it must be 1 to 1024"),
+        (lambda: evaluate("pretrained", device="\x1b[31m"), "there is no device"),
+        (lambda: evaluate("pretrained", pipeline="\x1b[31m"), "there is no pipeline"),
+    ],
+)
+def test_what_cannot_be_trained_or_compared_is_one_sentence(call, named):
+    with pytest.raises(
+        (ArgumentError, BackendError, ConfigurationError, ComparisonError, SuiteError), match=named
+    ) as caught:
+        call()
+    assert str(caught.value).isprintable()
+
+
+def test_numpy_s_numbers_are_numbers(tmp_path):
+    """They were a traceback where the request was written down."""
+    with pytest.raises(PolicyError, match="nowhere"):
+        evaluate(
+            "nowhere.pt", suite="demo", level=np.int64(3), seeds=np.arange(2), threads=np.int64(1), out=tmp_path / "r"
+        )
+    request = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gaitgauge.gauge.evaluate.evaluate", lambda asked, *_, **__: request.append(asked))
+        with pytest.raises(StoreError):
+            evaluate("pretrained", level=np.int64(3), seeds=np.arange(2), frictions=np.ones(1), out=tmp_path / "r")
+    assert json.dumps([request[0].level, *request[0].seeds, *request[0].frictions]) == "[3, 0, 1, 1.0]"
