@@ -212,19 +212,21 @@ def plain(data: Any, source: str, error: type[Exception], *, most: int = _MOST) 
         if len(steps) > _DEEPEST or left < 0:
             reason = "nested too deep" if len(steps) > _DEEPEST else "too long"
             raise error(f"{source} is {reason} at {_path(steps)[:_SHOWN]}")
+        if value is None or isinstance(value, bool | float):
+            return value
         if isinstance(value, str):
             return value.encode("utf-8", "backslashreplace").decode()
         if isinstance(value, list | tuple):
             return [copy(v, (*steps, i)) for i, v in enumerate(value)]
+        if isinstance(value, int):
+            if not -(2**63) <= value < 2**63:
+                raise error(f"{source}: {_path(steps)} is {shown(value)}; it must lie between -2^63 and 2^63")
+            return value
         if isinstance(value, Mapping):
             for key in value:
                 if not isinstance(key, str):
                     raise error(f"{source}: {_path(steps) or 'a table'} has the key {shown(key)}; keys must be texts")
             return {copy(k, steps): copy(v, (*steps, k)) for k, v in value.items()}
-        if isinstance(value, int) and not -(2**63) <= value < 2**63:
-            raise error(f"{source}: {_path(steps)} is {shown(value)}; it must lie between -2^63 and 2^63")
-        if value is None or isinstance(value, bool | int | float):
-            return value
         raise error(f"{source}: {_path(steps)} is {shown(value)}; it must be a text, a number, a list or a table")
 
     return copy(data, ())

@@ -84,6 +84,7 @@ def commit() -> str | None:
         return None
 
 
+@cache
 def plugins() -> dict[str, str]:
     """Installed plug-ins: ``value (distribution version)`` by ``group:name``."""
     found = {

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
@@ -342,9 +343,12 @@ def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
 _LONGEST_CHAIN = 10
 
 
+_hints = cache(get_type_hints)
+
+
 def _none_for_false(kind: type, data: dict[str, Any]) -> dict[str, Any]:
     """TOML has no null: ``false`` stands for None where a field may be None."""
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
 
     def value(key: str, given: Any) -> Any:
         hint = hints.get(key)

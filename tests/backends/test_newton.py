@@ -1,4 +1,7 @@
-"""The Newton engine beyond the conformance checks: its solvers, its import of the robot, its tables, and other engines' company."""
+"""The Newton engine beyond the conformance checks: its solvers, its import of the robot, its tables, and other engines' company.
+
+Newton takes seconds to import, so only those who run these tests do.
+"""
 
 from types import SimpleNamespace
 
@@ -9,11 +12,7 @@ import torch
 from gaitgauge.backends import BackendError, PhysicsOptions, Randomization, ResetState, Scene, Support
 from gaitgauge.backends.base import CAPABILITY_NAMES
 from gaitgauge.backends.mujoco.model import robot_spec
-from gaitgauge.backends.newton import NewtonBackend
-from gaitgauge.backends.newton.import_check import import_differences
-from gaitgauge.backends.newton.model import PARKED, _slot_tables, build_world_model, carriers
-from gaitgauge.backends.newton.solvers import SOLVERS, dry_friction_slope
-from gaitgauge.backends.registry import make_backend
+from gaitgauge.backends.registry import backend_class, make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Box, HeightField, Terrain
 from gaitgauge.terrains.registry import make_terrain
@@ -53,18 +52,22 @@ def compiled(change=lambda spec: None):
 
 
 def test_solvers_declare_every_capability():
+    from gaitgauge.backends.newton.solvers import SOLVERS
+
+    assert set(SOLVERS) == {"mujoco", "steel"}
     for name in SOLVERS:
-        capabilities = NewtonBackend.with_solver(name).capabilities()
+        capabilities = backend_class("newton").with_solver(name).capabilities()
         assert set(capabilities) == set(CAPABILITY_NAMES)
         # what is not exact says why
         assert all(c.note for c in capabilities.values() if c.support is not Support.EXACT)
 
 
 def test_solver_names():
-    assert NewtonBackend.with_solver("mujoco") is NewtonBackend
-    steel = NewtonBackend.with_solver("steel")
+    newton = backend_class("newton")
+    assert newton.with_solver("mujoco") is newton
+    steel = newton.with_solver("steel")
     assert steel.name == "newton:steel"
-    assert steel.capabilities() is not NewtonBackend.capabilities()
+    assert steel.capabilities() is not newton.capabilities()
     with pytest.raises(BackendError, match="unknown Newton solver 'bullet'; 'newton:NAME' runs mujoco and steel"):
         make_backend("newton:bullet", scene())
 
@@ -96,6 +99,8 @@ def test_terrains_that_newton_cannot_build_together_are_refused_in_a_sentence():
 
 
 def test_slots_of_a_palette():
+    from gaitgauge.backends.newton.model import PARKED, _slot_tables
+
     slots = _slot_tables((FLAT, BOXES, field(0.2), field(0.3)))
     assert slots.pose.shape == (4, 3, 7)
     np.testing.assert_allclose(slots.pose[0, :, :3], np.tile(PARKED, (3, 1)))
@@ -107,6 +112,8 @@ def test_slots_of_a_palette():
 
 
 def test_import_differences_are_found():
+    from gaitgauge.backends.newton.import_check import import_differences
+
     order = np.arange(compiled().ngeom)
     assert import_differences(compiled(), compiled(), order) == []
 
@@ -127,6 +134,8 @@ def test_import_differences_are_found():
 
 
 def test_dry_friction_slope_stops_a_joint_within_a_step_or_two():
+    from gaitgauge.backends.newton.solvers import dry_friction_slope
+
     reference = compiled()
     dofs = np.array([int(reference.joint(name).dofadr[0]) for name in ROBOT.joint_names])
     timestep = 0.002
@@ -144,6 +153,8 @@ def test_dry_friction_slope_stops_a_joint_within_a_step_or_two():
 
 @pytest.mark.slow
 def test_every_field_of_the_palette_is_in_the_model():
+    from gaitgauge.backends.newton.model import build_world_model, carriers
+
     for worlds in (1, 2, 5):
         terrains = (field(0.1), FLAT, field(0.2), field(0.3))
         world = build_world_model(scene(*terrains, index=(0,) * worlds), device="cpu", gap=0.0, skin=True)
@@ -197,7 +208,7 @@ def test_steel_stands_nearly_as_mujoco_does():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", ["mujoco", "steel"])
 def test_a_small_buffer_overflows_and_says_so(solver):
     assert stand(f"newton:{solver}", contacts_per_world=4, height=0.05, periods=2).overflowed
     assert not stand(f"newton:{solver}", contacts_per_world=60, height=0.3, periods=2).overflowed
@@ -218,12 +229,13 @@ def test_randomizing_some_worlds_takes_a_row_for_each():
 
 def test_the_solver_settings_told_are_those_asked_for():
     asked = PhysicsOptions(tolerance=1e-8, iterations=30)
-    assert NewtonBackend.solver_settings(asked)["tolerance"] == 1e-6
-    assert NewtonBackend.with_solver("steel").solver_settings(asked) == {"cone": "elliptic", "iterations": 30}
+    newton = backend_class("newton")
+    assert newton.solver_settings(asked)["tolerance"] == 1e-6
+    assert newton.with_solver("steel").solver_settings(asked) == {"cone": "elliptic", "iterations": 30}
 
 
 @pytest.mark.slow  # compiles its kernels on the first machine that runs it: minutes
 def test_the_solver_settings_told_are_those_that_act():
-    option = NewtonBackend(scene(tolerance=1e-8, iterations=30))._solver._model.opt
+    option = make_backend("newton", scene(tolerance=1e-8, iterations=30))._solver._model.opt
     np.testing.assert_allclose(option.tolerance.numpy(), 1e-6)
     assert option.iterations == 30

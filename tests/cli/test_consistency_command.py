@@ -3,18 +3,21 @@
 import json
 
 import pytest
+from gaitgauge.gauge.consistency import open_loop
 
 SUITE = """
 extends = "robogauge-1.1"
 name = "tiny"
 title = "a second"
-goals = [{ name = "max_velocity", phases = [0.2, 0.1] }, { name = "target_pos_velocity", phases = [] }]
+goals = [{ name = "max_velocity", phases = [0.1, 0.04] }, { name = "target_pos_velocity", phases = [] }]
 [matrix]
 frictions = [0.6, 0.8]
 [settling]
-longest = 0.2
+longest = 0.1
 [scoring]
-bootstrap = 200
+bootstrap = 50
+[metrics]
+interval = 20
 """
 
 
@@ -25,7 +28,8 @@ def tiny(tmp_path):
     return path
 
 
-def test_two_settings_of_the_c_engine(run, refused, tmp_path, policy, tiny):
+def test_two_settings_of_the_c_engine(run, refused, tmp_path, policy, tiny, monkeypatch):
+    monkeypatch.setattr(open_loop, "DURATION", 0.3)
     out = tmp_path / "study"
     command = (
         "consistency",

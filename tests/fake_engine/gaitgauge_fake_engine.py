@@ -306,8 +306,9 @@ class FakeBackend(PhysicsBackend):
 
     def _take_targets(self, joint_targets: torch.Tensor | None, takers: torch.Tensor) -> None:
         if joint_targets is not None:
-            self.targets[takers] = self._rows(joint_targets, takers)
-            self.limp[takers] = False
+            acting = joint_targets.to(self.device, self.dtype)
+            self.targets.copy_(torch.where(takers[:, None], acting, self.targets))
+            self.limp &= ~takers
 
     def _advance(self, mask: torch.Tensor) -> None:
         """One physics step of the masked worlds: semi-implicit Euler, the state's forces aside."""
@@ -346,13 +347,15 @@ class FakeBackend(PhysicsBackend):
             "joint_velocity": joint_velocity,
             "joint_torque": torque,
         }
-        gone = self._since(script.diverge_time)
+        if script.diverge_time is not None:
+            gone = self._since(script.diverge_time)[:, None]
+            new = {name: torch.where(gone, torch.full_like(value, math.nan), value) for name, value in new.items()}
         for name, value in new.items():
-            value = torch.where(gone[:, None], torch.full_like(value, math.nan), value)
             old = getattr(state, name)
             old.copy_(torch.where(mask[:, None], value, old))
-            state.diverged |= mask & ~value.isfinite().all(dim=-1)
-        state.overflowed |= mask & self._since(script.overflow_time)
+        state.diverged |= mask & ~torch.cat(list(new.values()), dim=1).isfinite().all(dim=1)
+        if script.overflow_time is not None:
+            state.overflowed |= mask & self._since(script.overflow_time)
 
     def _torque(self) -> torch.Tensor:
         """Motor law of ``JointParameters`` with the randomized factors, (N, J) [N·m]."""

@@ -44,6 +44,16 @@ terrains = ["flat"]
 frictions = [0.6]
 payloads = [0.0]
 seeds = [0]
+
+[physics]
+timestep = 0.005
+substeps = 4
+
+[noise]
+latency = 3
+
+[metrics]
+interval = 20
 """
 
 

@@ -137,6 +137,7 @@ def test_several_policies_side_by_side_and_one_that_has_nothing_to_look_at(polic
         policies=("pretrained", policies["plain"], policies["a<b>"]),
         terrains=("flat", "slope_fd"),
         seconds=0.2,
+        settling=0.2,
         robots=2,
     )
     results = study_latents(request, tmp_path)

@@ -58,8 +58,14 @@ def real_request(request_for, monkeypatch):
     monkeypatch.undo()
     request = request_for()
     text = Path(request.suite).read_text()
-    text = text.replace("timestep = 0.01\nsubsteps = 2", "").replace("interval = 2", "interval = 10")
-    text = text.replace("[0.04, 0.02]", "[0.2, 0.1]").replace("slope = 0.3", "slope = 1.0").replace("latency = 1", "")
+    text = text.replace("timestep = 0.01\nsubsteps = 2", "timestep = 0.005\nsubsteps = 4").replace(
+        "interval = 2", "interval = 4"
+    )
+    text = (
+        text.replace("[0.04, 0.02]", "[0.2, 0.1]")
+        .replace("slope = 0.3", "slope = 1.0")
+        .replace("latency = 1", "latency = 2")
+    )
     Path(request.suite).write_text(text)
     return replace(request, backend="mujoco")
 

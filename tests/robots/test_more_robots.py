@@ -119,9 +119,8 @@ def test_anymals_frames_knees_and_order_are_unlike_go2s():
 @pytest.mark.parametrize(
     ("name", "only"),
     [
-        ("go1", ("model/", "kinematics/", "motors/", "contact/rest")),
-        pytest.param("go1", (), marks=pytest.mark.slow),
-        ("anymal_c", ()),
+        *((name, ("model/", "kinematics/", "motors/", "contact/rest")) for name in ROBOTS),
+        *(pytest.param(name, (), marks=pytest.mark.slow) for name in ROBOTS),
     ],
 )
 def test_mujoco_holds_their_models_to_the_contract(name, only):
