@@ -2,55 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
 
 from ..files.writing import make_folder
-from ..policy.base import Policy
-from ..policy.export import (
-    ExportError,
-    export_deploy,
-    export_onnx,
-    export_policy,
-    export_torchscript,
-    export_unitree,
-    first_steps,
-)
+from ..policy.export import PARTS, ExportError, export_policy, export_unitree, first_steps
 from ..policy.its_robot import robot_for
 from ..policy.loading import load_policy
-from ..robots import Robot, load_robot
+from ..robots import load_robot
 from .console import Terminal
 from .errors import UserError
 from .policies import policy_file
 
-
-def _torchscript(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
-    path = folder / "policy.pt"
-    return {path: export_torchscript(policy, path)}
-
-
-def _onnx(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
-    path = folder / "policy.onnx"
-    return {path: export_onnx(policy, path)}
-
-
-def _deploy(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
-    path = folder / "deploy.yaml"
-    export_deploy(policy, path, robot)
-    return {path: 0.0}
-
-
-def _without_deploy(policy: Policy, folder: Path, robot: Robot) -> dict[Path, float]:
-    return _torchscript(policy, folder, robot) | _onnx(policy, folder, robot)
-
-
-FORMATS: dict[str, Callable[[Policy, Path, Robot], dict[Path, float]]] = {
-    "all": export_policy,
-    "torchscript": _torchscript,
-    "onnx": _onnx,
-    "deploy": _deploy,
-}
+FORMATS: Mapping[str, tuple[str, ...]] = {"all": PARTS, **{part: (part,) for part in PARTS}}
 _ABOUT = {
     ".pt": "TorchScript: one observation in, history inside, reset()",
     ".onnx": "ONNX: stacked observations in, the contract in its metadata",
@@ -86,18 +51,20 @@ def run_export(*, policy: str, out: Path | None, form: str, layout: str, trust: 
     make_folder(folder, ExportError)
     console = Terminal()
     console.say(f"policy {path}, contract {loaded.contract.hash[:12]}")
-    export = export_unitree if layout == "unitree" else FORMATS[form]
-    if export is export_policy and body.sdk_joint_names is None:
-        export = _without_deploy
+    parts = FORMATS[form]
+    if layout == "plain" and form == "all" and body.sdk_joint_names is None:
+        parts = tuple(part for part in PARTS if part != "deploy")
         console.say(
             f"no deploy.yaml: it numbers joints as the maker's SDK does, which robot '{body.name}' does not say "
             "(sdk_joint_names in its robot.toml)"
         )
-    for written, largest in export(loaded, folder, body).items():
+    unitree = layout == "unitree"
+    found = export_unitree(loaded, folder, body) if unitree else export_policy(loaded, folder, body, parts)
+    for written, largest in found.items():
         actions = f"actions differ by at most {largest:.1e}" if largest else "actions are the same"
         check = "reads back the same" if written.suffix == ".yaml" else actions
         console.say(f"{written}  {written.stat().st_size / 1e6:.2f} MB  {_ABOUT[written.suffix]}; {check}")
-    if layout == "unitree":
+    if unitree:
         console.say(f"point the controller's policy_dir at {folder.resolve()}")
         if sentence := first_steps(loaded):
             console.say(sentence)

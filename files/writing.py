@@ -54,15 +54,13 @@ def replacing(path: Path, error: type[Exception], *, durable: bool = True, endin
             partial.unlink()
 
 
-def write_atomically(
-    path: Path, data: str | bytes | memoryview, error: type[Exception], *, durable: bool = True
-) -> None:
+def write_atomically(path: Path, data: str | bytes | memoryview, error: type[Exception]) -> None:
     """Write a file, all or nothing.
 
     Raises:
         error: it cannot be written.
     """
-    with replacing(path, error, durable=durable) as partial:
+    with replacing(path, error) as partial:
         partial.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 

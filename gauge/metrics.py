@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from ..backends.base import PhysicsState
 from ..robots.base import Robot
 from ..robots.body_plan import LEG_PARTS, body_plan
 from ..robots.geometry import joint_ranges, stance_span
@@ -163,29 +164,20 @@ def fill_flight(values: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
     return torch.where(defined, values, mean)
 
 
-class MotionState(Protocol):
-    """What the metrics need of a state; ``PhysicsState`` has it, with the same frames and units."""
+@dataclass(frozen=True, kw_only=True)
+class SampledState:
+    """The part of ``PhysicsState`` that metrics look at, of T samples, in the same frames and units."""
 
-    @property
-    def base_quaternion_w(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def base_linear_velocity_w(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def base_angular_velocity_b(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def joint_position(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def joint_velocity(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def joint_torque(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def ground_moment_w(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def ground_force_w(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def foot_normal_force(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def foot_tangential_force(self) -> torch.Tensor: ...  # noqa: D102
+    base_quaternion_w: torch.Tensor
+    base_linear_velocity_w: torch.Tensor
+    base_angular_velocity_b: torch.Tensor
+    joint_position: torch.Tensor
+    joint_velocity: torch.Tensor
+    joint_torque: torch.Tensor
+    ground_moment_w: torch.Tensor
+    ground_force_w: torch.Tensor
+    foot_normal_force: torch.Tensor
+    foot_tangential_force: torch.Tensor
 
 
 def _joints_of(robot: Robot, parts: tuple[str, ...]) -> list[int]:
@@ -234,7 +226,7 @@ class MetricEvaluator:
 
     def evaluate(
         self,
-        state: MotionState,
+        state: SampledState | PhysicsState,
         command: torch.Tensor,
         limits: torch.Tensor,
         friction: torch.Tensor,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
-from .metrics import MetricEvaluator
+from .metrics import MetricEvaluator, SampledState
 from .suite import Suite
 
 GRAVITY = 9.81
@@ -22,22 +21,6 @@ _CONTACTS = ("ground_moment_w", "ground_force_w", "foot_normal_force", "foot_tan
 
 Samples = tuple[NDArray[np.float32], NDArray[np.bool_]]
 """Metrics and quality of T samples, (T, columns), NaN where a metric is not defined, and which of them count, (T,)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SampledState:
-    """The part of ``PhysicsState`` that metrics look at, of T samples."""
-
-    base_quaternion_w: torch.Tensor
-    base_linear_velocity_w: torch.Tensor
-    base_angular_velocity_b: torch.Tensor
-    joint_position: torch.Tensor
-    joint_velocity: torch.Tensor
-    joint_torque: torch.Tensor
-    ground_moment_w: torch.Tensor
-    ground_force_w: torch.Tensor
-    foot_normal_force: torch.Tensor
-    foot_tangential_force: torch.Tensor
 
 
 class SampleTable:

@@ -99,6 +99,31 @@ class Policy(ABC):
         return RowwiseSession(self.session, num_episodes)
 
 
+PROBE_EPISODES, _PROBE_STEPS = 3, 8
+PROBE_TOLERANCE = 1e-5
+"""Largest difference of an action between two ways to play a policy, absolute or relative."""
+
+
+def act_alike(alone: PolicySession, together: PolicySession, width: int) -> bool:
+    """Whether ``PROBE_EPISODES`` that are played together go as they go alone: random observations (N, ``width``) from a reset, with
+    one episode reset again on the way.
+    """
+    generator = torch.Generator().manual_seed(0)
+    for step in range(_PROBE_STEPS):
+        if step == _PROBE_STEPS // 2:
+            for session in (alone, together):
+                session.reset(torch.arange(PROBE_EPISODES) == 1)
+        observations = torch.randn(PROBE_EPISODES, width, generator=generator)
+        expected = alone.act(observations)
+        try:
+            actual = together.act(observations)
+        except PolicyError:
+            return False
+        if not torch.allclose(actual, expected, rtol=PROBE_TOLERANCE, atol=PROBE_TOLERANCE, equal_nan=True):
+            return False
+    return True
+
+
 def check_observation(observation: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> None:
     """Check that a session was handed ``rows`` observations of the contract's width.
 

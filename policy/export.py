@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,8 @@ from .native import NativePolicy
 from .networks import MlpNetwork
 from .torchscript import CONTRACT_FILE
 
+PARTS = ("torchscript", "onnx", "deploy")
+"""What ``export_policy`` writes."""
 TOLERANCE = 1e-5
 """Largest difference of an action between an export and its policy."""
 CHECK_STEPS = 16
@@ -186,8 +188,10 @@ def first_steps(policy: Policy) -> str | None:
     )
 
 
-def export_policy(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path, float]:
-    """Write ``policy.pt`` (TorchScript), ``policy.onnx`` and ``deploy.yaml`` into a folder.
+def export_policy(
+    policy: Policy, folder: str | Path, robot: Robot, parts: Collection[str] = PARTS
+) -> dict[Path, float]:
+    """Write ``policy.pt`` (TorchScript), ``policy.onnx`` and ``deploy.yaml`` into a folder, or some of these ``PARTS``.
 
     Returns:
         The written files, with the largest difference of an action to the policy's.
@@ -198,9 +202,12 @@ def export_policy(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path
     target = Path(folder)
     make_folder(target, ExportError)
     script, graph, deploy = target / "policy.pt", target / "policy.onnx", target / "deploy.yaml"
-    differences = {script: export_torchscript(policy, script), graph: export_onnx(policy, graph)}
-    export_deploy(policy, deploy, robot)
-    return differences | {deploy: 0.0}
+    written = {script: export_torchscript(policy, script)} if "torchscript" in parts else {}
+    written |= {graph: export_onnx(policy, graph)} if "onnx" in parts else {}
+    if "deploy" in parts:
+        export_deploy(policy, deploy, robot)
+        written[deploy] = 0.0
+    return written
 
 
 def stacked_contract(contract: PolicyContract, frames: int) -> PolicyContract:

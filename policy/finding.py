@@ -26,13 +26,12 @@ def policy_names() -> tuple[str, ...]:
     return (*_OF_RUNS, *shipped_policies())
 
 
-def find_policy(path_or_name: str | Path, *, log_root: Path = LOG_ROOT) -> Path:
+def find_policy(path_or_name: str | Path) -> Path:
     """The file behind a path or a name. A file that exists wins over a name.
 
     Args:
         path_or_name: a file; or ``latest`` (last checkpoint of the last training run), ``best`` (the last run's best
             checkpoint), ``pretrained`` (the Go2's that ships with the project), ``pretrained-go1`` … (the others that do).
-        log_root: where ``latest`` and ``best`` look.
 
     Raises:
         PolicyError: there is none.
@@ -49,7 +48,7 @@ def find_policy(path_or_name: str | Path, *, log_root: Path = LOG_ROOT) -> Path:
         raise PolicyError(f"'{name}' cannot be read: {getattr(error, 'strerror', None) or error}") from error
     names = policy_names()
     if name in names and not path.is_file():
-        found, otherwise = _of_runs(name, log_root) if name in _OF_RUNS else _shipped(name)
+        found, otherwise = _of_runs(name) if name in _OF_RUNS else _shipped(name)
         if found is None:
             raise PolicyError(f"{otherwise}; give a path")
         return found
@@ -74,14 +73,14 @@ def _shipped(name: str) -> tuple[Path | None, str]:
     return path if path.is_file() else None, f"no {name} policy ships with this installation (looked for '{path}')"
 
 
-def _of_runs(name: str, log_root: Path) -> tuple[Path | None, str]:
+def _of_runs(name: str) -> tuple[Path | None, str]:
     """The same for a checkpoint of the last run that has one."""
     # Runs are named by their time, so the name's order is that of time.
-    runs = sorted((r for r in log_root.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True)
+    runs = sorted((r for r in LOG_ROOT.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True)
     for run in runs:
         if name == "best" and (run / "best.pt").is_file():
             return run / "best.pt", ""
         if name == "latest" and (last := latest_checkpoint(run)) is not None:
             return last, ""
     wanted = "best.pt" if name == "best" else "model_<iteration>.pt"
-    return None, f"there is no policy '{name}': no run in '{log_root}/<experiment>/<run>/' has a {wanted}"
+    return None, f"there is no policy '{name}': no run in '{LOG_ROOT}/<experiment>/<run>/' has a {wanted}"

@@ -8,7 +8,6 @@ from pathlib import Path
 from ..robots import load_robot
 from ..robots.identity import identify
 from .contract import PolicyContract
-from .finding import LOG_ROOT
 from .its_robot import REMEMBERED
 from .loading import load_policy
 from .native import ForeignFile, load_entries, read_policy, save_policy
@@ -20,7 +19,6 @@ def import_policy(
     robot: str | None = None,
     *,
     trust: bool = False,
-    log_root: Path = LOG_ROOT,
     contract_file: Path | None = None,
 ) -> PolicyContract:
     """Write a policy and its contract into one file of the project's own format; its actions stay the same.
@@ -33,7 +31,6 @@ def import_policy(
         destination: the file to write; an existing file is replaced only once the source has been loaded.
         robot: name or path of the robot, as in ``load_policy``; the file remembers it.
         trust: as in ``load_policy``; the imported file, if it carries a program, needs it in turn.
-        log_root: as in ``load_policy``.
         contract_file: as in ``load_policy``.
 
     Returns:
@@ -44,7 +41,7 @@ def import_policy(
         ContractError: the policy is for another robot.
     """
     asked = None if robot is None else load_robot(robot)
-    policy = load_policy(source, asked, trust=trust, log_root=log_root, contract_file=contract_file)
+    policy = load_policy(source, asked, trust=trust, contract_file=contract_file)
     provenance = {**policy.contract.provenance, "imported_from": Path(policy.path).name}
     if asked is not None and robot is not None:
         provenance[REMEMBERED] = identify(asked, robot)

@@ -23,7 +23,7 @@ from .adapters import (
 from .base import PolicyError
 from .contract import ContractError, PolicyContract, check_robot, standard_contract
 from .fence.archive import archive_names, read_limited
-from .finding import LOG_ROOT, find_policy
+from .finding import find_policy
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 from .rebuilt import rebuilt
 
@@ -38,7 +38,6 @@ def load_policy(
     robot: Robot | None = None,
     *,
     trust: bool = False,
-    log_root: Path = LOG_ROOT,
     contract_file: Path | None = None,
 ) -> FilePolicy:
     """Load a policy and try it on zeros.
@@ -52,7 +51,6 @@ def load_policy(
         robot: the robot it has to fit, and whose data stand in where a foreign file does not say; None: any robot is
             accepted, and the Go2 stands in.
         trust: run a program that a file of the project's own format carries inside; it is fenced in either way.
-        log_root: where ``latest`` and ``best`` look: ``<log_root>/<experiment>/<run>/``.
         contract_file: a ``contract.toml`` that says how a file without a contract of its own is to be run; it goes before
             all else.
 
@@ -60,7 +58,7 @@ def load_policy(
         PolicyError: no such file or name, a damaged or foreign file, or a network that does not fit its contract.
         ContractError: the policy is for another robot or other joints.
     """
-    path = find_policy(path_or_name, log_root=log_root)
+    path = find_policy(path_or_name)
     data = read_limited(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
     contract = None if contract_file is None else described_contract(contract_file, stand_in)

@@ -17,13 +17,19 @@ import torch
 from onnx import numpy_helper
 from onnxruntime.capi import onnxruntime_pybind11_state as runtime_state
 
-from .base import PolicyError, PolicySession, RowwiseSession, check_observation, checked_action
+from .base import (
+    PROBE_EPISODES,
+    PROBE_TOLERANCE,
+    PolicyError,
+    PolicySession,
+    RowwiseSession,
+    check_observation,
+    checked_action,
+)
 from .contract import PolicyContract
 from .native import first_line
 
 ACTION_NAMES = ("actions", "action")
-PROBE_EPISODES = 3
-PROBE_TOLERANCE = 1e-5
 _RUN_ERRORS = (
     runtime_state.EPFail,
     runtime_state.Fail,

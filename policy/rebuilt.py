@@ -7,14 +7,10 @@ import logging
 
 import torch
 
-from .base import PolicyError, PolicySession
+from .base import PROBE_EPISODES, PolicySession, RowwiseSession, act_alike
 from .contract import PolicyContract
 from .native import FilePolicy, ForeignFile
 from .program import NotUnderstoodError, Program, ProgramSession
-
-TOLERANCE = 1e-5
-"""Largest difference of an action to the file's own, absolute or relative."""
-_EPISODES, _STEPS = 3, 8
 
 
 class RebuiltPolicy(FilePolicy):
@@ -30,7 +26,7 @@ class RebuiltPolicy(FilePolicy):
         """
         self.contract, self.stored, self.path = contract, stored, path
         self._program = program
-        self.session(_EPISODES)
+        self.session(PROBE_EPISODES)
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes."""
@@ -48,7 +44,8 @@ def rebuilt(policy: FilePolicy) -> FilePolicy:
         return policy
     try:
         made = RebuiltPolicy(policy.contract, file, _program(policy, file), path=policy.path)
-        if _acts_alike(policy, made):
+        alone = RowwiseSession(policy.session, PROBE_EPISODES)
+        if act_alike(alone, made.session(PROBE_EPISODES), policy.contract.observation_width):
             return made
         policy.not_rebuilt = "what was rebuilt of it acts differently"
     except NotUnderstoodError as reason:
@@ -74,22 +71,3 @@ def _program(policy: FilePolicy, file: ForeignFile) -> Program:
     from .onnx_program import onnx_program
 
     return onnx_program(file.data, width, source=policy.path)
-
-
-def _acts_alike(policy: FilePolicy, made: FilePolicy) -> bool:
-    """Whether episodes together go as they go alone with the file's own code."""
-    alone, together = [policy.session(1) for _ in range(_EPISODES)], made.session(_EPISODES)
-    generator = torch.Generator().manual_seed(0)
-    for step in range(_STEPS):
-        if step == _STEPS // 2:
-            alone[1].reset()
-            together.reset(torch.arange(_EPISODES) == 1)
-        observations = torch.randn(_EPISODES, policy.contract.observation_width, generator=generator)
-        expected = torch.cat([one.act(row) for one, row in zip(alone, observations.split(1), strict=True)])
-        try:
-            actual = together.act(observations)
-        except PolicyError:
-            return False
-        if not torch.allclose(actual, expected, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True):
-            return False
-    return True

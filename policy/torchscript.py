@@ -18,15 +18,20 @@ from typing import Any
 
 import torch
 
-from .base import PolicyError, PolicySession, RowwiseSession, check_observation, checked_action
+from .base import (
+    PROBE_EPISODES,
+    PolicyError,
+    PolicySession,
+    RowwiseSession,
+    act_alike,
+    check_observation,
+    checked_action,
+)
 from .contract import PolicyContract
 from .fence.operators import OPERATORS
 from .fence.script import CONTRACT_FILE
 from .native import LOAD_ERRORS
 
-PROBE_EPISODES = 3
-PROBE_STEPS = 8
-PROBE_TOLERANCE = 1e-5
 _RESET_METHODS = ("reset", "reset_memory")
 
 
@@ -248,21 +253,7 @@ class ScriptProgram:
         cpu = torch.device("cpu")
         batch = BatchSession(self._module, PROBE_EPISODES, self.contract, cpu, self.source, memories)
         copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, cpu, self.source)
-        generator = torch.Generator().manual_seed(0)
-        for step in range(PROBE_STEPS):
-            if step == PROBE_STEPS // 2:
-                some = torch.arange(PROBE_EPISODES) % 2 == 1
-                batch.reset(some)
-                copies.reset(some)
-            observation = torch.randn(PROBE_EPISODES, self.contract.observation_width, generator=generator)
-            expected = copies.act(observation)
-            try:
-                actual = batch.act(observation)
-            except PolicyError:
-                return False
-            if not torch.allclose(actual, expected, rtol=PROBE_TOLERANCE, atol=PROBE_TOLERANCE, equal_nan=True):
-                return False
-        return True
+        return act_alike(copies, batch, self.contract.observation_width)
 
 
 class BatchSession(PolicySession):

@@ -43,8 +43,6 @@ NUM_TILE_LEVELS = 12
 """Levels are 0..11; the difficulty of a level is level / 10. The gauge's hardest ground is that of level 8 to 10."""
 TILE_SIZE = 8.0
 """Side of a tile [m]; more than half of it from the centre, horizontally, the robot has crossed the tile."""
-MAX_TILE_BOXES = 36
-"""No tile of the default shape has more boxes; a model with this many can hold every tile."""
 
 _EDGE = TILE_SIZE / 2
 _FIELD_EDGE = 5.6  # half the side of height fields: waves go on beyond the tile and come down where nobody walks [m]

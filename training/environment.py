@@ -26,7 +26,7 @@ from ..robots.identity import identify
 from ..robots.registry import load_robot
 from .commands import largest_commands
 from .configuration import ConfigurationError
-from .curriculum import TrainingPalette, assign_kinds, build_palette
+from .curriculum import assign_kinds, build_palette
 from .domain_randomization import BodyParameters, draw_bodies
 from .environment_configuration import EnvironmentConfiguration
 from .environment_memory import fitting
@@ -60,7 +60,6 @@ class TrainingEnvironment(VecEnv):
         threads: int = 1,
         capture: bool = False,
         fuse: bool = False,
-        palette: TrainingPalette | None = None,
     ) -> None:
         """Build the worlds and begin their first episodes.
 
@@ -72,7 +71,6 @@ class TrainingEnvironment(VecEnv):
             capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
             fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels
                 into a few; takes a minute or two at the start, and numbers differ in the last digits.
-            palette: the tiles; None builds them from the configuration.
 
         Raises:
             ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device.
@@ -88,7 +86,7 @@ class TrainingEnvironment(VecEnv):
         self.configuration = configuration
         self.robot = load_robot(configuration.robot)
         parameters = joint_parameters(self.robot, configuration)
-        self.palette = build_palette(configuration.terrain) if palette is None else palette
+        self.palette = build_palette(configuration.terrain)
         kind = assign_kinds([tile.share for tile in self.palette.tiles], configuration.num_envs)
         level = self._start_levels(configuration)
         scene = Scene(

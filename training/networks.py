@@ -130,26 +130,16 @@ class StudentActor(nn.Module):
 class CtsActor(StudentActor):
     """Teacher encoder, student network (encoder and the shared actor) and exploration noise."""
 
-    def __init__(
-        self,
-        configuration: NetworkConfiguration,
-        *,
-        privileged_width: int,
-        architecture: str,
-        arguments: dict[str, Any],
-        distribution: type[Distribution] = GaussianDistribution,
-    ) -> None:
+    def __init__(self, configuration: NetworkConfiguration, *, privileged_width: int, **student: Any) -> None:
         """Build all parts.
 
         Args:
             configuration: sizes.
             privileged_width: width of the teacher's input.
-            architecture: name in ``policy.networks.ARCHITECTURES`` of the student network.
-            arguments: its arguments.
-            distribution: of the actions.
+            student: what ``StudentActor`` takes.
         """
         teacher = multilayer_perceptron((privileged_width, *configuration.teacher_hidden, configuration.latent_width))
-        super().__init__(configuration, architecture=architecture, arguments=arguments, distribution=distribution)
+        super().__init__(configuration, **student)
         self.teacher_encoder = teacher
 
     def teacher_latent(self, privileged: torch.Tensor) -> torch.Tensor:

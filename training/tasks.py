@@ -273,18 +273,13 @@ def _own_task(path: str) -> Task:
     return replace(found, name=path)
 
 
-def task_names() -> list[str]:
-    """Names of all tasks."""
-    return list(TASKS)
-
-
 def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = None) -> Task:
     """A task, for a robot, with settings changed.
 
     Schedules are spread over the run's iterations, unless ``environment.schedule.horizon_steps`` is set.
 
     Args:
-        name: one of ``task_names()``, or ``module:attribute`` of a ``Task`` of one's own.
+        name: one of ``TASKS``, or ``module:attribute`` of a ``Task`` of one's own.
         overrides: ``environment.…=value`` and ``training.…=value``, which change what is scaled for the robot.
         robot: name or path of a robot; None for the task's own.
 
@@ -313,4 +308,4 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
     return task if own_horizon else task.with_horizon()
 
 
-__all__ = ["TASKS", "Task", "TaskError", "find_task", "task_names"]
+__all__ = ["TASKS", "Task", "TaskError", "find_task"]

@@ -7,6 +7,7 @@ slots.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...terrains.base import Terrain
-from ..base import BackendError, Scene
+from ..base import BackendError, PhysicsOptions, Scene
 from ..mujoco.model import robot_spec
 
 PARKED = (0.0, 0.0, -1000.0)
@@ -22,7 +23,7 @@ PARKED = (0.0, 0.0, -1000.0)
 PARKED_SIZE = 0.01
 """Half size of an unused slot [m]."""
 DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
-"""Contacts per world for which room is made, by the hardest shape of the palette."""
+"""Contacts per world for which room is made, by the palette's hardest shape; a robot that lies flat needs about 30."""
 SPARE_CONTACTS = 256
 """Room for contacts on top, shared by all worlds: a fallen robot has more than an average one."""
 
@@ -133,7 +134,7 @@ def build_shared_model(scene: Scene) -> SharedModel:
     slots = max((len(t.boxes) for t in scene.terrains), default=0)
     has_field = any(t.height_field is not None for t in scene.terrains)
     spec = robot_spec(scene)
-    _strip(spec)
+    strip(spec)
     slot_names = _add_slots(spec, scene.terrains, slots)
     try:
         model = spec.compile()
@@ -171,30 +172,40 @@ def build_shared_model(scene: Scene) -> SharedModel:
     )
 
 
+def contacts_per_world(physics: PhysicsOptions, *, boxes: bool, fields: bool) -> int:
+    """Contact capacity of a world, from the options or, where they leave it open, from the shapes of the palette.
+
+    Raises:
+        BackendError: less than one contact is asked for.
+    """
+    asked = physics.contacts_per_world
+    if asked is not None and asked < 1:
+        raise BackendError(f"contacts_per_world is {asked}, but must be at least 1 (PhysicsOptions.contacts_per_world)")
+    return asked or DEFAULT_CONTACTS["height_field" if fields else "boxes" if boxes else "plane"]
+
+
+def constraint_rows(model: mujoco.MjModel, feet: Sequence[int], physics: PhysicsOptions, contacts: int) -> int:
+    """Constraint rows of one world: joint friction, joint limits and contacts, feet (geoms) with their own dimension."""
+    rows_of = (lambda d: d) if physics.cone == "elliptic" else (lambda d: max(1, 2 * (d - 1)))
+    rows = int(np.count_nonzero(model.dof_frictionloss > 0)) + int(model.jnt_limited.sum()) + contacts * rows_of(3)
+    # a foot has two contacts at most times: the ground and another box
+    rows += 2 * sum(rows_of(max(int(model.geom_condim[g]), 3)) - rows_of(3) for g in feet)
+    return 16 * -(-rows // 16)
+
+
 def buffer_capacity(scene: Scene, shared: SharedModel) -> Capacity:
     """Sizes of the buffers, from ``PhysicsOptions.contacts_per_world`` or the palette's shapes."""
     model, physics = shared.model, scene.physics
-    shape = "height_field" if shared.has_field else "boxes" if len(shared.slot_geom) else "plane"
-    contacts = physics.contacts_per_world or DEFAULT_CONTACTS[shape]
-    if contacts < 1:
-        raise BackendError(
-            f"contacts_per_world is {contacts}, but must be at least 1 (PhysicsOptions.contacts_per_world)"
-        )
-    rows_of = (lambda d: d) if physics.cone == "elliptic" else (lambda d: max(1, 2 * (d - 1)))
-    feet = np.flatnonzero(shared.geom_foot >= 0)
-    foot_rows = sum(rows_of(max(int(model.geom_condim[g]), 3)) - rows_of(3) for g in feet)
-    rows = int(np.count_nonzero(model.dof_frictionloss > 0)) + int(model.jnt_limited.sum())
-    rows += contacts * rows_of(3) + 2 * foot_rows
+    contacts = contacts_per_world(physics, boxes=len(shared.slot_geom) > 0, fields=shared.has_field)
+    rows = constraint_rows(model, np.flatnonzero(shared.geom_foot >= 0).tolist(), physics, contacts)
     collides = (shared.geom_ground == 0) & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
     same_shape = np.bincount(model.geom_type[collides]).max(initial=1)
     total = scene.num_worlds * contacts + SPARE_CONTACTS
     per_world = int(same_shape) if shared.has_field else max(8, contacts // 4)
-    return Capacity(
-        contacts=total, convex=min(scene.num_worlds * per_world + SPARE_CONTACTS, total), rows=16 * -(-rows // 16)
-    )
+    return Capacity(contacts=total, convex=min(scene.num_worlds * per_world + SPARE_CONTACTS, total), rows=rows)
 
 
-def _strip(spec: mujoco.MjSpec) -> None:
+def strip(spec: mujoco.MjSpec) -> None:
     """Remove what costs time in thousands of worlds: actuators (the motor law is ours) and what is only seen."""
     for element in [*spec.actuators, *spec.sensors, *spec.lights, *spec.cameras]:
         spec.delete(element)

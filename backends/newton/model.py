@@ -19,11 +19,8 @@ from numpy.typing import NDArray
 from ...terrains.base import HeightField, Terrain
 from ..base import BackendError, Scene
 from ..mujoco.model import robot_spec
+from ..mujoco_warp.model import PARKED, PARKED_SIZE, strip
 
-PARKED = (0.0, 0.0, -1000.0)
-"""Where unused slots wait, out of reach of any robot."""
-PARKED_SIZE = 0.01
-"""Half size of an unused box [m]."""
 BIRTH_HEIGHT = 50.0
 """Height of the base in a fresh model [m]: buffers are sized there, and no contact must be in the way."""
 
@@ -135,12 +132,9 @@ def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> W
 def _compiled_robot(scene: Scene) -> tuple[mujoco.MjModel, str]:
     """The robot with the scene's constants, less motors, sensors and what is only seen: compiled, and as MJCF text."""
     spec = robot_spec(scene)
-    for element in [*spec.actuators, *spec.sensors, *spec.lights, *spec.cameras, *spec.keys]:
-        spec.delete(element)
-    if all(body.explicitinertial for body in spec.bodies if body.name != "world"):  # else a visual geom may carry mass
-        for geom in list(spec.geoms):
-            if not geom.contype and not geom.conaffinity:
-                spec.delete(geom)
+    strip(spec)
+    for key in list(spec.keys):
+        spec.delete(key)
     try:
         return spec.compile(), spec.to_xml()
     except ValueError as error:

@@ -19,15 +19,12 @@ import warp as wp
 
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
 from ..mujoco_warp.height_fields.repair import repair_height_fields
-from ..mujoco_warp.model import SMALLEST_TOLERANCE
+from ..mujoco_warp.model import SMALLEST_TOLERANCE, constraint_rows, contacts_per_world
 from . import kernels, solver_kernels
 from .import_check import import_differences
 from .model import WorldModel, carriers
 
 repair_height_fields()
-
-DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
-"""Contacts per world for which room is made, by the palette's hardest shape; a robot that lies flat needs about 30."""
 
 _EXACT = Capability(support=Support.EXACT)
 
@@ -114,11 +111,7 @@ class SolverAdapter(ABC):
 
 def _contacts_per_world(scene: Scene, world: WorldModel) -> int:
     """Contact capacity of a world."""
-    shape = "height_field" if world.slots.fields else "boxes" if len(world.layout.slot_shape) else "plane"
-    asked = scene.physics.contacts_per_world
-    if asked is not None and asked < 1:
-        raise BackendError(f"contacts_per_world is {asked}, but must be at least 1 (PhysicsOptions.contacts_per_world)")
-    return asked or DEFAULT_CONTACTS[shape]
+    return contacts_per_world(scene.physics, boxes=len(world.layout.slot_shape) > 0, fields=bool(world.slots.fields))
 
 
 class MujocoAdapter(SolverAdapter):
@@ -144,14 +137,15 @@ class MujocoAdapter(SolverAdapter):
 
     def __init__(self, world: WorldModel, scene: Scene) -> None:
         physics, model = scene.physics, world.model
-        contacts = _contacts_per_world(scene, world)
+        contacts, reference = _contacts_per_world(scene, world), world.reference
+        feet = [reference.geom(name).id for name in scene.robot.foot_geoms]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the margins that it complains about are repaired below
             try:
                 self.solver = newton.solvers.SolverMuJoCo(
                     model,
                     nconmax=contacts,
-                    njmax=_constraint_rows(scene, world, contacts),
+                    njmax=constraint_rows(reference, feet, physics, contacts),
                     iterations=physics.iterations,
                     ls_iterations=physics.ls_iterations,
                     tolerance=physics.tolerance,
@@ -219,18 +213,6 @@ class MujocoAdapter(SolverAdapter):
 def _geom_shapes(solver: Any) -> np.ndarray:
     """Newton's shape of each MuJoCo geom in every world, (N, G)."""
     return solver.mjc_geom_to_newton_shape.numpy()
-
-
-def _constraint_rows(scene: Scene, world: WorldModel, contacts: int) -> int:
-    """Constraint rows of one world: joint friction, joint limits and contacts, feet with their own dimension."""
-    reference, elliptic = world.reference, scene.physics.cone == "elliptic"
-    rows = int(np.count_nonzero(reference.dof_frictionloss > 0)) + int(reference.jnt_limited.sum())
-    for name in scene.robot.foot_geoms:
-        dimension = max(int(reference.geom(name).condim[0]), 3)
-        # a foot has two contacts at most times: the ground and another box
-        rows += 2 * ((dimension - 3) if elliptic else 2 * (dimension - 3))
-    rows += contacts * (3 if elliptic else 4)
-    return 16 * -(-rows // 16)
 
 
 class _FieldGeom:

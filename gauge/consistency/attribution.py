@@ -13,7 +13,7 @@ from ...backends.registry import backend_class
 from ..episodes import QUALITY
 from ..plan import Records
 from .closed_loop import Design
-from .errors import ConsistencyError
+from .request import ConsistencyError
 from .variants import Value, Variant
 
 PERTURBATION = 1e-7

@@ -49,7 +49,7 @@ def compare_models(robot: Robot, descriptions: Mapping[str, Description | None],
         if key not in base:
             continue
         expected = np.asarray(base[key], dtype=np.float64)
-        row: dict[str, Any] = {"reference": _finite(np.abs(expected).mean()), "variants": {}}
+        row: dict[str, Any] = {"reference": finite(np.abs(expected).mean()), "variants": {}}
         for label, found in descriptions.items():
             if label == reference or found is None:
                 continue
@@ -77,13 +77,13 @@ def _difference(key: str, values: Sequence[float] | None, expected: np.ndarray, 
     worst = int(np.argmax(relative))
     names = entry_names(key, robot)
     return {
-        "largest": _finite(absolute.max()),
-        "relative": _finite(relative[worst]),
+        "largest": finite(absolute.max()),
+        "relative": finite(relative[worst]),
         "entry": names[worst] if worst < len(names) else str(worst),
         "agrees": bool((relative <= TOLERANCE).all()),
     }
 
 
-def _finite(value: float) -> float | None:
-    """A number for JSON, which knows no infinity."""
+def finite(value: float) -> float | None:
+    """A number for JSON, which knows neither infinity nor NaN."""
     return float(value) if np.isfinite(value) else None

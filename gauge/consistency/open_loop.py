@@ -22,6 +22,7 @@ from ...policy.observation import ObservationBuilder
 from ...robots import Robot
 from ...terrains.registry import make_terrain
 from ..suite import Suite
+from .models import finite
 from .variants import MakeBackend, Variant
 
 Array = NDArray[np.float64]
@@ -267,22 +268,17 @@ def compare_trajectories(
         apart = {f"{mark:g}": _first(time, ~(position <= mark)) for mark in MARKS}
         result[test] = {
             "time": [float(t) for t in time[thin]],
-            "curves": {name: [_finite(v) for v in curve[thin]] for name, curve in curves.items()},
-            "end": {name: _finite(curve[-1]) for name, curve in curves.items()},
-            "largest": {name: _finite(np.abs(curve).max()) for name, curve in curves.items()},
+            "curves": {name: [finite(v) for v in curve[thin]] for name, curve in curves.items()},
+            "end": {name: finite(curve[-1]) for name, curve in curves.items()},
+            "largest": {name: finite(np.abs(curve).max()) for name, curve in curves.items()},
             "apart": apart,
         }
         if test == "stand":
             rest = slice(max(0, steps - round(REST / period)), steps)
-            result[test]["support"] = [_finite(t.ground_force[rest, i].mean() / weight) for t in (reference, compared)]
+            result[test]["support"] = [finite(t.ground_force[rest, i].mean() / weight) for t in (reference, compared)]
     return result
 
 
 def _first(time: NDArray[np.floating], over: NDArray[np.bool_]) -> float | None:
     """First time at which a condition holds."""
     return float(time[int(over.argmax())]) if over.any() else None
-
-
-def _finite(value: float) -> float | None:
-    """A number for JSON, which knows no NaN."""
-    return float(value) if np.isfinite(value) else None

@@ -7,6 +7,10 @@ from dataclasses import dataclass
 from .statistics import MARGIN
 
 
+class ConsistencyError(ValueError):
+    """The study cannot be made; the message says why and what to change."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class StudyRequest:
     """What is to be compared. Empty tuples and None stand for a choice that suits the machine."""

@@ -28,10 +28,9 @@ from ..store import RunFolder, StoreError
 from ..suite import Suite, SuiteError, load_suite
 from .attribution import FLOOR_DRAWS, Factor, choose_factors, effect_of_switch, rounded
 from .closed_loop import Cell, Design, compare, floor_only, gap_only, health_of, make_cells, play_variant
-from .errors import ConsistencyError
 from .models import compare_models
 from .open_loop import Trajectory, compare_trajectories, record_targets, replay
-from .request import StudyRequest, StudyStatus
+from .request import ConsistencyError, StudyRequest, StudyStatus
 from .variants import MakeBackend, Variant, parse_variant, place
 
 SCHEMA = 2

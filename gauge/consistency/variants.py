@@ -10,7 +10,7 @@ from typing import Any, get_type_hints
 from ...backends.base import PhysicsBackend, PhysicsOptions, Scene, Support
 from ...backends.registry import choose_device, find_backend, make_backend
 from ...files.parsing import from_text, one_line, shown
-from .errors import ConsistencyError
+from .request import ConsistencyError
 from .wrapping import PerturbedBackend, RetimedBackend
 
 MakeBackend = Callable[..., PhysicsBackend]

@@ -19,7 +19,7 @@ from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...robots import RobotError
 from ...terrains.registry import gauge_terrain_names, make_terrain
-from ..policies import Loaded, Refused, describe, load_policies
+from ..policies import Loaded, PoliciesRequest, Refused, describe, load_policies
 from ..suite import SuiteError, load_suite
 from .collecting import COMMANDS, Notes, Walks, collect
 from .figures import FIGURES, render_figure, render_page
@@ -36,10 +36,9 @@ class LatentError(ValueError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LatentRequest:
+class LatentRequest(PoliciesRequest):
     """Whose latent is looked at, and where."""
 
-    policies: tuple[str, ...]
     terrains: tuple[str, ...] = ()
     """Names; none for the gauge's seven."""
     level: int = 5
@@ -53,14 +52,6 @@ class LatentRequest:
     """How long every robot walks [s]."""
     robots: int = 4
     """For each terrain and command, at least 2."""
-    seed: int = 0
-    backend: str = "mujoco"
-    robot: str | None = None
-    """Name of a robot, or its ``robot.toml``; None for the one that each policy is for."""
-    threads: int = 1
-    """CPU threads; they change the time, never the results."""
-    trust: bool = False
-    """Run the program that a policy file of the project's own format carries inside."""
 
 
 def study_latents(

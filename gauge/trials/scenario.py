@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -230,7 +231,8 @@ def load_scenario(name: str) -> Scenario:
     source = f"scenario file {one_line(path)}"
     data = parse_toml(read_text(path, "scenario file", ScenarioError), source, ScenarioError)
     scenario = build(Scenario, data, source, ScenarioError)
-    _check(scenario, source)
+    for problem in _problems(scenario):
+        raise ScenarioError(f"{source}: {problem}")
     if path.resolve().parent != SCENARIO_FOLDER.resolve() and scenario.name in scenario_names():
         raise ScenarioError(
             f"{source} is called '{scenario.name}' as a scenario that ships with the project; give it a 'name' of its own, so that "
@@ -239,83 +241,71 @@ def load_scenario(name: str) -> Scenario:
     return scenario
 
 
-def _check(scenario: Scenario, source: str) -> None:
-    """Refuse what each field alone allows and all of them together do not.
-
-    Raises:
-        ScenarioError: one sentence.
-    """
+def _problems(scenario: Scenario) -> Iterator[str]:
+    """What each field alone allows and all of them together do not, in sentences."""
     try:
         load_suite(scenario.suite)
     except SuiteError as error:
-        raise ScenarioError(f"{source}: {error}") from error
+        yield str(error)
     ground, start, success = scenario.ground, scenario.start, scenario.success
     seconds = scenario.seconds
     if seconds > LONGEST:
-        raise ScenarioError(f"{source}: the commands last {seconds:g} s; at most {LONGEST:g} s are possible")
+        yield f"the commands last {seconds:g} s; at most {LONGEST:g} s are possible"
     if ground.terrain is None and ground.level is not None:
-        raise ScenarioError(
-            f"{source}: ground.level is {ground.level} of no terrain; give ground.terrain, or leave it out"
-        )
+        yield f"ground.level is {ground.level} of no terrain; give ground.terrain, or leave it out"
     if ground.terrain is not None and (ground.stretches or ground.boxes):
-        raise ScenarioError(
-            f"{source}: ground has the terrain '{one_line(ground.terrain, 80)}' and stretches or boxes too; choose one of them"
-        )
+        yield f"ground has the terrain '{one_line(ground.terrain, 80)}' and stretches or boxes too; choose one of them"
     try:
         scenario.terrain()
     except TerrainError as error:
-        raise ScenarioError(f"{source}: {error}") from error
+        yield str(error)
     for number, force in enumerate(scenario.forces):
         for name, (least, largest) in (("newtons", force.newtons), ("begin", force.begin), ("seconds", force.seconds)):
             if least > largest:
-                raise ScenarioError(
-                    f"{source}: forces[{number}].{name} is {least:g} to {largest:g}; the least must come first"
-                )
+                yield f"forces[{number}].{name} is {least:g} to {largest:g}; the least must come first"
         if force.begin[1] >= seconds:
-            raise ScenarioError(
-                f"{source}: forces[{number}] may begin after {force.begin[1]:g} s, when the commands, of {seconds:g} s, are "
-                "over; let it begin sooner"
+            yield (
+                f"forces[{number}] may begin after {force.begin[1]:g} s, when the commands, of {seconds:g} s, are over; let it "
+                "begin sooner"
             )
         if force.every is not None and seconds / force.every > MOST_PULLS:
-            raise ScenarioError(
-                f"{source}: forces[{number}] pulls every {force.every:g} s of {seconds:g} s; at most "
-                f"{MOST_PULLS:,} pulls are possible"
+            yield (
+                f"forces[{number}] pulls every {force.every:g} s of {seconds:g} s; at most {MOST_PULLS:,} pulls are possible"
             )
     for number, found in enumerate(scenario.reported):
         successes, trials = found.successes, found.trials
         if successes is not None and trials is not None and (successes > trials or trials == 0):
-            raise ScenarioError(
-                f"{source}: reported[{number}] has {successes} successes in {trials} trials; there "
-                "cannot be more of them than trials, nor no trials"
+            yield (
+                f"reported[{number}] has {successes} successes in {trials} trials; there cannot be more of them than trials, nor "
+                "no trials"
             )
     first = scenario.commands[0].until_x
     if first is not None and first <= start.x + start.spread[0]:
-        raise ScenarioError(
-            f"{source}: commands[0].until_x is x = {first:g} m, and robots start at up to "
-            f"{start.x + start.spread[0]:g} m, where it is over before it begins; let it lead on, or leave it out"
+        yield (
+            f"commands[0].until_x is x = {first:g} m, and robots start at up to {start.x + start.spread[0]:g} m, where it is over "
+            "before it begins; let it lead on, or leave it out"
         )
     if not success.survive and success.beyond is None and success.speed is None:
-        raise ScenarioError(
-            f"{source}: nothing says what success is, so it can never be decided; give beyond, speed or survive = true "
-            "under [success]"
+        yield (
+            "nothing says what success is, so it can never be decided; give beyond, speed or survive = true under [success]"
         )
     fastest = max(phase.velocity[0] for phase in scenario.commands)
     if success.speed is not None and success.speed > fastest:
-        raise ScenarioError(
-            f"{source}: success.speed is {success.speed:g} m/s and no more than {fastest:g} m/s is ever commanded, so success "
-            "can never be decided; command more, or ask for less"
+        yield (
+            f"success.speed is {success.speed:g} m/s and no more than {fastest:g} m/s is ever commanded, so success can never be "
+            "decided; command more, or ask for less"
         )
     way = sum(math.hypot(*phase.velocity[:2]) * phase.seconds for phase in scenario.commands)
     if success.beyond is not None and not start.x + start.spread[0] < success.beyond <= start.x + way:
-        raise ScenarioError(
-            f"{source}: success.beyond is x = {success.beyond:g} m, but robots start at {start.x:g} m and the commands lead no "
-            f"further than to {start.x + way:g} m, so success can never be decided; choose a place between"
+        yield (
+            f"success.beyond is x = {success.beyond:g} m, but robots start at {start.x:g} m and the commands lead no further than "
+            f"to {start.x + way:g} m, so success can never be decided; choose a place between"
         )
     limits = [phase.until_x for phase in scenario.commands if phase.until_x is not None]
     if success.beyond is not None and limits and max(limits) < success.beyond and _ends_early(scenario):
-        raise ScenarioError(
-            f"{source}: success.beyond is x = {success.beyond:g} m, but the commands that lead on end at until_x = "
-            f"{max(limits):g} m, so success can never be decided; let until_x be as far"
+        yield (
+            f"success.beyond is x = {success.beyond:g} m, but the commands that lead on end at until_x = {max(limits):g} m, so "
+            "success can never be decided; let until_x be as far"
         )
 
 

@@ -17,7 +17,7 @@ from ...policy.base import PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
 from ..consistency.statistics import wilson_interval
-from ..policies import Refused, describe, load_policies
+from ..policies import PoliciesRequest, Refused, describe, load_policies
 from ..suite import SuiteError
 from .page import render_page
 from .running import Trial, run_scenario
@@ -30,24 +30,14 @@ MEASURES = ("reached", "progress", "mean_speed", "peak_speed", "speed_time", "tr
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialRequest:
+class TrialRequest(PoliciesRequest):
     """Who goes through what."""
 
-    policies: tuple[str, ...]
     scenarios: tuple[str, ...] = (ALL,)
     """Names, ``.toml`` files, or ``all``."""
     repeats: int | None = None
     """Robots of each policy in each scenario; None for the scenario's own number."""
-    seed: int = 0
-    """The first robot's seed; the others' follow it."""
-    backend: str = "mujoco"
     device: str = "cpu"
-    robot: str | None = None
-    """Name of a robot, or its ``robot.toml``; None for the one that each policy is for."""
-    threads: int = 1
-    """CPU threads; they change the time, never the results."""
-    trust: bool = False
-    """Run the program that a policy file of the project's own format carries inside."""
 
 
 def run_trials(

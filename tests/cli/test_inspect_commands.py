@@ -5,7 +5,7 @@ from gaitgauge.gauge.pipelines import make_environments
 from gaitgauge.gauge.suite import load_suite, suite_names
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.terrains.registry import terrain_names
-from gaitgauge.training.tasks import task_names
+from gaitgauge.training.tasks import TASKS
 
 
 def test_lists_are_complete(run):
@@ -13,7 +13,7 @@ def test_lists_are_complete(run):
         "terrains": terrain_names(),
         "backends": backend_names(),
         "suites": suite_names(),
-        "tasks": task_names(),
+        "tasks": list(TASKS),
         "policies": ["latest", "best", "pretrained"],
     }.items():
         result = run("list", what)

@@ -98,7 +98,7 @@ def test_many_writers_of_one_file_do_not_meet(tmp_path):
     target = tmp_path / "file"
     texts = [str(i) * 100_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda t: write_atomically(target, t, WriteError, durable=False), texts * 5))
+        list(pool.map(lambda t: write_atomically(target, t, WriteError), texts * 5))
     assert target.read_text() in texts
     assert list(tmp_path.iterdir()) == [target]
 

@@ -12,9 +12,8 @@ from gaitgauge.backends.base import BackendError
 from gaitgauge.gauge.consistency import open_loop
 from gaitgauge.gauge.consistency.attribution import choose_factors
 from gaitgauge.gauge.consistency.closed_loop import Design, make_cells
-from gaitgauge.gauge.consistency.errors import ConsistencyError
 from gaitgauge.gauge.consistency.page import render, verdict, write_page
-from gaitgauge.gauge.consistency.request import StudyRequest
+from gaitgauge.gauge.consistency.request import ConsistencyError, StudyRequest
 from gaitgauge.gauge.consistency.statistics import Estimate
 from gaitgauge.gauge.consistency.study import study
 from gaitgauge.gauge.store import StoreError

@@ -4,7 +4,7 @@ import pytest
 import torch
 from gaitgauge.backends import ResetState, Scene
 from gaitgauge.backends.base import BackendError, PhysicsOptions
-from gaitgauge.gauge.consistency.errors import ConsistencyError
+from gaitgauge.gauge.consistency.request import ConsistencyError
 from gaitgauge.gauge.consistency.variants import Variant, parse_variant, place
 from gaitgauge.gauge.consistency.wrapping import PerturbedBackend, RetimedBackend
 from gaitgauge.robots import load_robot

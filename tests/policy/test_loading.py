@@ -122,24 +122,26 @@ def test_robot_is_checked(cts_file, go2, contract, cts_stored, tmp_path):
         load_policy(tmp_path / "tail.pt", go2)
 
 
-def test_latest_and_best(tmp_path, cts_file):
+def test_latest_and_best(tmp_path, cts_file, monkeypatch):
+    monkeypatch.setattr(finding, "LOG_ROOT", tmp_path)
+
     def put(run: str, name: str) -> Path:
         path = tmp_path / run / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(cts_file.read_bytes())
         return path
 
-    assert "model_<iteration>.pt" in refused("latest", log_root=tmp_path)
+    assert "model_<iteration>.pt" in refused("latest")
     put("go2_flat/2026-01-01_10-00-00", "model_900.pt")
     put("go2_rough/2026-01-02_10-00-00_first", "model_50.pt")
     last = put("go2_rough/2026-01-02_10-00-00_first", "model_1000.pt")
     put("go2_rough/2026-01-02_10-00-00_first", "model_999.pt")
     (tmp_path / "go2_rough" / "2026-01-03_10-00-00").mkdir()
-    assert find_policy("latest", log_root=tmp_path) == last
-    assert load_policy("latest", log_root=tmp_path).path == "latest"
-    assert "best.pt" in refused("best", log_root=tmp_path)
+    assert find_policy("latest") == last
+    assert load_policy("latest").path == "latest"
+    assert "best.pt" in refused("best")
     best = put("go2_flat/2026-01-01_10-00-00", "best.pt")
-    assert find_policy("best", log_root=tmp_path) == best
+    assert find_policy("best") == best
 
 
 def test_policies_that_ship(monkeypatch, cts_file, tmp_path):

@@ -212,7 +212,8 @@ class SlowScorer:
         pass
 
 
-def test_best_is_chosen_by_the_gauge(tmp_path):
+def test_best_is_chosen_by_the_gauge(tmp_path, monkeypatch):
+    monkeypatch.setattr("gaitgauge.policy.finding.LOG_ROOT", tmp_path.parent.parent)
     scorer = SlowScorer({1: 0.2, 2: 0.6, 3: 0.4})
     seen = []
     configuration = toy_configuration(run={"gauge_interval": 1})
@@ -221,9 +222,7 @@ def test_best_is_chosen_by_the_gauge(tmp_path):
     assert (runner.best_score, runner.best_iteration) == (0.6, 2)
     assert read_checkpoint(tmp_path / "best.pt")["iter"] == 2
     assert seen[-1].scalars["Gauge/quick/score"] == 0.4
-    assert (
-        load_policy("best", log_root=tmp_path.parent.parent).contract == load_policy(tmp_path / "model_2.pt").contract
-    )
+    assert load_policy("best").contract == load_policy(tmp_path / "model_2.pt").contract
     resumed = make(tmp_path, seed=1)
     resume_run(resumed, tmp_path / "model_3.pt")
     assert resumed.best_score == 0.6

@@ -22,8 +22,7 @@ from torch import nn
 from ...policy.estimators import VELOCITY
 from ...policy.networks import multilayer_perceptron
 from ..configuration import TrainingConfiguration
-from ..networks import StudentActor, ValueNetwork
-from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, StateCritic, estimator_arguments
+from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments
 from .ppo import Widths
 
 _LEAST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE = -10.0, 10.0
@@ -103,13 +102,7 @@ class DreamwaqLosses(EstimatorLosses):
 class Dreamwaq(EstimatorPPO):
     """PPO with a variational context estimator. See the module docstring."""
 
-    losses_class = DreamwaqLosses
-
-    @classmethod
-    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
-        """See ``PPO``."""
-        critic = StateCritic(configuration.network, privileged_width=widths.privileged)
-        return DreamwaqActor(configuration, widths), critic
+    actor_class, losses_class = DreamwaqActor, DreamwaqLosses
 
     @torch.no_grad()
     def compute_returns(self, obs: Any) -> None:

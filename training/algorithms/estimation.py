@@ -9,7 +9,7 @@ whose episode ended have no next state and count for the velocity alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict
@@ -141,6 +141,15 @@ class EstimatorLosses(Losses):
 
 class EstimatorPPO(PPO):
     """PPO of an actor with an estimator. See the module docstring."""
+
+    actor_class: ClassVar[Any]
+    """The method's ``EstimatorActor``, made of a ``TrainingConfiguration`` and ``Widths``."""
+
+    @classmethod
+    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
+        """See ``PPO``."""
+        critic = StateCritic(configuration.network, privileged_width=widths.privileged)
+        return cls.actor_class(configuration, widths), critic
 
     @classmethod
     def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:

@@ -20,8 +20,7 @@ from torch.nn import functional
 from ...policy.estimators import VELOCITY
 from ...policy.networks import multilayer_perceptron
 from ..configuration import HimConfiguration, TrainingConfiguration
-from ..networks import StudentActor, ValueNetwork
-from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, StateCritic, estimator_arguments
+from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments
 from .ppo import Widths
 
 
@@ -106,10 +105,4 @@ def sinkhorn(scores: torch.Tensor, counts: torch.Tensor, settings: HimConfigurat
 class Him(EstimatorPPO):
     """PPO with a hybrid internal model. See the module docstring."""
 
-    losses_class = HimLosses
-
-    @classmethod
-    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
-        """See ``PPO``."""
-        critic = StateCritic(configuration.network, privileged_width=widths.privileged)
-        return HimActor(configuration, widths), critic
+    actor_class, losses_class = HimActor, HimLosses
