@@ -25,18 +25,20 @@ _Words = Annotated[str, Field(max_length=4096)]
 _Score = Annotated[float, Field(ge=0.0, le=1001.0)]
 """A level weighs at most 1, and there are at most 1000."""
 _Level = Annotated[float, Field(ge=0, le=1000)]
-_Table = Mapping[Text, Mapping[Text, float | tuple[float, float] | None]]
+_Value = Annotated[float, Field(ge=-1e9, le=1e9)]
+"""Of a metric, weighted by the level or not."""
+_Table = Mapping[Text, Mapping[Text, _Value | tuple[_Value, _Value] | None]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Result:
     score: _Score | None
-    score_interval: tuple[float, float] | None = None
+    score_interval: tuple[_Value, _Value] | None = None
     level: _Level | None = None
     backend: Text
     robot: Name
     pipeline: Text
-    groups: Mapping[Text, float] = field(default_factory=dict)
+    groups: Mapping[Text, _Value] = field(default_factory=dict)
     terrains: _Table = field(default_factory=dict)
     metrics: _Table = field(default_factory=dict)
 
@@ -75,10 +77,10 @@ class _Row:
     payload: Annotated[float, Field(ge=-5.0, le=50.0)]
     level: _Level | None = None
     score: _Score | None = None
-    quality: Mapping[Text, float] | None = None
-    metrics: Mapping[Text, Mapping[Text, float]] = field(default_factory=dict)
+    quality: Mapping[Text, _Value] | None = None
+    metrics: Mapping[Text, Mapping[Text, _Value]] = field(default_factory=dict)
     trials: Mapping[Seed, Mapping[Seed, bool]] = field(default_factory=dict)
-    runs: Mapping[Seed, Mapping[Text, float | Mapping[Text, float]]] = field(default_factory=dict)
+    runs: Mapping[Seed, Mapping[Text, _Value | Mapping[Text, _Value]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -80,6 +80,8 @@ def test_an_expected_level_is_no_edited_one(edited):
         (("environments", 0, "runs"), 5, "runs is 5"),
         (("environments", 0, "runs"), {"x": {}}, "'x'; it must be a whole number"),
         (("environments", 0, "runs"), {"0": {"quality": "high"}}, "runs.0.quality is 'high'"),
+        (("environments", 0, "runs"), {"0": {"quality": 1e300}}, r"runs.0.quality is 1e\+300; it must be less than"),
+        (("groups",), {"tracking": -1e300}, r"groups.tracking is -1e\+300; it must be greater than"),
         (("environments", 0, "metrics"), {"zmp_margin": 3}, "metrics.zmp_margin is 3"),
         (("environments", 1, "trials"), {"1": {"2": "no"}}, "trials.1.2 is 'no'"),
     ],
