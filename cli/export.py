@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from difflib import get_close_matches
 from pathlib import Path
 
+from ..files.parsing import did_you_mean
 from ..files.writing import make_folder
 from ..policy.export import PARTS, ExportError, export_policy, export_unitree, first_steps
 from ..policy.its_robot import robot_for
@@ -34,9 +34,8 @@ def run_export(*, policy: str, out: Path | None, form: str, layout: str, trust: 
         PolicyError, ContractError: no such policy, or it cannot be exported.
     """
     if form not in FORMATS:
-        close = get_close_matches(form, FORMATS, 1)
-        hint = f"did you mean '{close[0]}'? " if close else ""
-        raise UserError(f"there is no format '{form}'; {hint}choose one of: {', '.join(FORMATS)} (--format)")
+        hint = did_you_mean(form, FORMATS) or ";"
+        raise UserError(f"there is no format '{form}'{hint} choose one of: {', '.join(FORMATS)} (--format)")
     if layout not in LAYOUTS:
         raise UserError(f"there is no layout '{layout}'; choose one of: {', '.join(LAYOUTS)} (--layout)")
     if layout == "unitree" and form != "all":

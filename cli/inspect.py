@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from datetime import datetime
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from ..files.parsing import did_you_mean
 from .console import Terminal, make_table
 from .errors import UserError
 
@@ -126,9 +126,7 @@ def list_things(what: str) -> None:
     """
     make = LISTS.get(what)
     if make is None:
-        close = get_close_matches(what, LISTS, 1)
-        hint = f"did you mean '{close[0]}'? " if close else ""
-        raise UserError(f"cannot list '{what}'; {hint}choose one of: {', '.join(LISTS)}")
+        raise UserError(f"cannot list '{what}'{did_you_mean(what, LISTS) or ';'} choose one of: {', '.join(LISTS)}")
     Terminal().print(make())
 
 

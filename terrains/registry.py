@@ -7,11 +7,10 @@ The value of such an entry point is a callable that takes the level (0 where non
 from __future__ import annotations
 
 from collections.abc import Callable
-from difflib import get_close_matches
 from functools import partial
 from importlib.metadata import EntryPoint
 
-from ..files.parsing import one_line
+from ..files.parsing import did_you_mean, one_line
 from ..files.plugins import guarded, load_plugin, origin, plugins
 from .base import Terrain
 from .gauge_terrains import LEVELS, flat, obstacle, slope, stairs, wave
@@ -69,13 +68,8 @@ def make_terrain(name: str, level: int | None = None) -> Terrain:
         return _LEVELLED[name](level)
     plugin = plugins(GROUP).get(name)
     if plugin is None:
-        close = get_close_matches(name, terrain_names(), n=3)
-        hint = (
-            f"did you mean {' or '.join(repr(c) for c in close)}?"
-            if close
-            else f"choose one of: {', '.join(terrain_names())}"
-        )
-        raise TerrainError(f"unknown terrain '{one_line(name, 80)}'; {hint}")
+        hint = did_you_mean(name, terrain_names()) or f"; choose one of: {', '.join(terrain_names())}"
+        raise TerrainError(f"unknown terrain '{one_line(name, 80)}'{hint}")
     return _from_plugin(plugin, 0 if level is None else level)
 
 

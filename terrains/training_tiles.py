@@ -22,10 +22,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 
 import numpy as np
 
+from ..files.parsing import did_you_mean
 from .base import Box, FloatArray, HeightField, Pose, Terrain
 from .registry import TerrainError
 from .tile_geometry import (
@@ -149,9 +149,8 @@ def make_tile(kind: str, level: int, seed: int = 0, *, shape: TileShape = DEFAUL
         TerrainError: unknown kind or level.
     """
     if kind not in TILE_KINDS:
-        close = get_close_matches(kind, TILE_KINDS, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"choose one of: {', '.join(TILE_KINDS)}"
-        raise TerrainError(f"unknown kind of training tile '{kind}'; {hint}")
+        hint = did_you_mean(kind, TILE_KINDS) or f"; choose one of: {', '.join(TILE_KINDS)}"
+        raise TerrainError(f"unknown kind of training tile '{kind}'{hint}")
     if level not in range(NUM_TILE_LEVELS):
         raise TerrainError(f"training tile '{kind}' has levels 0 to {NUM_TILE_LEVELS - 1}, not {level}")
     random = np.random.default_rng((seed, list(TILE_KINDS).index(kind), level))
