@@ -56,6 +56,15 @@ def output_failures() -> Iterator[None]:
         sys.exit(2)
 
 
+def check_folder() -> None:
+    """End where the folder of the shell was removed: libraries say the oddest things there."""
+    try:
+        os.getcwd()
+    except OSError:
+        complain("gaitgauge: the folder that this was started in is not there any more; change to another one")
+        sys.exit(2)
+
+
 def complain(sentence: str) -> None:
     """Print one line on standard error."""
     print(printable(sentence.replace("\n", " ")), file=sys.stderr)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from typing import Annotated
 
@@ -9,7 +10,7 @@ import typer
 
 from .command_help import Program
 from .commands import experiments, judging, learning, looking, policies, robots
-from .errors import output_failures
+from .errors import check_folder, output_failures
 
 app = typer.Typer(
     name="gaitgauge",
@@ -41,7 +42,11 @@ def gaitgauge(
 
 def main() -> None:
     """Entry point of the ``gaitgauge`` command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # where the terminal has no such letter
     with output_failures():
+        check_folder()
         app(args=[_kebab(a) for a in sys.argv[1:]])
 
 

@@ -7,7 +7,23 @@ import os
 import torch
 
 from ..backends.registry import choose_device
+from ..files.parsing import shown
 from .configuration import ConfigurationError
+
+
+def told_number(name: str, default: int) -> int:
+    """A number that torchrun tells its processes in their environment.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    text = os.environ.get(name, str(default))
+    if not (text.isascii() and text.isdecimal() and len(text) < 7):
+        raise ConfigurationError(
+            f"the environment variable {name} is {shown(text)}; it must be a whole number, as torchrun makes it: unset it, or start "
+            "the run with torchrun"
+        )
+    return int(text)
 
 
 def own_device(asked: str | None, backend: str) -> str:
@@ -17,7 +33,7 @@ def own_device(asked: str | None, backend: str) -> str:
         ConfigurationError: there is no such device here.
     """
     asked = choose_device(backend) if asked is None else asked
-    place, gpus = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+    place, gpus = told_number("LOCAL_RANK", 0), torch.cuda.device_count()
     if asked == "cuda" and place >= gpus > 0:
         raise ConfigurationError(
             f"torchrun started more processes than this machine has GPUs ({gpus}); give --nproc-per-node {gpus}"
@@ -27,7 +43,7 @@ def own_device(asked: str | None, backend: str) -> str:
 
 def idle_gpus(device: str) -> str:
     """A sentence on GPUs that no process of a run uses, empty if there are none."""
-    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "0"))
+    processes = told_number("LOCAL_WORLD_SIZE", 0)
     gpus = torch.cuda.device_count() if device.startswith("cuda") else 0
     if not 0 < processes < gpus:
         return ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -25,7 +24,7 @@ from ..robots.registry import lasting
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .configuration import ConfigurationError, TrainingConfiguration, to_plain
-from .devices import idle_gpus, own_device
+from .devices import idle_gpus, own_device, told_number
 from .environment import TrainingEnvironment
 from .environment_configuration import EnvironmentConfiguration
 from .filming import Filmer
@@ -319,7 +318,7 @@ def train(
         went wrong.
     """
     request, task, device = plan.request, plan.task, plan.device
-    rank = int(os.environ.get("RANK", "0"))
+    rank = told_number("RANK", 0)
     run_settings = task.training.run
     run: Path | None = None
     if rank == 0:

@@ -6,7 +6,6 @@ instead. Whoever waits for the GPU therefore asks it again and again, so that si
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -15,6 +14,10 @@ from typing import Any
 
 import torch
 from torch import distributed
+
+from ..files.parsing import one_line
+from .configuration import ConfigurationError
+from .devices import told_number
 
 PATIENCE = 300.0
 """Longest wait for the others [s]; compiling may take one of them a minute longer."""
@@ -37,13 +40,23 @@ class Processes:
 
     @classmethod
     def join(cls, device: torch.device | str) -> Processes:
-        """Join the processes that torchrun started, if it did."""
-        here = cls(rank=int(os.environ.get("RANK", "0")), count=int(os.environ.get("WORLD_SIZE", "1")))
+        """Join the processes that torchrun started, if it did.
+
+        Raises:
+            ConfigurationError: what torchrun says in the environment is nonsense, or nobody is there.
+        """
+        here = cls(rank=told_number("RANK", 0), count=told_number("WORLD_SIZE", 1))
         if here.several:
             on_gpu = torch.device(device).type == "cuda"
             if on_gpu:
                 torch.cuda.set_device(device)
-            distributed.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo")
+            try:
+                distributed.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo")
+            except (ValueError, RuntimeError) as error:
+                raise ConfigurationError(
+                    f"the other processes of the run cannot be joined: {one_line(error)}; start all of them with torchrun, or "
+                    "unset WORLD_SIZE"
+                ) from error
         return here
 
     def leave(self) -> None:

@@ -96,6 +96,25 @@ def test_a_full_disk_behind_standard_output_is_one_sentence(arguments):
     assert done.stderr == "gaitgauge: output cannot be written: no space left on device\n"
 
 
+def test_letters_that_the_terminal_does_not_have_are_escaped():
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C", "PYTHONUTF8": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, "list", "suites"], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\\xd7" in done.stdout, "a times sign stands in a suite's title"
+
+
+def test_a_folder_that_was_removed_is_one_sentence(tmp_path):
+    (tmp_path / "gone").mkdir()
+    command = f"cd {tmp_path}/gone && rmdir ../gone && {sys.executable} -c '{PROGRAM}' list policies"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.endswith(
+        "gaitgauge: the folder that this was started in is not there any more; change to another one\n"
+    )
+
+
 def test_a_reader_that_left_is_no_error():
     done = subprocess.run(
         f"{sys.executable} -c '{PROGRAM}' list suites | true",

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.keepsake import Keepsake
 from gaitgauge.training.logger import RunLogger
 from gaitgauge.training.processes import Processes
@@ -54,6 +55,28 @@ def test_a_keepsake_does_not_change_with_what_it_was_taken_of():
     kept = keepsake.take()
     assert kept["state"][0].tolist() == [5.0, 5.0, 5.0]
     assert kept["groups"] == [plain]
+
+
+@pytest.mark.parametrize("name", ["RANK", "WORLD_SIZE"])
+@pytest.mark.parametrize("value", ["x", "", "-1", "1.5", "9" * 400, "\u0663", "[/x]\x1b"])
+def test_what_torchrun_did_not_say_is_one_sentence(monkeypatch, name, value):
+    monkeypatch.setenv(name, value)
+    with pytest.raises(ConfigurationError, match=f"the environment variable {name} is ") as caught:
+        Processes.join("cpu")
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [{}, {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "x"}, {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "-1"}],
+)
+def test_processes_that_are_not_there_are_one_sentence(monkeypatch, variables):
+    for name in ("MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in {"WORLD_SIZE": "2", "RANK": "0", **variables}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ConfigurationError, match=r"the other processes of the run cannot be joined: .*; start all"):
+        Processes.join("cpu")
 
 
 class Service:
