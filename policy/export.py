@@ -22,7 +22,7 @@ from torch import nn
 from ..files.writing import make_folder, replacing
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, deploy_contract
-from .base import Policy, PolicyError
+from .base import PROBE_EPISODES, Policy, PolicyError
 from .contract import TERM_WIDTH, HistoryOrder, PolicyContract, difference
 from .export_modules import SCRIPTS, Explained, TermMajor, term_major_order
 from .loading import load_policy
@@ -340,12 +340,15 @@ def _network(policy: Policy) -> nn.Module:
 
 
 def _largest_difference(policy: Policy, written: Path) -> float:
-    """Run both on the same random observations, with a reset on the way, as the gauge would run them."""
+    """Run both on the same random observations, with a reset on the way, as the gauge would run them.
+
+    The export plays for as many robots as loading recorded it for; all of them see the same.
+    """
     exported = load_policy(written)
     contract, stacked = policy.contract, exported.contract
     frames = stacked.history.length
     order = term_major_order(contract, frames)
-    ours, theirs = policy.session(1), exported.session(1)
+    ours, theirs = policy.session(1), exported.session(PROBE_EPISODES)
     generator = torch.Generator().manual_seed(0)
     history = torch.zeros(1, frames, contract.frame_width)
     repeat = contract.history.start == "repeat"
@@ -358,9 +361,11 @@ def _largest_difference(policy: Policy, written: Path) -> float:
         frame = torch.randn(1, contract.frame_width, generator=generator)
         begins = repeat and step in (0, CHECK_STEPS // 2)
         history = torch.cat((history[:, 1:], frame[:, None]), dim=1) if not begins else frame.expand_as(history).clone()
-        given = torch.empty(1, history.numel())
+        given = torch.empty(PROBE_EPISODES, history.numel())
         given[:, order] = history.flatten(1)
-        difference_now = (ours.act(frame) - theirs.act(given if frames > 1 else frame)).abs().max()
+        difference_now = (
+            (ours.act(frame) - theirs.act(given if frames > 1 else frame.expand(PROBE_EPISODES, -1))).abs().max()
+        )
         largest = max(largest, float(difference_now))
     if not largest <= TOLERANCE:
         raise ExportError(

@@ -59,6 +59,17 @@ def earlier_run(folder: Path, **identity: object) -> dict[str, bytes]:
 
 
 ONE = ("--pipeline", "base", "--threads", 1)
+COARSE = """
+extends = "gaitgauge-1"
+name = "coarse"
+[physics]
+timestep = 0.005
+substeps = 4
+[noise]
+latency = 2
+[settling]
+longest = 0.1
+"""
 
 
 # ---- policies -------------------------------------------------------------------------------------------------------
@@ -120,8 +131,9 @@ def test_policy_of_wrong_width(refused, tmp_path, width):
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
 @pytest.mark.parametrize("good", [0, 60])
 def test_policy_that_returns_no_numbers(refused, tmp_path, value, good):
-    path = scripted(tmp_path / "broken.pt", value=value, good=good)
-    assert f"{value}" in refused("evaluate", path, *ONE)
+    path, suite = scripted(tmp_path / "broken.pt", value=value, good=good), tmp_path / "coarse.toml"
+    suite.write_text(COARSE)
+    assert f"{value}" in refused("evaluate", path, "--suite", suite, *ONE)
     assert not list((tmp_path / "results").rglob("results.json"))
 
 
