@@ -88,6 +88,14 @@ def turn(quaternion: torch.Tensor, angular_velocity_b: torch.Tensor, duration: f
     return turned / turned.norm(dim=-1, keepdim=True)
 
 
+_STATE = tuple(f.name for f in fields(PhysicsState))
+
+
+def _rows_of(mask: torch.Tensor) -> torch.Tensor | slice:
+    """The masked rows as an index; all of them are a slice, which is copied several times faster."""
+    return slice(None) if bool(mask.all()) else mask
+
+
 class FakeBackend(PhysicsBackend):
     """N worlds that follow a ``FakeScript``. Deterministic, float64, on any torch device.
 
@@ -246,9 +254,12 @@ class FakeBackend(PhysicsBackend):
             self._watch(mask, substep)
             if sample_at is not None:
                 asked = mask & (sample_at.to(self.device) == substep)
+                if not bool(asked.any()):
+                    continue
                 self._report(asked)
-                for f in fields(PhysicsState):
-                    getattr(self._sample, f.name)[asked] = getattr(state, f.name)[asked]
+                rows = _rows_of(asked)
+                for name in _STATE:
+                    getattr(self._sample, name)[rows] = getattr(state, name)[rows]
         self._take_targets(joint_targets, mask & (late >= count))
         self._report(mask)
 
@@ -390,13 +401,14 @@ class FakeBackend(PhysicsBackend):
         arm_b = self.foot_points_b.expand(self.num_worlds, -1, -1)
         arm_w = rotate(quaternion, arm_b)
         spin_b = torch.linalg.cross(state.base_angular_velocity_b[:, None, :].expand_as(arm_b), arm_b)
-        state.foot_position_w[mask] = (state.base_position_w[:, None, :] + arm_w)[mask]
-        state.foot_velocity_w[mask] = (state.base_linear_velocity_w[:, None, :] + rotate(quaternion, spin_b))[mask]
+        rows = _rows_of(mask)
+        state.foot_position_w[rows] = (state.base_position_w[:, None, :] + arm_w)[rows]
+        state.foot_velocity_w[rows] = (state.base_linear_velocity_w[:, None, :] + rotate(quaternion, spin_b))[rows]
 
     def _report(self, mask: torch.Tensor) -> None:
         """Fill what follows from poses and script: feet and contacts of the masked worlds."""
         self._place_feet(mask)
-        state, script = self._state, self.script
+        state, script, rows = self._state, self.script, _rows_of(mask)
         weight = self.mass * GRAVITY
         fallen = self._since(script.fall_time)
         if script.foot_force is None:
@@ -423,4 +435,4 @@ class FakeBackend(PhysicsBackend):
             (state.contact_center_w, center),
             (state.contact_count, active.sum(1).long()),
         ):
-            old[mask] = new[mask]
+            old[rows] = new[rows]
