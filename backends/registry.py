@@ -123,7 +123,7 @@ def choose_device(name: str, asked: str | None = None) -> str:
     """
     from torch import cuda
 
-    found = find_backend(name, asked or "cpu")
+    found = find_backend(name, "cpu" if asked is None else asked)
     if asked is not None:
         return asked
     made_for_gpu = _ABOUT.get(name.partition(":")[0], ("", (), ""))[0] == "GPU"

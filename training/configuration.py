@@ -25,6 +25,7 @@ LOGGERS: tuple[str, ...] = ("tensorboard", "wandb", "neptune")
 COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default")
 
 
+_Rate = Annotated[float, Field(gt=0.0, le=1e3)]
 Width = Annotated[int, Field(ge=1, le=65_536)]
 
 
@@ -118,22 +119,22 @@ class AlgorithmConfiguration:
     """Discount factor gamma."""
     gae_lambda: float = 0.95
     """Lambda of generalized advantage estimation."""
-    clip: float = 0.2
+    clip: Positive = 0.2
     """Clip range of the probability ratio and of the value update."""
     value_coefficient: float = 1.0
     """Weight of the value loss."""
     entropy_coefficient: Ramp | float = 0.01
     """Weight of the entropy bonus; a ramp moves with the environment's schedules."""
-    learning_rate: float = 1e-3
+    learning_rate: _Rate = 1e-3
     """Initial learning rate of teacher encoder, actor and critic."""
-    learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
+    learning_rate_range: tuple[_Rate, _Rate] = (1e-5, 1e-2)
     """Bounds of the adaptive learning rate."""
     desired_kl: Ramp | float | None = 0.01
     """KL divergence that the learning rate is adapted to after every minibatch; a ramp moves with the environment's schedules, None
     keeps the rate fixed."""
     max_gradient_norm: float = 1.0
     """Gradient norm limit, of each optimizer; actor side and critic share one norm."""
-    student_learning_rate: float = 1e-3
+    student_learning_rate: _Rate = 1e-3
     """Learning rate of the student encoder's own Adam."""
     him: HimConfiguration = HimConfiguration()
     dreamwaq: DreamwaqConfiguration = DreamwaqConfiguration()

@@ -23,6 +23,7 @@ _Friction = Annotated[float, Field(ge=0.0, le=10.0)]
 _Kilograms = Annotated[float, Field(ge=-1_000.0, le=1_000.0)]
 _Shift = Annotated[float, Field(ge=-10.0, le=10.0)]
 _Delay = Annotated[float, Field(ge=0.0, le=1.0)]
+_Extent = Annotated[float, Field(ge=0.0, le=10.0)]
 _Metres = Annotated[float, Field(gt=0.0, le=100.0)]
 
 
@@ -230,7 +231,7 @@ class RewardConfiguration:
     """Commanded yaw rate between which sigma grows to the terrain's largest [rad/s]."""
     base_height_target: float = 0.38
     """[m]."""
-    trunk_area: tuple[float, float] = (0.4, 0.3)
+    trunk_area: tuple[_Extent, _Extent] = (0.4, 0.3)
     """Length and width of the area below the base whose mean ground the base's height is measured from [m]; points of the
     height scan count."""
     foot_height_scale: float = 0.025
@@ -323,7 +324,7 @@ class ResetConfiguration:
     """Largest component of the base's linear [m/s] and angular [rad/s] velocity."""
     clearance: float | None = None
     """Height of the base over the highest ground below the robot [m]; None for the robot's ``stand_height``."""
-    footprint: tuple[float, float] = (0.5, 0.4)
+    footprint: tuple[_Extent, _Extent] = (0.5, 0.4)
     """Length and width of what counts as below the robot there [m]."""
 
     def __post_init__(self) -> None:

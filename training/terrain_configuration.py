@@ -70,7 +70,7 @@ class TerrainConfiguration:
     """Share of the commanded way below which the level falls."""
     demote_falls: bool = True
     """Whether a fall before promotion lowers the level whatever the distance."""
-    leave_distance: float | None = 4.75
+    leave_distance: Annotated[float, Field(gt=0.0, le=100.0)] | None = 4.75
     """Distance from the tile's middle at which an episode is cut short as a time-out [m]; None for never. Beyond the
     edge there is only level ground, on which the published robots had the next tile."""
     spawn_jitter: float = 1.0

@@ -60,3 +60,9 @@ def test_engines_that_are_made_for_a_gpu_want_one_unless_told(gpus):
         choose_device("mujoco-warp")
     assert choose_device("mujoco-warp", "cpu") == "cpu"
     assert choose_device("fake") == "cpu"
+
+
+def test_a_device_without_a_name_is_refused():
+    """It was taken for none at all, and failed later."""
+    with pytest.raises(BackendError, match="there is no device ''; give cpu, cuda or cuda:N"):
+        choose_device("mujoco", "")

@@ -102,11 +102,16 @@ def test_mistakes_are_named(override, message):
         ("environment.commands.stages.0.forward=1,-1", r"forward is 1 to -1; it must rise"),
         ("environment.reset.joint_scale=2,1", r"joint_scale is 2 to 1; it must rise"),
         ("environment.rewards.sigma_linear_range=2,1", r"sigma_linear_range is 2 to 1; it must rise"),
+        ("environment.terrain.leave_distance=-1", r"'environment.terrain.leave_distance' is '-1'"),
+        ("environment.reset.footprint=1e300,1", r"'environment.reset.footprint' is '1e300'"),
+        ("environment.rewards.trunk_area=-1,1", r"'environment.rewards.trunk_area' is '-1'"),
+        ("training.algorithm.clip=1e300", r"'training.algorithm.clip' is '1e300'"),
+        ("training.algorithm.learning_rate_range=1e-5,1e300", r"'training.algorithm.learning_rate_range' is '1e300'"),
         ("environment.joints.armature=-1", r"'environment.joints.armature' is '-1'; .*, or none"),
         ("environment.joints.friction_loss=1e300", r"'environment.joints.friction_loss' is '1e300'"),
     ],
 )
-def test_no_motor_is_impossible(override, message):
+def test_no_setting_is_impossible(override, message):
     with pytest.raises(TaskError, match=message):
         find_task("go2-cts", [override])
 
