@@ -37,7 +37,20 @@ _TOML = (
     b"true",
     b"[/x]",
 )
-_XML = (b"<", b"/>", b'"', b"<include file='go2.xml'/>", b"<weld body1='base_link'/>", b"nan", b"-1 ", b"&a;", b"<!--")
+_XML = (
+    b'<replicate count="1000000">',
+    b"</replicate>",
+    b'<size nkey="1e9"/>',
+    b"<",
+    b"/>",
+    b'"',
+    b"<include file='go2.xml'/>",
+    b"<weld body1='base_link'/>",
+    b"nan",
+    b"-1 ",
+    b"&a;",
+    b"<!--",
+)
 REQUEST = {"suite": "demo 1.0.0", "seeds": [0, 1], "level": None}
 
 
