@@ -105,7 +105,10 @@ class Child:
         try:
             self._asked, self._done = CONTEXT.Semaphore(0), CONTEXT.Semaphore(0)
         except OSError as error:
-            raise PolicyError(f"'{source}' is a program, and no process can be started for it: {error}") from error
+            raise PolicyError(
+                f"'{source}' is a program, and no process can be started for it: {error}; two semaphores need "
+                "room in /dev/shm"
+            ) from error
         self._connection, theirs = CONTEXT.Pipe()
         self._memory, shared = _shared_memory()
         self._head = _head(self._memory)

@@ -374,4 +374,4 @@ def test_no_semaphores_are_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(fence_child.CONTEXT, "Semaphore", full)
     path = tmp_path / "policy.pt"
     path.write_bytes(script(Plain()))
-    refused(path, "No space left on device")
+    refused(path, "No space left on device; two semaphores need room in /dev/shm")
