@@ -19,8 +19,11 @@ SMALL = (
 )
 
 
+TITLES = ("One episode, from the command to the result", "One training step")
+
+
 def hops(title: str) -> list[str]:
-    """The functions of a section's table, as ``file:name``."""
+    """The functions of a section's table, as ``file:name``; the first is the command, which only names the second."""
     section = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split(f"## {title}")[1].split("\n## ")[0]
     return re.findall(r"^\| \d+ \| `([\w/]+\.py:[\w.]+)` \|", section, re.MULTILINE)
 
@@ -57,7 +60,14 @@ def assert_in_order(wanted: list[str], calls: list[str]) -> None:
         assert hop in rest, f"{hop} is not called after the hops above it"
 
 
-@pytest.mark.parametrize("title", ["One episode, from the command to the result", "One training step"])
+@pytest.mark.parametrize("title", TITLES)
+def test_a_command_names_what_it_runs(title):
+    (commands, _, command), (file, _, function) = (hop.partition(":") for hop in hops(title)[:2])
+    source = (ROOT / commands).read_text(encoding="utf-8")
+    assert re.search(rf'@runs\("{Path(file).stem}:{function}"\)\ndef {command}\(', source)
+
+
+@pytest.mark.parametrize("title", TITLES)
 def test_every_function_exists(title):
     for hop in hops(title):
         file, _, name = hop.partition(":")
@@ -69,7 +79,7 @@ def test_every_function_exists(title):
 
 @pytest.mark.slow
 def test_an_episode(tmp_path):
-    wanted = hops("One episode, from the command to the result")
+    wanted = hops(TITLES[0])[1:]
     assert len(wanted) > 12
     command = ["evaluate", "pretrained", "--suite", "demo", "--pipeline", "base", "--terrain", "flat", "--threads", "1"]
     assert_in_order(wanted, passed([*command, "--no-clip", "--out", str(tmp_path)], wanted))
@@ -78,7 +88,7 @@ def test_an_episode(tmp_path):
 @pytest.mark.slow
 def test_a_training_step(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    wanted = [hop for hop in hops("One training step") if not hop.startswith("backends/")]  # the engine is another
+    wanted = [hop for hop in hops(TITLES[1])[1:] if not hop.startswith("backends/")]  # the engine is another
     assert len(wanted) > 12
     command = ["train", "go2-flat", *SMALL, "--backend", "fake", "--device", "cpu", "--num-envs", "8", "--no-score"]
     assert_in_order(wanted, passed([*command, "--iterations", "1"], wanted))
