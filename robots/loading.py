@@ -120,11 +120,8 @@ def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
 
 
 def _model_files(mjcf: Path, within: Path | None) -> list[Path]:
-    found, described, size = (
-        {mjcf: None},
-        {mjcf: 1.0},
-        0,
-    )  # the XML files, and how many copies are made of what is in them
+    described = {mjcf: 1.0}  # the XML files, and how many copies are made of what is in them
+    found, size = {mjcf: None}, 0
     parts: dict[str, float] = {}
     pending = [mjcf]
     while pending:

@@ -190,7 +190,8 @@ class Child:
                 raise
             finally:
                 if anywhere:
-                    os.sched_setaffinity(0, anywhere)
+                    with suppress(OSError):  # those cores may be this process's no more
+                        os.sched_setaffinity(0, anywhere)
             if reply is not _FINE:
                 _content(reply)
             return numbers.action.clone()
