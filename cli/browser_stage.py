@@ -73,9 +73,7 @@ class Stage:
         """Send the geoms.
 
         Args:
-            server: the page's.
             session: whose robot and ground are shown.
-            name: of the frame.
             aside: where the world stands along y [m].
             titled: write the policy's name above the robot.
         """

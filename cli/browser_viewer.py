@@ -56,7 +56,6 @@ class Panel:
     def __init__(
         self, server: viser.ViserServer, chosen: Choice, sessions: Sequence[PlaySession], command: Command | None
     ) -> None:
-        """Add them to the page."""
         gui = server.gui
         self._server = server
         with gui.add_folder("ground"):
@@ -214,7 +213,6 @@ class Cameras:
     """Those of all who look: aimed at the robots at first, then taken along, and otherwise theirs to move."""
 
     def __init__(self, server: viser.ViserServer, page: Page) -> None:
-        """Look at a page's robots."""
         self._server, self._page = server, page
         self._aim_until: dict[int, float] = {}
         self._middle = page.middle
@@ -270,7 +268,6 @@ def serve(
         chosen: what the first worlds are.
         command: what the robots are told at first; None: to the target, or a tour.
         seconds: simulated time until the end [s]; None: until Ctrl-C.
-        port: of the page.
         host: the interface that is listened on.
 
     Raises:

@@ -25,7 +25,6 @@ def make_clip(folder: Path, results: Mapping[str, Any], options: Sequence[str]) 
     """Write the film beside the results, unless it is there.
 
     Args:
-        folder: of the results.
         results: what was found: the robot is shown where it was judged, at the level that it reached.
         options: of ``gaitgauge play``: the policy and what it is played with.
 

@@ -42,7 +42,6 @@ class Program(TyperGroup):
     """All commands, with their help made ready. Typer hands help texts to rich as markup, which would eat ``[m/s]``."""
 
     def __init__(self, **attributes: Any) -> None:
-        """See ``TyperGroup``."""
         super().__init__(**attributes)
         self.help = escape(self.help or "")
         for command in self.commands.values():

@@ -34,17 +34,7 @@ def examine_policy(
     json_output: bool,
     trust: bool,
 ) -> bool:
-    """Play a policy as described and otherwise, print what looks wrong and how to mend it.
-
-    Args:
-        choice: the policy, as for ``play``.
-        contract: a ``contract.toml`` that describes it.
-        robot: name or path of the robot; None for the one that the policy is for.
-        seconds: how long each description is played.
-        threads: CPU threads, None for all.
-        out: where the whole ``contract.toml`` of the best description is written.
-        json_output: print JSON instead of a table.
-        trust: run the program that the file carries inside.
+    """Play a policy as described and otherwise, print what looks wrong and how to mend it; arguments are ``doctor``'s options.
 
     Returns:
         Whether nothing looks wrong.

@@ -34,17 +34,7 @@ def import_file(
     contract: Path | None,
     robot: str | None,
 ) -> None:
-    """Write a foreign policy as the project's own file, and print the contract that it got.
-
-    Args:
-        source: a policy file, or ``latest``, ``best``, ``pretrained``.
-        destination: the file to write; it appears whole or not at all.
-        force: replace the destination if it exists.
-        trainable: keep the teacher and the critic of a training checkpoint.
-        raw: the same with the weights after the last update instead of their average.
-        trust: run the program that a file of the project's own format carries inside.
-        contract: a ``contract.toml`` that says how a TorchScript or ONNX file is to be run.
-        robot: name or path of the robot that the policy is for; None for what the file says, else the Go2.
+    """Write a foreign policy as the project's own file, and print its contract; arguments are the options of ``import``.
 
     Raises:
         CheckpointError: ``trainable``, and the source is no training checkpoint.

@@ -30,12 +30,6 @@ class Keyboard:
     """What the keys have asked for: None while the robot finds its own way."""
 
     def __init__(self, limits: Command, command: Command | None) -> None:
-        """Begin with a command.
-
-        Args:
-            limits: largest values.
-            command: at the start, None for the robot's own way.
-        """
         self.command = command
         self.restart = False
         self._limits = limits

@@ -116,7 +116,6 @@ class Follower:
     """Time constant [s]."""
 
     def __init__(self) -> None:
-        """Look at nothing yet."""
         self._at: np.ndarray | None = None
 
     def follow(self, position: np.ndarray, seconds: float) -> np.ndarray:

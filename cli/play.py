@@ -56,10 +56,7 @@ class PlayRequest:
 
 
 def run_play(**choices: Any) -> None:
-    """Load, build, and hand over to the viewer.
-
-    Args:
-        choices: fields of ``PlayRequest``.
+    """Load, build, and hand over to the viewer; ``choices`` are the fields of ``PlayRequest``.
 
     Raises:
         UserError: an option that makes no sense, or a viewer that this machine has no display for.

@@ -26,7 +26,6 @@ class ProgressDisplay:
     """A context manager; nothing is shown before the first ``update``."""
 
     def __init__(self, console: Terminal, title: str) -> None:
-        """Show progress of ``title`` on a console."""
         self._console = console
         self._title = title
         self._began = self._last = time.monotonic()
@@ -48,8 +47,6 @@ class ProgressDisplay:
 
         Args:
             share: of the work that is done, 0 to 1.
-            text: how far it is, in words.
-            details: more values by name.
             last: show it whatever the time.
         """
         now = time.monotonic()

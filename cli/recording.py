@@ -46,7 +46,6 @@ def record(wanted: Recording, quality: Quality, progress: Callable[[float], None
     """Play and film.
 
     Args:
-        wanted: what.
         quality: what ``choose_renderer`` says.
         progress: is told the share that is done.
 

@@ -32,7 +32,6 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
     Args:
         robot: whose ``qpos`` the model takes.
         terrain: walls are left out, they would hide the robot.
-        quality: what a picture may cost.
     """
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     _set_light(spec, quality)

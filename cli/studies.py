@@ -26,8 +26,6 @@ def resumable(console: Terminal, title: str, folder: Path | None = None, *more: 
     """A display around work that keeps what has finished: Ctrl-C says how to go on and ends with exit code 130.
 
     Args:
-        console: where progress is shown.
-        title: of what is going on.
         folder: where finished episodes are kept, where there is one such folder.
         more: arguments that the command needs to go on.
     """

@@ -84,12 +84,7 @@ class _Watch:
     """Tells the display of training's ``Progress``, and how long it still takes."""
 
     def __init__(self, display: ProgressDisplay, deadline: float | None) -> None:
-        """Watch.
-
-        Args:
-            display: where to.
-            deadline: value of ``time.monotonic()`` at which training stops, None for no limit.
-        """
+        """``deadline``: value of ``time.monotonic()`` at which training stops, None for no limit."""
         self._display = display
         self._deadline = deadline
         self._recent: deque[tuple[float, int]] = deque(maxlen=_RATE_WINDOW)

@@ -40,7 +40,6 @@ class Film:
         """Start the encoder for a path that ``check_film_path`` lets pass.
 
         Args:
-            path: of the file.
             fps: pictures a second.
             size: width and height [pixels].
         """

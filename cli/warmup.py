@@ -27,11 +27,8 @@ def run_warmup(
     """Compile what training and evaluating need.
 
     Args:
-        architectures: such as ``sm_90``; none for the GPU of this machine.
-        backends: engines on Warp; none for mujoco-warp.
         robot: name or path; its numbers of joints and feet are part of the kernels.
         cache: folder of the kernels, None for Warp's own.
-        threads: compilations at a time, None for all cores.
 
     Raises:
         UserError: no architecture and no GPU, or an engine without kernels.

@@ -24,7 +24,6 @@ def write_board(folder: Path, page: Path) -> Path:
 
     Args:
         folder: holds cards as ``*.json``, or folders of evaluations.
-        page: where the page goes.
 
     Raises:
         CardError: there is no card, or one does not hold what it says it holds of a suite that ships.

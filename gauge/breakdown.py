@@ -38,9 +38,6 @@ def command_label(name: str) -> str:
 def breakdown(rows: Sequence[Mapping[str, Any]]) -> dict[str, Table]:
     """Quality (mean@50) as measured, at the levels reached: the mean over a terrain's environments and seeds.
 
-    Args:
-        rows: environments of the results.
-
     Returns:
         ``direction``: of all sub-commands that go there, ``command``: of each sub-command. Empty where none was recorded.
     """

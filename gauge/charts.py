@@ -113,7 +113,6 @@ def sweep(rows: Sequence[Row], *, axis: str, quantity: str) -> list[dict[str, An
     """Small multiples, one for each terrain: a quantity over friction or payload where only that one varies.
 
     Args:
-        rows: environments.
         axis: ``friction`` or ``payload``.
         quantity: ``level`` or ``score``; environments without it are left out.
 
@@ -180,7 +179,6 @@ def heat(rows: Sequence[Row], *, quantity: str) -> list[dict[str, Any]]:
     """For terrains whose frictions and payloads are crossed: one map each, friction to the right, payload upwards.
 
     Args:
-        rows: environments.
         quantity: ``level`` or ``score``; environments without it are left out.
     """
     maps = []

@@ -145,12 +145,6 @@ class ClusterWorkers:
     def __init__(self, ray: Any, head: str, job: Job, count: int) -> None:
         """Start workers and wait for them; those that take long are ``Lost`` until they come.
 
-        Args:
-            ray: its module, connected.
-            head: address of the head node.
-            job: what to play with.
-            count: number of workers.
-
         Raises:
             ClusterError: no node is left.
             RobotError: a file of the robot's model cannot be read.

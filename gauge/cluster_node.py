@@ -44,7 +44,6 @@ class NodeWorker:
         Args:
             node: the node's name, for messages.
             wanted: ``fingerprint`` of the machine that asks.
-            shipment: what to play with.
         """
         self._node, self._wanted, self._shipment = node, wanted, shipment
         self._worker: Worker | None = None

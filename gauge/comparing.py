@@ -46,7 +46,6 @@ def compare_all(
         request: how policies are evaluated; its policy is replaced by each.
         folder: where the comparison goes.
         runs: folder of the evaluations; what it holds is gone on with.
-        command: the command line, for the provenance.
         watch: called a few times a second during an evaluation.
 
     Returns:

@@ -50,9 +50,6 @@ class ControlStep:
         """Prepare empty worlds.
 
         Args:
-            suite: the rules.
-            policy: what is judged.
-            backend: the worlds.
             early_outs: whether values may be read during a step; without, nothing in it waits for the device.
             capture: whether to capture steps as CUDA graphs (a CUDA device, and no early outs).
 
@@ -352,7 +349,6 @@ class ControlStep:
         """Lead robots to their targets.
 
         Args:
-            events: what happened in the step.
             commanded: robots that were commanded in it, (K,) bool.
             settled: robots that are not settling any more.
             full: those of them whose sub-command, or time for the way, is over.

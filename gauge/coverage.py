@@ -21,9 +21,6 @@ def coverage(
     """What of a suite was played.
 
     Args:
-        suite: the rules.
-        environments: all that were played.
-        seeds: seeds of the quality episodes.
         pipeline: ``level`` plays no quality episodes, so its seeds do not matter.
 
     Returns:

@@ -139,12 +139,8 @@ def diagnose(
     walk yet, go on from there.
 
     Args:
-        policy: whose contract is doubted.
-        robot: its body.
         seconds: how long each is played.
         threads: CPU threads of the physics; results do not depend on them.
-        backend: engine, by name.
-        device: where it runs.
 
     Raises:
         ContractError: the policy is not for this robot.

@@ -62,7 +62,6 @@ def play(
         records: episodes that have ended; those that end are added.
         keep: called with each record once, before anything follows from it.
         workers: who plays. They have stopped on return; the caller closes the transport.
-        speculation: which episodes are played before they are required.
         watch: called whenever a worker reports.
 
     Raises:

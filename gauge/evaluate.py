@@ -254,7 +254,6 @@ def evaluate(
         resume: go on with what the folder holds.
         command: the command line, for the provenance.
         watch: called a few times a second.
-        make: builds engines by name.
 
     Returns:
         The content of ``results.json``.

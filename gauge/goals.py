@@ -119,7 +119,6 @@ def _velocity_commands(
     """Commands of a velocity goal's sub-commands, step by step. The clock ends the last one, which may be a step short.
 
     Args:
-        name: the goal.
         phases: length of both phases of a sub-command [s].
         period: control period [s].
         early: how much the clock is read early [s].
@@ -146,7 +145,6 @@ def check_terrain(suite: Suite, terrain: Terrain, *, searched: bool) -> None:
     """Check that a terrain, a plug-in's for example, has what the goals need.
 
     Args:
-        suite: the rules.
         terrain: any level of it.
         searched: whether its target is to be reached.
 

@@ -146,7 +146,6 @@ class Evidence:
 
         Args:
             rows: environments, with ``trials`` where their level was searched and ``runs`` where quality was measured.
-            rules: the suite's.
             name: seeds the generator, so that the same rows have the same intervals; evaluations that are compared have two.
         """
         self.rows, self._rules = list(rows), rules

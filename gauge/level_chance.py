@@ -37,11 +37,6 @@ def success_curves(searches: Sequence[Trials], terrains: Sequence[str], levels: 
     those of a policy's terrains are alike. Centre and width are their means over what the trials leave possible, so that five
     successes in five trials are not taken for certainty, nor none in two for impossibility.
 
-    Args:
-        searches: trials of each environment.
-        terrains: their terrains.
-        levels: number of levels.
-
     Returns:
         (searches, levels), falling along each row.
     """
@@ -109,7 +104,6 @@ def shared_luck(searches: Sequence[Trials], curves: Array) -> float:
     taken for zero: many environments of few seeds would turn its noise into a far too wide interval.
 
     Args:
-        searches: trials of each environment.
         curves: their ``success_curves``, (searches, levels).
     """
     sums: dict[int, list[tuple[float, float, float]]] = {}
@@ -156,7 +150,6 @@ def redraw_levels(
         find: the level for each table of outcomes, (…, levels, seeds) to (…,).
         luck: correlation of a seed's luck between environments, see ``shared_luck``.
         resamples: number of replicates B.
-        generator: source of the draws.
 
     Returns:
         (E, B).

@@ -46,7 +46,6 @@ def follow(outcomes: Callable[[int], Outcomes], levels: int, seeds: int, bracket
 
     Args:
         outcomes: of every seed at a level.
-        levels: number of levels.
         seeds: search seeds at a level.
         bracket: how many of them look for the crossing.
     """
@@ -103,11 +102,7 @@ def bracketing_levels(level: float) -> dict[int, float]:
 
 
 def fitted_curve(trials: Mapping[int, Collection[bool]]) -> dict[int, float]:
-    """The isotonic fit: share of successes at each level that was played, made to fall with the level.
-
-    Args:
-        trials: outcomes at each level.
-    """
+    """The isotonic fit: share of successes at each level that was played, made to fall with the level."""
     levels = sorted(level for level, found in trials.items() if found)
     if not levels:
         return {}

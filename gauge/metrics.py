@@ -197,11 +197,7 @@ class MetricEvaluator:
         """Prepare the constants.
 
         Args:
-            metrics: which metrics, and how.
-            robot: the robot.
             weight: the robot's weight [N].
-            device: where the states live.
-            dtype: floating-point type of the states.
         """
         self.names = tuple(metrics.weights)
         self.needs_contacts = not {"zmp_margin", "friction_margin"}.isdisjoint(self.names)

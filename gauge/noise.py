@@ -126,7 +126,6 @@ class _PythonGenerator:
         """``count`` times ``width`` calls of ``random()`` followed by one of ``randint(0, most)``.
 
         Args:
-            count: number of rows.
             width: calls of ``random()`` in a row.
             most: largest whole number.
             wanted: columns of the ``width`` to return, None for all.
@@ -247,8 +246,6 @@ class NoiseReader:
         """Let some worlds read other streams from the next step on.
 
         Args:
-            worlds: which.
-            episodes: whose streams.
             starts: the places in them at which to begin, in control steps.
             steps: none of them reads more than this number of control steps.
         """

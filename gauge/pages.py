@@ -39,8 +39,6 @@ def page_of(source: Path, name: str, render: Callable[[dict[str, Any]], str], *,
 
     Args:
         source: what the run found, JSON.
-        name: of the page's file.
-        render: makes HTML of the content.
         command: of ``gaitgauge`` that writes ``source``, for who lacks it.
 
     Returns:

@@ -43,8 +43,6 @@ def make_environments(
     """The environments of a run: terrain by terrain, payload by payload, friction by friction.
 
     Args:
-        suite: the rules.
-        terrains: terrain names.
         frictions: None for the suite's. Without payloads they are played at the nominal one where the suite does not cross both.
         payloads: None for the suite's. Without frictions they are played as the suite does: a payload other than the nominal one
             at the nominal friction only, unless it crosses both.

@@ -59,9 +59,7 @@ def plan(environment: Environment, records: Records, rules: PlanRules) -> Plan:
     """Plan an environment: the level as the suite finds it unless it is given, then the quality episodes.
 
     Args:
-        environment: what is gauged.
         records: episodes that have ended, of this environment and of others.
-        rules: see ``PlanRules``.
     """
     if environment.level is None and rules.suite.scoring.level == "curve":
         return _plan_curve(environment, records, rules)

@@ -46,9 +46,6 @@ _LONGEST = 400
 def write_report(folder: Path) -> Path:
     """Write ``report.html`` beside the results that it shows, all or nothing.
 
-    Args:
-        folder: folder of a finished run.
-
     Returns:
         The path of the page.
 
@@ -103,9 +100,6 @@ def _short_metric_label(name: str) -> str:
 
 def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
     """Everything that the page shows, in the order and the coordinates in which it is shown.
-
-    Args:
-        results: content of ``results.json``.
 
     Returns:
         Plain data for ``templates/report.html.j2``.

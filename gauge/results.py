@@ -46,7 +46,6 @@ def fold(
     """Everything of ``results.json`` but the policy and the provenance.
 
     Args:
-        suite: the rules.
         environments: all of them with their level, and their quality episodes where these were played.
         columns: the metrics, then ``quality``.
         evaluated: whether quality was asked for, and not the level alone; None: if any environment has quality episodes. Where

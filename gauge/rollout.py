@@ -60,8 +60,6 @@ class Rollout:
         """Prepare empty worlds.
 
         Args:
-            suite: the rules.
-            policy: what is judged.
             backend: worlds to play in; its scene holds every terrain that an episode asks for.
             terrain_index: the scene's index of an episode's terrain.
             poll_interval: control steps between two polls; None for 1 on the CPU and ``POLL_INTERVAL`` on a GPU. With 1,

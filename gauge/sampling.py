@@ -40,12 +40,7 @@ class SampleTable:
         """Prepare the table; ``reserve`` gives it rows.
 
         Args:
-            suite: the rules.
-            robot: the robot.
             weight: its weight [N].
-            worlds: number of worlds K.
-            device: where the states live.
-            dtype: floating-point type of the states.
             one_by_one: evaluate metrics segment by segment. In a CPU's vector units the last bit may depend on who else is in a
                 batch, while a GPU evaluates all segments at once.
         """
@@ -123,7 +118,6 @@ class SampleTable:
         """What the metrics say of some worlds' first samples.
 
         Args:
-            worlds: which.
             counts: number of samples T of each, at least 1.
             limits: command limits of all worlds' segments, (K, 3).
             friction: their friction coefficients, (K,).

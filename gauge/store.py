@@ -26,7 +26,6 @@ class RunFolder:
         """Open or create the folder.
 
         Args:
-            folder: where results go.
             request: everything that decides about the results (suite, policy hash, engine, environments …), plain data.
             resume: go on with a run that is already there.
 

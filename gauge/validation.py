@@ -231,7 +231,6 @@ def validate(real: Measurements, simulators: Sequence[Measurements], *, ranks_on
     """Errors and ranks of any number of simulators.
 
     Args:
-        real: what was measured.
         simulators: what each predicted, for the same policies and motions.
         ranks_only: both sides are on different scales (a score, and the share of trials survived): errors mean nothing.
 

@@ -50,11 +50,8 @@ def prepare_replay(
         card: content of a ``results.json``.
         policy: the policy's file, where it is not at the card's path.
         suite: name or ``.toml`` file, where the suite is one of the user's own.
-        device: torch device.
-        threads: CPU threads.
         quick: one environment of each terrain, at nominal friction and payload where the card has it, else the card's first.
         fresh: number from which other seeds than the card's are made; None for the card's.
-        trust: as for ``evaluate``.
 
     Raises:
         CardError: policy, suite or robot is not the card's, or other seeds can say nothing about it.
@@ -113,7 +110,6 @@ def check_coverage(card: Mapping[str, Any], suite: Suite, source: str) -> None:
     """Check that a card holds what of its suite it says it holds: else a replay of what is left would confirm it.
 
     Args:
-        card: content of a ``results.json``.
         suite: the card's, by digest.
         source: what the card is called in the sentence.
 

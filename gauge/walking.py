@@ -35,7 +35,6 @@ class Walk:
         """Prepare the robots; ``reset`` puts them to their start.
 
         Args:
-            policy: who walks.
             backend: one world for each robot.
             noise: how noisy and late everything is; None for nothing of it.
             episodes: with noise, one for each robot, whose stream of random numbers it has.

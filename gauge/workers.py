@@ -327,7 +327,6 @@ def _run_worker(job: Job, pipe: Connection, inherited: Sequence[Connection]) -> 
     """A worker process's whole life.
 
     Args:
-        job: what it plays with.
         pipe: to its parent.
         inherited: the parent's ends of all pipes; while any process holds one, its worker would not notice that the parent is
             gone.

@@ -166,10 +166,8 @@ class WorldBuffers:
         """Let segments begin in worlds; nothing of the worlds' earlier ones is left.
 
         Args:
-            worlds: where.
             segments: one for each of them.
             terrain_index: their terrains, indices into ``terrains``.
-            terrains: those of the scene.
             suite, robot, schedule, rules: what decides about a segment.
         """
         device = self.active.device

@@ -48,7 +48,6 @@ def expect_close(what: str, actual: ArrayLike, expected: ArrayLike, tolerance: A
 
     Args:
         what: name of the quantity with its unit, for the message.
-        actual: the engine's values.
         expected: the reference's values; broadcast against ``actual``.
         tolerance: largest allowed magnitude of the difference, broadcast too.
 
@@ -235,7 +234,6 @@ class Bench:
 
         Args:
             parameters: joint constants, ``soft()`` where None.
-            terrains: the palette.
             terrain_index: terrain of each world; None for ``WORLDS`` worlds on the first one.
             physics: changes to ``physics()``.
         """

@@ -31,14 +31,12 @@ def stand_still(
     """Put robots on their feet, let them come to rest and read the state.
 
     Args:
-        bench: the bench.
         worlds: worlds with ``Bench.stiff()`` joints.
         seconds: time to come to rest [s].
         ground: height of the ground below each robot [m], (N,).
         xy: place of each robot [m], (N, 2).
         turn: turn of the whole, level robot, quaternions (N, 4); None for another heading in each world.
         mask: worlds to reset, (N,) bool; None for all.
-        reset: more arguments of ``Worlds.reset``.
     """
     stance = level_stance(Reference(bench.robot, worlds.backend.scene.parameters))
     if turn is None:

@@ -238,8 +238,6 @@ def follow_reference(
     """Compare a state with one reference run per world.
 
     Args:
-        bench: the bench.
-        worlds: the engine's worlds.
         asked: the arguments of the reset at the start.
         state: the engine's state at the end.
         seconds: duration in between [s].

@@ -191,7 +191,6 @@ def level_stance(reference: Reference, *, clearance: float = 0.0005) -> Stance:
     """Fit the plane through the foot centres and turn the base so that it is level.
 
     Args:
-        reference: the robot.
         clearance: distance of the lowest foot from the ground [m].
     """
     reference.place((0.0, 0.0, 0.0))

@@ -148,9 +148,7 @@ def run_conformance(
     """Run the conformance checks against an engine.
 
     Args:
-        backend: as for ``make_bench``.
-        device: as for ``make_bench``.
-        robot: as for ``make_bench``.
+        backend, device, robot: as for ``make_bench``.
         only: beginnings of the names of the checks to run (``motors``, ``contact/rest``); empty for all.
         report: called with each result as soon as it is there.
 

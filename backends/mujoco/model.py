@@ -102,8 +102,6 @@ def add_terrain(
     """Add the ground of one world.
 
     Args:
-        spec: the robot's model.
-        terrain: what to add.
         walls: number of walls in the layout, at least as many as the terrain has; the rest meets nothing.
         blocks: the same for the other boxes.
         field_shape: (rows, columns) of the layout's height field, None for none. A terrain without one gets one that

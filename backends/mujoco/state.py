@@ -102,7 +102,6 @@ class BatchState(PhysicsState):
         Args:
             now: the state after the whole step.
             rows: the worlds that were stepped.
-            records: what was recorded of them.
             at: (rows,).
         """
         self._computed = {}

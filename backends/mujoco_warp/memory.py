@@ -21,7 +21,6 @@ def bytes_per_world(model: mujoco.MjModel, capacity: Capacity, worlds: int, proc
     """Memory that one world needs [bytes], scratch memory included as an estimate; measured on small copies.
 
     Args:
-        model: the model that all worlds share.
         capacity: buffer sizes for ``worlds`` worlds.
         worlds: number of worlds that the capacity is for.
         processors: multiprocessors of the GPU; an H200's if nothing is said.

@@ -95,8 +95,6 @@ def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> W
     """Build the model of all worlds.
 
     Args:
-        scene: what to build.
-        device: where the model lives.
         gap: distance at which contacts are looked for [m], for each shape.
         skin: whether the robot file's contact margins are kept; they thicken the shapes of solvers with hard contacts.
 

@@ -396,7 +396,6 @@ def dry_friction_slope(reference: mujoco.MjModel, dofs: np.ndarray, timestep: fl
     A slope of half the joint's own inertia per step keeps even three coupled joints of a leg stable.
 
     Args:
-        reference: the robot.
         dofs: degree of freedom of each joint, (J,).
         timestep: length of a physics step [s].
     """

@@ -26,7 +26,6 @@ class RecordedFunction(Generic[Result]):
         """Keep the function; nothing runs yet.
 
         Args:
-            function: see above.
             device: the GPU that it runs on, whichever is torch's current one.
             warm_up: calls that run as they are, on a stream of their own, as recording asks for.
         """

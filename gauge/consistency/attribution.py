@@ -100,7 +100,6 @@ def effect_of_switch(
     """What switching a factor does to an engine's score and metrics, and to its gap to other engines.
 
     Args:
-        design: the episodes.
         base: the engine as the suite has it.
         switched: the same engine with the factor switched.
         others: records of the engines whose gap to ``base`` is to be explained, by label.

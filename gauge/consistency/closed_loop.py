@@ -102,15 +102,9 @@ def play_variant(
     """Play the episodes of which there is no record yet, as an evaluation plays those that its plans require.
 
     Args:
-        variant: the engine.
-        episodes: what to play.
-        suite: the rules.
-        robot: whose model is simulated.
-        policy: who walks.
         records: episodes that have ended; those that end are added.
         keep: called with each record.
         threads: CPU threads; results do not depend on them.
-        make: builds engines by name.
         watch: called now and then with the number of episodes that have ended.
 
     Raises:
@@ -216,7 +210,6 @@ def compare(
     """Compare two runs of the same episodes.
 
     Args:
-        design: the episodes.
         reference: records of the one run.
         compared: records of the other.
         floor: records of the reference engine put off by a hair, once for each draw: what chaos alone does.

@@ -241,8 +241,6 @@ def compare_trajectories(
     """Differences of two engines over time.
 
     Args:
-        reference: of the one engine.
-        compared: of the other.
         period: control period [s].
         weight: of the robot [N].
 

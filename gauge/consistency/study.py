@@ -189,12 +189,9 @@ def study(
     """Carry out a study; every finished episode is on disk at once.
 
     Args:
-        request: what to compare.
         folder: where ``consistency.json`` and a folder for each engine go (with several policies, one for each of them above).
         resume: go on with what the folder holds.
-        command: the command line, for the provenance.
         watch: called after every control step.
-        make: builds engines by name.
 
     Returns:
         The content of ``consistency.json``; ``docs/consistency.md`` explains it.

@@ -72,23 +72,8 @@ class Variant:
             )
         return replace(changed, substeps=round(count))
 
-    def check(self, suite: PhysicsOptions) -> None:
-        """Say at once what would go wrong later.
-
-        Raises:
-            ConsistencyError: an impossible option.
-            BackendError: the engine is not there or cannot run on the device.
-        """
-        self.physics(suite)
-        find_backend(self.backend, self.device)
-
     def worlds(self, scene: Scene, *, threads: int, make: MakeBackend = make_backend) -> PhysicsBackend:
         """Build the worlds of a scene, whose physics options are the suite's.
-
-        Args:
-            scene: what to build.
-            threads: CPU threads.
-            make: builds engines by name.
 
         Raises:
             BackendError: the engine cannot do what the scene or the variant asks for.

@@ -94,7 +94,6 @@ class PerturbedBackend(WrappedBackend):
         """Perturb ``inner``.
 
         Args:
-            inner: the engine.
             magnitude: largest relative change. It never is below four roundings of the engine's numbers.
             draw: number of the perturbation; each has other signs and sizes.
             targets: whether the joint targets are put off too.

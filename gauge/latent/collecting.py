@@ -91,12 +91,7 @@ def collect(
     """Let a policy's robots walk, and note what its encoder and experts say.
 
     Args:
-        policy: whose inside is looked at.
-        robot: its body.
-        walks: where, how and how long.
-        backend: engine, by name, on the CPU.
         threads: CPU threads; results do not depend on them.
-        make: builds engines by name.
 
     Raises:
         BackendError: the engine cannot do it.

@@ -65,11 +65,7 @@ def study_latents(
     """Look at the latents of some policies. What cannot be looked at is said under ``refused``; the others are.
 
     Args:
-        request: whose, and where.
-        folder: where the files go.
-        command: the command line, for the provenance.
         watch: called before each policy's turn with the turn's number, their count, and its label.
-        make: builds engines by name.
 
     Returns:
         The content of ``latent.json`` (docs/latent.md).

@@ -122,15 +122,8 @@ def run_scenario(
     """Send a robot through a scenario for each seed.
 
     Args:
-        policy: who walks.
-        robot: its body.
-        scenario: what it goes through.
         seeds: one for each trial.
-        backend: engine, by name.
-        device: where it runs.
         threads: CPU threads; results do not depend on them.
-        make: builds engines by name.
-        watch: called after every control step.
 
     Raises:
         BackendError: the engine cannot do what the scenario asks for.

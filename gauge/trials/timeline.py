@@ -23,7 +23,6 @@ class Timeline:
         """Begin with the first phase.
 
         Args:
-            scenario: whose commands.
             period: control period [s].
             line: x, y [m] and heading [rad] of the line that steering keeps to.
         """

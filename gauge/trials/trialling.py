@@ -51,11 +51,7 @@ def run_trials(
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 
     Args:
-        request: who and what.
-        folder: where the files go.
-        command: the command line, for the provenance.
         watch: called before each policy's turn in each scenario with the turn's number, their count, and its name.
-        make: builds engines by name.
 
     Returns:
         The content of ``trials.json`` (docs/trials.md).
