@@ -1,7 +1,7 @@
 """Exports of the project's own policies: TorchScript, ONNX and the ``deploy.yaml`` of the robot's C++ runtime.
 
-Every export is compared with the policy it was made from before it gets its name: an export that acts differently is
-never left behind.
+Every export is compared with the policy it was made from before it gets its name, in place of a file that has it: an export
+that acts differently is never left behind. Functions return the largest difference of an action to the policy's.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Any
 import onnx
 import torch
 import yaml
-from torch import nn
 
 from ..files.writing import make_folder, replacing
 from ..robots import Robot
@@ -42,16 +41,8 @@ measures, is commanded or may be sent.
 ONNX_OPSET, ONNX_IR_VERSION = 17, 8
 """What onnxruntime 1.16 reads, which the published C++ controller prescribes on the robot."""
 
-# This project's observation terms as Isaac Lab, whose names the C++ runtime knows, calls them.
-DEPLOY_TERMS = {
-    "base_linear_velocity_b": "base_lin_vel",
-    "base_angular_velocity_b": "base_ang_vel",
-    "projected_gravity_b": "projected_gravity",
-    "command": "velocity_commands",
-    "joint_position": "joint_pos_rel",
-    "joint_velocity": "joint_vel_rel",
-    "last_action": "last_action",
-}
+DEPLOY_TERMS = {own: name for name, own in reversed([*FOREIGN_TERMS.items()])}
+"""This project's observation terms as Isaac Lab, whose names the C++ runtime knows, calls them: the first name of each."""
 
 
 class ExportError(PolicyError):
@@ -65,19 +56,12 @@ def export_torchscript(policy: Policy, path: str | Path) -> float:
     the actions alone for a perceptron, ``(actions, (None, latent))`` for a network with a latent, ``(actions, (gate weights,
     latent))`` for one with experts. The contract lies in the archive as ``contract.json``.
 
-    Args:
-        policy: one of the project's own.
-        path: file to write; an existing one is replaced.
-
-    Returns:
-        Largest difference of an action to the policy's.
-
     Raises:
         ExportError: the policy is foreign or recurrent, the file cannot be written, or it acts differently.
     """
     network = _network(policy)
     contract = policy.contract
-    history = torch.zeros(1, int(network.history_length), int(network.frame_width))  # type: ignore[arg-type]
+    history = torch.zeros(1, network.history_length, network.frame_width)
     start = torch.full_like(history, math.nan) if contract.history.start == "repeat" else history
     core = network if isinstance(network, MlpNetwork) else Explained(network)
     buffer = io.BytesIO()
@@ -97,18 +81,11 @@ def export_onnx(policy: Policy, path: str | Path) -> float:
     The metadata hold the contract in full precision under ``contract``, and what mjlab's runtime reads under its own
     names.
 
-    Args:
-        policy: one of the project's own.
-        path: file to write; an existing one is replaced.
-
-    Returns:
-        Largest difference of an action to the policy's.
-
     Raises:
         ExportError: the policy is foreign or recurrent, the file cannot be written, or it acts differently.
     """
     network = _network(policy)
-    frames = int(network.history_length)  # type: ignore[arg-type]
+    frames = network.history_length
     module = TermMajor(network, term_major_order(policy.contract, frames)).eval()
     contract = stacked_contract(policy.contract, frames)
     buffer = io.BytesIO()
@@ -136,17 +113,12 @@ def export_deploy(policy: Policy, path: str | Path, robot: Robot, *, finite_clip
 
     The runtime fills the history with the first observation; ``first_steps`` says what that changes.
 
-    Args:
-        policy: one of the project's own.
-        path: file to write; an existing one is replaced.
-        robot: the robot the policy is for.
-        finite_clips: write clips of ``WIDE`` where the contract clips nothing.
+    With ``finite_clips``, what the contract does not clip is clipped to ``WIDE``.
 
     Raises:
         ExportError: the robot's own joint numbers are not known, or the file cannot say what the contract says.
     """
-    network = _network(policy)
-    contract = stacked_contract(policy.contract, int(network.history_length))  # type: ignore[arg-type]
+    contract = stacked_contract(policy.contract, _network(policy).history_length)
     settings = deploy_settings(contract, robot, finite_clips=finite_clips)
     text = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
     expected = _with_wide_clips(contract) if finite_clips else contract
@@ -163,9 +135,6 @@ def export_deploy(policy: Policy, path: str | Path, robot: Robot, *, finite_clip
 def export_unitree(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path, float]:
     """Write the folder that the published C++ controller is pointed at: ``exported/policy.onnx`` and ``params/deploy.yaml``.
 
-    Returns:
-        The written files, with the largest difference of an action to the policy's.
-
     Raises:
         ExportError: see ``export_onnx`` and ``export_deploy``.
     """
@@ -179,7 +148,7 @@ def export_unitree(policy: Policy, folder: str | Path, robot: Robot) -> dict[Pat
 
 def first_steps(policy: Policy) -> str | None:
     """What the robot's C++ runtime does otherwise at the start, in one sentence; None where it does the same."""
-    frames = int(_network(policy).history_length)  # type: ignore[arg-type]
+    frames = _network(policy).history_length
     if frames == 1 or policy.contract.history.start == "repeat":
         return None
     return (
@@ -192,9 +161,6 @@ def export_policy(
     policy: Policy, folder: str | Path, robot: Robot, parts: Collection[str] = PARTS
 ) -> dict[Path, float]:
     """Write ``policy.pt`` (TorchScript), ``policy.onnx`` and ``deploy.yaml`` into a folder, or some of these ``PARTS``.
-
-    Returns:
-        The written files, with the largest difference of an action to the policy's.
 
     Raises:
         ExportError: see the three exports.
@@ -312,8 +278,7 @@ def _spelled_out(contract: PolicyContract) -> PolicyContract:
     terms = []
     for term in contract.observation:
         width = TERM_WIDTH[term.name] or contract.num_joints
-        clip = None if term.clip is None else every(term.clip, width)
-        terms.append(replace(term, scale=every(term.scale, width), clip=clip))
+        terms.append(replace(term, scale=every(term.scale, width), clip=term.clip and every(term.clip, width)))
     return replace(contract, observation=tuple(terms))
 
 
@@ -329,7 +294,7 @@ def _with_wide_clips(contract: PolicyContract) -> PolicyContract:
     )
 
 
-def _network(policy: Policy) -> nn.Module:
+def _network(policy: Policy) -> Any:
     if not isinstance(policy, NativePolicy):
         raise ExportError(
             f"'{policy.path}' is an exported file already; export a checkpoint of the project's own format"
@@ -354,19 +319,16 @@ def _largest_difference(policy: Policy, written: Path) -> float:
     repeat = contract.history.start == "repeat"
     largest = 0.0
     for step in range(CHECK_STEPS):
+        frame = torch.randn(1, contract.frame_width, generator=generator)
         if step in (0, CHECK_STEPS // 2):
             ours.reset()
             theirs.reset()
-            history.zero_()
-        frame = torch.randn(1, contract.frame_width, generator=generator)
-        begins = repeat and step in (0, CHECK_STEPS // 2)
-        history = torch.cat((history[:, 1:], frame[:, None]), dim=1) if not begins else frame.expand_as(history).clone()
+            history = frame.expand_as(history) if repeat else torch.zeros_like(history)
+        history = torch.cat((history[:, 1:], frame[:, None]), dim=1)
         given = torch.empty(PROBE_EPISODES, history.numel())
         given[:, order] = history.flatten(1)
-        difference_now = (
-            (ours.act(frame) - theirs.act(given if frames > 1 else frame.expand(PROBE_EPISODES, -1))).abs().max()
-        )
-        largest = max(largest, float(difference_now))
+        theirs_now = theirs.act(given if frames > 1 else frame.expand(PROBE_EPISODES, -1))
+        largest = max(largest, float((ours.act(frame) - theirs_now).abs().max()))
     if not largest <= TOLERANCE:
         raise ExportError(
             f"the export of '{policy.path}' differs from it by {largest:.2g} in an action; {TOLERANCE:g} is allowed"
@@ -379,6 +341,3 @@ def _write_checked(path: Path, data: bytes, check: Callable[[Path], float]) -> f
     with replacing(path, ExportError) as partial:
         partial.write_bytes(data)
         return check(partial)
-
-
-assert set(DEPLOY_TERMS.values()) <= set(FOREIGN_TERMS)

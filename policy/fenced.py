@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 
 import torch
 
@@ -24,16 +24,6 @@ def graph_program(data: bytes, source: str) -> Program:
     from .onnx_file import GraphProgram
 
     return GraphProgram(data, source)
-
-
-def program_width(child: Child, candidates: Sequence[int] = ()) -> int | None:
-    """Width of a program's input: for TorchScript the first of the candidates that it takes, for ONNX None if it is open.
-
-    Raises:
-        PolicyError: it takes none of them.
-    """
-    width = child.ask("width", candidates=list(candidates))["width"]
-    return None if width is None else int(width)
 
 
 class FencedPolicy(FilePolicy):
@@ -62,14 +52,9 @@ class FencedPolicy(FilePolicy):
         """
         self.stored, self.contract, self.path = stored, contract, path
         self._child = child
-        self._batched = bool(
-            child.ask("prepare", contract=contract.to_json(), attributes=sorted(attributes))["batched"]
-        )
-
-    @property
-    def batched(self) -> bool:
+        found = child.ask("prepare", contract=contract.to_json(), attributes=sorted(attributes))
+        self.batched = bool(found["batched"])
         """Whether one run of the program serves all episodes."""
-        return self._batched
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes; the program runs on the CPU wherever the tensors are."""

@@ -57,4 +57,4 @@ def carries_program(path: str | Path) -> bool:
         PolicyError: it is no such file.
     """
     entries = load_entries(Path(path).read_bytes(), source=str(path))
-    return isinstance(read_policy(entries, source=str(path)).network, ForeignFile)
+    return isinstance(read_policy(entries, source=str(path))[1], ForeignFile)

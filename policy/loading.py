@@ -21,7 +21,7 @@ from .adapters import (
     sidecar_contract,
 )
 from .base import PolicyError
-from .contract import ContractError, PolicyContract, check_robot, standard_contract
+from .contract import ContractError, HistoryOrder, PolicyContract, check_robot, standard_contract
 from .fence.archive import archive_names, read_limited
 from .finding import find_policy
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
@@ -99,15 +99,15 @@ def _load(
     if is_policy(entries):
         if contract is not None:
             raise PolicyError(f"'{source}' has its contract inside; leave out --contract, or import its source again")
-        stored = read_policy(entries, source=source)
-        if isinstance(stored.network, StoredNetwork):
-            return NativePolicy(stored.contract, stored.network, path=source)
+        inside, network = read_policy(entries, source=source)
+        if isinstance(network, StoredNetwork):
+            return NativePolicy(inside, network, path=source)
         if not trust:
             raise PolicyError(
-                f"'{source}' carries a program of another format inside ({stored.network.kind}); "
+                f"'{source}' carries a program of another format inside ({network.kind}); "
                 "add --trust (in Python trust=True) to run it, in a process of its own"
             )
-        return _foreign(stored.network, path, source, robot, contract=stored.contract)
+        return _foreign(network, path, source, robot, contract=inside)
     found = checkpoint_network(entries, robot, path=path)
     if found is None:
         raise PolicyError(f"'{source}' is a torch.save file, but neither a gaitgauge policy nor an rsl_rl checkpoint")
@@ -123,64 +123,46 @@ def _foreign(
     from .fence.child import Child
     from .fenced import FencedPolicy, graph_program, script_program
 
+    metadata: dict[str, str] = {}
     if file.kind == "torchscript":
         from .fence.script import check_script
 
         script = check_script(file.data, source=source)
-        child = Child(script_program, script.data, source=source)
-        if contract is None:
-            contract = _torchscript_contract(child, script.contract, path, source, robot)
-        return FencedPolicy(file, child, contract, path=source, attributes=script.attributes)
-    import onnxruntime  # noqa: F401  (the child, which is forked, may not load libraries any more)
+        child, attributes = Child(script_program, script.data, source=source), script.attributes
+        if script.contract:
+            metadata["contract"] = script.contract
+    else:
+        import onnxruntime  # noqa: F401  (the child, which is forked, may not load libraries any more)
 
-    from .fence.graph import check_graph
+        from .fence.graph import check_graph
 
-    model = check_graph(file.data, source=source, folder=path.parent)
-    whole = ForeignFile(kind=file.kind, data=model.SerializeToString())
-    child = Child(graph_program, whole.data, source=source)
-    if contract is None:
+        model = check_graph(file.data, source=source, folder=path.parent)
         metadata = {entry.key: entry.value for entry in model.metadata_props}
-        contract = _onnx_contract(child, metadata, path, source, robot)
-    return FencedPolicy(whole, child, contract, path=source)
+        file = ForeignFile(kind=file.kind, data=model.SerializeToString())
+        child, attributes = Child(graph_program, file.data, source=source), frozenset()
+    contract = contract or _foreign_contract(child, file.kind, metadata, path, source, robot)
+    return FencedPolicy(file, child, contract, path=source, attributes=attributes)
 
 
-def _torchscript_contract(child: Child, text: str, path: Path, source: str, robot: Robot) -> PolicyContract:
-    """The contract beside the file, in it, or the standard one with as many frames as the input is wide."""
-    from .fenced import program_width
-
-    contract = sidecar_contract(path)
-    if contract is None and text:
-        contract = _stored_contract(text, source)
-    if contract is not None:
-        return contract
-    frame = standard_contract(robot).frame_width
-    width = program_width(child, [frame * n for n in range(1, LONGEST_HISTORY + 1)]) or frame
-    provenance = {"adapter": "TorchScript", "file": path.name}
-    return contract_for_width(width, robot, order="frame-major", provenance=provenance, source=source)
-
-
-def _onnx_contract(child: Child, metadata: Mapping[str, str], path: Path, source: str, robot: Robot) -> PolicyContract:
-    """The contract beside the file, in its metadata, from its deploy.yaml, or the standard one for its input's
-    width.
+def _foreign_contract(
+    child: Child, kind: str, metadata: Mapping[str, str], path: Path, source: str, robot: Robot
+) -> PolicyContract:
+    """The contract beside the file, in it, of an ONNX file that of its deploy.yaml or of what mjlab wrote into it, or else the
+    standard one with as many frames as the input is wide.
     """
-    from .fenced import program_width
-
     contract = sidecar_contract(path)
-    if contract is not None:
-        return contract
-    if "contract" in metadata:
-        return _stored_contract(metadata["contract"], source)
-    deploy = find_deploy_file(path)
-    if deploy is not None:
-        return deploy_contract(deploy, robot)
-    contract = mjlab_contract(metadata, robot, source=source)
+    if contract is None and "contract" in metadata:
+        contract = _stored_contract(metadata["contract"], source)
+    if contract is None and kind == "onnx":
+        deploy = find_deploy_file(path)
+        contract = deploy_contract(deploy, robot) if deploy else mjlab_contract(metadata, robot, source=source)
     if contract is not None:
         return contract
     frame = standard_contract(robot).frame_width
-    provenance = {"adapter": "ONNX", "file": path.name}
-    return contract_for_width(
-        program_width(child) or frame, robot, order="term-major", provenance=provenance, source=source
-    )
+    order: HistoryOrder = "term-major" if kind == "onnx" else "frame-major"
+    width = child.ask("width", candidates=[frame * n for n in range(1, LONGEST_HISTORY + 1)])["width"]
+    provenance = {"adapter": "ONNX" if kind == "onnx" else "TorchScript", "file": path.name}
+    return contract_for_width(int(width or frame), robot, order=order, provenance=provenance, source=source)
 
 
 def _stored_contract(text: str, source: str) -> PolicyContract:

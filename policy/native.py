@@ -26,8 +26,6 @@ import math
 import pickle
 import re
 import warnings
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,24 +54,10 @@ _PLAIN_CALLS = frozenset({REBUILD_TENSOR, "torch._utils _rebuild_parameter", "to
 _PLAIN_CALLS |= {"collections OrderedDict", "builtins set", "__builtin__ set", "_codecs encode"}
 _PLAIN_NAMES = re.compile(r"torch (\w+Storage|u?int\d+|float\d+|bfloat16|complex\d+|bool)")
 
-# What torch raises for damaged or foreign data, from the archive down to the tensors.
-LOAD_ERRORS = (
-    RuntimeError,
-    torch.jit.Error,
-    pickle.UnpicklingError,
-    EOFError,
-    OSError,
-    ValueError,
-    KeyError,
-    IndexError,
-    TypeError,
-    AttributeError,
-    AssertionError,
-    OverflowError,
-    MemoryError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+PROGRAM_ERRORS = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, MemoryError)
+"""What goes wrong inside torch where things do not fit together."""
+LOAD_ERRORS = (*PROGRAM_ERRORS, torch.jit.Error, pickle.UnpicklingError, EOFError, OSError, AssertionError)
+"""The same for damaged or foreign data, from the archive down to the tensors."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,52 +80,32 @@ class ForeignFile:
     data: bytes
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PolicyFile:
-    """What a file of the project's own format holds."""
-
-    contract: PolicyContract
-    network: StoredNetwork | ForeignFile
-
-
 def first_line(error: BaseException) -> str:
     """The first line that says anything of an error's message, for messages of one sentence."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0].partition(". ")[0].rstrip(".")[:200] if lines else type(error).__name__
 
 
-def save_policy(
-    path: str | Path,
-    contract: PolicyContract,
-    network: StoredNetwork | ForeignFile,
-    *,
-    extra: Mapping[str, Any] | None = None,
-) -> None:
+def save_policy(path: str | Path, contract: PolicyContract, network: StoredNetwork | ForeignFile) -> None:
     """Write a policy file. The file appears whole or not at all.
 
     Args:
         path: conventionally ``model_<iteration>.pt`` for a checkpoint and ``<name>.gauge.pt`` for an import.
         contract: what the policy expects of the loop that runs it.
         network: the network.
-        extra: more entries of the file, tensors and plain data only, for example an optimiser's state.
 
     Raises:
-        PolicyError: ``extra`` uses a name of the format, or the network does not fit the contract.
+        PolicyError: the network does not fit the contract, or the file cannot be written.
     """
     if isinstance(network, StoredNetwork):
         build_network(network, contract, source=str(path))
     entries = policy_entries(contract, network)
     entries["checksum"] = checksum(entries)
-    taken = entries.keys() & (extra or {}).keys()
-    if taken:
-        raise PolicyError(
-            f"extra entries of a policy file cannot be named {', '.join(sorted(taken))}: the format uses these names"
-        )
     target = Path(path)
     make_folder(target.parent, PolicyError, option="place")
     # Given a path, torch would write its name into the file: equal policies, unequal bytes.
     with replacing(target, PolicyError) as partial, partial.open("wb") as file:
-        torch.save({**entries, **(extra or {})}, file)
+        torch.save(entries, file)
 
 
 def policy_entries(contract: PolicyContract, network: StoredNetwork | ForeignFile) -> dict[str, Any]:
@@ -184,8 +148,8 @@ def is_policy(entries: Mapping[str, Any]) -> bool:
     return isinstance(name, str) and name == FORMAT
 
 
-def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
-    """Take the parts out of a loaded file's dictionary.
+def read_policy(entries: Mapping[str, Any], *, source: str) -> tuple[PolicyContract, StoredNetwork | ForeignFile]:
+    """Contract and network out of a loaded file's dictionary.
 
     Args:
         entries: the dictionary; its ``format`` has been checked.
@@ -215,7 +179,7 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
         data = spec.get("bytes")
         if not isinstance(data, torch.Tensor) or data.dtype != torch.uint8:
             raise PolicyError(f"'{source}' says that it carries a {kind} file, but has none")
-        return PolicyFile(contract=contract, network=ForeignFile(kind=kind, data=data.numpy().tobytes()))
+        return contract, ForeignFile(kind=kind, data=data.numpy().tobytes())
     if not isinstance(kind, str) or kind != "native":
         raise PolicyError(f"'{source}' has a network of unknown kind {shown(kind)}")
     state_dict = entries.get("state_dict")
@@ -231,8 +195,7 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> PolicyFile:
             raise
         raise PolicyError(f"'{source}' has malformed network arguments: {first_line(error)}") from error
     architecture = str(spec.get("architecture"))
-    stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=state_dict)
-    return PolicyFile(contract=contract, network=stored)
+    return contract, StoredNetwork(architecture=architecture, arguments=arguments, state_dict=state_dict)
 
 
 def _intact(entries: Mapping[str, Any]) -> bool:

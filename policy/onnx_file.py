@@ -164,7 +164,7 @@ class GraphProgram:
                 f"'{self.source}' takes {self.file.width} values, "
                 f"but its contract's observation has {contract.observation_width}"
             )
-        self._rows = _Runner(self.file.data, self.file, contract, self.source)
+        self._rows = _Runner(self.file.data, self.file, contract)
         self._rows.run(np.zeros((1, contract.observation_width), np.float32))
         self._batch = self._proved_batch()
 
@@ -173,7 +173,7 @@ class GraphProgram:
         if rowwise:
             return RowwiseSession(self.session, rows)
         batched = self._batch is not None
-        runner = _Runner(self._batch or self.file.data, self.file, self.contract, self.source)
+        runner = _Runner(self._batch or self.file.data, self.file, self.contract)
         return OnnxSession(runner, rows, self.contract, batched=batched)
 
     def _proved_batch(self) -> bytes | None:
@@ -182,7 +182,7 @@ class GraphProgram:
         expected = np.concatenate([self._rows.run(probe[i : i + 1]) for i in range(PROBE_EPISODES)])
         for variant in self.file.variants():
             try:
-                actual = _Runner(variant, self.file, self.contract, self.source).run(probe)
+                actual = _Runner(variant, self.file, self.contract).run(probe)
             except PolicyError:
                 continue
             if np.allclose(actual, expected, rtol=PROBE_TOLERANCE, atol=PROBE_TOLERANCE, equal_nan=True):
@@ -193,13 +193,13 @@ class GraphProgram:
 class _Runner:
     """Runs one form of a file and checks its output."""
 
-    def __init__(self, data: bytes, file: OnnxFile, contract: PolicyContract, source: str) -> None:
+    def __init__(self, data: bytes, file: OnnxFile, contract: PolicyContract) -> None:
         try:
             self._runtime = _runtime(data)
         except _RUN_ERRORS as error:
-            raise PolicyError(f"'{source}' cannot be prepared by onnxruntime: {first_line(error)}") from error
+            raise PolicyError(f"'{file.source}' cannot be prepared by onnxruntime: {first_line(error)}") from error
         self._input, self._output = file.input_name, file.output_name
-        self._contract, self._source = contract, source
+        self._contract, self._source = contract, file.source
 
     def run(self, observation: np.ndarray) -> np.ndarray:
         try:

@@ -13,8 +13,9 @@ import torch
 from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 
+from .native import PROGRAM_ERRORS
 from .onnx_operators import DTYPES, OPERATORS, Node
-from .program import MOST_ELEMENTS, PROGRAM_ERRORS, Budget, NotUnderstoodError, Program
+from .program import MOST_ELEMENTS, Budget, NotUnderstoodError, Program
 
 ACTION_NAMES = ("actions", "action")
 _MOST_NUMBERS = 1 << 16

@@ -23,7 +23,7 @@ from torch.nn import functional
 
 from .base import PolicyError, PolicySession, check_observation, checked_action
 from .contract import PolicyContract
-from .native import first_line
+from .native import PROGRAM_ERRORS, first_line
 
 MOST_ELEMENTS = 1 << 24
 """Entries of one tensor of a program."""
@@ -31,20 +31,6 @@ MOST_WORK = 1 << 30
 """Multiplications and entries that one run of a program for one robot may take."""
 MOST_OPERATORS = 20_000
 """Operators that one run of a program may call."""
-# What goes wrong inside torch when a program is followed that does not fit together.
-PROGRAM_ERRORS = (
-    RuntimeError,
-    TypeError,
-    ValueError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    NotImplementedError,
-    ZeroDivisionError,
-    OverflowError,
-    RecursionError,
-    MemoryError,
-)
 
 
 class NotUnderstoodError(Exception):

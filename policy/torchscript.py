@@ -188,7 +188,7 @@ class ScriptProgram:
             PolicyError: the module fails on zeros, or its input or output has the wrong width.
         """
         self.contract, self._attributes = contract, frozenset(attributes)
-        check = CopiesSession(self._module, 1, contract, torch.device("cpu"), self.source)
+        check = CopiesSession(self._module, 1, contract, self.source)
         check.act(torch.zeros(1, contract.observation_width))
         self.memories = self._find_memories()
 
@@ -196,10 +196,9 @@ class ScriptProgram:
         """Start work on so many episodes with a copy of the module, all at once or each alone."""
         if rowwise:
             return RowwiseSession(self.session, rows)
-        cpu = torch.device("cpu")
         if self.memories is None:
-            return CopiesSession(self._module, rows, self.contract, cpu, self.source)
-        return BatchSession(self._module, rows, self.contract, cpu, self.source, self.memories)
+            return CopiesSession(self._module, rows, self.contract, self.source)
+        return BatchSession(self._module, rows, self.contract, self.source, self.memories)
 
     def _find_memories(self) -> tuple[Memory, ...] | None:
         """The module's memories, such that a batch proves equal to single runs; None if there is no such way."""
@@ -250,9 +249,8 @@ class ScriptProgram:
 
     def _proved(self, memories: tuple[Memory, ...]) -> bool:
         """Whether a batch acts as single copies do."""
-        cpu = torch.device("cpu")
-        batch = BatchSession(self._module, PROBE_EPISODES, self.contract, cpu, self.source, memories)
-        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, cpu, self.source)
+        batch = BatchSession(self._module, PROBE_EPISODES, self.contract, self.source, memories)
+        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, self.source)
         return act_alike(copies, batch, self.contract.observation_width)
 
 
@@ -262,16 +260,10 @@ class BatchSession(PolicySession):
     batched = True
 
     def __init__(
-        self,
-        module: Any,
-        num_episodes: int,
-        contract: PolicyContract,
-        device: torch.device,
-        source: str,
-        memories: Sequence[Memory],
+        self, module: Any, num_episodes: int, contract: PolicyContract, source: str, memories: Sequence[Memory]
     ) -> None:
         """Copy the module and widen its memories."""
-        self._module = copy.deepcopy(module).to(device)
+        self._module = copy.deepcopy(module)
         self._contract = contract
         self._num_episodes = num_episodes
         self._source = source
@@ -279,7 +271,7 @@ class BatchSession(PolicySession):
         self._memories: list[tuple[Any, Memory, torch.Tensor]] = []
         for memory in memories:
             part = parts[memory.module]
-            value = part._c.getattr(memory.name).detach().to(device)
+            value = part._c.getattr(memory.name).detach()
             shape = list(value.shape)
             shape[memory.axis] = num_episodes
             self._memories.append((part, memory, value.expand(shape).clone()))
@@ -305,11 +297,9 @@ class CopiesSession(PolicySession):
 
     batched = False
 
-    def __init__(
-        self, module: Any, num_episodes: int, contract: PolicyContract, device: torch.device, source: str
-    ) -> None:
-        """Copy the module, which must be freshly reset and on the CPU."""
-        self._fresh = copy.deepcopy(module).to(device)
+    def __init__(self, module: Any, num_episodes: int, contract: PolicyContract, source: str) -> None:
+        """Copy the module, which must be freshly reset."""
+        self._fresh = copy.deepcopy(module)
         self._contract = contract
         self._source = source
         self._modules = [copy.deepcopy(self._fresh) for _ in range(num_episodes)]

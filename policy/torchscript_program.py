@@ -16,7 +16,8 @@ from typing import Any
 
 import torch
 
-from .program import PROGRAM_ERRORS, Budget, NotUnderstoodError, Program, convolution, linear, matmul
+from .native import PROGRAM_ERRORS
+from .program import Budget, NotUnderstoodError, Program, convolution, linear, matmul
 from .torchscript_archive import Archive, ScriptObject, read_archive
 
 _RESETS = ("reset", "reset_memory")

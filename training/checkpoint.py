@@ -207,7 +207,7 @@ def _load(file: Path, purpose: str) -> dict[str, Any]:
 def _check_policy(entries: Mapping[str, Any], source: str, purpose: str) -> None:
     """Refuse a checkpoint whose policy is damaged, or a program: training goes on with weights."""
     try:
-        network = read_policy(entries, source=source).network
+        _, network = read_policy(entries, source=source)
     except PolicyError as error:
         raise CheckpointError(f"Cannot {purpose.partition(' ')[0]}: {error}.") from error
     if isinstance(network, ForeignFile):

@@ -380,7 +380,7 @@ def test_copies_are_made_of_the_fresh_module(tmp_path, contract, cts_network):
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.jit.save(torch.jit.script(WithHistory(cts_network)), buffer)
         module = torch.jit.load(io.BytesIO(buffer.getvalue()))
-    session = CopiesSession(module, 1, contract, torch.device("cpu"), "policy")
+    session = CopiesSession(module, 1, contract, "policy")
     observation = torch.ones(1, 45)
     first = session.act(observation)
     module(observation)

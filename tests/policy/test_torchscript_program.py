@@ -243,7 +243,7 @@ def test_an_archive_that_holds_something_else_is_not_read():
     changed = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(script(SharedHead()))) as archive, zipfile.ZipFile(changed, "w") as target:
         for name in archive.namelist():
-            content = b"cos\nsystem\n(S'true'\ntR." if name.endswith("/data.pkl") else archive.read(name)
+            content = b"cos\nsystem\n(X\x04\0\0\0truetR." if name.endswith("/data.pkl") else archive.read(name)
             target.writestr(name, content)
     with pytest.raises(NotUnderstoodError, match=r"os\.system"):
         torchscript_program(changed.getvalue(), 45, source="file")
