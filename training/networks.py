@@ -6,7 +6,7 @@ borrows. Teacher encoder and critic exist in training only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,45 +15,67 @@ from torch import nn
 from torch.nn import functional
 
 from ..policy.networks import ARCHITECTURES, ExpertMixture, multilayer_perceptron
-from .configuration import ConfigurationError, NetworkConfiguration
+from .configuration import ConfigurationError, NetworkConfiguration, TrainingConfiguration
 
 
-def student_architecture(
-    configuration: NetworkConfiguration,
-    *,
-    frame_width: int,
-    num_actions: int,
-    history_length: int,
-    command_entries: Sequence[int],
-) -> tuple[str, dict[str, Any]]:
-    """Name and arguments, plain data, of the deployed network in ``policy.networks``.
+@dataclass(frozen=True, kw_only=True)
+class Widths:
+    """Sizes of an environment's observations and actions."""
 
-    Args:
-        configuration: sizes.
-        frame_width: width of one observation frame.
-        num_actions: width of an action.
-        history_length: frames that the student sees, the current one included.
-        command_entries: entries of a frame that hold the command, which the experts of ``moe_ng`` do not see.
+    environments: int
+    """Number of environments N."""
+    frame: int
+    """Width of a frame F."""
+    history: int
+    """Frames in a history H."""
+    privileged: int
+    """Width of the privileged state P."""
+    actions: int
+    """Width of an action J."""
+    command_entries: tuple[int, ...]
+    """Entries of a frame that hold the command."""
+
+    def arguments(self, latent_width: int) -> dict[str, Any]:
+        """Arguments, plain data, that all networks of ``policy.networks`` with an encoder have."""
+        return {
+            "frame_width": self.frame,
+            "num_actions": self.actions,
+            "history_length": self.history,
+            "latent_width": latent_width,
+        }
+
+
+def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason: str) -> dict[str, Any]:
+    """Arguments of a network of ``policy.networks`` whose encoder is plain.
 
     Raises:
-        ConfigurationError: ``moe_ng`` without command entries.
+        ConfigurationError: another encoder is asked for; ``reason`` says what of the method does not go with it.
     """
-    common: dict[str, Any] = {
-        "frame_width": frame_width,
-        "num_actions": num_actions,
-        "history_length": history_length,
-        "latent_width": configuration.latent_width,
+    network, method = configuration.network, configuration.algorithm.method
+    if network.student_encoder != "mlp":
+        raise ConfigurationError(
+            f"student_encoder is {network.student_encoder!r}; the method {method!r} {reason} and takes 'mlp'."
+        )
+    return {**widths.arguments(network.latent_width), "encoder_hidden": list(network.student_hidden)}
+
+
+def student_architecture(configuration: NetworkConfiguration, widths: Widths) -> tuple[str, dict[str, Any]]:
+    """Name and arguments, plain data, of the deployed network in ``policy.networks``.
+
+    Raises:
+        ConfigurationError: ``moe_ng`` without a command in the frame, which its experts are not to see.
+    """
+    common = {
+        **widths.arguments(configuration.latent_width),
         "actor_hidden": list(configuration.actor_hidden),
     }
     if configuration.student_encoder == "mlp":
         return "cts", {**common, "encoder_hidden": list(configuration.student_hidden)}
-    blind: list[int] = []
-    if configuration.student_encoder == "moe_ng":
-        if not command_entries:
-            raise ConfigurationError(
-                "student_encoder is 'moe_ng', but the observation frame has no command to hide from the experts."
-            )
-        blind = list(command_entries)
+    blind = list(widths.command_entries) if configuration.student_encoder == "moe_ng" else []
+    if configuration.student_encoder == "moe_ng" and not blind:
+        raise ConfigurationError(
+            "student_encoder is 'moe_ng', but the observation frame has no command to hide from the experts."
+        )
     return "moe_cts", {
         **common,
         "num_experts": configuration.expert_count,

@@ -4,11 +4,11 @@ from itertools import pairwise
 import pytest
 import torch
 from gaitgauge.training.algorithms.cts import CTS
-from gaitgauge.training.algorithms.gradients import clip_gradients
+from gaitgauge.training.algorithms.optimization import clip_gradients
 from gaitgauge.training.algorithms.symmetry import passes
 from gaitgauge.training.configuration import ConfigurationError, NetworkConfiguration
 from gaitgauge.training.environment_configuration import Ramp
-from gaitgauge.training.networks import CtsActor, CtsCritic, student_architecture
+from gaitgauge.training.networks import CtsActor, CtsCritic, Widths, student_architecture
 from gaitgauge.training.runner import TrainingRunner, command_entries
 from rsl_rl.modules.distribution import GaussianDistribution
 from toy_training import ACTIONS, FRAME, PRIVILEGED, ToyEnv, toy_configuration, toy_contract, toy_mirror
@@ -47,11 +47,10 @@ def test_published_sizes():
     def count(module):
         return sum(p.numel() for p in module.parameters())
 
+    widths = Widths(environments=8, frame=45, history=5, privileged=263, actions=12, command_entries=(6, 7, 8))
     for encoder, expected in (("mlp", 255_264), ("moe", 1_088_264), ("moe_ng", 1_080_584)):
         network = NetworkConfiguration(student_encoder=encoder)
-        architecture, arguments = student_architecture(
-            network, frame_width=45, num_actions=12, history_length=5, command_entries=(6, 7, 8)
-        )
+        architecture, arguments = student_architecture(network, widths)
         actor = CtsActor(network, privileged_width=263, architecture=architecture, arguments=arguments)
         assert count(actor.student.encoder) == expected
         assert count(actor.teacher_encoder) == 274_720

@@ -11,12 +11,10 @@ import torch
 
 from ...policy.layers import Experts, mixed
 from ..configuration import NetworkConfiguration, TrainingConfiguration
-from ..networks import StudentActor, ValueNetwork
+from ..networks import StudentActor, ValueNetwork, Widths
 from .composed import ComposedActor, composed_arguments
-from .cts import CTS
-from .cts_losses import CtsLosses
+from .cts import CTS, CtsLosses
 from .losses import POLICY_LOSSES, load_balance
-from .ppo import Widths
 
 
 class AcMoeActor(ComposedActor):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
-from .gradients import FlatGradients
+from .optimization import FlatGradients
 
 if TYPE_CHECKING:
     from .ppo import PPO

@@ -7,9 +7,8 @@ from typing import Any
 
 import torch
 
-from ..configuration import ConfigurationError, TrainingConfiguration
-from ..networks import CtsActor
-from .ppo import Widths
+from ..configuration import TrainingConfiguration
+from ..networks import CtsActor, Widths, plain_arguments
 
 
 def composed_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
@@ -19,17 +18,8 @@ def composed_arguments(configuration: TrainingConfiguration, widths: Widths) -> 
         ConfigurationError: the student's encoder is no plain one.
     """
     network = configuration.network
-    if network.student_encoder != "mlp":
-        raise ConfigurationError(
-            f"student_encoder is {network.student_encoder!r}; the method {configuration.algorithm.method!r} has its experts in "
-            "the actor and takes 'mlp'."
-        )
     return {
-        "frame_width": widths.frame,
-        "num_actions": widths.actions,
-        "history_length": widths.history,
-        "latent_width": network.latent_width,
-        "encoder_hidden": list(network.student_hidden),
+        **plain_arguments(configuration, widths, "has its experts in the actor"),
         "num_experts": network.expert_count,
         "expert_width": network.expert_width,
         "trunk_hidden": list(network.actor_hidden),

@@ -22,8 +22,8 @@ from torch import nn
 from ...policy.estimators import VELOCITY
 from ...policy.networks import multilayer_perceptron
 from ..configuration import TrainingConfiguration
+from ..networks import Widths
 from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments
-from .ppo import Widths
 
 _LEAST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE = -10.0, 10.0
 

@@ -18,11 +18,10 @@ from torch import nn
 from ...policy.estimators import VELOCITY
 from ...policy.networks import multilayer_perceptron
 from ..configuration import ConfigurationError, NetworkConfiguration, TrainingConfiguration
-from ..networks import StudentActor, ValueNetwork, last_in_float32
+from ..networks import StudentActor, ValueNetwork, Widths, last_in_float32, plain_arguments
 from .bootstrap import Bootstrap
 from .losses import Losses
-from .ppo import PPO, Widths
-from .storage import EnvironmentSplit, RolloutStorage
+from .ppo import PPO
 from .symmetry import VECTOR, MirrorMap
 
 
@@ -32,24 +31,13 @@ def estimator_arguments(configuration: TrainingConfiguration, widths: Widths) ->
     Raises:
         ConfigurationError: the encoder is no plain one, or the privileged state does not begin with velocity and frame.
     """
-    network, method = configuration.network, configuration.algorithm.method
-    if network.student_encoder != "mlp":
-        raise ConfigurationError(
-            f"student_encoder is {network.student_encoder!r}; the method {method!r} has one encoder and takes 'mlp'."
-        )
+    arguments = plain_arguments(configuration, widths, "has one encoder")
     if widths.privileged < VELOCITY + widths.frame:
         raise ConfigurationError(
-            f"The privileged observation is {widths.privileged} wide; the method {method!r} needs the base's velocity and the "
-            f"frame without noise at its beginning, {VELOCITY + widths.frame} entries."
+            f"The privileged observation is {widths.privileged} wide; the method {configuration.algorithm.method!r} needs the "
+            f"base's velocity and the frame without noise at its beginning, {VELOCITY + widths.frame} entries."
         )
-    return {
-        "frame_width": widths.frame,
-        "num_actions": widths.actions,
-        "history_length": widths.history,
-        "latent_width": network.latent_width,
-        "encoder_hidden": list(network.student_hidden),
-        "actor_hidden": list(network.actor_hidden),
-    }
+    return {**arguments, "actor_hidden": list(configuration.network.actor_hidden)}
 
 
 class EstimatorActor(StudentActor):
@@ -142,6 +130,7 @@ class EstimatorLosses(Losses):
 class EstimatorPPO(PPO):
     """PPO of an actor with an estimator. See the module docstring."""
 
+    estimated = VELOCITY
     actor_class: ClassVar[Any]
     """The method's ``EstimatorActor``, made of a ``TrainingConfiguration`` and ``Widths``."""
 
@@ -150,21 +139,6 @@ class EstimatorPPO(PPO):
         """See ``PPO``."""
         critic = StateCritic(configuration.network, privileged_width=widths.privileged)
         return cls.actor_class(configuration, widths), critic
-
-    @classmethod
-    def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:
-        """See ``PPO``."""
-        return RolloutStorage(
-            EnvironmentSplit.whole(widths.environments, device),
-            configuration.run.steps_per_iteration,
-            frame_width=widths.frame,
-            privileged_width=widths.privileged,
-            history_width=widths.history * widths.frame,
-            latent_width=VELOCITY + configuration.network.latent_width,
-            num_actions=widths.actions,
-            next_state_width=VELOCITY + widths.frame,
-            device=device,
-        )
 
     def latents(
         self, obs: TensorDict, privileged: torch.Tensor, history: torch.Tensor

@@ -20,8 +20,8 @@ from torch.nn import functional
 from ...policy.estimators import VELOCITY
 from ...policy.networks import multilayer_perceptron
 from ..configuration import HimConfiguration, TrainingConfiguration
+from ..networks import Widths
 from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments
-from .ppo import Widths
 
 
 class HimActor(EstimatorActor):

@@ -10,10 +10,9 @@ import torch
 from rsl_rl.modules.distribution import HeteroscedasticGaussianDistribution
 
 from ..configuration import ConfigurationError, TrainingConfiguration
-from ..networks import CtsCritic, StudentActor, ValueNetwork
+from ..networks import CtsCritic, StudentActor, ValueNetwork, Widths
 from .composed import ComposedActor, composed_arguments
 from .cts import CTS
-from .ppo import Widths
 
 
 class McpActor(ComposedActor):

@@ -7,7 +7,6 @@ A method is a class derived from ``PPO``: its networks, its storage, what the ac
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import torch
@@ -16,38 +15,19 @@ from tensordict import TensorDict
 from ...backends.warp.graphs import RecordedFunction
 from ...policy.fence.archive import LARGEST_FILE
 from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
-from ..networks import StudentActor, ValueNetwork
+from ..networks import StudentActor, ValueNetwork, Widths
 from ..processes import Processes
 from ..schedules import RampTable
 from .bootstrap import Bootstrap
-from .gradients import FlatGradients, clip_gradients
 from .losses import Losses
-from .moments import load_moments
-from .storage import RolloutStorage
+from .optimization import FlatGradients, clip_gradients, load_moments
+from .storage import EnvironmentSplit, RolloutStorage
 from .symmetry import Mirror, passes
 
 MOST_WEIGHTS = LARGEST_FILE // 24
 """A checkpoint has each weight as it is and averaged, with two moments, and a part of them once more as the policy, at 4 bytes."""
 GROUPS = ("policy", "history", "privileged")
 Step = Callable[..., None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Widths:
-    """Sizes of an environment's observations and actions."""
-
-    environments: int
-    """Number of environments N."""
-    frame: int
-    """Width of a frame F."""
-    history: int
-    """Frames in a history H."""
-    privileged: int
-    """Width of the privileged state P."""
-    actions: int
-    """Width of an action J."""
-    command_entries: tuple[int, ...]
-    """Entries of a frame that hold the command."""
 
 
 class PPO:
@@ -57,6 +37,8 @@ class PPO:
     """Losses of the method."""
     has_teacher: ClassVar[bool] = False
     """Whether a teacher acts in some environments (``student_period``)."""
+    estimated: ClassVar[int] = 0
+    """Entries of the next state before its frame, the base's velocity, that an encoder estimates beside its latent; 0 for none."""
 
     def __init__(
         self,
@@ -185,7 +167,15 @@ class PPO:
     @classmethod
     def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:
         """The method's storage of a rollout."""
-        raise NotImplementedError
+        period = configuration.algorithm.student_period if cls.has_teacher else 1
+        return RolloutStorage(
+            EnvironmentSplit.build(widths.environments, period, device),
+            configuration.run.steps_per_iteration,
+            widths,
+            latent_width=cls.estimated + configuration.network.latent_width,
+            next_state_width=cls.estimated + widths.frame if cls.estimated else 0,
+            device=device,
+        )
 
     @property
     def learning_rate(self) -> float:

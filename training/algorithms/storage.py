@@ -6,13 +6,16 @@ from dataclasses import dataclass
 
 import torch
 
+from ..networks import Widths
+
 
 @dataclass(frozen=True)
 class EnvironmentSplit:
     """Which environments belong to the teacher and which to the student.
 
     Environment i is a student's if i is a multiple of ``period`` (so every contiguous range of environments, and with
-    it every kind of terrain, holds both). Blocks: rows ``[0, num_teacher)`` are the teacher's, the rest the student's.
+    it every kind of terrain, holds both); with a period of 1 all are. Blocks: rows ``[0, num_teacher)`` are the teacher's,
+    the rest the student's.
     """
 
     num_teacher: int
@@ -29,7 +32,7 @@ class EnvironmentSplit:
         Raises:
             ValueError: too few environments for at least one of each.
         """
-        if num_envs < 2:
+        if period > 1 and num_envs < 2:
             raise ValueError(
                 f"{num_envs} environment(s) cannot be split into teacher and student; use at least {period}."
             )
@@ -40,12 +43,6 @@ class EnvironmentSplit:
         inverse[order] = index
         num_student = (num_envs + period - 1) // period
         return cls(num_teacher=num_envs - num_student, num_student=num_student, order=order, inverse=inverse)
-
-    @classmethod
-    def whole(cls, num_envs: int, device: torch.device | str) -> EnvironmentSplit:
-        """All environments are the student's: there is no teacher."""
-        index = torch.arange(num_envs, device=device)
-        return cls(num_teacher=0, num_student=num_envs, order=index, inverse=index)
 
 
 class RolloutStorage:
@@ -61,13 +58,10 @@ class RolloutStorage:
         self,
         split: EnvironmentSplit,
         num_steps: int,
+        widths: Widths,
         *,
-        frame_width: int,
-        privileged_width: int,
-        history_width: int,
         latent_width: int,
-        num_actions: int,
-        next_state_width: int = 0,
+        next_state_width: int,
         device: torch.device | str,
     ) -> None:
         """Allocate for ``num_steps`` steps."""
@@ -80,13 +74,13 @@ class RolloutStorage:
         self.num_envs = split.num_teacher + split.num_student
         self.step = 0
         """Steps stored so far."""
-        self.policy = zeros(self.num_envs, frame_width)
-        self.privileged = zeros(self.num_envs, privileged_width)
-        self.student_history = zeros(split.num_student, history_width)
+        self.policy = zeros(self.num_envs, widths.frame)
+        self.privileged = zeros(self.num_envs, widths.privileged)
+        self.student_history = zeros(split.num_student, widths.history * widths.frame)
         self.student_latent = zeros(split.num_student, latent_width)
-        self.actions = zeros(self.num_envs, num_actions)
-        self.action_mean = zeros(self.num_envs, num_actions)
-        self.action_std = zeros(self.num_envs, num_actions)
+        self.actions = zeros(self.num_envs, widths.actions)
+        self.action_mean = zeros(self.num_envs, widths.actions)
+        self.action_std = zeros(self.num_envs, widths.actions)
         self.log_prob = zeros(self.num_envs)
         self.values = zeros(self.num_envs)
         self.rewards = zeros(self.num_envs)
