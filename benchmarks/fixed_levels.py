@@ -31,9 +31,9 @@ from gaitgauge.training.terminations import Ends
 LOOKED_AT = ("steps", "moving", "along base", "along command", "off 45", "off 90")
 
 
-def ahead(speed: float) -> CommandConfiguration:
-    """The same forward speed [m/s] for whole episodes, each of which holds the heading that it begins with."""
-    stage = CommandStage(begin=0.0, forward=(speed, speed), lateral=(0.0, 0.0), yaw=(-1.0, 1.0))
+def steady(forward: float, lateral: float) -> CommandConfiguration:
+    """The same speeds [m/s] for whole episodes, each of which holds the heading that it begins with."""
+    stage = CommandStage(begin=0.0, forward=(forward, forward), lateral=(lateral, lateral), yaw=(-1.0, 1.0))
     never = Ramp(start=0.0, end=0.0)
     return CommandConfiguration(
         stages=(stage,),
@@ -56,7 +56,7 @@ class FixedLevels:
         kind: str,
         levels: Sequence[int],
         worlds: int,
-        speed: float | None,
+        speeds: tuple[float, float] | None,
         settings: Sequence[str],
     ) -> None:
         """Build the worlds.
@@ -66,7 +66,7 @@ class FixedLevels:
             kind: a kind of tile.
             levels: which levels.
             worlds: how many worlds in all.
-            speed: command this throughout [m/s]; None for the task's commands.
+            speeds: command these throughout, forward and to the left [m/s]; None for the task's commands.
             settings: ``environment.…=value``.
         """
         configuration = find_task("go2-moe-cts", settings).environment
@@ -74,7 +74,7 @@ class FixedLevels:
         configuration = replace(
             configuration,
             num_envs=worlds,
-            commands=configuration.commands if speed is None else ahead(speed),
+            commands=configuration.commands if speeds is None else steady(*speeds),
             terrain=replace(configuration.terrain, tiles=tiles),
             schedule=replace(configuration.schedule, begin=1.0),
         )
@@ -163,17 +163,20 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=32, help="worlds in all")
     parser.add_argument("--seconds", type=float, default=25.0, help="time to play; an episode lasts 25 s")
     parser.add_argument("--ahead", type=float, help="command this forward speed throughout, at the first heading [m/s]")
+    parser.add_argument("--aside", type=float, help="command this speed to the left throughout, likewise [m/s]")
     parser.add_argument("--terms", action="store_true", help="rewards term by term")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     settings = [p for p in arguments.policies if "=" in p]
+    given = arguments.ahead, arguments.aside
+    speeds = None if given == (None, None) else (arguments.ahead or 0.0, arguments.aside or 0.0)
     for policy in (p for p in arguments.policies if "=" not in p):
         played = FixedLevels(
             policy,
             kind=arguments.kind,
             levels=arguments.levels,
             worlds=arguments.worlds,
-            speed=arguments.ahead,
+            speeds=speeds,
             settings=settings,
         )
         played.play(arguments.seconds)

@@ -64,7 +64,7 @@ class TileShape:
     """Rise over run."""
     stair_riser: tuple[float, float] = (0.05, 0.23)
     """Mean height of a step [m]."""
-    stair_tread: Range = (0.26, 0.36)
+    stair_tread: Range = (0.28, 0.36)
     """Range of a flight's mean depth of a step [m]."""
     stair_irregularity: float = 0.15
     """Treads and risers of one flight differ from their mean by up to a share, drawn from 0 to this."""
@@ -84,7 +84,7 @@ class TileShape:
     """Range of the distance between two bars [m]."""
     bar_height: Range = (0.8, 1.0)
     """Range of a bar's height as a share of ``obstacle_height``."""
-    wave_steepness: tuple[float, float] = (0.20, 0.50)
+    wave_steepness: tuple[float, float] = (0.20, 0.60)
     """Largest gradient of each of the two waves, 2 pi amplitude / length."""
     wave_length: Range = (1.4, 2.8)
     """Range of each wave's length [m]."""

@@ -56,8 +56,8 @@ class TerrainConfiguration:
     """Dimensions of the tiles."""
     levels: Annotated[int, Field(ge=1, le=1000)] = NUM_TILE_LEVELS
     """Number of levels, from the easiest."""
-    variants: Annotated[int, Field(ge=1, le=1000)] = 4
-    """Different tiles per kind and level, where a kind has chance in it."""
+    variants: Annotated[int, Field(ge=1, le=1000)] = 16
+    """Different tiles per kind and level, where a kind has chance in it. With four, chance makes a level harder than the next."""
     seed: Seed = 0
     """Seed of the tiles' chance."""
     curriculum: bool = True

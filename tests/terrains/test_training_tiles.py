@@ -62,7 +62,7 @@ def test_stairs(level, seed, points):
         assert at[0] == pytest.approx(1.3, abs=1e-3) and at[-1] <= 3.8 + 1e-3
         assert np.all(np.abs(risers / mean - 1.0) <= 0.15 + 1e-6)
         treads = np.diff(at)
-        assert np.all((treads >= 0.26 * 0.85 - 2e-3) & (treads <= 0.36 * 1.15 + 2e-3))
+        assert np.all((treads >= 0.28 * 0.85 - 2e-3) & (treads <= 0.36 * 1.15 + 2e-3))
         # The same all round.
         line = np.interp(radius, distance, height)
         far_from_edges = np.abs(radius[:, None] - at).min(axis=1) > 2e-3
@@ -203,7 +203,7 @@ def test_bad_requests():
         make_tile("stairs_upp", 0)
     with pytest.raises(TerrainError, match="levels 0 to 11, not 12"):
         make_tile("wave", 12)
-    with pytest.raises(TerrainError, match=r"leaves no room for two steps of 0\.26 m within 3\.8 m"):
+    with pytest.raises(TerrainError, match=r"leaves no room for two steps of 0\.28 m within 3\.8 m"):
         TileShape(platform_radius=3.7)
     with pytest.raises(TerrainError, match=r"obstacle_free_radius is 4\.0 m"):
         TileShape(obstacle_free_radius=4.0)
