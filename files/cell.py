@@ -71,7 +71,6 @@ def enclose(kept: int, owner: int, readable: Iterable[Path] = ()) -> tuple[str, 
 
     Args:
         kept: descriptor of the connection with its owner.
-        owner: process id.
         readable: as for ``lock``.
 
     Returns:

@@ -88,9 +88,7 @@ def read_text(path: Path, what: str, error: type[Exception], *, largest: int = L
     """The text of a file.
 
     Args:
-        path: the file.
         what: what it is, for the sentence (``suite file``).
-        error: class of the error.
         largest: size that is not exceeded [bytes].
 
     Raises:
@@ -157,7 +155,6 @@ def edited(source: str, error: type[Exception], *others: type[Exception]) -> Ite
 
     Args:
         source: the file, the beginning of the sentence.
-        error: class of the error.
         others: errors, beside those of Python's own lookups and arithmetic, that mean the same.
     """
     caught: tuple[type[Exception], ...] = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, *others)
@@ -253,7 +250,6 @@ def build(kind: type[Kind], data: object, source: str, error: type[Exception]) -
         kind: the dataclass; its annotations are the rules.
         data: what a parser above gave; lists stand for tuples.
         source: where the data come from, the beginning of every sentence.
-        error: class of the error.
 
     Raises:
         error: an unknown or missing field, a value of another type or out of range, or what ``__post_init__`` refuses.

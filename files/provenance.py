@@ -33,9 +33,6 @@ def provenance(
     """Where a result comes from, as plain data.
 
     Args:
-        command: the command line.
-        device: torch device.
-        threads: CPU threads.
         digests: SHA-256 by what it is of (``policy``, ``robot``, ``suite``).
         measured: entries of the caller's own, such as ``seconds``.
     """

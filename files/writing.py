@@ -28,8 +28,6 @@ def replacing(path: Path, error: type[Exception], *, durable: bool = True, endin
     """A path to write to in place of ``path``, which gets its name at the end; at an error it goes, and ``path`` stays as it was.
 
     Args:
-        path: the file that is to be.
-        error: class of the error.
         durable: wait until the disk has it; otherwise it survives the end of the process, not that of the machine.
         ending: of the name, for libraries that go by it.
 

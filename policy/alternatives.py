@@ -45,12 +45,7 @@ class Alternative:
 
 
 def alternatives(contract: PolicyContract, robot: Robot) -> list[Alternative]:
-    """All contracts that are one likely mistake away from this one, none twice.
-
-    Args:
-        contract: what was said of a policy.
-        robot: the robot that it is for.
-    """
+    """All contracts that are one likely mistake away from this one, none twice."""
     found: dict[str, Alternative] = {contract.hash: Alternative(kind="", text="", contract=contract)}
     for make in (_joint_orders, _action_scales, _histories, _scales, _gains, _poses, _term_orders):
         for each in make(contract, robot):

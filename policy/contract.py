@@ -267,7 +267,6 @@ def standard_contract(
     Args:
         robot: gives the joints, the standing pose, the gains and the command limits.
         history: frames in the network's input, None for the current one alone.
-        provenance: where the policy comes from.
     """
     motors = robot.parameters[robot.default_parameters]
     return PolicyContract(

@@ -41,10 +41,7 @@ class FencedPolicy(FilePolicy):
         """Try the program on zeros and find out how to run it in batches.
 
         Args:
-            stored: the file.
             child: the process that has loaded it.
-            contract: of the policy.
-            path: for messages.
             attributes: names that the file's classes declare, for TorchScript.
 
         Raises:

@@ -19,7 +19,6 @@ def robot_for(contract: PolicyContract, asked: str | None = None) -> Robot:
     """The robot to run a policy on. Where it is not as the policy remembers it, a notice says so.
 
     Args:
-        contract: the policy's.
         asked: name of a robot, or the path of its ``robot.toml``; None for the policy's own.
 
     Raises:

@@ -92,7 +92,6 @@ def save_policy(path: str | Path, contract: PolicyContract, network: StoredNetwo
     Args:
         path: conventionally ``model_<iteration>.pt`` for a checkpoint and ``<name>.gauge.pt`` for an import.
         contract: what the policy expects of the loop that runs it.
-        network: the network.
 
     Raises:
         PolicyError: the network does not fit the contract, or the file cannot be written.
@@ -153,7 +152,6 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> tuple[PolicyContr
 
     Args:
         entries: the dictionary; its ``format`` has been checked.
-        source: name for messages.
 
     Raises:
         PolicyError: the file is of another version, incomplete or malformed.

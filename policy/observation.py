@@ -35,7 +35,6 @@ class ObservationBuilder:
         """Prepare buffers and index maps.
 
         Args:
-            contract: what the policy expects.
             robot: the robot whose joint order the physics uses.
             num_episodes: number of rows N.
             device: where the physics' tensors live.

@@ -54,7 +54,6 @@ class OnnxFile:
 
         Args:
             data: the content, after ``fence.graph.check_graph`` and with all its weights.
-            source: name for messages.
 
         Raises:
             PolicyError: onnxruntime does not take it, or it has not exactly one float input of shape (batch, width).

@@ -28,7 +28,6 @@ def onnx_program(data: bytes, width: int, *, source: str) -> Program:
     Args:
         data: the file, its weights inside.
         width: entries of an observation.
-        source: name for messages.
 
     Returns:
         The program, which has no memory.

@@ -150,7 +150,6 @@ class Program:
         Args:
             step: observation (1, F) float32, then each memory, to action and then each memory.
             initial: the memories of a robot that has just begun.
-            source: name for messages.
         """
         self._step = step
         self.initial = tuple(value.detach().clone() for value in initial)

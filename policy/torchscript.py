@@ -61,7 +61,6 @@ def load_module(data: bytes, *, source: str) -> Any:
 
     Args:
         data: the archive, after ``fence.script.check_script``: loading it may run code of its own.
-        source: name for messages.
 
     Raises:
         PolicyError: the archive is damaged, or its methods use an operator that is not on the list.
@@ -180,7 +179,6 @@ class ScriptProgram:
         """Find out how to run the module in batches.
 
         Args:
-            contract: of the policy.
             attributes: names of all attributes that the archive's classes declare; torch itself lists only parameters and
                 buffers.
 

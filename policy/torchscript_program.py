@@ -78,9 +78,7 @@ def torchscript_program(data: bytes, width: int, *, source: str) -> Program:
     """Follow a TorchScript file's ``forward`` on one observation.
 
     Args:
-        data: the file.
         width: entries of an observation.
-        source: name for messages.
 
     Returns:
         The program. Its memories are what ``forward`` changes.

@@ -32,7 +32,6 @@ def check_robot(robot: Robot, *, foreign: bool = False) -> None:
     ``stand_height``. A robot whose files have not changed is checked once in a process.
 
     Args:
-        robot: description and model.
         foreign: somebody else wrote it: it is compiled and checked in a process of its own, with limits of time and memory.
 
     Raises:

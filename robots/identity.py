@@ -52,7 +52,6 @@ def identify(robot: Robot, source: str) -> dict[str, Any]:
     """What a policy is to remember of a robot, as plain data.
 
     Args:
-        robot: the robot.
         source: how it was asked for: a name or a path.
 
     Raises:
@@ -138,7 +137,6 @@ def unpacked(known: RobotIdentity, folder: Path, *, largest: int = _LARGEST_UNPA
 
     Args:
         known: the robot, perhaps a stranger's.
-        folder: where its files go.
         largest: their size once they are unpacked, at most [bytes].
 
     Raises:

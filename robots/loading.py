@@ -106,7 +106,6 @@ def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
     A name that leads nowhere is left out; MuJoCo refuses such a model.
 
     Args:
-        mjcf: the model's file.
         within: folder in which all must lie, links followed; None for anywhere.
 
     Raises:

@@ -36,7 +36,6 @@ def box_top(box: Box, x: FloatArray, y: FloatArray) -> FloatArray:
     """Height at which the vertical line through (x, y) leaves a box.
 
     Args:
-        box: the solid.
         x: world frame [m], any shape.
         y: world frame [m], same shape as ``x``.
 
@@ -74,7 +73,6 @@ def height_field_top(field: HeightField, x: FloatArray, y: FloatArray) -> FloatA
     Each cell has the diagonal from its node of lowest x and y to that of highest x and y; each triangle is flat.
 
     Args:
-        field: the grid.
         x: world frame [m], any shape.
         y: world frame [m], same shape as ``x``.
 

@@ -139,7 +139,6 @@ def make_tile(kind: str, level: int, seed: int = 0, *, shape: TileShape = DEFAUL
         kind: a key of ``TILE_KINDS``.
         level: 0..11.
         seed: chooses among the tiles of a random kind; the same arguments give the same tile. Other kinds ignore it.
-        shape: dimensions.
 
     Returns:
         A terrain with one spawn, ``train``, on the ground in the middle. Its family is ``tile_field`` for the kinds

@@ -118,7 +118,6 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: s
     """Read a training checkpoint onto the CPU.
 
     Args:
-        path: the file.
         training_state: whether it must hold what training needs to continue; otherwise a policy file will do.
         purpose: what it is read for, in the sentences on what is wrong.
 
@@ -239,8 +238,6 @@ def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False)
     (``--init-from``), with its teacher and its critic.
 
     Args:
-        source: the checkpoint.
-        destination: the policy file.
         raw: the weights after the last update instead of their average.
 
     Raises:

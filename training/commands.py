@@ -93,11 +93,9 @@ class CommandGenerator:
         """Put ranges on the device.
 
         Args:
-            configuration: what to draw.
             terrain_limits: largest forward, lateral and yaw speed of each kind of terrain.
             control_period: [s].
             max_episode_length: control steps in the longest episode.
-            device: where draws happen.
 
         Raises:
             ConfigurationError: the stages are not in order, or the first does not begin at 0.

@@ -87,8 +87,6 @@ class Levels:
         """Put the tiles' indices on the device.
 
         Args:
-            configuration: distances and switches.
-            palette: the tiles.
             kind: kind of tile of every world, (N,) int64.
 
         Raises:
@@ -148,7 +146,6 @@ def next_level(
     made. Who masters the last level starts anywhere again, so that easy tiles are not forgotten.
 
     Args:
-        configuration: distances and switches.
         level: present level from 0, (N,) int64.
         num_levels: L.
         farthest: largest distance from the tile's middle in the episode [m], (N,).

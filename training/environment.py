@@ -64,7 +64,6 @@ class TrainingEnvironment(VecEnv):
         """Build the worlds and begin their first episodes.
 
         Args:
-            configuration: the environment's settings.
             backend: an engine's registry name, or a function that makes one from a scene.
             device: torch device of the physics and of everything else.
             threads: CPU threads for engines that use them.

@@ -32,7 +32,6 @@ class EpisodeLog:
         Args:
             rewards: names of the reward terms.
             terminations: names of the rules that end episodes.
-            palette: the tiles.
             kind: kind of tile of every world, (N,) int64.
             control_period: [s].
         """

@@ -27,7 +27,6 @@ class HeightRasters:
             terrains: the palette; terrain index 0 is the first.
             half_size: extent of the rasters from the origin in every direction [m].
             cell: distance between nodes [m].
-            device: where queries will be made.
         """
         steps = round(half_size / cell)
         self.cell = cell

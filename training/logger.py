@@ -85,7 +85,6 @@ class RunLogger:
         Args:
             configuration: steps of an iteration, and every which environment is a student's.
             num_envs: environments of this process.
-            processes: of the run.
             device: of the environments' rewards.
             has_teacher: whether a teacher acts in the other environments.
         """

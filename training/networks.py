@@ -102,10 +102,7 @@ class StudentActor(nn.Module):
         """Build student and noise.
 
         Args:
-            configuration: sizes.
             architecture: name in ``policy.networks.ARCHITECTURES`` of the student network.
-            arguments: its arguments.
-            distribution: of the actions.
         """
         super().__init__()
         self.architecture = architecture
@@ -156,7 +153,6 @@ class CtsActor(StudentActor):
         """Build all parts.
 
         Args:
-            configuration: sizes.
             privileged_width: width of the teacher's input.
             student: what ``StudentActor`` takes.
         """

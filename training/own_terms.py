@@ -32,10 +32,6 @@ class _Named(Protocol):
 def resolve(path: str, setting: str) -> Callable[..., Any]:
     """The function or class at ``module:name``. What it raises when it is called, and is not of this package, is one sentence.
 
-    Args:
-        path: what a setting holds.
-        setting: the setting's name, for messages.
-
     Raises:
         ConfigurationError: there is no such module or function, or importing it fails.
     """
@@ -66,8 +62,6 @@ def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> C
     """The class at ``module:name``.
 
     Args:
-        path: what a setting holds.
-        setting: the setting's name, for messages.
         base: what it must be derived from.
         methods: what is called of its instances.
 
@@ -100,8 +94,6 @@ def resolve_own(
     """The functions of all terms by name.
 
     Args:
-        terms: of one's own.
-        setting: the setting that holds them, for messages.
         taken: names that they cannot have.
         gives: whether a function's result is what it must be, from its first argument and the result; None where nothing is
             looked at.
@@ -144,7 +136,6 @@ def guarded(call: Callable[..., Any], where: str) -> Callable[..., Any]:
     """Somebody's code, of which whatever it raises, its wish to end the program included, is one sentence.
 
     Args:
-        call: a function or a class.
         where: the beginning of the sentence.
     """
 

@@ -62,11 +62,9 @@ class TrainingRunner:
 
         Args:
             env: gives the groups ``policy``, ``history`` and ``privileged``.
-            configuration: settings of learning.
             contract: of the policy that is trained, one observation frame wide.
             task: name of the task, kept in checkpoints.
             log_dir: run directory, None to leave nothing behind.
-            device: where to learn.
             processes: of the run, None for this one alone.
             mirror: left-right mirror maps, needed if the algorithm uses symmetry.
             scorer: gauges the student every ``run.gauge_interval`` iterations.

@@ -67,11 +67,7 @@ class EnvironmentStep:
         """Allocate everything.
 
         Args:
-            configuration: the environment's settings.
-            robot: the robot.
-            parameters: its joint constants.
             contract: the policy's interface, one frame of observation.
-            palette: the tiles.
             kind: kind of tile of every world, (N,) int64.
             inputs: tensors that the physics state is copied into before each part.
             generator: where uniform numbers come from.

@@ -36,12 +36,8 @@ class StepReader:
         """Prepare constants.
 
         Args:
-            configuration: the environment's settings.
-            robot: the robot.
-            palette: the tiles.
             kind: kind of tile of every world, (N,) int64.
             scan: points of the height scan about the base [m], (P, 2).
-            rasters: heights of the ground.
         """
         self._settings, self._rasters = configuration.rewards, rasters
         self._joint_velocity_limit = configuration.termination.joint_velocity

@@ -54,10 +54,6 @@ def archive_names(data: bytes, *, source: str) -> frozenset[str]:
 def read_archive(data: bytes, *, source: str) -> dict[str, bytes]:
     """All records of an archive by their names without the folder that holds them all.
 
-    Args:
-        data: the file's content.
-        source: name for messages.
-
     Raises:
         PolicyError: not an archive of torch's form, damaged (a checksum is wrong), or larger than ``LARGEST_FILE`` unpacked.
     """

@@ -93,8 +93,6 @@ class Child:
 
         Args:
             make: loads a program, given its content and its name for messages.
-            data: the program.
-            source: its name for messages.
 
         Raises:
             PolicyError: it cannot be loaded, takes too long or too much memory.

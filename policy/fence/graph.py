@@ -25,8 +25,6 @@ def check_graph(data: bytes, *, source: str, folder: Path | None) -> onnx.ModelP
     """Read an ONNX file with the weights that lie beside it, and refuse it if it could do anything but compute.
 
     Args:
-        data: the file's content.
-        source: name for messages.
         folder: where weights stored beside the file are; None: none may be.
 
     Raises:

@@ -290,7 +290,6 @@ def check_tensors(calls: Iterator[Call], sizes: Mapping[str, int], *, source: st
     Args:
         calls: those that make tensors.
         sizes: of the archive's records of tensors by key [bytes].
-        source: name for messages.
 
     Raises:
         PolicyError: a tensor's storage is missing or too short, or spelled out all tensors occupy over ``LARGEST_FILE``.

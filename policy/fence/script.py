@@ -62,10 +62,6 @@ class ScriptFile:
 def check_script(data: bytes, *, source: str) -> ScriptFile:
     """Read a TorchScript file, and refuse it if it could do anything but compute.
 
-    Args:
-        data: the file's content.
-        source: name for messages.
-
     Raises:
         PolicyError: it is damaged, too large, or uses what is not on the list of operators; the message names that.
     """

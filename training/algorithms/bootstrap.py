@@ -35,10 +35,7 @@ class Bootstrap:
 
         Args:
             algorithm: whose rollout and settings count.
-            iterations: how long it lasts.
-            parameters: what is learned.
             losses: from the rows of a minibatch, one tensor for each group of environments, to one number for each name.
-            names: of the losses.
         """
         self._algorithm = algorithm
         self._left = iterations

@@ -77,7 +77,6 @@ def swapped_prediction(
         source: cosines of the embeddings with the prototypes, (B, K).
         target: those of the next states' embeddings, (B, K).
         counts: 1 for samples that count, else 0, (B,).
-        settings: temperatures and iterations.
     """
     codes = [sinkhorn(scores, counts, settings) for scores in (source, target)]
     predictions = [functional.log_softmax(scores / settings.temperature, dim=-1) for scores in (source, target)]
@@ -93,7 +92,6 @@ def sinkhorn(scores: torch.Tensor, counts: torch.Tensor, settings: HimConfigurat
     Args:
         scores: cosines, (B, K).
         counts: 1 for samples that count, else 0, (B,); the others do not take part and have codes of zero.
-        settings: sharpness and iterations.
     """
     codes = torch.exp((scores - scores.max()) / settings.code_sharpness) * counts[:, None]
     for _ in range(settings.sinkhorn_iterations):

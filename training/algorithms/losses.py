@@ -42,9 +42,6 @@ class Losses:
 
         Args:
             actor: student, exploration noise, and what else learns with them.
-            critic: values.
-            storage: the rollout.
-            settings: of the algorithm.
             mirror: mirror maps on the storage's device, None without symmetry.
             cached_casts: whether weights in bfloat16 may be kept within a pass; they would outlive the weights in a CUDA graph.
         """

@@ -17,7 +17,6 @@ def clip_gradients(parameters: Iterable[nn.Parameter], limit: float) -> tuple[to
 
     Args:
         parameters: those without a gradient are left out.
-        limit: largest norm.
 
     Returns:
         The norm before, and 1.0 if the gradients were dropped, else 0.0; both ().
@@ -56,7 +55,6 @@ def load_moments(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> 
 
     Args:
         optimizer: of the same parameters.
-        state: from the checkpoint.
 
     Returns:
         The learning rate that it had, of the first group.

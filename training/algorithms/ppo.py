@@ -114,11 +114,9 @@ class PPO:
         Args:
             observations: the groups ``policy`` (N, F), ``history`` (N, H·F) frame by frame, oldest first, and
                 ``privileged`` (N, P).
-            configuration: settings of learning.
             num_actions: width J of an action.
             command_entries: entries of a frame that hold the command.
             mirror: mirror maps, needed for symmetry.
-            device: where to learn.
             processes: of the run, None for this one alone.
 
         Raises:

@@ -100,8 +100,6 @@ class RolloutStorage:
 
         Args:
             last_values: values of the states after the last step, (N,).
-            discount: γ.
-            gae_lambda: λ.
         """
         advantage = torch.zeros_like(last_values)
         following = last_values

@@ -28,11 +28,8 @@ def fold_sweep(
     """Write ``sweep.json``, ``sweep.html``, ``curves.csv``, and the comparison of the entries where two or more have a score.
 
     Args:
-        sweep: what was asked for.
-        runs: its runs.
         refused: why entries could not start, by name.
         failures: why runs failed, by label.
-        folder: where the files go.
 
     Returns:
         The content of ``sweep.json``: ``runs``, ``entries``, their differences ``across_seeds``, and ``sentences``.
