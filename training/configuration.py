@@ -6,13 +6,12 @@ The numbers are those of concurrent teacher-student learning as published with i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
-from enum import Enum
+from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Annotated, Any
 
 from pydantic import Field
+from pydantic_core import to_jsonable_python
 
 from ..files.parsing import Count, NotNegative, Positive, Seed
 from .environment_configuration import Ramp
@@ -240,23 +239,10 @@ class TrainingConfiguration:
 
 
 def to_plain(value: Any) -> Any:
-    """Configuration as plain data that YAML and JSON can hold and read back safely.
-
-    Dataclasses and mappings become dictionaries, tuples lists, enumerations their values, paths strings.
+    """Configuration as plain data that YAML and JSON can hold and read back safely: dataclasses and mappings become dictionaries,
+    tuples lists, paths texts.
 
     Raises:
-        TypeError: a value has no plain form.
+        ValueError: a value has no plain form.
     """
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(k): to_plain(v) for k, v in value.items()}
-    if isinstance(value, Enum):
-        return to_plain(value.value)
-    if isinstance(value, PurePath):
-        return str(value)
-    if isinstance(value, list | tuple | set | frozenset):
-        return [to_plain(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    raise TypeError(f"A configuration value of type {type(value).__name__} has no plain form: {value!r}.")
+    return to_jsonable_python(value)

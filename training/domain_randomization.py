@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 
 import torch
 
@@ -15,43 +14,24 @@ MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_offset")
 """Names of the uniform numbers that a reset takes, one column per joint each."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class BodyParameters:
-    """Drawn once per world."""
-
-    friction: torch.Tensor
-    """Effective sliding friction, (N,)."""
-    base_mass_offset: torch.Tensor
-    """[kg], (N,)."""
-    link_mass_scale: torch.Tensor
-    """(N, bodies)."""
-    base_com_offset: torch.Tensor
-    """[m], (N, 3)."""
-
-    def by_name(self) -> dict[str, torch.Tensor]:
-        """The values by their names."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    def apply(self, backend: PhysicsBackend) -> None:
-        """Write the values into the physics of all worlds."""
-        backend.randomize(Randomization(**self.by_name()))
-
-
 def draw_bodies(
     ranges: RandomizationConfiguration, num_envs: int, num_bodies: int, generator: torch.Generator
-) -> BodyParameters:
-    """Draw friction, masses and centres of mass for ``num_envs`` worlds, on the generator's device."""
+) -> dict[str, torch.Tensor]:
+    """What is drawn once per world, on the generator's device, by the names of ``Randomization``: effective sliding friction (N,),
+    what is added to the base's mass [kg] (N,), factors on the other bodies' masses (N, bodies), and the shift of the base's centre
+    of mass [m] (N, 3).
+    """
 
     def between(bounds: Range, *shape: int) -> torch.Tensor:
         values = torch.empty(num_envs, *shape, device=generator.device)
         return values.uniform_(bounds[0], bounds[1], generator=generator)
 
-    return BodyParameters(
-        friction=between(ranges.friction),
-        base_mass_offset=between(ranges.base_mass),
-        link_mass_scale=between(ranges.link_mass, num_bodies),
-        base_com_offset=between(ranges.base_com, 3),
-    )
+    return {
+        "friction": between(ranges.friction),
+        "base_mass_offset": between(ranges.base_mass),
+        "link_mass_scale": between(ranges.link_mass, num_bodies),
+        "base_com_offset": between(ranges.base_com, 3),
+    }
 
 
 class MotorParameters:

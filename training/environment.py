@@ -9,14 +9,14 @@ in a step waits for the device.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from ..backends.base import PhysicsBackend, ResetState, Scene
+from ..backends.base import PhysicsBackend, Randomization, ResetState, Scene
 from ..backends.registry import make_backend
 from ..backends.warp.graphs import WARM_UP, RecordedFunction
 from ..policy.contract import History, PolicyContract, standard_contract
@@ -27,7 +27,7 @@ from ..robots.registry import load_robot
 from .commands import largest_commands
 from .configuration import ConfigurationError
 from .curriculum import assign_kinds, build_palette
-from .domain_randomization import BodyParameters, draw_bodies
+from .domain_randomization import draw_bodies
 from .environment_configuration import EnvironmentConfiguration
 from .environment_memory import fitting
 from .events import EpisodeStart
@@ -122,7 +122,7 @@ class TrainingEnvironment(VecEnv):
         self._bodies = draw_bodies(
             configuration.randomization, self.num_envs, len(self.robot.collision_bodies), self._generator
         )
-        self._bodies.apply(self.backend)
+        self.backend.randomize(Randomization(**self._bodies))
         schedule = configuration.schedule
         if not 0.0 <= schedule.begin <= 1.0:
             raise ConfigurationError(f"schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1")
@@ -256,8 +256,7 @@ class TrainingEnvironment(VecEnv):
         )
 
     def _pack(self, observations: Observations) -> TensorDict:
-        groups = {f.name: getattr(observations, f.name) for f in fields(observations)}
-        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+        return TensorDict(dict(vars(observations)), batch_size=[self.num_envs], device=self.device)
 
     def _log(self) -> dict[str, torch.Tensor]:
         """What happened since the last log, as tensors on the device."""
@@ -274,7 +273,7 @@ class TrainingEnvironment(VecEnv):
             "version": STATE_VERSION,
             "step": self.parts.memory.step.clone(),
             "level": self.parts.memory.level.to(torch.int16),
-            "bodies": {name: value.clone() for name, value in self._bodies.by_name().items()},
+            "bodies": {name: value.clone() for name, value in self._bodies.items()},
             "common_step_counter": self.common_step_counter,
         }
 
@@ -291,8 +290,8 @@ class TrainingEnvironment(VecEnv):
             "version": STATE_VERSION,
             "memory": self.parts.memory.snapshot(),
             "motors": self.parts.motors.snapshot(),
-            "bodies": {name: value.clone() for name, value in self._bodies.by_name().items()},
-            "observations": {f.name: getattr(self._observations, f.name).clone() for f in fields(self._observations)},
+            "bodies": {name: value.clone() for name, value in self._bodies.items()},
+            "observations": {name: value.clone() for name, value in vars(self._observations).items()},
             "generator": self._generator.get_state(),
             "common_step_counter": self.common_step_counter,
             "physics": {name: getattr(state, name).clone() for name in AFTER_RESET},
@@ -320,12 +319,9 @@ class TrainingEnvironment(VecEnv):
         self._require_below(parts.memory.level, self.palette.num_levels, "level")
         self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")
         parts.motors.restore(state["motors"])
-        self._bodies = BodyParameters(**fitting(state["bodies"], self._bodies.by_name()))
-        self._bodies.apply(self.backend)
+        self._take_bodies(state["bodies"])
         parts.motors.apply(self.backend)
-        observed = {f.name: getattr(self._observations, f.name) for f in fields(self._observations)}
-        kept = fitting(state["observations"], observed)
-        self._observations = Observations(**{name: value.clone() for name, value in kept.items()})
+        self._observations = Observations(**fitting(state["observations"], vars(self._observations))).clone()
         self._generator.set_state(state["generator"].cpu())
         self.common_step_counter = int(state["common_step_counter"])
         physics = fitting(state["physics"], {name: getattr(now, name) for name in AFTER_RESET})
@@ -356,9 +352,12 @@ class TrainingEnvironment(VecEnv):
         self._require_below(found["level"], self.palette.num_levels, "level")
         memory.step.copy_(found["step"])
         self.common_step_counter = int(progress["common_step_counter"])
-        self._bodies = BodyParameters(**fitting(progress["bodies"], self._bodies.by_name()))
-        self._bodies.apply(self.backend)
+        self._take_bodies(progress["bodies"])
         self._begin(found["level"])
+
+    def _take_bodies(self, saved: dict[str, Any]) -> None:
+        self._bodies = fitting(saved, self._bodies)
+        self.backend.randomize(Randomization(**self._bodies))
 
     @staticmethod
     def _require_below(numbers: torch.Tensor, count: int, name: str) -> None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from .side_process import Job, SideProcess
+from .side_process import PROGRAM, Job, SideProcess
 
 VIDEO_FOLDER = "videos"
 """Folder of a run directory that holds ``model_<iteration>.mp4``."""
 SECONDS = 8.0
 """Length of a video [s]."""
-_PACKAGE = __name__.partition(".")[0]
 
 
 class Filmer:
@@ -31,15 +29,8 @@ class Filmer:
             return
         video = self._folder / f"{path.stem}.mp4"
         options = ["--terrain", self._terrain, "--seconds", f"{SECONDS:g}", "--out", str(video)]
-        self._side.submit(
-            Job(
-                command=[sys.executable, "-m", f"{_PACKAGE}.cli.main", "play", str(path), *options],
-                checkpoint=path,
-                iteration=iteration,
-                output=self._folder / f"{path.stem}.txt",
-                log=self._folder / f"{path.stem}.log",
-            )
-        )
+        command, output = [*PROGRAM, "play", str(path), *options], self._folder / f"{path.stem}.txt"
+        self._side.submit(Job(command=command, checkpoint=path, iteration=iteration, output=output))
 
     def take(
         self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False

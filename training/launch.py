@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -24,13 +24,12 @@ from ..robots.registry import lasting
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .configuration import ConfigurationError, TrainingConfiguration, to_plain
-from .devices import idle_gpus, own_device, told_number
 from .environment import TrainingEnvironment
 from .environment_configuration import EnvironmentConfiguration
 from .filming import Filmer
 from .logger import check_logger
 from .own_terms import foreign_functions
-from .processes import Processes, ProcessLostError
+from .processes import Processes, ProcessLostError, idle_gpus, own_device, told_number
 from .resuming import begin_with, resume_run
 from .run_directory import (
     LOG_ROOT,
@@ -331,7 +330,8 @@ def train(
     with ExitStack() as closing:
         if run is not None:
             closing.callback(lock_folder(run, CheckpointError).release)
-        try:
+        worlds = f"{environment.num_envs} environments"
+        with _enough_memory(f"{worlds} do not fit into the memory of {device}; use a smaller --num-envs"):
             env = TrainingEnvironment(
                 environment,
                 backend=plan.backend,
@@ -370,31 +370,30 @@ def train(
                 message=message if rank == 0 else None,
             )
             closing.callback(runner.close)
-        except (RuntimeError, MemoryError) as error:
-            if not _out_of_memory(error):
-                raise
-            raise ConfigurationError(
-                f"{environment.num_envs} environments do not fit into the memory of {device}; use a smaller --num-envs"
-            ) from error
+        too_much = f"learning with {worlds} does not fit into the memory of {device}"
         try:
-            outcome = _learn(plan, runner, began)
+            with _enough_memory(f"{too_much}; use a smaller --num-envs, or more training.algorithm.minibatches"):
+                outcome = _learn(plan, runner, began)
         except ProcessLostError:
             closing.pop_all()  # closing would wait for the lost process
             raise
-        except (RuntimeError, MemoryError) as error:
-            if not _out_of_memory(error):
-                raise
-            raise ConfigurationError(
-                f"learning with {environment.num_envs} environments does not fit into the memory of {device}; use a "
-                "smaller --num-envs, or more training.algorithm.minibatches"
-            ) from error
         processes.leave()
     return outcome, run
 
 
-def _out_of_memory(error: Exception) -> bool:
-    """Whether the memory of the device, or on a CPU of the machine, did not suffice."""
-    return isinstance(error, torch.OutOfMemoryError | MemoryError) or "can't allocate memory" in str(error)
+@contextmanager
+def _enough_memory(otherwise: str) -> Iterator[None]:
+    """Around what the memory of the device, or on a CPU of the machine, may not suffice for; then that is a sentence.
+
+    Raises:
+        ConfigurationError: it does not suffice.
+    """
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if isinstance(error, torch.OutOfMemoryError | MemoryError) or "can't allocate memory" in str(error):
+            raise ConfigurationError(otherwise) from error
+        raise
 
 
 def _learn(plan: TrainPlan, runner: TrainingRunner, began: float) -> TrainingOutcome:

@@ -7,7 +7,7 @@ The frame itself comes from the policy package's builder, the one that the gauge
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 
@@ -42,11 +42,6 @@ _NOISE_FIELD = {
     "joint_position": "joint_position",
     "joint_velocity": "joint_velocity",
 }
-
-
-def add_noise(frame: torch.Tensor, signed: torch.Tensor, amplitude: torch.Tensor) -> torch.Tensor:
-    """A frame with independent uniform noise on every entry; ``signed`` has numbers in [-1, 1), the frame's shape."""
-    return frame + signed * amplitude
 
 
 def push_history(history: torch.Tensor, frame: torch.Tensor, forget: torch.Tensor, *, start: str) -> torch.Tensor:
@@ -136,7 +131,7 @@ class Observations:
 
     def clone(self) -> Observations:
         """Copies."""
-        return Observations(**{f.name: getattr(self, f.name).clone() for f in fields(self)})
+        return Observations(**{name: value.clone() for name, value in vars(self).items()})
 
 
 class Observer:
@@ -173,7 +168,7 @@ class Observer:
     def __call__(self, state: PhysicsState, memory: EnvironmentMemory, uniform: UniformColumns) -> Observations:
         """Observations; the noisy frame is added to the history."""
         clean = self._builder.build(state, memory.command, memory.action)
-        noisy = add_noise(clean, uniform.signed("noise"), self._noise)
+        noisy = clean + uniform.signed("noise") * self._noise
         memory.history.copy_(push_history(memory.history, noisy, memory.just_reset, start=self._start))
         points = place_pattern(self._scan, state.base_position_w[:, :2], heading(state.base_quaternion_w))
         inputs = ObservationInputs(

@@ -39,23 +39,33 @@ def resolve(path: str, setting: str) -> Callable[..., Any]:
     return found if _own(path) else guarded(found, f"{setting} is {shown(path)}")
 
 
+def imported(path: str, where: str, error: type[Exception]) -> Any:
+    """What stands at ``module:name``, None where the module has no such name.
+
+    Raises:
+        error: importing it fails; ``where`` is the beginning of the sentence.
+    """
+    module, _, name = path.partition(":")
+    try:
+        found: Any = import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part, None)
+    except ImportError as problem:
+        raise error(f"{where} {one_line(problem)}; is its folder on PYTHONPATH?") from problem
+    except (Exception, SystemExit) as problem:
+        raise error(f"{where} importing it {raised(problem)}; mend that module") from problem
+    return found
+
+
 def _found(path: str, setting: str) -> Callable[..., Any]:
     where = f"{setting} is {shown(path)}"
     module, colon, name = path.partition(":")
     if not colon or not module or not name:
         raise ConfigurationError(f"{where}; write module:function, for example my_robot.rewards:airtime")
-    try:
-        found: Any = import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part, None)
-    except ImportError as error:
-        raise ConfigurationError(f"{where}, but {one_line(error)}; is its folder on PYTHONPATH?") from error
-    except (Exception, SystemExit) as error:
-        raise ConfigurationError(f"{where}, but importing it {raised(error)}; mend that module") from error
+    found = imported(path, f"{where}, but", ConfigurationError)
     if not callable(found):
         raise ConfigurationError(f"{where}, but module {shown(module)} has no function {shown(name)}")
-    result: Callable[..., Any] = found
-    return result
+    return found  # type: ignore[no-any-return]
 
 
 def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> Callable[..., Kind]:

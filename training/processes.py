@@ -1,4 +1,4 @@
-"""The processes of one run: one for each GPU, as torchrun starts them, or this one alone.
+"""The processes of one run: one for each GPU, as torchrun starts them, or this one alone; and which GPU each takes.
 
 CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it
 instead. Whoever waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
@@ -6,6 +6,7 @@ instead. Whoever waits for the GPU therefore asks it again and again, so that si
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -15,14 +16,29 @@ from typing import Any
 import torch
 from torch import distributed
 
-from ..files.parsing import one_line
+from ..backends.registry import choose_device
+from ..files.parsing import one_line, shown
 from .configuration import ConfigurationError
-from .devices import told_number
 
 PATIENCE = 300.0
 """Longest wait for the others [s]; compiling may take one of them a minute longer."""
 PATIENCE_AFTER_SIGNAL = 10.0
 """Longest wait [s] once this process was asked to stop: torchrun asks all others when one is lost."""
+
+
+def told_number(name: str, default: int) -> int:
+    """A number that torchrun tells its processes in their environment.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    text = os.environ.get(name, str(default))
+    if not (text.isascii() and text.isdecimal() and len(text) < 7):
+        raise ConfigurationError(
+            f"the environment variable {name} is {shown(text)}; it must be a whole number, as torchrun makes it: unset it, or start "
+            "the run with torchrun"
+        )
+    return int(text)
 
 
 class ProcessLostError(RuntimeError):
@@ -129,3 +145,30 @@ def _heard() -> Iterator[None]:
     except RuntimeError as error:
         words = str(error).partition("\n")[0].partition(". ")[0]
         raise ProcessLostError(f"another process has gone: {(words.partition('] ')[2] or words)[:200]}") from error
+
+
+def own_device(asked: str | None, backend: str) -> str:
+    """The torch device of this process.
+
+    Raises:
+        ConfigurationError: there is no such device here.
+    """
+    asked = choose_device(backend) if asked is None else asked
+    place, gpus = told_number("LOCAL_RANK", 0), torch.cuda.device_count()
+    if asked == "cuda" and place >= gpus > 0:
+        raise ConfigurationError(
+            f"torchrun started more processes than this machine has GPUs ({gpus}); give --nproc-per-node {gpus}"
+        )
+    return choose_device(backend, f"cuda:{place}" if asked == "cuda" and gpus > 0 else asked)
+
+
+def idle_gpus(device: str) -> str:
+    """A sentence on GPUs that no process of a run uses, empty if there are none."""
+    processes = told_number("LOCAL_WORLD_SIZE", 0)
+    gpus = torch.cuda.device_count() if device.startswith("cuda") else 0
+    if not 0 < processes < gpus:
+        return ""
+    return (
+        f"{processes} of {gpus} GPUs are used; --nproc-per-node {gpus} uses all, and CUDA_VISIBLE_DEVICES says which are "
+        "meant."
+    )

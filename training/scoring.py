@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +11,10 @@ from typing import Any
 
 from ..files.parsing import edited, read_results
 from ..gauge.suite import load_suite
-from .side_process import Finished, Job, SideProcess
+from .side_process import PROGRAM, Finished, Job, SideProcess
 
 GAUGE_FOLDER = "gauge"
 """Folder of a run directory that holds what the gauge left behind, by suite and checkpoint."""
-_PACKAGE = __name__.partition(".")[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,15 +56,8 @@ class Scorer:
         # A resumed run may come by the same iteration again, with other weights.
         shutil.rmtree(out, ignore_errors=True)
         options = ["--suite", self._asked, "--json", "--no-clip", "--threads", str(self._threads), "--out", str(out)]
-        self._side.submit(
-            Job(
-                command=[sys.executable, "-m", f"{_PACKAGE}.cli.main", "evaluate", str(path), *options],
-                checkpoint=path,
-                iteration=iteration,
-                output=self._folder / f"{path.stem}.json",
-                log=self._folder / f"{path.stem}.log",
-            )
-        )
+        command, output = [*PROGRAM, "evaluate", str(path), *options], self._folder / f"{path.stem}.json"
+        self._side.submit(Job(command=command, checkpoint=path, iteration=iteration, output=output))
 
     def poll(self) -> list[ScoreReport]:
         """Reports that arrived since the last call, without waiting."""

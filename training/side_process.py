@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+PROGRAM = (sys.executable, "-m", f"{__name__.partition('.')[0]}.cli.main")
+"""This package's command line."""
 ENVIRONMENT: Mapping[str, str] = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
 """A side process has no business on the GPU that trains."""
 
@@ -24,8 +27,11 @@ class Job:
     iteration: int
     output: Path
     """Where its standard output goes."""
-    log: Path
-    """Where its standard error goes."""
+
+    @property
+    def log(self) -> Path:
+        """Where its standard error goes."""
+        return self.output.with_suffix(".log")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,37 +39,33 @@ class Finished:
     """What became of a job."""
 
     job: Job
-    seconds: float
-    """How long it ran [s]."""
     failure: str
     """Why it failed, in one sentence; empty if it did not."""
 
 
 class SideProcess:
-    """Runs jobs in the order of their submission."""
+    """Runs jobs in the order of their submission; of those that wait, all but the last are given up."""
 
-    def __init__(self, *, max_waiting: int = 1) -> None:
-        """Begin without a job; when more than ``max_waiting`` wait, the oldest of them is given up."""
-        self._max_waiting = max_waiting
+    def __init__(self) -> None:
         self._waiting: deque[Job] = deque()
-        self._running: tuple[Job, subprocess.Popen[bytes], float] | None = None
+        self._running: tuple[Job, subprocess.Popen[bytes]] | None = None
         self._finished: list[Finished] = []
 
     def submit(self, job: Job) -> None:
         """Run a job when its turn comes."""
         self._waiting.append(job)
-        if len(self._waiting) > self._max_waiting:
-            self._finished.append(Finished(job=self._waiting.popleft(), seconds=0.0, failure="skipped"))
+        if len(self._waiting) > 1:
+            self._finished.append(Finished(job=self._waiting.popleft(), failure="skipped"))
         self._start_next()
 
     def poll(self) -> list[Finished]:
         """Jobs that ended since the last call, without waiting."""
         if self._running is not None:
-            job, process, start = self._running
+            job, process = self._running
             if (code := process.poll()) is not None:
                 self._running = None
                 failure = f"exit code {code}; see {job.log}" if code else ""
-                self._finished.append(Finished(job=job, seconds=time.monotonic() - start, failure=failure))
+                self._finished.append(Finished(job=job, failure=failure))
         self._start_next()
         finished, self._finished = self._finished, []
         return finished
@@ -108,6 +110,6 @@ class SideProcess:
                 )
             except OSError as error:
                 failure = f"cannot start {job.command[0]}: {error.strerror}"
-                self._finished.append(Finished(job=job, seconds=0.0, failure=failure))
+                self._finished.append(Finished(job=job, failure=failure))
                 return
-        self._running = (job, process, time.monotonic())
+        self._running = (job, process)

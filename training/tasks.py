@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from importlib import import_module
 from types import MappingProxyType
 
 from ..files.parsing import one_line, shown
-from ..files.plugins import raised
 from ..robots import load_robot
 from ..robots.loading import robot_digest
 from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
@@ -24,6 +22,7 @@ from .environment_configuration import (
     TerminationConfiguration,
 )
 from .overrides import TaskError, apply_overrides
+from .own_terms import imported
 from .scaling import scaled_environment, scaled_training
 from .terrain_configuration import FLAT_TILE, TerrainConfiguration
 
@@ -261,13 +260,7 @@ TASKS: Mapping[str, Task] = MappingProxyType({task.name: task for task in (*_met
 
 def _own_task(path: str) -> Task:
     """The task at ``module:attribute``, under this name, by which a resumed run finds it again."""
-    module, _, attribute = path.partition(":")
-    try:
-        found = getattr(import_module(module), attribute, None)
-    except (ImportError, ValueError) as error:
-        raise TaskError(f"task {shown(path)}: {one_line(error)}; is its folder on PYTHONPATH?") from error
-    except (Exception, SystemExit) as error:
-        raise TaskError(f"task {shown(path)}: importing it {raised(error)}; mend that module") from error
+    found, (module, _, attribute) = imported(path, f"task {shown(path)}:", TaskError), path.partition(":")
     if not isinstance(found, Task):
         raise TaskError(f"task {shown(path)}: module {shown(module)} has no Task of the name {shown(attribute)}")
     return replace(found, name=path)

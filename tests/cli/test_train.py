@@ -15,9 +15,9 @@ from gaitgauge.cli.train import parse_duration
 from gaitgauge.files import writing
 from gaitgauge.files.writing import lock_folder
 from gaitgauge.training.configuration import ConfigurationError
-from gaitgauge.training.devices import idle_gpus
 from gaitgauge.training.launch import TrainRequest, prepare
 from gaitgauge.training.overrides import override_keys
+from gaitgauge.training.processes import idle_gpus
 from gaitgauge.training.scoring import Scorer, scores_of
 from gaitgauge.training.tasks import TASKS
 from small_run import FAKE, SMALL

@@ -17,7 +17,6 @@ def job(folder: Path, number: int, *command: str) -> Job:
         checkpoint=Path(f"model_{number}.pt"),
         iteration=number,
         output=folder / "side" / f"{number}.txt",
-        log=folder / "side" / f"{number}.log",
     )
 
 
@@ -26,7 +25,7 @@ def python(folder: Path, number: int, code: str) -> Job:
 
 
 def test_jobs_run_in_order_and_not_on_the_gpu(tmp_path):
-    side = SideProcess(max_waiting=2)
+    side = SideProcess()
     code = "import os; print(repr(os.environ['CUDA_VISIBLE_DEVICES']))"
     for number in (1, 2):
         side.submit(python(tmp_path, number, code))
@@ -48,8 +47,8 @@ def test_failures_are_reported(tmp_path):
 
 
 def test_the_oldest_waiting_job_is_given_up_and_a_running_one_can_be_stopped(tmp_path):
-    side = SideProcess(max_waiting=2)
-    for number in range(4):
+    side = SideProcess()
+    for number in range(3):
         side.submit(python(tmp_path, number, "import time; time.sleep(60)"))
     assert [(f.job.iteration, f.failure) for f in side.poll()] == [(1, "skipped")]
     start = time.monotonic()

@@ -15,6 +15,7 @@ import torch
 
 from ...files.parsing import one_line
 from ..checkpoint import CheckpointError
+from ..side_process import ENVIRONMENT
 from ..stopping import StopSignals
 from .file import Sweep
 from .runs import SweepRun
@@ -23,7 +24,6 @@ _POLL = 0.1
 """Time between two looks at the processes [s]."""
 _PATIENCE = 120.0
 """Longest wait for processes that were asked to stop [s]: an iteration and its checkpoint."""
-_NO_GPU: Mapping[str, str] = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +138,7 @@ class Jobs:
         return bool(self._live)
 
     def _launch(self, run: SweepRun, command: Sequence[str], place: str, log: Path, sentence: str) -> None:
-        environment = {**os.environ, **self._places.get(place, _NO_GPU)}
+        environment = {**os.environ, **self._places.get(place, ENVIRONMENT)}
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as output:
             # A session of its own: Ctrl-C in the terminal is for the sweep, which hands it on.

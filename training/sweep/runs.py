@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +17,8 @@ from ..configuration import ConfigurationError
 from ..launch import TrainRequest, prepare
 from ..overrides import TaskError
 from ..run_directory import read_run_json
+from ..side_process import PROGRAM
 from .file import NO_SUITE, Sweep, SweepEntry, SweepError
-
-_PROGRAM = (sys.executable, "-m", f"{__name__.partition('.')[0]}.cli.main")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,17 +93,17 @@ class SweepRun:
         options += [] if self.on_gpu else ["--device", "cpu"]
         if (run := self.directory) is not None:
             # The settings are those of the checkpoint; given again, functions that they name need no --trust.
-            return [*_PROGRAM, "train", self.entry.task, *self.settings, "--resume", str(run), *options]
+            return [*PROGRAM, "train", self.entry.task, *self.settings, "--resume", str(run), *options]
         options += ["--backend", self.backend, "--seed", str(self.seed), "--log-root", str(self.folder / "logs")]
         options += [] if self.init_from is None else ["--init-from", self.init_from]
-        return [*_PROGRAM, "train", self.entry.task, *self.settings, *options]
+        return [*PROGRAM, "train", self.entry.task, *self.settings, *options]
 
     def gauging_command(self, sweep: Sweep, *, where: Sequence[str]) -> list[str]:
         """Gauges its policy, or goes on with that; ``where`` are the options ``--threads`` and ``--cluster``."""
         policy, results = self.policy(sweep), self.results(sweep)
         assert policy is not None and results is not None
         options = ["--suite", sweep.suite, *where, "--out", str(results), "--json", "--no-clip"]
-        return [*_PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
+        return [*PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
 
     def claim(self) -> None:
         """Note in its folder what it is trained with, or check that it is the same as before.
