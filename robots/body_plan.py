@@ -5,6 +5,7 @@ Nothing here goes by names. Frames are the base's: x forward, y left, z up, orig
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -90,20 +91,12 @@ def body_plan(robot: Robot) -> BodyPlan:
         if not chain or any(j not in order for j in chain):
             raise RobotError(f"robot '{robot.name}': the foot '{name}' is not moved by joints of joint_names")
         legs.append(tuple(order[j] for j in chain))
-        sideways = next((j for j in chain if _sideways(data, j)), None)
+        sideways, swinging = sideways_and_swinging(data, chain)
         if sideways is not None:
             abduction.append(order[sideways])
-        swinging = [j for j in chain if j != sideways] or chain
-        ends = [*(data.xanchor[j] for j in swinging), data.geom_xpos[foot]]
         # from the base down to the leg's first joint, and from the foot's centre to its lowest point
         below.append(data.geom_xpos[foot, 2] - lowest_point(model, data, foot) - data.xanchor[swinging[0], 2])
-        # what lies along a hinge is width, not length
-        lengths.append(
-            sum(
-                float(np.linalg.norm(link - axis * (link @ axis)))
-                for link, axis in zip(np.diff(ends, axis=0), data.xaxis[swinging], strict=True)
-            )
-        )
+        lengths.append(stretched_length(data, swinging, foot))
     sideways_ids = {model.joint(robot.joint_names[i]).id for i in abduction}
     bodies = [joint_chain(model, model.body(name).id, base) for name in robot.collision_bodies]
     return BodyPlan(
@@ -162,11 +155,18 @@ def _no_image(robot: Robot, kind: str, name: str, image: NDArray[np.float64]) ->
     )
 
 
+def robot_model(robot: Robot) -> mujoco.MjModel:
+    """The robot's compiled model."""
+    import mujoco
+
+    return mujoco.MjModel.from_xml_path(str(robot.mjcf))
+
+
 def default_pose(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """The robot's model, and its kinematics in the default pose with the base at the origin, level and unturned."""
     import mujoco
 
-    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    model = robot_model(robot)
     data = mujoco.MjData(model)
     start = model.jnt_qposadr[model.body(robot.base_body).jntadr[0]]
     data.qpos[start : start + 7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -186,9 +186,16 @@ def joint_chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
     return joints
 
 
-def _sideways(data: mujoco.MjData, joint: int) -> bool:
-    """Whether a joint turns more about the x axis than about any other."""
-    return int(np.abs(data.xaxis[joint]).argmax()) == 0
+def sideways_and_swinging(data: mujoco.MjData, chain: Sequence[int]) -> tuple[int | None, list[int]]:
+    """The first joint of a leg that turns more about the x axis than about any other, if there is one, and the others, or all."""
+    sideways = next((j for j in chain if int(np.abs(data.xaxis[j]).argmax()) == 0), None)
+    return sideways, [j for j in chain if j != sideways] or list(chain)
+
+
+def stretched_length(data: mujoco.MjData, joints: list[int], foot: int) -> float:
+    """Length of the links from the first of a leg's joints to its foot, a geom [m]; what lies along a hinge is width."""
+    links = np.diff([*data.xanchor[joints], data.geom_xpos[foot]], axis=0)
+    return sum(float(np.linalg.norm(d - a * (d @ a))) for d, a in zip(links, data.xaxis[joints], strict=True))
 
 
 def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _DEPTH_TOLERANCE = 1e-3
 """Depth to which a robot that is put on the ground may reach into it [m]."""
 _GRAVITY = (0.0, 0.0, -9.81)
+_COUNTS = {"joint": "njnt", "body": "nbody", "geom": "ngeom", "site": "nsite"}
 _checked: set[str] = set()
 """Digests of the robots that this process has found sound."""
 
@@ -72,6 +73,11 @@ def compiled(mjcf: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
         raise RobotError(f"'{one_line(mjcf)}' is not a model that MuJoCo can compile: {reason}") from error
 
 
+def solid(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom meets the ground, whose contype and conaffinity are 1."""
+    return bool((model.geom_contype[geom] | model.geom_conaffinity[geom]) & 1)
+
+
 class ModelChecks:
     """The single checks. Each says in a sentence what it found, or raises ``RobotError``."""
 
@@ -89,23 +95,13 @@ class ModelChecks:
 
     def _require(self, names: Iterable[str], key: str, kind: str) -> list[int]:
         """Ids of named model objects (``joint``, ``body``, ``geom``, ``site``); those of ``key`` must all exist."""
-        object_type = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-        known = self._names(object_type)
+        view = getattr(self.model, kind)
+        known = {view(i).name: i for i in range(getattr(self.model, _COUNTS[kind]))}
         for name in names:
             if name not in known:
                 hint = did_you_mean(name, known)
                 raise self._error(f"{key} names '{name}' but {self.robot.mjcf.name} has no {kind} of that name{hint}")
-        return [self.mujoco.mj_name2id(self.model, object_type, name) for name in names]
-
-    def _names(self, object_type: mujoco.mjtObj) -> list[str]:
-        count = {
-            self.mujoco.mjtObj.mjOBJ_JOINT: self.model.njnt,
-            self.mujoco.mjtObj.mjOBJ_BODY: self.model.nbody,
-            self.mujoco.mjtObj.mjOBJ_GEOM: self.model.ngeom,
-            self.mujoco.mjtObj.mjOBJ_SITE: self.model.nsite,
-        }[object_type]
-        found = (self.mujoco.mj_id2name(self.model, object_type, i) for i in range(count))
-        return [name for name in found if name is not None]
+        return [known[name] for name in names]
 
     def size(self) -> str:
         """A few lines of XML can stand for a million parts, each of which every world would simulate."""
@@ -127,7 +123,7 @@ class ModelChecks:
             raise self._error(f"{robot.mjcf.name} has geoms or sites in its worldbody; it must hold the robot alone")
         outside = [i for i in range(1, model.nbody) if model.body_rootid[i] != base]
         if outside:
-            name = self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_BODY, outside[0]) or f"body {outside[0]}"
+            name = model.body(outside[0]).name or f"body {outside[0]}"
             raise self._error(
                 f"{robot.mjcf.name} has the body '{name}' outside '{robot.base_body}'; it must hold the robot alone"
             )
@@ -173,7 +169,7 @@ class ModelChecks:
             if model.jnt_type[joint] != self.mujoco.mjtJoint.mjJNT_HINGE:
                 raise self._error(f"joint_names names '{name}', which is not a hinge in {robot.mjcf.name}")
         others = [
-            self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j}"
+            model.joint(j).name or f"joint {j}"
             for j in range(model.njnt)
             if model.jnt_type[j] != self.mujoco.mjtJoint.mjJNT_FREE and j not in ids
         ]
@@ -213,14 +209,10 @@ class ModelChecks:
         """Feet have shapes that meet the ground."""
         model, robot = self.model, self.robot
         for geom in self._require(robot.foot_geoms, "foot_shapes" if robot.foot_shapes else "foot_names", "geom"):
-            if not self._solid(geom):
+            if not solid(model, geom):
                 name = model.geom(geom).name
                 raise self._error(f"the foot geom '{name}' does not meet the ground; give it contype or conaffinity 1")
         return f"{len(robot.foot_names)} feet that meet the ground: {', '.join(robot.foot_names)}"
-
-    def _solid(self, geom: int) -> bool:
-        """Whether a geom meets the ground, whose contype and conaffinity are 1."""
-        return bool((self.model.geom_contype[geom] | self.model.geom_conaffinity[geom]) & 1)
 
     def bodies_and_sites(self) -> str:
         """Bodies, trunk shapes and the gyroscope's site are where they must be."""
@@ -231,7 +223,7 @@ class ModelChecks:
             raise self._error(f"collision_bodies lacks the base_body '{self.robot.base_body}'; add it")
         for name, body in zip(self.robot.collision_bodies, bodies, strict=True):
             first = model.body_geomadr[body]
-            if not any(self._solid(g) for g in range(first, first + model.body_geomnum[body])):
+            if not any(solid(model, g) for g in range(first, first + model.body_geomnum[body])):
                 raise self._error(
                     f"no geom of the body '{name}' (collision_bodies) meets the ground; give one contype 1"
                 )
@@ -241,7 +233,7 @@ class ModelChecks:
                 raise self._error(
                     f"trunk_shapes names '{name}', which is not on the base_body '{self.robot.base_body}'"
                 )
-            if not self._solid(geom):
+            if not solid(model, geom):
                 raise self._error(
                     f"the trunk shape '{name}' does not meet the ground; give it contype or conaffinity 1"
                 )
@@ -263,17 +255,17 @@ class ModelChecks:
         model = spec.compile()
         data = self.mujoco.MjData(model)
         data.qpos[:7] = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
-        joints = [self.mujoco.mj_name2id(model, self.mujoco.mjtObj.mjOBJ_JOINT, n) for n in robot.joint_names]
-        data.qpos[model.jnt_qposadr[joints]] = robot.default_joint_position
+        for name, angle in zip(robot.joint_names, robot.default_joint_position, strict=True):
+            data.joint(name).qpos[0] = angle
         self.mujoco.mj_fwdPosition(model, data)
         contacts = [data.contact[i] for i in range(data.ncon) if 0 in model.geom_bodyid[data.contact[i].geom]]
         deepest = min(contacts, key=lambda c: c.dist, default=None)
         if deepest is not None and deepest.dist < -_DEPTH_TOLERANCE:
             geom = next(int(g) for g in deepest.geom if model.geom_bodyid[g] != 0)
-            part, kind = self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_GEOM, geom), "geom"
-            if part is None:
-                body = int(model.geom_bodyid[geom])
-                part, kind = self.mujoco.mj_id2name(model, self.mujoco.mjtObj.mjOBJ_BODY, body) or str(body), "body"
+            part, kind = model.geom(geom).name, "geom"
+            if not part:
+                body = model.body(model.geom_bodyid[geom])
+                part, kind = body.name or str(body.id), "body"
             raise self._error(
                 f"at stand_height {height:g} m the {kind} '{part}' is {-deepest.dist:.3f} m below the ground; "
                 f"raise it to {height - deepest.dist:.3f} m or more"

@@ -8,23 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Robot
-from .body_plan import default_pose
+from .body_plan import default_pose, robot_model
 
 
 def joint_ranges(robot: Robot) -> NDArray[np.float64]:
     """Lower and upper limit of every joint in the robot's order [rad], (J, 2); infinite where a joint has none."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    model = robot_model(robot)
     ids = [model.joint(name).id for name in robot.joint_names]
     return np.where(model.jnt_limited[ids, None], model.jnt_range[ids], [-np.inf, np.inf])
 
 
 def model_joint_order(robot: Robot) -> list[int]:
     """The robot's joints in the order in which the model has them behind the free joint: indices into ``joint_names``."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    model = robot_model(robot)
     address = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
     return sorted(range(robot.num_joints), key=address.__getitem__)
 
@@ -38,7 +34,4 @@ def stance_span(robot: Robot) -> float:
 
 def total_mass(robot: Robot) -> float:
     """Mass of the whole robot [kg]."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
-    return float(model.body_mass.sum())
+    return float(robot_model(robot).body_mass.sum())

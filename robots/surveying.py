@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files.parsing import one_line
-from .body_plan import joint_chain, lowest_point
+from .body_plan import joint_chain, lowest_point, sideways_and_swinging, stretched_length
+from .checking import solid
 from .loading import RobotError
 
 if TYPE_CHECKING:
@@ -116,18 +117,14 @@ class Survey:
         return found
 
     def _solid(self, geom: int) -> bool:
-        return bool((self.model.geom_contype[geom] | self.model.geom_conaffinity[geom]) & 1)
+        return solid(self.model, geom)
 
     def leg_length(self, leg: Leg) -> float:
         """Length of a leg when it is stretched [m], without what swings it sideways."""
-        swinging = self._swinging(leg)
-        ends = [*(self.data.xanchor[j] for j in swinging), self.data.geom_xpos[leg.foot]]
-        axes = self.data.xaxis[swinging]
-        return sum(float(np.linalg.norm(d - a * (d @ a))) for d, a in zip(np.diff(ends, axis=0), axes, strict=True))
+        return stretched_length(self.data, self._swinging(leg), leg.foot)
 
     def _swinging(self, leg: Leg) -> list[int]:
-        sideways = next((j for j in leg.joints if int(np.abs(self.data.xaxis[j]).argmax()) == 0), None)
-        return [j for j in leg.joints if j != sideways] or list(leg.joints)
+        return sideways_and_swinging(self.data, leg.joints)[1]
 
     # ---- pose -------------------------------------------------------------------------------------------------------
 
