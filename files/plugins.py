@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeVar
@@ -47,6 +48,24 @@ def raised(error: BaseException) -> str:
     frames = [f for f in traceback.extract_tb(error.__traceback__)[1:] if not f.filename.startswith("<frozen")]
     place = f" ({one_line(Path(frames[-1].filename).name, 80)}, line {frames[-1].lineno})" if frames else ""
     return f"raised {type(error).__name__}: {one_line(error, 200)}".rstrip(": ") + place
+
+
+def imported(path: str, where: str, error: type[Exception]) -> Any:
+    """What stands at ``module:name``, None where the module has no such name.
+
+    Raises:
+        error: importing it fails; ``where`` is the beginning of the sentence.
+    """
+    module, _, name = path.partition(":")
+    try:
+        found: Any = import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part, None)
+    except ImportError as problem:
+        raise error(f"{where} {one_line(problem)}; is its folder on PYTHONPATH?") from problem
+    except (Exception, SystemExit) as problem:
+        raise error(f"{where} importing it {raised(problem)}; mend that module") from problem
+    return found
 
 
 def origin(entry: EntryPoint) -> str:

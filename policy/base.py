@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import torch
 
+from ..files.parsing import one_line
 from .contract import PolicyContract
 
 LONGEST_MESSAGE = 1000
@@ -20,16 +21,7 @@ class PolicyError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(plain(message))
-
-
-def plain(text: str) -> str:
-    """One line of text without control characters, marks of direction and halves of characters, and not too long."""
-    text = text if len(text) <= LONGEST_MESSAGE else text[: LONGEST_MESSAGE - 2] + " …"
-    # of a printable text nothing is changed; a blank is printable, a line's end is not
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+        super().__init__(one_line(message, LONGEST_MESSAGE))
 
 
 class PolicySession(ABC):

@@ -30,17 +30,8 @@ from .contract import PolicyContract
 from .native import first_line
 
 ACTION_NAMES = ("actions", "action")
-_RUN_ERRORS = (
-    runtime_state.EPFail,
-    runtime_state.Fail,
-    runtime_state.InvalidArgument,
-    runtime_state.InvalidGraph,
-    runtime_state.InvalidProtobuf,
-    runtime_state.NoModel,
-    runtime_state.NoSuchFile,
-    runtime_state.NotFound,
-    runtime_state.NotImplemented,
-    runtime_state.RuntimeException,
+_RUN_ERRORS: tuple[type[Exception], ...] = (
+    *(e for e in vars(runtime_state).values() if isinstance(e, type) and issubclass(e, Exception)),
     RuntimeError,
     ValueError,
 )

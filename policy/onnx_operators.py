@@ -173,10 +173,6 @@ def _flatten(node: Node, inputs: Inputs) -> torch.Tensor:
     return inputs[0].reshape(math.prod(shape[:axis]), math.prod(shape[axis:]))
 
 
-def _transpose(node: Node, inputs: Inputs) -> torch.Tensor:
-    return inputs[0].permute(node.get("perm", list(range(inputs[0].dim()))[::-1]))
-
-
 def _squeeze(node: Node, inputs: Inputs) -> torch.Tensor:
     axes = node.listed(1, "axes")
     return inputs[0].squeeze() if axes is None else inputs[0].squeeze(axes)
@@ -270,29 +266,28 @@ def _gelu(node: Node, inputs: Inputs) -> torch.Tensor:
     return functional.gelu(inputs[0], approximate=node.get("approximate", b"none").decode())
 
 
+_SAME_NAMES = """
+Abs Add Ceil Cos Erf Exp Floor Log Mul Neg Pow Reciprocal Relu Sigmoid Sign Sin Sqrt Sub Tan Tanh Where
+"""
+"""Operators that torch has by the same name and with the same inputs."""
+
 OPERATORS: Mapping[str, Callable[[Node, Inputs], Any]] = {
-    "Abs": _plain(torch.abs),
-    "Add": _plain(torch.add),
+    **{name: _plain(getattr(torch, name.lower())) for name in _SAME_NAMES.split()},
     "And": _plain(torch.logical_and),
     "BatchNormalization": _batch_normalization,
     "Cast": _cast,
-    "Ceil": _plain(torch.ceil),
     "Celu": _plain(functional.celu, alpha=1.0),
     "Clip": _clip,
     "Concat": lambda node, inputs: torch.cat(list(inputs), dim=node.get("axis")),
     "Constant": _constant,
     "ConstantOfShape": _constant_of_shape,
     "Conv": _conv,
-    "Cos": _plain(torch.cos),
     "Div": _divide,
     "Dropout": lambda node, inputs: inputs[0],
     "Elu": _plain(functional.elu, alpha=1.0),
     "Equal": _plain(torch.eq),
-    "Erf": _plain(torch.erf),
-    "Exp": _plain(torch.exp),
     "Expand": _expand,
     "Flatten": _flatten,
-    "Floor": _plain(torch.floor),
     "Gather": _gather,
     "GatherND": _gather_nd,
     "Gelu": _gelu,
@@ -306,7 +301,6 @@ OPERATORS: Mapping[str, Callable[[Node, Inputs], Any]] = {
     "LeakyRelu": _plain(functional.leaky_relu, alpha=0.01),
     "Less": _plain(torch.lt),
     "LessOrEqual": _plain(torch.le),
-    "Log": _plain(torch.log),
     "LogSoftmax": _softmax(torch.log_softmax),
     "LpNormalization": _lp_normalization,
     "MatMul": _matmul,
@@ -314,14 +308,10 @@ OPERATORS: Mapping[str, Callable[[Node, Inputs], Any]] = {
     "Min": _all_of(torch.minimum),
     "Mish": _plain(functional.mish),
     "Mod": _mod,
-    "Mul": _plain(torch.mul),
-    "Neg": _plain(torch.neg),
     "NonZero": lambda node, inputs: inputs[0].nonzero().t(),
     "Not": _plain(torch.logical_not),
     "Or": _plain(torch.logical_or),
     "PRelu": _plain(lambda x, slope: torch.where(x < 0.0, slope * x, x)),
-    "Pow": _plain(torch.pow),
-    "Reciprocal": _plain(torch.reciprocal),
     "ReduceL1": _reduce(lambda x, axes, keep: torch.linalg.vector_norm(x, 1, axes, keep)),
     "ReduceL2": _reduce(lambda x, axes, keep: torch.linalg.vector_norm(x, 2, axes, keep)),
     "ReduceLogSumExp": _reduce(torch.logsumexp),
@@ -330,28 +320,19 @@ OPERATORS: Mapping[str, Callable[[Node, Inputs], Any]] = {
     "ReduceMin": _reduce(torch.amin),
     "ReduceSum": _reduce(torch.sum),
     "ReduceSumSquare": _reduce(lambda x, axes, keep: torch.sum(x * x, axes, keep)),
-    "Relu": _plain(torch.relu),
     "Reshape": _reshape,
     "Selu": _plain(_selu, alpha=1.67326319217681884765625, gamma=1.05070102214813232421875),
     "Shape": _shape,
-    "Sigmoid": _plain(torch.sigmoid),
-    "Sign": _plain(torch.sign),
-    "Sin": _plain(torch.sin),
     "Slice": _slice,
     "Softmax": _softmax(torch.softmax),
     "Softplus": _plain(functional.softplus),
     "Softsign": _plain(functional.softsign),
     "Split": _split,
-    "Sqrt": _plain(torch.sqrt),
     "Squeeze": _squeeze,
-    "Sub": _plain(torch.sub),
     "Sum": _all_of(torch.add),
-    "Tan": _plain(torch.tan),
-    "Tanh": _plain(torch.tanh),
     "Tile": lambda node, inputs: inputs[0].repeat(node.listed(1) or []),
-    "Transpose": _transpose,
+    "Transpose": lambda node, inputs: inputs[0].permute(node.get("perm", list(range(inputs[0].dim()))[::-1])),
     "Unsqueeze": _unsqueeze,
-    "Where": _plain(torch.where),
     "Xor": _plain(torch.logical_xor),
 }
 """Operators by name: what they make of a node and its inputs, one tensor or several."""

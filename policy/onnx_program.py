@@ -6,6 +6,7 @@ operator by operator, those of ``onnx_operators.py`` and no others.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import onnx
@@ -65,10 +66,7 @@ class _Graph:
         self._known = [self._described(node) for node in self._nodes]
 
     def _tensor(self, stored: onnx.TensorProto) -> torch.Tensor:
-        elements = 1
-        for length in stored.dims:
-            elements *= length
-        self._elements += elements
+        self._elements += math.prod(stored.dims)
         external = stored.data_location == onnx.TensorProto.EXTERNAL
         if (
             external

@@ -260,7 +260,6 @@ class BatchSession(PolicySession):
     def __init__(
         self, module: Any, num_episodes: int, contract: PolicyContract, source: str, memories: Sequence[Memory]
     ) -> None:
-        """Copy the module and widen its memories."""
         self._module = copy.deepcopy(module)
         self._contract = contract
         self._num_episodes = num_episodes

@@ -17,18 +17,6 @@ from .program import MOST_ELEMENTS, NotUnderstoodError
 
 MOST_SOURCE = 1 << 20
 """Of one file of code."""
-_STORAGES = {
-    "torch FloatStorage": torch.float32,
-    "torch DoubleStorage": torch.float64,
-    "torch HalfStorage": torch.float16,
-    "torch BFloat16Storage": torch.bfloat16,
-    "torch LongStorage": torch.int64,
-    "torch IntStorage": torch.int32,
-    "torch ShortStorage": torch.int16,
-    "torch CharStorage": torch.int8,
-    "torch ByteStorage": torch.uint8,
-    "torch BoolStorage": torch.bool,
-}
 _KINDS = ("build_intlist", "build_doublelist", "build_boollist", "build_tensorlist", "restore_type_tag")
 _PLAIN = frozenset(f"torch.jit._pickle {kind}" for kind in _KINDS)
 """Calls that only say of which type their first argument is."""
@@ -192,9 +180,7 @@ class _Reader:
 
     def _tensor(self, call: Call, folder: str) -> torch.Tensor:
         stored = stored_tensor(call, source="the file")
-        if stored.storage.kind not in _STORAGES:
-            raise NotUnderstoodError(f"it stores a '{stored.storage.kind.replace(' ', '.')}'")
-        key, dtype = f"{folder}/{stored.storage.key}", _STORAGES[stored.storage.kind]
+        key, dtype = f"{folder}/{stored.storage.key}", stored.storage.dtype
         self._elements += math.prod(stored.shape)
         if self._elements > MOST_ELEMENTS:
             raise NotUnderstoodError("its tensors are larger than those of a policy")

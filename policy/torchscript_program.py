@@ -45,32 +45,11 @@ _FRESH = frozenset({"arange", "eye", "full", "ones", "scalar_tensor", "zeros"})
 OPERATORS = frozenset(_OPERATOR_NAMES.split())
 """Operators of torch that a program may call; all depend on their arguments alone."""
 
+_SAME_NAMES = "add sub mul floordiv neg eq ne lt le gt ge __not__ __and__ __or__ __getitem__ __contains__"
 _NUMBERS: Mapping[str, Callable[..., Any]] = {
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.truediv,
-    "floordiv": operator.floordiv,
-    "remainder": operator.mod,
-    "neg": operator.neg,
-    "eq": operator.eq,
-    "ne": operator.ne,
-    "lt": operator.lt,
-    "le": operator.le,
-    "gt": operator.gt,
-    "ge": operator.ge,
-    "__not__": operator.not_,
-    "__and__": operator.and_,
-    "__or__": operator.or_,
-    "len": len,
-    "max": max,
-    "min": min,
-    "prim_min": min,
-    "prim_max": max,
-    "abs": abs,
-    "__getitem__": operator.getitem,
-    "__contains__": operator.contains,
-    "list": list,
+    **{name: getattr(operator, name) for name in _SAME_NAMES.split()},
+    **{"div": operator.truediv, "remainder": operator.mod, "abs": abs, "len": len, "list": list},
+    **{"max": max, "min": min, "prim_max": max, "prim_min": min},
 }
 
 

@@ -26,7 +26,7 @@ _LINE = 100
 """Longest line of a list [characters]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Entry:
     """A line of the description."""
 
@@ -108,46 +108,29 @@ def _draft(path: Path, name: str | None, home: Path) -> str:
     height = math.ceil(1000 * (survey.depth() + _CLEARANCE)) / 1000
     sites = [model.site(s).name for s in range(model.nsite) if model.site_bodyid[s] == survey.base]
     imu = next((site for site in sites if "imu" in site.lower()), None)
+    order = f"{_GUESSED} order: leg by leg, the front left one first, from the base outwards"
+    feet = f"{_GUESSED}: the shape at the end of each leg, legs in the same order"
+    trunk = f"{_GUESSED}: the largest shape of the base; others count as head and sensors"
+    above = f"{_GUESSED}: {_CLEARANCE:g} m above where the feet touch the ground in the default pose"
+    commands = f"{_GUESSED} from legs of {length:.3f} m: forward, sideways [m/s], turning [rad/s]"
     entries = [
-        Entry(key="name", value=re.sub(r"[^a-z0-9_-]+", "-", title.lower()).strip("-_") or "robot"),
-        Entry(key="title", value=title),
-        Entry(key="mjcf", value=path.name),
-        Entry(
-            key="joint_names",
-            value=[model.joint(j).name for j in joints],
-            remark=f"{_GUESSED} order: leg by leg, the front left one first, from the base outwards",
-        ),
-        Entry(key="default_joint_position", value=[round(pose[j], 4) for j in joints], remark=how),
-        Entry(key="base_body", value=survey.body_name(survey.base)),
-        Entry(
-            key="foot_names",
-            value=[survey.geom_name(leg.foot, "foot") for leg in survey.legs],
-            remark=f"{_GUESSED}: the shape at the end of each leg, legs in the same order",
-        ),
-        Entry(key="collision_bodies", value=survey.colliding_bodies()),
-        Entry(
-            key="trunk_shapes",
-            value=[survey.geom_name(survey.trunk(), "trunk")],
-            remark=f"{_GUESSED}: the largest shape of the base; others count as head and sensors",
-        ),
-        *([Entry(key="imu_site", value=imu)] if imu else []),
-        Entry(
-            key="stand_height",
-            value=height,
-            remark=f"{_GUESSED}: {_CLEARANCE:g} m above where the feet touch the ground in the default pose",
-        ),
-        Entry(
-            key="command_limits",
-            value=[fast, round(fast / 2, 2), fast],
-            remark=f"{_GUESSED} from legs of {length:.3f} m: forward, sideways [m/s], turning [rad/s]",
-        ),
-        Entry(
-            key="action_scale", value=0.25, remark=f"{_GUESSED}: how far an output of 1 moves a joint's target [rad]"
-        ),
-        Entry(key="default_parameters", value="gauge"),
+        Entry("name", re.sub(r"[^a-z0-9_-]+", "-", title.lower()).strip("-_") or "robot"),
+        Entry("title", title),
+        Entry("mjcf", path.name),
+        Entry("joint_names", [model.joint(j).name for j in joints], order),
+        Entry("default_joint_position", [round(pose[j], 4) for j in joints], how),
+        Entry("base_body", survey.body_name(survey.base)),
+        Entry("foot_names", [survey.geom_name(leg.foot, "foot") for leg in survey.legs], feet),
+        Entry("collision_bodies", survey.colliding_bodies()),
+        Entry("trunk_shapes", [survey.geom_name(survey.trunk(), "trunk")], trunk),
+        *([Entry("imu_site", imu)] if imu else []),
+        Entry("stand_height", height, above),
+        Entry("command_limits", [fast, round(fast / 2, 2), fast], commands),
+        Entry("action_scale", 0.25, f"{_GUESSED}: how far an output of 1 moves a joint's target [rad]"),
+        Entry("default_parameters", "gauge"),
     ]
     for key, (value, remark) in survey.motors(joints, length).items():
-        entries.append(Entry(key=f"parameters.gauge.{key}", value=value, remark=remark))
+        entries.append(Entry(f"parameters.gauge.{key}", value, remark))
     text = ""
     if survey.renamed:
         for kind in ("meshdir", "texturedir"):

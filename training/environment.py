@@ -104,7 +104,8 @@ class TrainingEnvironment(VecEnv):
         self.contract = training_contract(self.robot, parameters, configuration)
         self._generator = torch.Generator(device=self.device)
         self._generator.manual_seed(configuration.seed)
-        self._inputs = static_inputs(self.backend.state, stays=self.backend.state_stays)
+        state = self.backend.state
+        self._inputs = state if self.backend.state_stays else static_inputs(state)
         self.parts = EnvironmentStep(
             configuration,
             robot=self.robot,

@@ -66,7 +66,6 @@ class EpisodeStarts:
         rasters: HeightRasters,
         device: torch.device | str,
     ) -> None:
-        """Put constants on the device."""
         self._reset, self._terrain, self._rasters = reset, terrain, rasters
         self._footprint = scan_pattern(*reset.footprint, 0.1, device)
         self._clearance = robot.stand_height if reset.clearance is None else reset.clearance
@@ -106,7 +105,6 @@ class Pushes:
     def __init__(
         self, configuration: PushConfiguration, num_envs: int, *, control_period: float, device: torch.device | str
     ) -> None:
-        """Put constants on the device."""
         self._stays = torch.full((num_envs, 1), math.nan, device=device)
         self._add = configuration.add
         self.steps = round(configuration.interval / control_period)
@@ -131,7 +129,6 @@ class Latency:
     """For how long the previous target still acts."""
 
     def __init__(self, configuration: RandomizationConfiguration, physics: PhysicsOptions) -> None:
-        """Turn times into whole substeps."""
         self._first, self._last = (min(round(t / physics.timestep), physics.substeps) for t in configuration.delay)
 
     def __call__(self, uniform: UniformColumns) -> torch.Tensor | None:

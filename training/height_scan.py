@@ -61,7 +61,7 @@ def scan_pattern(length: float, width: float, spacing: float, device: torch.devi
     columns, rows = round(length / spacing) + 1, round(width / spacing) + 1
     x = (torch.arange(columns, dtype=torch.float32) - (columns - 1) / 2) * spacing
     y = (torch.arange(rows, dtype=torch.float32) - (rows - 1) / 2) * spacing
-    return torch.stack((x[:, None].expand(-1, rows), y[None, :].expand(columns, -1)), dim=-1).reshape(-1, 2).to(device)
+    return torch.cartesian_prod(x, y).to(device)
 
 
 def heading(quaternion: torch.Tensor) -> torch.Tensor:

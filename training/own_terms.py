@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeVar
 import torch
 
 from ..files.parsing import one_line, shown
-from ..files.plugins import raised
+from ..files.plugins import imported, raised
 from .configuration import ConfigurationError, to_plain
 
 Kind = TypeVar("Kind")
@@ -37,24 +37,6 @@ def resolve(path: str, setting: str) -> Callable[..., Any]:
     """
     found = _found(path, setting)
     return found if _own(path) else guarded(found, f"{setting} is {shown(path)}")
-
-
-def imported(path: str, where: str, error: type[Exception]) -> Any:
-    """What stands at ``module:name``, None where the module has no such name.
-
-    Raises:
-        error: importing it fails; ``where`` is the beginning of the sentence.
-    """
-    module, _, name = path.partition(":")
-    try:
-        found: Any = import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part, None)
-    except ImportError as problem:
-        raise error(f"{where} {one_line(problem)}; is its folder on PYTHONPATH?") from problem
-    except (Exception, SystemExit) as problem:
-        raise error(f"{where} importing it {raised(problem)}; mend that module") from problem
-    return found
 
 
 def _found(path: str, setting: str) -> Callable[..., Any]:

@@ -16,7 +16,6 @@ class UniformColumns:
     """Named blocks of columns of one (N, C) tensor of uniform numbers in [0, 1)."""
 
     def __init__(self, widths: Mapping[str, int], num_envs: int, generator: torch.Generator) -> None:
-        """Allocate columns for every name on the generator's device."""
         self._slices: dict[str, slice] = {}
         total = 0
         for name, width in widths.items():

@@ -76,7 +76,7 @@ def scaled_environment(environment: EnvironmentConfiguration, source: str) -> En
     robot, reference = load_robot(source), load_robot(environment.robot)
     by = ratios(robot, reference)
     rewards, randomization, commands = environment.rewards, environment.randomization, environment.commands
-    parameters = environment.joints.parameters
+    parameters, (length, width) = environment.joints.parameters, environment.reset.footprint
     return replace(
         environment,
         robot=source,
@@ -102,7 +102,7 @@ def scaled_environment(environment: EnvironmentConfiguration, source: str) -> En
             sigma_linear_range=_scaled(rewards.sigma_linear_range, by.speed[0]),
             sigma_yaw_range=_scaled(rewards.sigma_yaw_range, by.speed[2]),
         ),
-        reset=replace(environment.reset, footprint=_footprint(environment.reset.footprint, by.stance)),
+        reset=replace(environment.reset, footprint=(length * by.stance[0], width * by.stance[1])),
         randomization=replace(
             randomization,
             base_mass=_scaled(randomization.base_mass, by.mass),
@@ -142,10 +142,6 @@ def scaled_training(training: TrainingConfiguration, source: str, reference: str
 
 def _scaled(pair: Range, factor: float) -> Range:
     return pair[0] * factor, pair[1] * factor
-
-
-def _footprint(footprint: Range, stance: Range) -> Range:
-    return footprint[0] * stance[0], footprint[1] * stance[1]
 
 
 def _ramp(ramp: Ramp, factor: float) -> Ramp:

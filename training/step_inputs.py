@@ -28,17 +28,10 @@ AFTER_RESET = AFTER_STEP[:6]
 """Physics state that is observed."""
 
 
-def static_inputs(state: PhysicsState, *, stays: bool = False) -> PhysicsState:
-    """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32; or, if these stay for
-    good, the engine's own.
-    """
-    if stays:
-        return state
-    return PhysicsState(**{f.name: _float32(getattr(state, f.name)).clone() for f in fields(PhysicsState)})
-
-
-def _float32(value: torch.Tensor) -> torch.Tensor:
-    return value.float() if value.is_floating_point() else value
+def static_inputs(state: PhysicsState) -> PhysicsState:
+    """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32."""
+    values = {f.name: getattr(state, f.name).clone() for f in fields(PhysicsState)}
+    return PhysicsState(**{name: v.float() if v.is_floating_point() else v for name, v in values.items()})
 
 
 @dataclass(kw_only=True)

@@ -44,7 +44,6 @@ class StopSignals:
     """While active, SIGTERM and SIGINT ask for an orderly stop; a second SIGINT interrupts at once."""
 
     def __init__(self, message: Callable[[str], None]) -> None:
-        """Report the request through ``message``."""
         self.received: int | None = None
         self._message = message
         self._previous: dict[int, Any] = {}

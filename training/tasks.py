@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from types import MappingProxyType
 
 from ..files.parsing import one_line, shown
+from ..files.plugins import imported
 from ..robots import load_robot
 from ..robots.loading import robot_digest
 from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
@@ -22,7 +23,6 @@ from .environment_configuration import (
     TerminationConfiguration,
 )
 from .overrides import TaskError, apply_overrides
-from .own_terms import imported
 from .scaling import scaled_environment, scaled_training
 from .terrain_configuration import FLAT_TILE, TerrainConfiguration
 
@@ -106,7 +106,26 @@ _ALL_TERRAINS_ITERATIONS = 5000
 """Two billion steps of 16,384 worlds, in all."""
 
 
-def _all_terrains(name: str, title: str, *, network: NetworkConfiguration, method: str = "cts") -> Task:
+_PLAIN = NetworkConfiguration(student_encoder="mlp")
+_MOE_NG = NetworkConfiguration(student_encoder="moe_ng")
+_AC_MOE = replace(_PLAIN, expert_width=128, actor_hidden=(512, 256), critic_hidden=(512, 256))
+_MCP = replace(_PLAIN, gate_hidden=(512, 256, 128))
+_HIM = replace(_PLAIN, latent_width=16, student_hidden=(128, 64), teacher_hidden=(128, 64))
+_DREAMWAQ = replace(_HIM, teacher_hidden=(64, 128, 48))
+
+_METHODS = (
+    ("go2-moe-cts", "cts", NetworkConfiguration(), "Mixture-of-Experts student (the paper's method)"),
+    ("go2-cts", "cts", _PLAIN, "plain student"),
+    ("go2-moe-ng", "cts", _MOE_NG, "experts that do not see the command (ablation MoE-NG)"),
+    ("go2-ac-moe", "ac_moe", _AC_MOE, "experts in actor and critic (ablation AC-MoE)"),
+    ("go2-mcp", "mcp", _MCP, "an actor that multiplies primitives (ablation MCP)"),
+    ("go2-him", "him", _HIM, "hybrid internal model (baseline HIM)"),
+    ("go2-dreamwaq", "dreamwaq", _DREAMWAQ, "variational estimator (baseline DreamWaQ)"),
+)
+"""The paper's method, its baselines and its ablations, with their own sizes: task, method, network, title."""
+
+
+def _on_all_terrains(name: str, method: str, network: NetworkConfiguration, title: str) -> Task:
     """A method on the environment that all methods share."""
     return Task(
         name=name,
@@ -116,47 +135,6 @@ def _all_terrains(name: str, title: str, *, network: NetworkConfiguration, metho
             algorithm=replace(_ALL_TERRAINS_LEARNING, method=method),
             network=network,
             run=RunConfiguration(experiment=name.replace("-", "_"), iterations=_ALL_TERRAINS_ITERATIONS),
-        ),
-    )
-
-
-_PLAIN = NetworkConfiguration(student_encoder="mlp")
-_ESTIMATOR = replace(_PLAIN, latent_width=16, student_hidden=(128, 64))
-
-
-def _methods() -> tuple[Task, ...]:
-    """The paper's method, its baselines and its ablations, with their own sizes."""
-    return (
-        _all_terrains("go2-moe-cts", "Mixture-of-Experts student (the paper's method)", network=NetworkConfiguration()),
-        _all_terrains("go2-cts", "plain student", network=_PLAIN),
-        _all_terrains(
-            "go2-moe-ng",
-            "experts that do not see the command (ablation MoE-NG)",
-            network=NetworkConfiguration(student_encoder="moe_ng"),
-        ),
-        _all_terrains(
-            "go2-ac-moe",
-            "experts in actor and critic (ablation AC-MoE)",
-            method="ac_moe",
-            network=replace(_PLAIN, expert_width=128, actor_hidden=(512, 256), critic_hidden=(512, 256)),
-        ),
-        _all_terrains(
-            "go2-mcp",
-            "an actor that multiplies primitives (ablation MCP)",
-            method="mcp",
-            network=replace(_PLAIN, gate_hidden=(512, 256, 128)),
-        ),
-        _all_terrains(
-            "go2-him",
-            "hybrid internal model (baseline HIM)",
-            method="him",
-            network=replace(_ESTIMATOR, teacher_hidden=(128, 64)),
-        ),
-        _all_terrains(
-            "go2-dreamwaq",
-            "variational estimator (baseline DreamWaQ)",
-            method="dreamwaq",
-            network=replace(_ESTIMATOR, teacher_hidden=(64, 128, 48)),
         ),
     )
 
@@ -254,7 +232,9 @@ def _sprint() -> Task:
     )
 
 
-TASKS: Mapping[str, Task] = MappingProxyType({task.name: task for task in (*_methods(), _flat(), _sprint())})
+TASKS: Mapping[str, Task] = MappingProxyType(
+    {task.name: task for task in (*(_on_all_terrains(*row) for row in _METHODS), _flat(), _sprint())}
+)
 """All tasks by name."""
 
 

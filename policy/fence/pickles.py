@@ -12,6 +12,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
+
 from ..base import PolicyError
 from .archive import LARGEST_FILE
 
@@ -23,24 +25,24 @@ REBUILD_TENSOR = "torch._utils _rebuild_tensor_v2"
 REBUILD_QUANTIZED = "torch._utils _rebuild_qtensor"
 """The call that makes a quantized one, with the same arguments first."""
 
-ITEM_SIZES: Mapping[str, int] = {
-    "torch DoubleStorage": 8,
-    "torch FloatStorage": 4,
-    "torch HalfStorage": 2,
-    "torch BFloat16Storage": 2,
-    "torch LongStorage": 8,
-    "torch IntStorage": 4,
-    "torch ShortStorage": 2,
-    "torch CharStorage": 1,
-    "torch ByteStorage": 1,
-    "torch BoolStorage": 1,
-    "torch QInt8Storage": 1,
-    "torch QUInt8Storage": 1,
-    "torch QInt32Storage": 4,
-    "torch ComplexFloatStorage": 8,
-    "torch ComplexDoubleStorage": 16,
+STORAGES: Mapping[str, torch.dtype] = {
+    "torch DoubleStorage": torch.float64,
+    "torch FloatStorage": torch.float32,
+    "torch HalfStorage": torch.float16,
+    "torch BFloat16Storage": torch.bfloat16,
+    "torch LongStorage": torch.int64,
+    "torch IntStorage": torch.int32,
+    "torch ShortStorage": torch.int16,
+    "torch CharStorage": torch.int8,
+    "torch ByteStorage": torch.uint8,
+    "torch BoolStorage": torch.bool,
+    "torch QInt8Storage": torch.qint8,
+    "torch QUInt8Storage": torch.quint8,
+    "torch QInt32Storage": torch.qint32,
+    "torch ComplexFloatStorage": torch.complex64,
+    "torch ComplexDoubleStorage": torch.complex128,
 }
-"""Size of one entry by the name of its storage's class [bytes]."""
+"""Type of the entries by the name of their storage's class."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +73,9 @@ class Storage:
     """Entries."""
 
     @property
-    def item_size(self) -> int:
-        """Size of an entry [bytes]."""
-        return ITEM_SIZES[self.kind]
+    def dtype(self) -> torch.dtype:
+        """Type of an entry."""
+        return STORAGES[self.kind]
 
 
 class PickleError(PolicyError):
@@ -173,7 +175,7 @@ class _Machine:
     def persistent(self, _: Any) -> None:
         identity = self._stack.pop()
         kind, cls, key, _place, count = identity if isinstance(identity, tuple) else [identity] * 5
-        if kind != "storage" or not isinstance(cls, Name) or cls.name not in ITEM_SIZES or not isinstance(key, str):
+        if kind != "storage" or not isinstance(cls, Name) or cls.name not in STORAGES or not isinstance(key, str):
             shown = cls.name if isinstance(cls, Name) else "no storage"
             raise PickleError(f"'{self._source}' holds a storage of an unknown kind ({shown})")
         if not _whole(count) or count < 0:
@@ -298,9 +300,9 @@ def check_tensors(calls: Iterator[Call], sizes: Mapping[str, int], *, source: st
     for call in calls:
         tensor = stored_tensor(call, source=source)
         storage = tensor.storage
-        if sizes.get(storage.key, -1) < storage.count * storage.item_size:
+        if sizes.get(storage.key, -1) < storage.count * storage.dtype.itemsize:
             raise PickleError(f"'{source}' lacks the weights that it lists: record '{storage.key}' is missing or short")
-        total += math.prod(tensor.shape) * storage.item_size
+        total += math.prod(tensor.shape) * storage.dtype.itemsize
         if total > LARGEST_FILE:
             raise PickleError(
                 f"'{source}' holds tensors of over {LARGEST_FILE // 2**20} MiB once they are spelled out; "

@@ -33,7 +33,6 @@ class CtsLosses(Losses):
     student_names = ("latent", "load_balance", "largest_expert_share")
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
-        """Allocate; see ``Losses``."""
         super().__init__(*arguments, **settings)
         latents = self.storage.student_latent.flatten(0, 1)
         self.targets = torch.zeros_like(latents)
@@ -116,14 +115,9 @@ class CTS(PPO):
         del policy
         return self.critic.value(latent, privileged)
 
-    @property
-    def has_experts(self) -> bool:
-        """Whether the student encoder is a Mixture of Experts."""
-        return bool(self.actor.architecture == "moe_cts")
-
     def without_meaning(self) -> tuple[str, ...]:
         """See ``PPO``."""
-        return () if self.has_experts else ("load_balance", "largest_expert_share")
+        return () if self.actor.architecture == "moe_cts" else ("load_balance", "largest_expert_share")
 
     def make_bootstrap(self, iterations: int) -> Bootstrap:
         """The teacher encoder learns the student's latent from what the teacher sees, the critic the values of the student's

@@ -70,7 +70,6 @@ class DreamwaqLosses(EstimatorLosses):
     student_names = ("velocity", "reconstruction", "divergence")
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
-        """Allocate; see ``Losses``."""
         super().__init__(*arguments, **settings)
         samples = self.storage.num_steps * self.storage.num_envs * (2 if self.settings.symmetry == "augment" else 1)
         self.noise = torch.zeros(samples, self.storage.student_latent.shape[-1] - VELOCITY, device=self.device)

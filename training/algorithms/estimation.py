@@ -85,7 +85,6 @@ class EstimatorLosses(Losses):
     """What an estimator learns from: histories, true velocities, next states, and which samples have one."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
-        """Allocate; see ``Losses``."""
         super().__init__(*arguments, **settings)
         # Made once: nothing may travel to the device in a recorded step.
         self.velocity_map = VECTOR.to(self.device)

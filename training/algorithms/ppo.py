@@ -27,7 +27,7 @@ from .symmetry import Mirror, passes
 MOST_WEIGHTS = LARGEST_FILE // 24
 """A checkpoint has each weight as it is and averaged, with two moments, and a part of them once more as the policy, at 4 bytes."""
 GROUPS = ("policy", "history", "privileged")
-Step = Callable[..., None]
+Loss = Callable[..., tuple[torch.Tensor, torch.Tensor]]
 
 
 class PPO:
@@ -334,15 +334,26 @@ class PPO:
         losses = self.losses
         self._policy_gradients = FlatGradients(self._policy_parameters, extra=len(losses.policy_names))
         self._student_gradients = FlatGradients(self.actor.student_parameters(), extra=len(losses.student_names))
-        self._policy_step = self._joined(self._compute_policy, self._policy_gradients, self._apply_policy)
-        self._student_step = self._joined(self._compute_student, self._student_gradients, self._apply_student)
+        self._policy_step = self._joined(self._policy_loss, self.optimizer, self._policy_gradients, self._apply_policy)
+        self._student_step = self._joined(
+            self._student_loss, self.student_optimizer, self._student_gradients, self._apply_student
+        )
 
-    def _joined(self, compute: Step, gradients: FlatGradients, apply: Step) -> Step:
-        """One step of two halves. Between several processes each half is a CUDA graph of its own: a message inside a graph
-        could not be given up when a process is lost.
+    def _joined(
+        self, loss: Loss, optimizer: torch.optim.Optimizer, gradients: FlatGradients, apply: Callable[[], None]
+    ) -> Callable[..., None]:
+        """One step of two halves: gradients of a loss of rows, and what follows from them. Between several processes each half is a
+        CUDA graph of its own: a message inside a graph could not be given up when a process is lost.
         """
 
-        def recorded(step: Step) -> Step:
+        def compute(*rows: torch.Tensor) -> None:
+            value, metrics = loss(*rows)
+            optimizer.zero_grad(set_to_none=True)
+            value.backward()
+            gradients.gather()
+            gradients.extra.copy_(metrics)
+
+        def recorded(step: Callable[..., None]) -> Callable[..., None]:
             return RecordedFunction(step, self.device) if self._graphs else step
 
         def whole(*rows: torch.Tensor) -> None:
@@ -360,28 +371,12 @@ class PPO:
 
         return shared
 
-    def _compute_policy(self, *groups: torch.Tensor) -> None:
-        """Gradients of the PPO loss of one minibatch."""
-        loss, metrics = self._policy_loss(*groups)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self._policy_gradients.gather()
-        self._policy_gradients.extra.copy_(metrics)
-
     def _apply_policy(self) -> None:
         metrics = self._policy_gradients.extra
         self._adapt_learning_rate(metrics[self.losses.policy_names.index("kl")])
         norm, skipped = clip_gradients(self._policy_parameters, self.configuration.max_gradient_norm)
         self.optimizer.step()
         self._policy_metrics += torch.nan_to_num(torch.cat((metrics, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
-
-    def _compute_student(self, rows: torch.Tensor) -> None:
-        """Gradients of the student's loss of one minibatch; ``rows`` index the student-only buffers."""
-        loss, metrics = self._student_loss(rows)
-        self.student_optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        self._student_gradients.gather()
-        self._student_gradients.extra.copy_(metrics)
 
     def _apply_student(self) -> None:
         _, skipped = clip_gradients(self.actor.student_parameters(), self.configuration.max_gradient_norm)

@@ -64,7 +64,6 @@ class RolloutStorage:
         next_state_width: int,
         device: torch.device | str,
     ) -> None:
-        """Allocate for ``num_steps`` steps."""
 
         def zeros(envs: int, *width: int) -> torch.Tensor:
             return torch.zeros(num_steps, envs, *width, device=device)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import torch
 
@@ -53,9 +54,7 @@ class MirrorMap:
     @classmethod
     def joined(cls, maps: Sequence[MirrorMap]) -> MirrorMap:
         """The map of the concatenation of several vectors."""
-        offsets = [0]
-        for part in maps:
-            offsets.append(offsets[-1] + part.width)
+        offsets = accumulate((part.width for part in maps), initial=0)
         index = torch.cat([part.index + offset for part, offset in zip(maps, offsets, strict=False)])
         return cls(index, torch.cat([part.sign for part in maps]))
 
@@ -90,12 +89,7 @@ class Mirror:
 
     def to(self, device: torch.device | str) -> Mirror:
         """The same maps on another device."""
-        return Mirror(
-            policy=self.policy.to(device),
-            history=self.history.to(device),
-            privileged=self.privileged.to(device),
-            action=self.action.to(device),
-        )
+        return Mirror(**{name: each.to(device) for name, each in vars(self).items()})
 
 
 def build_mirror(observations: ObservationConfiguration, *, contract: PolicyContract, robot: Robot) -> Mirror:
