@@ -41,11 +41,6 @@ def backends(incomplete: str) -> list[str]:
     return [before + comma + name for name in backend_names()]
 
 
-def warp_backends(incomplete: str) -> list[str]:
-    """Names of the engines whose kernels can be compiled."""
-    return ["mujoco-warp", "newton"]
-
-
 def robots(incomplete: str) -> list[str]:
     """Names of robots, and descriptions."""
     from ..robots.registry import robot_names

@@ -24,6 +24,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
+from . import picture
 from .console import Terminal, make_table
 
 OK, WARNING, PROBLEM = "ok", "warning", "problem"
@@ -213,26 +214,12 @@ def check_mujoco() -> Iterator[Finding]:
 
 # ---- pictures -------------------------------------------------------------------------------------------------------
 
-_RENDER_PROBE = """
-import json, mujoco
-model = mujoco.MjModel.from_xml_string(
-    "<mujoco><worldbody><light pos='0 0 3'/><geom type='plane' size='1 1 1' rgba='1 1 1 1'/></worldbody></mujoco>"
-)
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-renderer = mujoco.Renderer(model, 32, 32)
-renderer.update_scene(data)
-print(json.dumps(int(renderer.render().max())))
-"""
 _PACKAGES_OF = {"egl": "libegl1 (and a GPU driver or libgl1-mesa-dri)", "osmesa": "libosmesa6"}
 
 
 def check_rendering() -> Iterator[Finding]:
     """Which of MuJoCo's ways to render without a window work; one is enough for videos."""
-    works: dict[str, bool] = {}
-    for backend in ("egl", "osmesa"):
-        brightest, trouble = _ask(_RENDER_PROBE, MUJOCO_GL=backend)
-        works[backend] = not trouble and brightest > 0
+    works = {backend: not _ask(picture.PROBE, MUJOCO_GL=backend)[1] for backend in picture.RENDERERS}
     for backend, good in works.items():
         what = f"rendering ({backend})"
         if good:

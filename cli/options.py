@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share. What differs from command to command stands in the command."""
+"""Arguments and options that several commands share, by the name of the parameter. What differs stands in the command."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 from ..files import MOST_THREADS
 from . import completion
 
-PolicyArgument = Annotated[
+Policy = Annotated[
     str,
     typer.Argument(
         help="A policy file (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
@@ -17,7 +17,7 @@ PolicyArgument = Annotated[
         autocompletion=completion.policies,
     ),
 ]
-PoliciesArgument = Annotated[
+Policies = Annotated[
     list[str],
     typer.Argument(
         help="One or more policy files (own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained.",
@@ -28,55 +28,53 @@ PoliciesArgument = Annotated[
 LARGEST_SEED = 2**63 - 2**32
 """Commands count on from a seed."""
 
-TrustOption = Annotated[
+Trust = Annotated[
     bool,
     typer.Option("--trust", help="Run the program that a policy file of the project's own format carries inside."),
 ]
-SuiteOption = Annotated[
+Suite = Annotated[
     str,
     typer.Option(
         help="Suite name (see 'gaitgauge list suites') or a suite's .toml file.", autocompletion=completion.suites
     ),
 ]
-BackendOption = Annotated[
+Backend = Annotated[
     str, typer.Option(help="Physics engine, see 'gaitgauge list backends'.", autocompletion=completion.backends)
 ]
-DeviceOption = Annotated[
+Device = Annotated[
     str | None,
     typer.Option(
         help="cpu or cuda; the default is what the engine is made for.", autocompletion=completion.of("cpu", "cuda")
     ),
 ]
-RobotOption = Annotated[
+Robot = Annotated[
     str | None,
     typer.Option(
         help="Robot name, or a robot.toml. Default: the robot that the policy is for.", autocompletion=completion.robots
     ),
 ]
-TerrainsOption = Annotated[
+Terrains = Annotated[
     list[str] | None,
     typer.Option("--terrain", help="Terrain; repeatable. Default: the suite's.", autocompletion=completion.terrains),
 ]
-LevelOption = Annotated[
-    int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")
-]
-FrictionsOption = Annotated[
+Level = Annotated[int | None, typer.Option(help="Play at this level (1-10) instead of searching for the highest.")]
+Frictions = Annotated[
     list[float] | None, typer.Option("--friction", help="Friction coefficient; repeatable. Default: the suite's.")
 ]
-PayloadsOption = Annotated[
+Payloads = Annotated[
     list[float] | None, typer.Option("--payload", help="Mass on the base [kg]; repeatable. Default: the suite's.")
 ]
-SeedsOption = Annotated[
+Seeds = Annotated[
     list[int] | None, typer.Option("--seed", help="Seed of the quality episodes; repeatable. Default: the suite's.")
 ]
-FirstSeedOption = Annotated[
+FirstSeed = Annotated[
     int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first robot; the others' follow it.")
 ]
-ThreadsOption = Annotated[
+Threads = Annotated[
     int | None,
     typer.Option(min=1, max=MOST_THREADS, help="CPU threads; results do not depend on them. Default: all cores."),
 ]
-ClusterOption = Annotated[
+Cluster = Annotated[
     str | None,
     typer.Option(
         help="Ray cluster whose CPUs play, all that are free or as many as --threads: auto, HOST:PORT or ray://HOST:PORT. "

@@ -19,8 +19,8 @@ RENDERERS = ("egl", "osmesa")
 """Ways to draw without a display, the faster first; the value of MUJOCO_GL."""
 _ON_THE_CPU = ("llvmpipe", "softpipe", "swrast", "swiftshader")
 """What drivers that draw without a GPU call themselves."""
-_PROBE = """
-import mujoco
+PROBE = """
+import json, mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
@@ -28,8 +28,9 @@ with mujoco.Renderer(model, 32, 32) as renderer:
     renderer.update_scene(data)
     assert renderer.render().max() > 0
     from OpenGL import GL
-    print(GL.glGetString(GL.GL_RENDERER).decode())
+    print(json.dumps(GL.glGetString(GL.GL_RENDERER).decode()))
 """
+"""Draws a picture, or fails, and prints what the driver calls itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +96,7 @@ def choose_renderer() -> Quality:
     asked = os.environ.get("MUJOCO_GL")
     for name in (asked,) if asked else RENDERERS:
         environment = {**os.environ, "MUJOCO_GL": name}
-        tried = subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True, check=False)
+        tried = subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True, check=False)
         if tried.returncode == 0:
             os.environ["MUJOCO_GL"] = name
             driver = tried.stdout.decode(errors="replace").lower()

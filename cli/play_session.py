@@ -99,25 +99,25 @@ def beyond(command: Command, limits: Command) -> str | None:
     return f"the policy's contract clips the command: {', '.join(parts)}" if parts else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlaySettings:
-    """Where and how a policy is played."""
-
-    backend: str
-    device: str
-    friction: float
-    seed: int
-    suite: Suite
-    """Gives the physics, the robot's joint constants, and the speeds at which a robot goes its own way."""
-
-
 class PlaySession:
     """A robot that walks until it is told to stop: it starts again after a fall and at the target."""
 
     def __init__(
-        self, policy: Policy, robot: Robot, terrain: Terrain, settings: PlaySettings, label: str = "policy"
+        self,
+        policy: Policy,
+        robot: Robot,
+        terrain: Terrain,
+        *,
+        suite: Suite,
+        backend: str,
+        device: str,
+        friction: float,
+        seed: int,
+        label: str = "policy",
     ) -> None:
         """Build the world and put the robot at the start.
+
+        ``suite`` gives the physics, the robot's joint constants, and the speeds at which a robot goes its own way.
 
         Raises:
             BackendError: the engine cannot do this.
@@ -125,15 +125,13 @@ class PlaySession:
             UserError: the policy's control period is no multiple of the physics step, or the robot lacks the suite's joint
                 parameters.
         """
-        suite = settings.suite
         period = policy.contract.control_period
         physics = replace(suite.physics, substeps=max(1, round(period / suite.physics.timestep)))
         if abs(physics.control_period - period) > 1e-9:
             raise UserError(
                 f"the policy's control period is {period:g} s, no multiple of the physics step of {physics.timestep:g} s"
             )
-        self.policy, self.robot, self.terrain, self.period = policy, robot, terrain, period
-        self.label = label
+        self.policy, self.robot, self.terrain, self.period, self.label = policy, robot, terrain, period, label
         self.limits = policy.contract.command_limits
         """Largest commands that the policy was made for."""
         self._own_limits = clip(suite.command_limits(terrain.family), self.limits)
@@ -151,10 +149,10 @@ class PlaySession:
             terrain_index=(0,),
             physics=physics,
         )
-        self.backend = make_backend(settings.backend, scene, device=settings.device)
+        self.backend = make_backend(backend, scene, device=device)
         self._walk = Walk(policy, self.backend, session=policy.session(1, device=str(self.backend.device)))
-        self.set_friction(settings.friction)
-        self._random = np.random.default_rng(settings.seed)
+        self.set_friction(friction)
+        self._random = np.random.default_rng(seed)
         self.time = 0.0
         """Simulated time in all [s]."""
         self.falls = 0

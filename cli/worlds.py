@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ..backends.registry import choose_device
 from ..gauge.suite import load_suite
@@ -13,7 +14,7 @@ from ..policy.loading import load_policy
 from ..robots import load_robot
 from ..terrains.gauge_terrains import LEVELS
 from ..terrains.registry import gauge_terrain_names, make_terrain
-from .play_session import PlaySession, PlaySettings
+from .play_session import PlaySession
 from .policies import policy_file
 
 
@@ -30,23 +31,15 @@ class WorldMaker:
         robot: str | None = None,
         suite: str = "gaitgauge-1",
     ) -> None:
-        """Choose an engine.
-
-        Args:
-            backend: name of the engine.
-            device: where it computes, None for what it is made for.
-            seed: of the heading at each start.
-            trust: run the program that a policy file carries inside.
-            robot: name or path of the robot; None for the one that each policy is for.
-            suite: name or path of the suite whose physics, joint parameters and speeds are played with.
+        """Take the options of ``gaitgauge play`` of these names.
 
         Raises:
             BackendError: no such engine or device.
             SuiteError: no such suite.
         """
-        self._backend, self._device = backend, choose_device(backend, device)
-        self._seed, self._trust, self._robot = seed, trust, robot
-        self._suite = load_suite(suite)
+        self._trust, self._robot = trust, robot
+        where = choose_device(backend, device)
+        self._settings: dict[str, Any] = {"backend": backend, "device": where, "seed": seed, "suite": load_suite(suite)}
         self._policies: dict[str, Policy] = {}
 
     def make(self, choice: str, terrain: str, level: int | None, friction: float, label: str) -> PlaySession:
@@ -60,10 +53,8 @@ class WorldMaker:
             asked = None if self._robot is None else load_robot(self._robot)
             self._policies[choice] = load_policy(policy_file(choice), asked, trust=self._trust)
         policy = self._policies[choice]
-        settings = PlaySettings(
-            backend=self._backend, device=self._device, friction=friction, seed=self._seed, suite=self._suite
-        )
-        return PlaySession(policy, robot_for(policy.contract, self._robot), ground, settings, label)
+        body = robot_for(policy.contract, self._robot)
+        return PlaySession(policy, body, ground, friction=friction, label=label, **self._settings)
 
     @staticmethod
     def default_level(terrain: str) -> int | None:

@@ -7,16 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .. import completion
-from ..options import (
-    DeviceOption,
-    FirstSeedOption,
-    PoliciesArgument,
-    RobotOption,
-    SuiteOption,
-    ThreadsOption,
-    TrustOption,
-)
+from .. import completion, options
 from ..running import runs
 
 app = typer.Typer()
@@ -35,7 +26,7 @@ EngineOption = Annotated[
 @app.command()
 @runs("trial:run_trial")
 def trial(
-    policies: PoliciesArgument,
+    policies: options.Policies,
     scenarios: Annotated[
         list[str] | None,
         typer.Option(
@@ -47,14 +38,14 @@ def trial(
     repeats: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Robots in each scenario. Default: the scenario's own.")
     ] = None,
-    seed: FirstSeedOption = 0,
+    seed: options.FirstSeed = 0,
     backend: EngineOption = "mujoco",
-    device: DeviceOption = None,
-    robot: RobotOption = None,
-    threads: ThreadsOption = None,
+    device: options.Device = None,
+    robot: options.Robot = None,
+    threads: options.Threads = None,
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: results/trial-<policies>.")] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print trials.json instead of a table.")] = False,
-    trust: TrustOption = False,
+    trust: options.Trust = False,
 ) -> None:
     """Send policies through field trials (pulls, stairs, drops, a sprint …) and count how many robots come through.
 
@@ -67,7 +58,7 @@ def trial(
 @app.command()
 @runs("latent:run_latent")
 def latent(
-    policies: PoliciesArgument,
+    policies: options.Policies,
     terrains: Annotated[
         list[str] | None,
         typer.Option(
@@ -76,19 +67,19 @@ def latent(
     ] = None,
     level: Annotated[int, typer.Option(min=1, help="Level of the terrains that have levels.")] = 5,
     friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.8,
-    suite: SuiteOption = "gaitgauge-1",
+    suite: options.Suite = "gaitgauge-1",
     seconds: Annotated[float, typer.Option(min=0.2, max=60.0, help="How long every robot walks [s].")] = 5.0,
     robots: Annotated[
         int,
         typer.Option(min=2, max=1000, help="Robots for each terrain and command; the probe is tried on each in turn."),
     ] = 4,
-    seed: FirstSeedOption = 0,
+    seed: options.FirstSeed = 0,
     backend: EngineOption = "mujoco",
-    robot: RobotOption = None,
-    threads: ThreadsOption = None,
+    robot: options.Robot = None,
+    threads: options.Threads = None,
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: results/latent-<policies>.")] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print latent.json instead of tables.")] = False,
-    trust: TrustOption = False,
+    trust: options.Trust = False,
 ) -> None:
     """Look into policies: how well terrains and commands separate in the encoder's latent and in the experts' weights.
 

@@ -7,24 +7,8 @@ from typing import Annotated
 
 import typer
 
-from .. import completion
+from .. import completion, options
 from ..errors import UserError, report_errors
-from ..options import (
-    BackendOption,
-    ClusterOption,
-    DeviceOption,
-    FrictionsOption,
-    LevelOption,
-    PayloadsOption,
-    PoliciesArgument,
-    PolicyArgument,
-    RobotOption,
-    SeedsOption,
-    SuiteOption,
-    TerrainsOption,
-    ThreadsOption,
-    TrustOption,
-)
 from ..running import runs
 
 app = typer.Typer()
@@ -33,7 +17,7 @@ app = typer.Typer()
 @app.command()
 @runs("evaluate:run_evaluation")
 def evaluate(
-    policy: PolicyArgument,
+    policy: options.Policy,
     pipeline: Annotated[
         str,
         typer.Option(
@@ -41,17 +25,17 @@ def evaluate(
             autocompletion=completion.of("base", "multi", "level", "stress"),
         ),
     ] = "stress",
-    suite: SuiteOption = "gaitgauge-1",
-    backend: BackendOption = "mujoco",
-    device: DeviceOption = None,
-    robot: RobotOption = None,
-    terrains: TerrainsOption = None,
-    level: LevelOption = None,
-    frictions: FrictionsOption = None,
-    payloads: PayloadsOption = None,
-    seeds: SeedsOption = None,
-    threads: ThreadsOption = None,
-    cluster: ClusterOption = None,
+    suite: options.Suite = "gaitgauge-1",
+    backend: options.Backend = "mujoco",
+    device: options.Device = None,
+    robot: options.Robot = None,
+    terrains: options.Terrains = None,
+    level: options.Level = None,
+    frictions: options.Frictions = None,
+    payloads: options.Payloads = None,
+    seeds: options.Seeds = None,
+    threads: options.Threads = None,
+    cluster: options.Cluster = None,
     out: Annotated[
         Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-<pipeline>.")
     ] = None,
@@ -60,7 +44,7 @@ def evaluate(
         bool, typer.Option("--clip/--no-clip", help="Film the robot for the report, where this machine can draw.")
     ] = True,
     json_output: Annotated[bool, typer.Option("--json", help="Print results.json instead of tables.")] = False,
-    trust: TrustOption = False,
+    trust: options.Trust = False,
 ) -> None:
     """Gauge a policy: terrains, levels, frictions, payloads, noise and latency, down to one score with its interval.
 
@@ -89,16 +73,16 @@ def compare(
             autocompletion=completion.of("stress", "multi"),
         ),
     ] = "stress",
-    suite: SuiteOption = "gaitgauge-1",
-    backend: BackendOption = "mujoco",
-    device: DeviceOption = None,
-    robot: RobotOption = None,
-    terrains: TerrainsOption = None,
-    level: LevelOption = None,
-    frictions: FrictionsOption = None,
-    payloads: PayloadsOption = None,
-    seeds: SeedsOption = None,
-    threads: ThreadsOption = None,
+    suite: options.Suite = "gaitgauge-1",
+    backend: options.Backend = "mujoco",
+    device: options.Device = None,
+    robot: options.Robot = None,
+    terrains: options.Terrains = None,
+    level: options.Level = None,
+    frictions: options.Frictions = None,
+    payloads: options.Payloads = None,
+    seeds: options.Seeds = None,
+    threads: options.Threads = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -127,7 +111,7 @@ def verify(
     device: Annotated[
         str | None, typer.Option(help="cpu or cuda. Default: what the card's engine is made for.")
     ] = None,
-    threads: ThreadsOption = None,
+    threads: options.Threads = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="One environment of each terrain, at nominal friction and payload.")
     ] = False,
@@ -137,7 +121,7 @@ def verify(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the replay. Default: results/verify-<card>.")] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
-    trust: TrustOption = False,
+    trust: options.Trust = False,
 ) -> None:
     """Play a score card again and say whether it holds on this machine; exit code 1 where it does not.
 
@@ -198,7 +182,7 @@ def validate(
 @app.command()
 @runs("consistency:run_consistency")
 def consistency(
-    policies: PoliciesArgument,
+    policies: options.Policies,
     backends: Annotated[
         str,
         typer.Option(
@@ -215,9 +199,9 @@ def consistency(
     device: Annotated[
         str | None, typer.Option(help="cpu or cuda, for the engines that can use a GPU. Default: a GPU.")
     ] = None,
-    suite: SuiteOption = "robogauge-1.1",
-    robot: RobotOption = None,
-    terrains: TerrainsOption = None,
+    suite: options.Suite = "robogauge-1.1",
+    robot: options.Robot = None,
+    terrains: options.Terrains = None,
     frictions: Annotated[
         list[float] | None,
         typer.Option(
@@ -240,13 +224,13 @@ def consistency(
         typer.Option(min=0.0, help="Difference of quality that does not matter: below it engines are equivalent."),
     ] = 0.02,
     attribution: Annotated[bool, typer.Option(help="Switch one factor at a time and see what it does.")] = True,
-    threads: ThreadsOption = None,
+    threads: options.Threads = None,
     out: Annotated[
         Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-consistency.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the output folder.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print consistency.json instead of tables.")] = False,
-    trust: TrustOption = False,
+    trust: options.Trust = False,
 ) -> None:
     """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why.
 

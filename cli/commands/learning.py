@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from ...files import MOST_THREADS
-from .. import completion
-from ..options import ClusterOption
+from .. import completion, options
 from ..running import runs
 
 app = typer.Typer()
@@ -141,7 +140,7 @@ def sweep(
     threads: Annotated[
         int | None, typer.Option(min=1, max=MOST_THREADS, help="CPU threads of the gauge. Default: half of the cores.")
     ] = None,
-    cluster: ClusterOption = None,
+    cluster: options.Cluster = None,
     time: Annotated[str | None, typer.Option(help="Stop after this wall-clock time: seconds, 9m, 2h or 1h30m.")] = None,
     report: Annotated[
         bool, typer.Option("--report", help="Train and gauge nothing: tables and curves of what there is.")

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .. import completion
-from ..options import RobotOption, ThreadsOption, TrustOption
+from .. import completion, options
 from ..running import runs
 
 app = typer.Typer()
@@ -50,12 +49,12 @@ def doctor(
     contract: Annotated[
         Path | None, typer.Option(help="A contract.toml that says how the policy is to be run.", metavar="PATH")
     ] = None,
-    robot: RobotOption = None,
+    robot: options.Robot = None,
     seconds: Annotated[float, typer.Option(min=0.5, max=20.0, help="How long each description is played [s].")] = 2.0,
-    threads: ThreadsOption = None,
+    threads: options.Threads = None,
     out: Annotated[Path | None, typer.Option(help="Write the contract.toml that fits best.")] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-    trust: TrustOption = False,
+    trust: options.Trust = False,
 ) -> None:
     """Say what is wrong: with this machine, or with how a policy is run; exit code 1 where something is.
 
@@ -82,14 +81,14 @@ def warmup(
         typer.Option(
             "--backend",
             help="mujoco-warp or newton; repeatable. Default: mujoco-warp.",
-            autocompletion=completion.warp_backends,
+            autocompletion=completion.of("mujoco-warp", "newton"),
         ),
     ] = None,
     robot: Annotated[str, typer.Option(help="Robot name, or a robot.toml.", autocompletion=completion.robots)] = "go2",
     cache: Annotated[
         Path | None, typer.Option(help="Folder of the kernels. Default: Warp's own, or WARP_CACHE_PATH.")
     ] = None,
-    threads: ThreadsOption = None,
+    threads: options.Threads = None,
 ) -> None:
     """Compile the GPU kernels of training and evaluating before they are needed, also for a GPU that is not here.
 

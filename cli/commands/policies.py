@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .. import completion
-from ..options import LARGEST_SEED, BackendOption, DeviceOption, RobotOption, TrustOption
+from .. import completion, options
 from ..running import runs
 
 app = typer.Typer()
@@ -43,8 +42,8 @@ def export(
             autocompletion=completion.of("plain", "unitree"),
         ),
     ] = "plain",
-    trust: TrustOption = False,
-    robot: RobotOption = None,
+    trust: options.Trust = False,
+    robot: options.Robot = None,
 ) -> None:
     """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it.
 
@@ -91,16 +90,18 @@ def play(
         ),
     ] = None,
     friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.6,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the robot's heading at each start.")] = 0,
-    backend: BackendOption = "mujoco",
-    device: DeviceOption = None,
+    seed: Annotated[
+        int, typer.Option(min=0, max=options.LARGEST_SEED, help="Seed of the robot's heading at each start.")
+    ] = 0,
+    backend: options.Backend = "mujoco",
+    device: options.Device = None,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,
     host: Annotated[
         str, typer.Option(help="Interface of the browser's viewer; 0.0.0.0 lets other machines in.")
     ] = "127.0.0.1",
     gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
-    trust: TrustOption = False,
-    robot: RobotOption = None,
+    trust: options.Trust = False,
+    robot: options.Robot = None,
     suite: Annotated[
         str,
         typer.Option(
@@ -137,7 +138,7 @@ def import_command(
     raw: Annotated[
         bool, typer.Option("--raw", help="The same with the weights after the last update, not their average.")
     ] = False,
-    trust: TrustOption = False,
+    trust: options.Trust = False,
     contract: Annotated[
         Path | None, typer.Option(help="A contract.toml that says how a TorchScript or ONNX file is to be run.")
     ] = None,

@@ -79,7 +79,7 @@ def test_doctor_says_what_to_do_about_a_missing_package(monkeypatch, run):
 
 
 def test_doctor_survives_what_kills_a_process(monkeypatch):
-    monkeypatch.setattr(doctor, "_RENDER_PROBE", "import os; os.abort()")
+    monkeypatch.setattr(doctor.picture, "PROBE", "import os; os.abort()")
     assert [f.status for f in doctor.check_rendering()] == [doctor.WARNING, doctor.WARNING]
     monkeypatch.setattr(doctor, "_MUJOCO_PROBE", "raise ImportError('no libmujoco')")
     (finding,) = doctor.check_mujoco()

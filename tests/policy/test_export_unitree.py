@@ -9,7 +9,7 @@ import onnx
 import pytest
 import torch
 import yaml
-from gaitgauge.cli.play_session import PlaySession, PlaySettings
+from gaitgauge.cli.play_session import PlaySession
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.adapters import deploy_contract
 from gaitgauge.policy.base import Policy, PolicySession
@@ -67,8 +67,8 @@ def closed_loop(contract):
     """Observations (200, 225) and actions (200, 12) of the pretrained policy walking over waves in MuJoCo."""
     policy = Recorded(contract)
     suite = load_suite("gaitgauge-1")
-    settings = PlaySettings(backend="mujoco", device="cpu", friction=0.6, seed=0, suite=suite)
-    session = PlaySession(policy, ROBOT, make_terrain("wave", 3), settings)
+    settings = {"backend": "mujoco", "device": "cpu", "friction": 0.6, "seed": 0, "suite": suite}
+    session = PlaySession(policy, ROBOT, make_terrain("wave", 3), **settings)
     for step in range(STEPS):
         session.step((0.8, 0.0, 0.5 if step > 100 else 0.0))
     session.close()
