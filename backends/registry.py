@@ -110,7 +110,7 @@ def find_backend(name: str, device: str) -> type[PhysicsBackend]:
     """
     from .devices import find_device  # listing engines must not wait for torch
 
-    found = _with_variant(name)
+    found = engine_class(name)
     find_device(device, found.name, gpu=_can_use_gpu(found))
     return found
 
@@ -145,12 +145,13 @@ def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int =
     Raises:
         BackendError: unknown engine, missing package, or something the engine cannot do.
     """
-    found, plugin = _with_variant(name), plugins(GROUP).get(name.partition(":")[0])
+    found, plugin = engine_class(name), plugins(GROUP).get(name.partition(":")[0])
     build = partial(found, scene, device=device, threads=threads)
     return build() if plugin is None or name.partition(":")[0] in _OWN else guarded(plugin, BackendError, build)
 
 
-def _with_variant(name: str) -> type[PhysicsBackend]:
+def engine_class(name: str) -> type[PhysicsBackend]:
+    """The engine's class, with the solver that the name asks for; raises as ``backend_class`` does."""
     found = backend_class(name)
     variant = name.partition(":")[2]
     if not variant:

@@ -37,9 +37,9 @@ class ConformanceError(AssertionError):
     """An engine does something else than the contract says; the message gives both values."""
 
 
-def expect(condition: bool, message: str) -> None:
-    """Raise ``ConformanceError`` with the message unless the condition holds."""
-    if not condition:
+def expect(condition: ArrayLike, message: str) -> None:
+    """Raise ``ConformanceError`` with the message unless the condition holds, everywhere."""
+    if not np.all(condition):
         raise ConformanceError(message)
 
 
@@ -101,11 +101,13 @@ class Worlds:
         return _snapshot(self.backend.sample)
 
     def reset(self, worlds: ArrayLike | None = None, **arguments: Any) -> None:
-        """``PhysicsBackend.reset`` with the fields of ``ResetState``; the base is upright at (0, 0, 1) where no pose is given."""
-        arguments.setdefault("base_position", np.tile([0.0, 0.0, 1.0], (self.count, 1)))
-        arguments.setdefault("base_quaternion", np.tile([1.0, 0.0, 0.0, 0.0], (self.count, 1)))
+        """``PhysicsBackend.reset`` with the fields of ``ResetState``, which may have one row for all worlds; the base is upright at
+        (0, 0, 1) where no pose is given.
+        """
         terrain_index = arguments.pop("terrain_index", None)
-        tensors = {name: self._tensor(value) for name, value in arguments.items() if value is not None}
+        arguments = {"base_position": (0.0, 0.0, 1.0), "base_quaternion": (1.0, 0.0, 0.0, 0.0), **arguments}
+        rows = {k: np.broadcast_to(v, (self.count, np.shape(v)[-1])) for k, v in arguments.items() if v is not None}
+        tensors = {name: self._tensor(value) for name, value in rows.items()}
         start = ResetState(terrain_index=self._whole(terrain_index), **tensors)
         self.backend.reset(start, self._mask(worlds))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .bench import Bench, expect, expect_close
-from .contact import back_height, stand_still
+from .contact import lay_on_back, stand_still
 from .ground import incline
 from .reference import GRAVITY, Reference, axis_angle, level_stance
 from .suite import check
@@ -37,9 +37,9 @@ def slides_or_stays(bench: Bench) -> str:
             said = f"friction {friction[row]} on an incline of tan {np.tan(angle[row]):.3f}"
             if expected[row] > 0:
                 expect_close(f"acceleration down, {said} [m/s²]", gained[row], expected[row], bound * GRAVITY * 0.5)
-                expect(bool(moved[row] > 0.01), f"{said}: the robot must slide, but moved {1e3 * moved[row]:.1f} mm")
+                expect(moved[row] > 0.01, f"{said}: the robot must slide, but moved {1e3 * moved[row]:.1f} mm")
             else:
-                expect(bool(abs(moved[row]) < 0.01), f"{said}: the robot must stay, but slid {1e3 * moved[row]:.1f} mm")
+                expect(abs(moved[row]) < 0.01, f"{said}: the robot must stay, but slid {1e3 * moved[row]:.1f} mm")
     return f"slides with {gained[0]:.2f} and {gained[2]:.2f} m/s², must {expected[0]:.2f} and {expected[2]:.2f}"
 
 
@@ -50,8 +50,7 @@ def braking(bench: Bench) -> str:
     level = slice(0, 3)  # at 0.8 the robot pitches onto its front feet, which slip sideways too
     with bench.worlds(bench.stiff()) as worlds:
         worlds.randomize(friction=friction)
-        velocity = np.tile([3.0, 0.0, 0.0], (worlds.count, 1))
-        start = stand_still(bench, worlds, seconds=0.02, turn=HEADING_X, base_linear_velocity=velocity)
+        start = stand_still(bench, worlds, seconds=0.02, turn=HEADING_X, base_linear_velocity=(3.0, 0.0, 0.0))
         impulse = np.zeros((worlds.count, 3))
         tangential, normal = np.zeros(worlds.count), np.zeros(worlds.count)
         steps = 40
@@ -78,12 +77,7 @@ def body_friction(bench: Bench) -> str:
     friction = np.array([0.15, 0.3, 0.5, 0.7])
     with bench.worlds(bench.stiff()) as worlds:
         worlds.randomize(friction=friction)
-        worlds.reset(
-            base_position=np.tile([0.0, 0.0, back_height(Reference(bench.robot, bench.stiff()))], (worlds.count, 1)),
-            base_quaternion=np.tile([0.0, 1.0, 0.0, 0.0], (worlds.count, 1)),
-            base_linear_velocity=np.tile([3.0, 0.0, 0.0], (worlds.count, 1)),
-            held_target=worlds.default_pose,
-        )
+        lay_on_back(bench, worlds, base_linear_velocity=(3.0, 0.0, 0.0), held_target=worlds.default_pose)
         worlds.step(substeps=20)
         impulse = np.zeros((worlds.count, 3))
         for _ in range(40):

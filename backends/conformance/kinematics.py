@@ -78,7 +78,7 @@ def state_fields(bench: Bench) -> str:
             expect_close(f"{name} after a reset", getattr(state, name), 0.0, 0.0)
         expect(not state.diverged.any() and not state.overflowed.any(), "a fresh world is diverged or overflowed")
         kept = backend.state.clone()
-        worlds.reset(base_position=np.full((n, 3), 2.0))
+        worlds.reset(base_position=(2.0, 2.0, 2.0))
         expect_close("base height in a clone of an earlier state [m]", kept.base_position_w[:, 2].cpu(), 1.0, 1e-6)
         expect_close("base height of the present state [m]", worlds.read().base_position_w[:, 2], 2.0, 1e-6)
     return f"{str(backend.dtype).removeprefix('torch.')} on {backend.device}"
@@ -184,9 +184,8 @@ def frames(bench: Bench) -> str:
 def free_fall(bench: Bench) -> str:
     """A limp robot falls with g = 9.81 m/s² and does not turn."""
     with bench.worlds() as worlds:
-        start = np.tile([0.3, -0.2, 3.0], (worlds.count, 1))
+        start, thrown = np.array([0.3, -0.2, 3.0]), np.array([0.5, 0.25, 1.0])
         yawed = np.array([axis_angle((0.0, 0.3, 1.0), a) for a in np.linspace(0.0, 3.0, worlds.count)])
-        thrown = np.tile([0.5, 0.25, 1.0], (worlds.count, 1))
         worlds.reset(base_position=start, base_quaternion=yawed, base_linear_velocity=thrown)
         h, count = worlds.backend.scene.physics.timestep, 100
         for _ in range(count // 10):

@@ -77,7 +77,7 @@ def motor_speed_limit(bench: Bench) -> str:
     strength[2] = 0.5
     with bench.worlds(parameters, torque_limits=True, torque_speed_limit=True) as worlds:
         worlds.randomize(motor_strength=strength)
-        worlds.reset(joint_position=worlds.default_pose, joint_velocity=np.tile(speed[joints], (worlds.count, 1)))
+        worlds.reset(joint_position=worlds.default_pose, joint_velocity=speed[joints])
         worlds.step(worlds.default_pose + reach, substeps=1)
         error = expect_close("joint_torque with limits by speed [N·m]", worlds.read().joint_torque, wanted, 4e-3)
         # it is the speed of each substep that counts
@@ -85,7 +85,7 @@ def motor_speed_limit(bench: Bench) -> str:
         worlds.step(worlds.default_pose + 100.0, sample_at=[9] * worlds.count)
         before, after = worlds.read_sample(), worlds.read()
         share = np.clip(2.0 - before.joint_velocity / 10.0, 0.0, 1.0)
-        expect(bool((share < 0.79).any()), "the check's own joints do not become faster")
+        expect((share < 0.79).any(), "the check's own joints do not become faster")
         wanted = np.where(before.joint_velocity >= 0.0, 16.0 * share, 20.0) * strength
         expect_close("joint_torque of the last substep [N·m]", after.joint_torque, wanted, 4e-3)
     return f"largest error {error:.1e} N·m"
@@ -215,7 +215,7 @@ def latency(bench: Bench) -> str:
             )
             expect_close("joint_torque with latency [N·m]", state.joint_torque, expected.joint_torque, 200 * tolerance)
         spread = np.abs(state.joint_position[1:] - state.joint_position[:-1]).max(axis=1).min()
-        expect(bool(spread > 10 * tolerance), f"delays 0, 3, 9 and 10 make no difference ({spread:.1e} rad)")
+        expect(spread > 10 * tolerance, f"delays 0, 3, 9 and 10 make no difference ({spread:.1e} rad)")
         # a target that came too late to act in its own period acts from the next one on
         worlds.step()
         single.step(np.where((delay == 10)[:, None], second, previous))
@@ -229,5 +229,5 @@ def latency(bench: Bench) -> str:
         worlds.step(first, delay=[0, 10, 10, 10])
         torque = worlds.read().joint_torque
         expect_close("joint_torque of a limp robot whose first target is late [N·m]", torque[1:], 0.0, 1e-5)
-        expect(bool(np.abs(torque[0]).max() > 0.1), "the first target of a limp robot without delay has no effect")
+        expect(np.abs(torque[0]).max() > 0.1, "the first target of a limp robot without delay has no effect")
     return f"equal to switching targets between single substeps to {error:.1e} rad"

@@ -32,8 +32,8 @@ def stand(bench: Bench, worlds: Worlds, *, clearance: float = 0.02, held: bool =
     speed = np.zeros((worlds.count, 3))
     speed[:, 0] = np.linspace(0.0, 0.6, worlds.count)
     worlds.reset(
-        base_position=np.tile([0.0, 0.0, stance.height], (worlds.count, 1)),
-        base_quaternion=np.tile(stance.quaternion, (worlds.count, 1)),
+        base_position=(0.0, 0.0, stance.height),
+        base_quaternion=stance.quaternion,
         base_linear_velocity=speed,
         held_target=worlds.default_pose if held else None,
     )
@@ -132,7 +132,7 @@ def step_mask(bench: Bench) -> str:
         expect_same("worlds outside of the mask", before, after, np.flatnonzero(~stepped))
         expect_close("time of the masked worlds [s]", after.time, [0.04, 0.02, 0.04, 0.02], 1e-6)
         moved = np.abs(after.joint_position - before.joint_position).max(axis=1)
-        expect(bool((moved[stepped] > 1e-4).all()), "worlds inside of the mask did not move")
+        expect(moved[stepped] > 1e-4, "worlds inside of the mask did not move")
         # the worlds left out go on as if nothing had been: the targets of the masked step were not theirs
         worlds.step(worlds=~stepped)
         other.step()
@@ -155,7 +155,7 @@ def reset_mask(bench: Bench) -> str:
             stand(bench, each)
             each.step(wave(each, 0))
         before = worlds.read()
-        worlds.reset(chosen, base_position=np.full((worlds.count, 3), 2.0))
+        worlds.reset(chosen, base_position=(2.0, 2.0, 2.0))
         after = worlds.read()
         rows = np.flatnonzero(~chosen)
         expect_same("worlds outside of the reset's mask", before, after, rows)
@@ -215,9 +215,9 @@ def independence(bench: Bench) -> str:
         row = 2
         stance = level_stance(Reference(bench.robot, bench.soft()), clearance=0.02)
         alone.reset(
-            base_position=[[0.0, 0.0, stance.height]],
-            base_quaternion=[stance.quaternion],
-            base_linear_velocity=[[np.linspace(0.0, 0.6, count)[row], 0.0, 0.0]],
+            base_position=(0.0, 0.0, stance.height),
+            base_quaternion=stance.quaternion,
+            base_linear_velocity=(np.linspace(0.0, 0.6, count)[row], 0.0, 0.0),
             held_target=alone.default_pose,
         )
         for target in targets:

@@ -11,7 +11,7 @@ import mujoco
 
 from ...robots import Robot, load_robot
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsBackend, Scene, Support, unsupported
-from ..registry import backend_class, make_backend
+from ..registry import engine_class, make_backend
 from .bench import Bench
 
 # Whatever an engine under test may raise is a failed check, not the end of the run.
@@ -94,10 +94,8 @@ def run_check(check: Check, bench: Bench) -> CheckResult:
     start = perf_counter()
     missing = unsupported(check.needs, bench.capabilities)
     if missing:
-        outcome, detail = (
-            Outcome.NOT_SUPPORTED,
-            ", ".join(_described(name, bench.capabilities[name]) for name in missing),
-        )
+        outcome = Outcome.NOT_SUPPORTED
+        detail = ", ".join(_described(name, bench.capabilities[name]) for name in missing)
     else:
         try:
             outcome, detail = Outcome.PASSED, check.run(bench)
@@ -119,11 +117,7 @@ def make_bench(backend: str | type[PhysicsBackend], device: str = "cpu", *, robo
         BackendError: the engine is unknown or not installed, or does not declare all capabilities.
     """
     name = backend if isinstance(backend, str) else backend.name
-    found = backend_class(name) if isinstance(backend, str) else backend
-    variant = name.partition(":")[2] if isinstance(backend, str) else ""
-    with_solver = getattr(found, "with_solver", None)
-    if variant and with_solver is not None:
-        found = with_solver(variant)
+    found = engine_class(name) if isinstance(backend, str) else backend
     capabilities = found.capabilities()
     undeclared = [n for n in CAPABILITY_NAMES if n not in capabilities]
     if undeclared:
