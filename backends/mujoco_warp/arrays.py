@@ -1,17 +1,15 @@
 # mypy: disable-error-code="valid-type, assignment"
 """Arrays of the mujoco_warp engine as Warp's kernels see them, bundled by purpose, and what fills the bundles.
 
-N worlds, J joints, F feet, G geoms, S terrain slots. Numbers are float32 and int32 unless said otherwise.
+N worlds, J joints, F feet, L links, G geoms, T terrains, S terrain slots. Numbers are float32 and int32 unless said otherwise.
 """
 
 # Warp reads the annotations of structs: no ``from __future__ import annotations`` here.
-from typing import Any
-
 import mujoco_warp
-import numpy as np
 import warp as wp
 
-from .model import FootChains, PaletteTables, SharedModel
+from ..warp.structures import filled
+from .model import SharedModel
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 """mujoco_warp's five friction coefficients of a contact: sliding twice, torsional, rolling twice."""
@@ -48,24 +46,30 @@ class Links:
     """Chains of links from the base to each foot, one after the other."""
 
     start: wp.array[int]
-    """First link of each foot, and the total at the end."""
+    """First link of each foot, and L at the end, (F + 1,)."""
     position: wp.array[wp.vec3]
+    """Fixed offset from the link before [m], (L,)."""
     rotation: wp.array[wp.quat]
+    """Fixed rotation from the link before, xyzw, (L,)."""
     hinge: wp.array[int]
-    """Whether the link ends in a hinge."""
+    """Whether the link ends in a hinge, (L,)."""
     axis: wp.array[wp.vec3]
+    """Hinge axis in the link's frame, (L,)."""
     anchor: wp.array[wp.vec3]
+    """Point on the hinge axis [m], (L,)."""
     address_q: wp.array[int]
+    """Of the hinge in qpos, (L,)."""
     address_v: wp.array[int]
+    """Of the hinge in qvel, (L,)."""
     zero: wp.array[float]
-    """Joint angle at which the link's fixed rotation holds."""
+    """Hinge angle at which the fixed rotation holds [rad], (L,)."""
     foot: wp.array[wp.vec3]
-    """Centre of each foot in the frame of its last link."""
+    """Centre of each foot in its last link's frame [m], (F,)."""
 
 
 @wp.struct
 class Roles:
-    """What each geom is."""
+    """What each geom is, (G,)."""
 
     foot: wp.array[int]
     """Index of the foot, -1 for other geoms."""
@@ -76,22 +80,28 @@ class Roles:
     ground: wp.array[int]
     """1 for floor, walls and terrain."""
     slot: wp.array[int]
-    """Index of the terrain slot: boxes 0..S-1, the height field S; -1 for floor and robot."""
+    """Index of the terrain slot, the height field's the last; -1 for floor and robot."""
 
 
 @wp.struct
 class Palette:
-    """Terrain shapes by terrain and slot. Slots are the boxes and, last, the height field."""
+    """Terrains as slot poses and sizes. Slots are the boxes and, last, the height field if a terrain has one."""
 
     position: wp.array2d[wp.vec3]
+    """[m], (T, S)."""
     rotation: wp.array2d[wp.mat33]
     size: wp.array2d[wp.vec3]
+    """Geom sizes as the engine defines them, (T, S)."""
     bound_center: wp.array2d[wp.vec3]
+    """Centre of the bounding box in the slot's frame [m], (T, S)."""
     bound_half: wp.array2d[wp.vec3]
+    """Half size of the bounding box [m], (T, S)."""
     radius: wp.array2d[float]
+    """Radius of the bounding sphere [m], (T, S)."""
     field: wp.array[int]
-    """Height field of the terrain, 0 where it has none (the geom is parked then)."""
+    """Index of the height field, 0 where there is none and the geom is parked, (T,)."""
     wall: wp.array2d[int]
+    """1 for boundary walls, (T, S)."""
 
 
 @wp.struct
@@ -104,7 +114,6 @@ class ContactArrays:
     distance: wp.array[float]
     position: wp.array[wp.vec3]
     frame: wp.array[wp.mat33]
-    margin: wp.array[float]
     friction: wp.array[vec5]
     dimension: wp.array[int]
     address: wp.array2d[int]
@@ -118,62 +127,31 @@ class ContactArrays:
     pyramidal: int
 
 
-def to_warp(values: np.ndarray, dtype: type) -> Any:
-    """Copy a constant table to the current Warp device."""
-    return wp.array(np.ascontiguousarray(values), dtype=dtype)
-
-
 def motion_arrays(model: mujoco_warp.Model, data: mujoco_warp.Data, shared: SharedModel) -> Motion:
     """mujoco_warp's own state arrays."""
-    motion = Motion()
-    motion.positions, motion.velocities, motion.bodies = model.nq, model.nv, model.nbody
-    motion.joint_q, motion.joint_v = to_warp(shared.joint_q, int), to_warp(shared.joint_v, int)
-    motion.qpos, motion.qvel, motion.warmstart = data.qpos, data.qvel, data.qacc_warmstart
-    motion.applied, motion.external = data.qfrc_applied, data.xfrc_applied
-    motion.time, motion.overflow = data.time, data.overflow
-    return motion
-
-
-def palette_arrays(tables: PaletteTables) -> Palette:
-    """The palette on the current Warp device."""
-    palette = Palette()
-    for name in ("position", "size", "bound_center", "bound_half"):
-        setattr(palette, name, to_warp(getattr(tables, name), wp.vec3))
-    palette.rotation = to_warp(tables.rotation, wp.mat33)
-    palette.radius = to_warp(tables.radius, float)
-    palette.field, palette.wall = to_warp(tables.field, int), to_warp(tables.wall, int)
-    return palette
-
-
-def link_arrays(chains: FootChains) -> Links:
-    """The chains of links on the current Warp device."""
-    links = Links()
-    for name in ("position", "axis", "anchor", "foot"):
-        setattr(links, name, to_warp(getattr(chains, name), wp.vec3))
-    links.rotation = to_warp(np.roll(chains.quaternion, -1, axis=1), wp.quat)  # Warp's quaternions are xyzw
-    for name in ("start", "hinge", "address_q", "address_v"):
-        setattr(links, name, to_warp(getattr(chains, name), int))
-    links.zero = to_warp(chains.zero, float)
-    return links
-
-
-def role_arrays(shared: SharedModel) -> Roles:
-    """What each geom is, on the current Warp device."""
-    roles = Roles()
-    for name in ("foot", "body", "trunk", "ground", "slot"):
-        setattr(roles, name, to_warp(getattr(shared, f"geom_{name}"), int))
-    return roles
+    sizes = {"positions": model.nq, "velocities": model.nv, "bodies": model.nbody}
+    forces = {"applied": data.qfrc_applied, "external": data.xfrc_applied}
+    return filled(Motion, data, shared, **sizes, **forces, warmstart=data.qacc_warmstart)
 
 
 def contact_arrays(data: mujoco_warp.Data, *, pyramidal: bool) -> ContactArrays:
     """mujoco_warp's own contact and constraint arrays."""
-    contact, contacts = data.contact, ContactArrays()
-    contacts.count, contacts.world, contacts.geom = data.nacon, contact.worldid, contact.geom
-    contacts.distance, contacts.position, contacts.frame = contact.dist, contact.pos, contact.frame
-    contacts.margin, contacts.friction, contacts.dimension = contact.includemargin, contact.friction, contact.dim
-    contacts.address, contacts.row_id, contacts.row_force = contact.efc_address, data.efc.id, data.efc.force
-    contacts.row_count, contacts.equality_rows = data.nefc, data.ne
-    contacts.friction_rows, contacts.limit_rows = data.nf, data.nl
-    contacts.row_capacity = data.njmax
-    contacts.pyramidal = int(pyramidal)
-    return contacts
+    contact = data.contact
+    return filled(
+        ContactArrays,
+        contact,
+        count=data.nacon,
+        world=contact.worldid,
+        distance=contact.dist,
+        position=contact.pos,
+        dimension=contact.dim,
+        address=contact.efc_address,
+        row_count=data.nefc,
+        equality_rows=data.ne,
+        friction_rows=data.nf,
+        limit_rows=data.nl,
+        row_id=data.efc.id,
+        row_force=data.efc.force,
+        row_capacity=data.njmax,
+        pyramidal=int(pyramidal),
+    )

@@ -17,8 +17,9 @@ from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, R
 from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
 from ..warp.state import StateArrays
+from ..warp.structures import filled, to_warp
 from . import kernels, readout
-from .arrays import contact_arrays, link_arrays, motion_arrays, palette_arrays, role_arrays, to_warp
+from .arrays import Links, Palette, Roles, contact_arrays, motion_arrays
 from .height_fields import repair_height_fields
 from .masses import BATCHED_FIELDS, WorldMasses, describe_model
 from .memory import bytes_per_world
@@ -106,8 +107,8 @@ class MujocoWarpBackend(WarpBackend):
         self._allocate()
         self._masses = WorldMasses(shared, self._model, self.device)
         self._motion = motion_arrays(self._model, self._data, shared)
-        self._palette, self._links = palette_arrays(shared.palette), link_arrays(shared.chains)
-        self._roles, self._slot_geom = role_arrays(shared), to_warp(shared.slot_geom, int)
+        self._palette, self._links = filled(Palette, **shared.palette), filled(Links, **shared.links)
+        self._roles, self._slot_geom = filled(Roles, **shared.roles), to_warp(shared.slot_geom, int)
         self._contacts = contact_arrays(self._data, pyramidal=scene.physics.cone == "pyramidal")
         if scene.physics.deterministic:
             self._order = CanonicalOrder(self._model, self._data)

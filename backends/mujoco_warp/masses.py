@@ -85,7 +85,7 @@ def describe_model(model: mujoco_warp.Model, shared: SharedModel, motors: MotorT
     bodies, dofs = shared.bodies, shared.joint_v
     joints = [int(shared.model.dof_jntid[d]) for d in dofs]
     limited = shared.model.jnt_limited[joints, None].astype(bool)
-    feet = [int(np.flatnonzero(shared.geom_foot == f)[0]) for f in range(int(shared.geom_foot.max()) + 1)]
+    feet = [int(np.flatnonzero(shared.roles["foot"] == f)[0]) for f in range(int(shared.roles["foot"].max()) + 1)]
     floor, priority = shared.model.geom("floor").id, model.geom_priority.numpy()
     friction, strength = first("geom_friction"), motors.strength[0].cpu().numpy()
     return ModelFields(

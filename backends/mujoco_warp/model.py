@@ -32,54 +32,8 @@ SMALLEST_TOLERANCE = 1e-6
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int32]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaletteTables:
-    """Terrains as slot poses and sizes. T terrains, S slots: the boxes and, if a terrain has one, the height field."""
-
-    position: Floats
-    """[m], (T, S, 3)."""
-    rotation: Floats
-    """Rotation matrices, (T, S, 3, 3)."""
-    size: Floats
-    """Geom sizes as the engine defines them, (T, S, 3)."""
-    bound_center: Floats
-    """Centre of the bounding box in the slot's frame [m], (T, S, 3)."""
-    bound_half: Floats
-    """Half size of the bounding box [m], (T, S, 3)."""
-    radius: Floats
-    """Radius of the bounding sphere [m], (T, S)."""
-    field: Integers
-    """Index of the height field, 0 where there is none, (T,)."""
-    wall: Integers
-    """1 for boundary walls, (T, S)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FootChains:
-    """Links from the base to each foot. F feet, L links in all."""
-
-    start: Integers
-    """First link of each foot, and L at the end, (F + 1,)."""
-    position: Floats
-    """Fixed offset from the link before [m], (L, 3)."""
-    quaternion: Floats
-    """Fixed rotation from the link before, wxyz, (L, 4)."""
-    hinge: Integers
-    """Whether the link ends in a hinge, (L,)."""
-    axis: Floats
-    """Hinge axis in the link's frame, (L, 3)."""
-    anchor: Floats
-    """Point on the hinge axis [m], (L, 3)."""
-    address_q: Integers
-    """Of the hinge in qpos, (L,)."""
-    address_v: Integers
-    """Of the hinge in qvel, (L,)."""
-    zero: Floats
-    """Hinge angle at which the fixed rotation holds [rad], (L,)."""
-    foot: Floats
-    """Centre of each foot in its last link's frame [m], (F, 3)."""
+Tables = dict[str, NDArray]
+"""By name of a structure's field."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,21 +41,15 @@ class SharedModel:
     """The compiled model and what the kernels need to know about it. G geoms, B collision bodies, J joints."""
 
     model: mujoco.MjModel
-    palette: PaletteTables
-    chains: FootChains
+    palette: Tables
+    """Terrains as slot poses and sizes: the fields of ``arrays.Palette``."""
+    links: Tables
+    """Links from the base to each foot: the fields of ``arrays.Links``."""
     slot_geom: Integers
     """Geom of each slot, (S,)."""
     has_field: bool
-    geom_foot: Integers
-    """Index of the foot that a geom is, -1 for others, (G,)."""
-    geom_body: Integers
-    """Index of the collision body that a geom belongs to, -1 for others, (G,)."""
-    geom_trunk: Integers
-    """1 for the trunk's shapes, (G,)."""
-    geom_ground: Integers
-    """1 for floor, walls and terrain, (G,)."""
-    geom_slot: Integers
-    """Slot of a geom, -1 for robot and floor, (G,)."""
+    roles: Tables
+    """What each geom is: the fields of ``arrays.Roles``."""
     joint_q: Integers
     """Address in qpos, (J,)."""
     joint_v: Integers
@@ -157,14 +105,16 @@ def build_shared_model(scene: Scene) -> SharedModel:
     return SharedModel(
         model=model,
         palette=_palette(scene.terrains, slots, has_field),
-        chains=_foot_chains(model, scene, base),
+        links=_links(model, scene, base),
         slot_geom=slot_geom,
         has_field=has_field,
-        geom_foot=geom_foot,
-        geom_body=np.array([index.get(int(b), -1) for b in model.geom_bodyid], dtype=np.int32),
-        geom_trunk=np.isin(np.arange(model.ngeom), trunk).astype(np.int32),
-        geom_ground=(model.geom_bodyid == 0).astype(np.int32),
-        geom_slot=geom_slot,
+        roles={
+            "foot": geom_foot,
+            "body": np.array([index.get(int(b), -1) for b in model.geom_bodyid], dtype=np.int32),
+            "trunk": np.isin(np.arange(model.ngeom), trunk).astype(np.int32),
+            "ground": (model.geom_bodyid == 0).astype(np.int32),
+            "slot": geom_slot,
+        },
         joint_q=np.array([model.joint(j).qposadr[0] for j in robot.joint_names], dtype=np.int32),
         joint_v=np.array([model.joint(j).dofadr[0] for j in robot.joint_names], dtype=np.int32),
         base=base,
@@ -197,8 +147,8 @@ def buffer_capacity(scene: Scene, shared: SharedModel) -> Capacity:
     """Sizes of the buffers, from ``PhysicsOptions.contacts_per_world`` or the palette's shapes."""
     model, physics = shared.model, scene.physics
     contacts = contacts_per_world(physics, boxes=len(shared.slot_geom) > 0, fields=shared.has_field)
-    rows = constraint_rows(model, np.flatnonzero(shared.geom_foot >= 0).tolist(), physics, contacts)
-    collides = (shared.geom_ground == 0) & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+    rows = constraint_rows(model, np.flatnonzero(shared.roles["foot"] >= 0).tolist(), physics, contacts)
+    collides = (shared.roles["ground"] == 0) & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
     same_shape = np.bincount(model.geom_type[collides]).max(initial=1)
     total = scene.num_worlds * contacts + SPARE_CONTACTS
     per_world = int(same_shape) if shared.has_field else max(8, contacts // 4)
@@ -249,7 +199,7 @@ def _write_fields(model: mujoco.MjModel, terrains: tuple[Terrain, ...]) -> None:
         model.hfield_data[address : address + size] = (field.heights / _top(field.heights)).ravel()
 
 
-def _palette(terrains: tuple[Terrain, ...], slots: int, has_field: bool) -> PaletteTables:
+def _palette(terrains: tuple[Terrain, ...], slots: int, has_field: bool) -> Tables:
     """Slot poses, sizes and bounds of every terrain."""
     t, s = len(terrains), slots + int(has_field)
     position = np.tile(np.array(PARKED), (t, s, 1))
@@ -278,19 +228,19 @@ def _palette(terrains: tuple[Terrain, ...], slots: int, has_field: bool) -> Pale
             center[i, -1] = (0.0, 0.0, 0.5 * (top - base))
             half[i, -1] = (*field.half_size, 0.5 * (top + base))
             radius[i, -1] = np.sqrt(np.sum(np.square(field.half_size)) + max(top, base) ** 2)
-    return PaletteTables(
-        position=position,
-        rotation=rotation,
-        size=size,
-        bound_center=center,
-        bound_half=half,
-        radius=radius,
-        field=field_index,
-        wall=wall,
-    )
+    return {
+        "position": position,
+        "rotation": rotation,
+        "size": size,
+        "bound_center": center,
+        "bound_half": half,
+        "radius": radius,
+        "field": field_index,
+        "wall": wall,
+    }
 
 
-def _foot_chains(model: mujoco.MjModel, scene: Scene, base: int) -> FootChains:
+def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
     """Follow each foot's body up to the base; one link for each body, and one more for each further joint of a body."""
     start: list[int] = [0]
     rows: list[tuple[Floats, Floats, int]] = []
@@ -324,18 +274,19 @@ def _foot_chains(model: mujoco.MjModel, scene: Scene, base: int) -> FootChains:
     def of_joint(values: NDArray, empty: float | Floats) -> NDArray:
         return np.array([values[j] if j >= 0 else empty for j in joint_of])
 
-    return FootChains(
-        start=np.array(start, dtype=np.int32),
-        position=np.array([p for p, _, _ in rows]).reshape(-1, 3),
-        quaternion=np.array([q for _, q, _ in rows]).reshape(-1, 4),
-        hinge=np.array([int(j >= 0) for j in joint_of], dtype=np.int32),
-        axis=of_joint(model.jnt_axis, np.array([0.0, 0.0, 1.0])).reshape(-1, 3),
-        anchor=of_joint(model.jnt_pos, np.zeros(3)).reshape(-1, 3),
-        address_q=of_joint(model.jnt_qposadr, 0).astype(np.int32),
-        address_v=of_joint(model.jnt_dofadr, 0).astype(np.int32),
-        zero=np.array([model.qpos0[model.jnt_qposadr[j]] if j >= 0 else 0.0 for j in joint_of]),
-        foot=np.array(feet).reshape(-1, 3),
-    )
+    turns = np.array([q for _, q, _ in rows]).reshape(-1, 4)
+    return {
+        "start": np.array(start, dtype=np.int32),
+        "position": np.array([p for p, _, _ in rows]).reshape(-1, 3),
+        "rotation": np.roll(turns, -1, axis=1),  # Warp's quaternions are xyzw
+        "hinge": np.array([int(j >= 0) for j in joint_of], dtype=np.int32),
+        "axis": of_joint(model.jnt_axis, np.array([0.0, 0.0, 1.0])).reshape(-1, 3),
+        "anchor": of_joint(model.jnt_pos, np.zeros(3)).reshape(-1, 3),
+        "address_q": of_joint(model.jnt_qposadr, 0).astype(np.int32),
+        "address_v": of_joint(model.jnt_dofadr, 0).astype(np.int32),
+        "zero": np.array([model.qpos0[model.jnt_qposadr[j]] if j >= 0 else 0.0 for j in joint_of]),
+        "foot": np.array(feet).reshape(-1, 3),
+    }
 
 
 def _body(model: mujoco.MjModel, scene: Scene, name: str) -> int:

@@ -12,6 +12,7 @@ rows by kind and contact before the solver.
 import mujoco_warp
 import warp as wp
 
+from ..warp.structures import filled
 from .arrays import vec5
 
 wp.set_module_options({"enable_backward": False})
@@ -55,8 +56,9 @@ class RowFields:
     J: wp.array3d[float]
 
 
-CONTACT_FIELDS = tuple(ContactFields.vars)
-ROW_FIELDS = tuple(RowFields.vars)
+def _with_spare(kind: type, source: object) -> tuple:
+    """A structure over the source's arrays, and one over other memory of that size."""
+    return filled(kind, source), filled(kind, **{name: wp.empty_like(getattr(source, name)) for name in kind.vars})
 
 
 class CanonicalOrder:
@@ -66,14 +68,8 @@ class CanonicalOrder:
         if model.is_sparse:
             raise NotImplementedError("rows of a sparse Jacobian cannot be brought into order")
         self._geoms, self._columns = model.ngeom, data.efc.J.shape[2]
-        self._contacts, self._spare_contacts = ContactFields(), ContactFields()
-        for name in CONTACT_FIELDS:
-            setattr(self._contacts, name, getattr(data.contact, name))
-            setattr(self._spare_contacts, name, wp.empty_like(getattr(data.contact, name)))
-        self._rows, self._spare_rows = RowFields(), RowFields()
-        for name in ROW_FIELDS:
-            setattr(self._rows, name, getattr(data.efc, name))
-            setattr(self._spare_rows, name, wp.empty_like(getattr(data.efc, name)))
+        self._contacts, self._spare_contacts = _with_spare(ContactFields, data.contact)
+        self._rows, self._spare_rows = _with_spare(RowFields, data.efc)
         self._keys = wp.zeros(2 * data.naconmax, dtype=wp.int64)
         self._order = wp.zeros(2 * data.naconmax, dtype=int)
         self._row_order = wp.zeros((data.nworld, data.njmax), dtype=int)

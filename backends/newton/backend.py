@@ -19,9 +19,10 @@ import warp as wp
 from ..base import BackendError, Capability, PhysicsOptions, Randomization, Scene
 from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
+from ..warp.structures import filled, to_warp
 from . import kernels
 from . import readout_kernels as readout
-from .buffers import MassTensors, contact_structure, floats, ints, layout_structure, palette_structure
+from .buffers import MassTensors, contact_structure
 from .description import describe_newton
 from .model import BIRTH_HEIGHT, build_world_model
 from .solvers import SOLVERS, SolverAdapter, dry_friction_slope
@@ -110,15 +111,14 @@ class NewtonBackend(WarpBackend):
         self._allocate()
         self._now, self._next = self._model.state(), self._model.state()
         self._control = self._model.control()
-        self._layout = layout_structure(world.layout, on)
-        self._palette = palette_structure(world.slots, on)
-        self._slot_shape = ints(world.layout.slot_shape, on)
+        self._layout, self._palette = filled(kernels.Layout, world.layout), filled(kernels.Palette, world.slots)
+        self._slot_shape = to_warp(world.layout.slot_shape, int)
         force = self._solver.observables.contact_f
         self._contacts = contact_structure(self._solver.contacts, force, self._model.shape_body)
         dry = np.zeros(self._joints) if self.adapter.own_dry_friction else np.asarray(scene.parameters.friction_loss)
         dofs = np.array([int(world.reference.joint(name).dofadr[0]) for name in scene.robot.joint_names])
-        self._dry_friction = floats(dry, on)
-        self._dry_slope = floats(dry_friction_slope(world.reference, dofs, scene.physics.timestep), on)
+        self._dry_friction = to_warp(dry, float)
+        self._dry_slope = to_warp(dry_friction_slope(world.reference, dofs, scene.physics.timestep), float)
         self._masses = MassTensors(world, n, self.device)
         self._mask = torch.ones(n + 1, dtype=torch.bool, device=self.device)
         self._ticks = wp.zeros(n, dtype=int, device=on)

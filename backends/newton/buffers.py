@@ -1,65 +1,27 @@
-"""The memory that the Newton engine shares between torch and Warp: masses, layout."""
+"""The memory that the Newton engine shares between torch and Warp: contacts, masses."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import newton
-import numpy as np
 import torch
 import warp as wp
-from numpy.typing import ArrayLike
 
+from ..warp.structures import filled
 from . import kernels
-from .model import SlotTables, WorldLayout, WorldModel
+from .model import WorldModel
 from .solvers import SolverAdapter
 
 SMALLEST_MASS = 0.01
 """A base never gets lighter than this [kg]."""
 
 
-def ints(values: ArrayLike, device: wp.Device) -> wp.array:
-    """A Warp array of whole numbers."""
-    return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=device)
-
-
-def floats(values: ArrayLike, device: wp.Device) -> wp.array:
-    """A Warp array of single-precision numbers."""
-    return wp.array(np.asarray(values, dtype=np.float32), dtype=float, device=device)
-
-
-def structure(kind: Any, **values: Any) -> Any:
-    """A Warp structure with its fields set."""
-    made = kind()
-    for name, value in values.items():
-        setattr(made, name, value)
-    return made
-
-
-def layout_structure(layout: WorldLayout, device: wp.Device) -> Any:
-    """Where things are in a world, as the kernels see it."""
-    numbers = {name: getattr(layout, name) for name in ("coordinates", "dofs", "bodies", "shapes", "base")}
-    shapes = ("shape_foot", "shape_body", "shape_trunk", "shape_ground", "shape_slot")
-    tables = {name: ints(getattr(layout, name), device) for name in ("joint_q", "joint_v", "foot_body", *shapes)}
-    center: wp.array = wp.array(layout.foot_center, dtype=wp.vec3, device=device)
-    return structure(kernels.Layout, foot_center=center, **numbers, **tables)
-
-
-def palette_structure(slots: SlotTables, device: wp.Device) -> Any:
-    """The palette's slots, as the kernels see them."""
-    return structure(
-        kernels.Palette,
-        pose=wp.array(slots.pose, dtype=wp.transform, device=device),
-        scale=wp.array(slots.scale, dtype=wp.vec3, device=device),
-        wall=wp.array(slots.wall, dtype=int, device=device),
-    )
-
-
 def contact_structure(contacts: newton.Contacts, force: Any, shape_body: Any) -> Any:
     """Newton's contacts, as the kernels see them."""
-    names = ("count", "shape0", "shape1", "point0", "point1", "margin0", "margin1", "normal")
-    found = {name: getattr(contacts, f"rigid_contact_{name}") for name in names}
-    return structure(kernels.ContactArrays, force=force, shape_body=shape_body, **found)
+    kind: Any = kernels.ContactArrays
+    own = {"force": force, "shape_body": shape_body}
+    return filled(kind, **{n: getattr(contacts, f"rigid_contact_{n}") for n in kind.vars if n not in own}, **own)
 
 
 class MassTensors:

@@ -10,7 +10,7 @@ import torch
 from gaitgauge.backends import BackendError, PhysicsState, Randomization, ResetState
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
 from gaitgauge.backends.mujoco_warp.model import build_shared_model
-from gaitgauge.backends.mujoco_warp.order import CONTACT_FIELDS, ROW_FIELDS
+from gaitgauge.backends.mujoco_warp.order import ContactFields, RowFields
 from gaitgauge.backends.registry import make_backend
 from mujoco_warp_scenes import BOXES, COARSE, FINE, FLAT, ROBOT, TRAINING, scene, upright
 
@@ -185,7 +185,7 @@ def test_a_target_delayed_by_the_whole_period_acts_in_the_next():
 def shuffle_contacts(data, random):
     count = int(data.nacon.numpy()[0])
     order = random.permutation(count)
-    for name in CONTACT_FIELDS:
+    for name in ContactFields.vars:
         array = getattr(data.contact, name)
         values = array.numpy().copy()
         values[:count] = values[:count][order]
@@ -225,9 +225,9 @@ def test_rows_come_into_order_and_contacts_find_theirs():
     for _ in range(12):
         backend.step(arguments["held_target"])
     data, random = backend._data, np.random.default_rng(0)
-    before = {name: getattr(data.efc, name).numpy().copy() for name in ROW_FIELDS}
+    before = {name: getattr(data.efc, name).numpy().copy() for name in RowFields.vars}
     address = data.contact.efc_address.numpy().copy()
-    for name in ROW_FIELDS:
+    for name in RowFields.vars:
         mixed = before[name].copy()
         for world in range(3):
             first = int(data.ne.numpy()[world] + data.nf.numpy()[world] + data.nl.numpy()[world])
@@ -240,7 +240,7 @@ def test_rows_come_into_order_and_contacts_find_theirs():
         getattr(data.efc, name).assign(mixed)
     data.contact.efc_address.assign(random.permutation(address))
     backend._order.sort_rows(data)
-    for name in ROW_FIELDS:
+    for name in RowFields.vars:
         np.testing.assert_array_equal(getattr(data.efc, name).numpy(), before[name], err_msg=name)
     count = int(data.nacon.numpy()[0])
     active = address[:count, 0] >= 0

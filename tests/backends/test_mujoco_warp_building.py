@@ -27,26 +27,26 @@ ROOT = Path(__file__).parents[2]
 def test_palette_parks_unused_slots_and_bounds_the_used():
     shared = build_shared_model(scene(FLAT, BOXES, COARSE, FINE))
     palette = shared.palette
-    assert palette.position.shape == (4, 3, 3)
-    assert (palette.position[0] == PARKED).all() and (palette.position[1, 2] == PARKED).all()
-    np.testing.assert_allclose(palette.position[1, :2], [BLOCK.center, WALL.center])
-    np.testing.assert_array_equal(palette.wall, [[0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    assert palette["position"].shape == (4, 3, 3)
+    assert (palette["position"][0] == PARKED).all() and (palette["position"][1, 2] == PARKED).all()
+    np.testing.assert_allclose(palette["position"][1, :2], [BLOCK.center, WALL.center])
+    np.testing.assert_array_equal(palette["wall"], [[0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]])
     # the wall is turned by 90° about z: its own x axis points along the world's y
-    np.testing.assert_allclose(palette.rotation[1, 1] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(palette.radius[1, 0], np.linalg.norm(BLOCK.half_size))
-    np.testing.assert_array_equal(palette.field, [0, 0, 0, 1])
-    np.testing.assert_allclose(palette.position[2:, 2], [(0.5, 0, 0), (0, 0, 0)])
-    low, high = palette.bound_center - palette.bound_half, palette.bound_center + palette.bound_half
+    np.testing.assert_allclose(palette["rotation"][1, 1] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(palette["radius"][1, 0], np.linalg.norm(BLOCK.half_size))
+    np.testing.assert_array_equal(palette["field"], [0, 0, 0, 1])
+    np.testing.assert_allclose(palette["position"][2:, 2], [(0.5, 0, 0), (0, 0, 0)])
+    low, high = palette["bound_center"] - palette["bound_half"], palette["bound_center"] + palette["bound_half"]
     np.testing.assert_allclose((low[3, 2, 2], high[3, 2, 2]), (-0.2, 0.05))
 
 
 def test_bounds_are_those_of_the_compiler():
     shared = build_shared_model(scene(COARSE))
     model, geom = shared.model, shared.slot_geom[-1]
-    np.testing.assert_allclose(shared.palette.bound_center[0, -1], model.geom_aabb[geom, :3], atol=1e-6)
-    np.testing.assert_allclose(shared.palette.bound_half[0, -1], model.geom_aabb[geom, 3:], atol=1e-6)
-    np.testing.assert_allclose(shared.palette.radius[0, -1], model.geom_rbound[geom], rtol=1e-6)
-    np.testing.assert_allclose(shared.palette.size[0, -1], model.geom_size[geom], rtol=1e-6)
+    np.testing.assert_allclose(shared.palette["bound_center"][0, -1], model.geom_aabb[geom, :3], atol=1e-6)
+    np.testing.assert_allclose(shared.palette["bound_half"][0, -1], model.geom_aabb[geom, 3:], atol=1e-6)
+    np.testing.assert_allclose(shared.palette["radius"][0, -1], model.geom_rbound[geom], rtol=1e-6)
+    np.testing.assert_allclose(shared.palette["size"][0, -1], model.geom_size[geom], rtol=1e-6)
 
 
 def test_height_fields_keep_their_heights_and_shapes():
@@ -70,10 +70,10 @@ def test_what_is_only_seen_goes_and_masses_stay():
 def test_geom_roles():
     shared = build_shared_model(scene(BOXES))
     names = [shared.model.geom(g).name for g in range(shared.model.ngeom)]
-    assert [names[g] for g in np.flatnonzero(shared.geom_ground)] == ["floor", "box_0", "box_1"]
-    assert [names[g] for g in np.flatnonzero(shared.geom_foot >= 0)] == list(ROBOT.foot_names)
-    assert shared.geom_body[names.index("FL")] == ROBOT.collision_bodies.index("FL_calf")
-    assert (shared.geom_body[shared.geom_ground == 1] == -1).all()
+    assert [names[g] for g in np.flatnonzero(shared.roles["ground"])] == ["floor", "box_0", "box_1"]
+    assert [names[g] for g in np.flatnonzero(shared.roles["foot"] >= 0)] == list(ROBOT.foot_names)
+    assert shared.roles["body"][names.index("FL")] == ROBOT.collision_bodies.index("FL_calf")
+    assert (shared.roles["body"][shared.roles["ground"] == 1] == -1).all()
 
 
 def test_capacity_follows_option_cone_and_number_of_worlds():

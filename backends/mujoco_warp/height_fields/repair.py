@@ -31,6 +31,7 @@ from mujoco_warp._src.collision_core import CollisionContext
 from mujoco_warp._src.math import upper_trid_index
 from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType, OverflowType
 
+from ...warp.structures import filled
 from . import kernels
 from .contacts import Contacts, Materials, write_contacts
 from .prisms import support
@@ -90,13 +91,14 @@ def scratch_bytes(iterations: int) -> int:
 def empty_lists(contacts: int, worlds: int) -> kernels.Lists:
     """Lists for so many worlds with room for so many contacts together."""
     prisms, touches = (each * contacts + spare * worlds for each, spare in (_PRISMS, _TOUCHES))
-    lists = kernels.Lists()
-    lists.counts = wp.zeros(3, dtype=int)
-    lists.spans = wp.empty(contacts, dtype=wp.vec2i)
-    lists.prisms = wp.empty(prisms, dtype=wp.vec2i)
-    lists.touches = wp.empty(touches, dtype=kernels.Touch)
-    lists.searches = wp.empty(touches, dtype=wp.vec3i)
-    return lists
+    return filled(
+        kernels.Lists,
+        counts=wp.zeros(3, dtype=int),
+        spans=wp.empty(contacts, dtype=wp.vec2i),
+        prisms=wp.empty(prisms, dtype=wp.vec2i),
+        touches=wp.empty(touches, dtype=kernels.Touch),
+        searches=wp.empty(touches, dtype=wp.vec3i),
+    )
 
 
 def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: tuple[int, ...]) -> None:
@@ -107,9 +109,8 @@ def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: t
     multiprocessors = data.ncollision.device.sm_count
     testing = multiprocessors * _TEST_THREADS or _SERIAL_THREADS
     searching = max(1, min(multiprocessors * SEARCH_THREADS or _SERIAL_THREADS, data.naccdmax))
-    shapes = _filled(kernels.Shapes(), model, model.opt, data, context)
-    materials = _filled(Materials(), model)
-    contacts = _filled(Contacts(), data.contact, data)
+    shapes = filled(kernels.Shapes, model, model.opt, data, context)
+    materials, contacts = filled(Materials, model), filled(Contacts, data.contact, data)
     lists = empty_lists(data.naconmax, data.nworld)
     scratch = scratch_memory(searching, model.opt.ccd_iterations)
     test_prisms, search_prisms = kernels.prism_kernels(kinds)
@@ -138,11 +139,3 @@ def repair_height_fields() -> None:
     """Let mujoco_warp use the functions above. To be called before its first collision kernel is built; idempotent."""
     collision_gjk.support = collision_convex.support = support
     collision_driver.convex_narrowphase = convex_narrowphase
-
-
-def _filled(struct: Any, *sources: object) -> Any:
-    """The struct with every field from the first source that has one of that name."""
-    for name in struct._cls.vars:
-        source = next(source for source in sources if hasattr(source, name))
-        setattr(struct, name, getattr(source, name))
-    return struct

@@ -1,0 +1,25 @@
+"""Structures of arrays that kernels see, filled by the names of their fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+
+def to_warp(values: Any, dtype: type) -> Any:
+    """Copy a constant table to the current Warp device."""
+    return wp.array(np.ascontiguousarray(values), dtype=dtype)
+
+
+def filled(kind: Any, *sources: object, **values: Any) -> Any:
+    """A structure of Warp's with every field from ``values``, or from the first source that has something of that name.
+
+    NumPy's arrays are copied to the current Warp device, in the field's type.
+    """
+    made = kind()
+    for name, field in kind.vars.items():
+        value = values[name] if name in values else next(getattr(s, name) for s in sources if hasattr(s, name))
+        setattr(made, name, to_warp(value, field.type.dtype) if isinstance(value, np.ndarray) else value)
+    return made
