@@ -30,7 +30,8 @@ from typing import Any
 import numpy as np
 from gaitgauge.backends.base import PhysicsOptions
 from gaitgauge.files.writing import write_atomically
-from gaitgauge.gauge.evaluate import Request, evaluate, file_digest, prepare
+from gaitgauge.gauge.evaluate import Request, evaluate, prepare
+from gaitgauge.gauge.policies import file_digest
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import Suite, SuiteError, load_suite
 from gaitgauge.policy.base import PolicyError

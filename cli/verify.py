@@ -10,7 +10,8 @@ from pathlib import Path
 import typer
 
 from ..backends.registry import choose_device
-from ..gauge.verify import load_card, prepare_replay, verify
+from ..gauge.comparison import load_result
+from ..gauge.verify import prepare_replay, verify
 from .console import Terminal
 from .evaluate import shower
 from .studies import resumable
@@ -30,7 +31,7 @@ def run_verification(
     trust: bool,
 ) -> None:
     """Replay, show progress, print whether the card holds; exit code 1 where it does not."""
-    content = load_card(card)
+    content = load_result(card)
     prepared = prepare_replay(
         content,
         policy=policy,

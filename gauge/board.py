@@ -12,11 +12,12 @@ import jinja2
 from ..files.parsing import edited, one_line
 from ..files.writing import write_atomically
 from ..policy.contract import PRIVILEGED_TERMS
+from .comparison import load_result
 from .coverage import COMPLETE, coverage_of
 from .pages import page_template
 from .result_check import robot_digest_of
 from .suite import load_suite, suite_names
-from .verify import CardError, check_coverage, load_card
+from .verify import CardError, check_coverage
 
 
 def write_board(folder: Path, page: Path) -> Path:
@@ -32,7 +33,7 @@ def write_board(folder: Path, page: Path) -> Path:
     files = sorted([*folder.glob("*.json"), *folder.glob("*/results.json")])
     if not files:
         raise CardError(f"'{folder}' holds no score cards; put results.json files or folders of evaluations there")
-    cards = {str(file.relative_to(folder)): load_card(file) for file in files}
+    cards = {str(file.relative_to(folder)): load_result(file) for file in files}
     for file, card in cards.items():
         name, digest = card["suite"]["name"], card["suite"]["digest"]
         if name in suite_names() and (suite := load_suite(name)).digest == digest:

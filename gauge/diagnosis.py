@@ -132,8 +132,6 @@ def diagnose(
     *,
     seconds: float = 2.0,
     threads: int = 1,
-    backend: str = "mujoco",
-    device: str = "cpu",
 ) -> Diagnosis:
     """Play a policy as described and with every likely other contract; where one is clearly better and the robot does not
     walk yet, go on from there.
@@ -151,7 +149,7 @@ def diagnose(
     steps = round(seconds / policy.contract.control_period)
 
     def played(chosen: Sequence[Alternative]) -> list[Outcome]:
-        worlds = _worlds(robot, policy.contract, len(chosen) * len(_SHARES), backend, device, threads)
+        worlds = _worlds(robot, policy.contract, len(chosen) * len(_SHARES), threads)
         with closing(worlds) as physics, torch.inference_mode():
             return _play(policy, chosen, physics, steps)
 
@@ -185,10 +183,8 @@ def _sorted(paths: Iterable[tuple[Outcome, ...]]) -> list[tuple[Outcome, ...]]:
     return sorted(paths, key=lambda path: -path[-1].score)
 
 
-def _worlds(
-    robot: Robot, contract: PolicyContract, count: int, backend: str, device: str, threads: int
-) -> PhysicsBackend:
-    """Level ground; motors with gains of 1, which factors turn into those of a contract."""
+def _worlds(robot: Robot, contract: PolicyContract, count: int, threads: int) -> PhysicsBackend:
+    """Level ground in MuJoCo; motors with gains of 1, which factors turn into those of a contract."""
     physics = replace(TRAINING_PHYSICS, substeps=max(1, round(contract.control_period / TRAINING_PHYSICS.timestep)))
     if abs(physics.control_period - contract.control_period) > 1e-9:
         raise DiagnosisError(
@@ -204,7 +200,7 @@ def _worlds(
         terrain_index=(0,) * count,
         physics=physics,
     )
-    return make_backend(backend, scene, device=device, threads=threads)
+    return make_backend("mujoco", scene, threads=threads)
 
 
 def _play(policy: Policy, tried: Sequence[Alternative], physics: PhysicsBackend, steps: int) -> list[Outcome]:

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
@@ -27,7 +26,6 @@ from ..files.provenance import plugins, provenance, source_digest, versions
 from ..files.writing import json_text, write_atomically
 from ..policy.contract import kind_of_observations
 from ..policy.digest import policy_digest
-from ..policy.finding import find_policy
 from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
@@ -42,7 +40,7 @@ from .goals import TARGET, check_terrain, count_sub_commands
 from .motors import gains_note, joint_parameters
 from .pipelines import PIPELINES, Environment, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
-from .policies import check_fit
+from .policies import check_fit, file_digest
 from .results import fold, health, rows_csv
 from .segments import count_segments
 from .store import RunFolder, StoreError
@@ -229,12 +227,6 @@ def identity(prepared: Prepared) -> dict[str, Any]:
         "versions": versions(),
         "plugins": plugins(),
     }
-
-
-def file_digest(name: str) -> str:
-    """SHA-256 of a policy's file, hexadecimal, as ``sha256sum`` prints it."""
-    with find_policy(name).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def evaluate(

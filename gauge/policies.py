@@ -104,15 +104,19 @@ def check_fit(suite: Suite, robot: Robot, contract: PolicyContract) -> None:
         )
 
 
+def file_digest(name: str) -> str:
+    """SHA-256 of a policy's file, hexadecimal, as ``sha256sum`` prints it."""
+    with find_policy(name).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def describe(label: str, loaded: Loaded) -> dict[str, Any]:
     """What a result says of a policy, as plain data."""
     policy = loaded.policy
-    with find_policy(policy.path).open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {
         "label": label,
         "path": policy.path,
-        "file_sha256": digest,
+        "file_sha256": file_digest(policy.path),
         "robot": loaded.robot.name,
         "contract_hash": policy.contract.hash,
         "command_limits": list(policy.contract.command_limits),

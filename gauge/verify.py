@@ -13,11 +13,11 @@ import numpy as np
 from ..files.parsing import edited, one_line, shown
 from ..robots import robot_names
 from ..robots.loading import robot_digest
-from .comparison import load_result
 from .coverage import UNKNOWN, coverage, coverage_of
-from .evaluate import Prepared, Request, Status, evaluate, file_digest, prepare
+from .evaluate import Prepared, Request, Status, evaluate, prepare
 from .intervals import Evidence
 from .pipelines import Environment
+from .policies import file_digest
 from .result_check import chance_rules_of, robot_digest_of
 from .results import environment_weights
 from .suite import Suite, load_suite
@@ -155,14 +155,13 @@ def verify(
     fresh: int | None = None,
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
-    play: Callable[..., dict[str, Any]] = evaluate,
 ) -> dict[str, Any]:
     """Play what ``prepare_replay`` chose, into a folder that keeps finished episodes, and compare.
 
     Returns:
         Plain data of ``judge``, and the number that ``fresh`` seeds were made from.
     """
-    return judge(card, play(prepared, folder, resume=True, command=command, watch=watch)) | {"fresh": fresh}
+    return judge(card, evaluate(prepared, folder, resume=True, command=command, watch=watch)) | {"fresh": fresh}
 
 
 def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
@@ -221,15 +220,6 @@ def tolerance_band(score: float | None, interval: Sequence[float] | None) -> lis
         return None
     low, high = (score + math.sqrt(2.0) * (end - score) for end in interval)
     return [round(max(float(low), 0.0), 6), round(min(float(high), 1.0), 6)]
-
-
-def load_card(path: Path) -> dict[str, Any]:
-    """Read a score card: a ``results.json`` or a copy of it, or its folder.
-
-    Raises:
-        ComparisonError: there is none, it is damaged or too old, or a field is missing.
-    """
-    return load_result(path)
 
 
 def _sample(rows: Sequence[Row], suite: Suite) -> list[Row]:

@@ -27,15 +27,7 @@ from ..scoring import run_statistics
 from ..segments import count_segments
 from ..suite import Suite
 from ..workers import Job, local_workers, start_workers
-from .statistics import (
-    MARGIN,
-    Array,
-    Estimate,
-    OutcomeAgreement,
-    effect_size,
-    outcome_agreement,
-    paired_mean,
-)
+from .statistics import MARGIN, Array, Estimate, effect_size, outcome_agreement, paired_mean
 from .variants import MakeBackend, Variant
 
 _WORLDS = 24
@@ -309,16 +301,12 @@ def _outcomes(design: Design, reference: Records, compared: Records, rows: Seque
     walks = [(a, b) for a, b in pairs if a.episode.stage == "eval"]
     crossings = [(a, b) for a, b in pairs if a.episode.stage == "search"]
 
-    def agreement(
-        chosen: Sequence[tuple[Record, Record]], outcome: Callable[[Record], bool]
-    ) -> OutcomeAgreement | None:
+    def agreement(chosen: Sequence[tuple[Record, Record]], outcome: Callable[[Record], bool]) -> dict[str, Any] | None:
         seeds = [a.episode.seed for a, _ in chosen]
         first, second = [outcome(a) for a, _ in chosen], [outcome(b) for _, b in chosen]
         return outcome_agreement(first, second, seeds, shared=design.shared_draws)
 
-    fell = agreement(walks, lambda record: record.falls > 0)
-    reached = agreement(crossings, lambda record: bool(record.success))
-    return {"fell": None if fell is None else fell.plain(), "reached": None if reached is None else reached.plain()}
+    return {"fell": agreement(walks, lambda r: r.falls > 0), "reached": agreement(crossings, lambda r: bool(r.success))}
 
 
 def _rows(design: Design, reference: Records, compared: Records, first: Table, second: Table) -> list[dict[str, Any]]:

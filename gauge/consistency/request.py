@@ -55,4 +55,3 @@ class StudyStatus:
     done: int
     """Episodes of this run that have ended."""
     episodes: int
-    seconds: float

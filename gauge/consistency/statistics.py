@@ -9,6 +9,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,47 +157,10 @@ def effect_size(differences: Array) -> float | None:
     return float(flat.mean()) / spread
 
 
-@dataclass(frozen=True, kw_only=True)
-class OutcomeAgreement:
-    """How often a yes-or-no outcome was the same in both engines."""
-
-    both: int
-    only_reference: int
-    only_compared: int
-    neither: int
-    interval: tuple[float, float]
-    """95 % interval of the share of episodes with the same outcome."""
-    p_value: float
-    """How likely so lopsided a count of disagreements is if either engine may be the one."""
-
-    @property
-    def episodes(self) -> int:
-        """Number of paired episodes."""
-        return self.both + self.only_reference + self.only_compared + self.neither
-
-    @property
-    def share(self) -> float:
-        """Share of episodes with the same outcome."""
-        return (self.both + self.neither) / self.episodes
-
-    def plain(self) -> dict[str, float | int | list[float]]:
-        """As plain data."""
-        return {
-            "episodes": self.episodes,
-            "same": self.share,
-            "interval": list(self.interval),
-            "both": self.both,
-            "only_reference": self.only_reference,
-            "only_compared": self.only_compared,
-            "neither": self.neither,
-            "p_value": self.p_value,
-        }
-
-
 def outcome_agreement(
     reference: Sequence[bool], compared: Sequence[bool], seeds: Sequence[int], *, shared: bool
-) -> OutcomeAgreement | None:
-    """Agreement of an outcome over paired episodes; None where there are none.
+) -> dict[str, Any] | None:
+    """How often a yes-or-no outcome was the same in both engines, over paired episodes; None where there are none.
 
     Episodes that share a seed's random numbers are no independent witnesses. The interval is Wilson's for as many episodes as
     they amount to (Korn and Graubard 1998, "Confidence intervals for proportions with small expected number of positive counts
@@ -208,20 +172,27 @@ def outcome_agreement(
         compared: in the other, (N,).
         seeds: of the episodes, (N,).
         shared: whether episodes of one seed share its random numbers.
+
+    Returns:
+        Counts of ``episodes`` and of each outcome, the share with the ``same`` and its 95 % ``interval``, and ``p_value``: how
+        likely so lopsided a count of disagreements is if either engine may be the one.
     """
     first, second = np.asarray(reference, dtype=bool), np.asarray(compared, dtype=bool)
     if len(first) == 0:
         return None
     _, cluster = np.unique(seeds if shared else np.arange(len(first)), return_inverse=True)
     lone = np.bincount(cluster, weights=second.astype(float) - first)
-    return OutcomeAgreement(
-        both=int((first & second).sum()),
-        only_reference=int((first & ~second).sum()),
-        only_compared=int((~first & second).sum()),
-        neither=int((~first & ~second).sum()),
-        interval=_share_interval((first == second).astype(float), cluster),
-        p_value=sign_flip(lone.astype(np.int64)),
-    )
+    same = first == second
+    return {
+        "episodes": len(first),
+        "same": int(same.sum()) / len(first),
+        "interval": list(_share_interval(same.astype(float), cluster)),
+        "both": int((first & second).sum()),
+        "only_reference": int((first & ~second).sum()),
+        "only_compared": int((~first & second).sum()),
+        "neither": int((~first & ~second).sum()),
+        "p_value": sign_flip(lone.astype(np.int64)),
+    }
 
 
 def _share_interval(same: Array, cluster: NDArray[np.intp]) -> tuple[float, float]:

@@ -206,7 +206,7 @@ def study(
     blocks = []
     for number, (name, policy) in enumerate(prepared.policies):
         home = folder / f"{number + 1}-{Path(name).name}" if several else folder
-        blocks.append(_Policy(prepared, name, policy, home, resume=resume, watch=watch, make=make, began=began).run())
+        blocks.append(_Policy(prepared, name, policy, home, resume=resume, watch=watch, make=make).run())
     results: dict[str, Any] = {
         "schema": SCHEMA,
         "suite": {"name": prepared.suite.name, "version": prepared.suite.version, "title": prepared.suite.title},
@@ -243,10 +243,9 @@ class _Policy:
         resume: bool,
         watch: Watch | None,
         make: MakeBackend,
-        began: float,
     ) -> None:
         self._prepared, self._name, self._policy, self._folder = prepared, name, policy, folder
-        self._resume, self._watch, self._make, self._began = resume, watch, make, began
+        self._resume, self._watch, self._make = resume, watch, make
         self._records: dict[str, Records] = {}
         self._unable: dict[str, str] = {}
         self._part, self._parts = 0, len(prepared.engines)
@@ -308,10 +307,7 @@ class _Policy:
 
         def on_progress(done: int) -> None:
             if self._watch is not None:
-                seconds = time.perf_counter() - self._began
-                self._watch(
-                    StudyStatus(self._name, variant.label, self._part, self._parts, done, len(episodes), seconds)
-                )
+                self._watch(StudyStatus(self._name, variant.label, self._part, self._parts, done, len(episodes)))
 
         with RunFolder(self._folder / variant.folder, self._identity(variant), resume=self._resume) as store:
             play_variant(

@@ -18,7 +18,7 @@ from gaitgauge.gauge.comparison_report import write_comparison
 from gaitgauge.gauge.consistency.page import write_page
 from gaitgauge.gauge.report import write_report
 from gaitgauge.gauge.validation import read_measurements, validate
-from gaitgauge.gauge.verify import judge, load_card
+from gaitgauge.gauge.verify import judge
 from gaitgauge.policy.adapters import described_contract
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.fence.archive import packed, read_archive
@@ -57,7 +57,7 @@ def _compared(folder: Path) -> None:
 
 
 def _card(folder: Path) -> None:
-    judge(load_card(folder), TRUE)
+    judge(load_result(folder), TRUE)
 
 
 def _tables(folder: Path) -> None:

@@ -124,14 +124,14 @@ def test_agreement_of_outcomes():
     reference = [True] * 5 + [False] * 5 + [True] * 3 + [False] * 7
     compared = [False] * 5 + [False] * 5 + [True] * 3 + [False] * 7
     found = outcome_agreement(reference, compared, range(20), shared=False)
-    assert (found.both, found.only_reference, found.only_compared, found.neither) == (3, 5, 0, 12)
-    assert found.share == pytest.approx(0.75)
+    assert (found["both"], found["only_reference"], found["only_compared"], found["neither"]) == (3, 5, 0, 12)
+    assert found["same"] == pytest.approx(0.75)
     # Wilson: (p + z²/2n ± z sqrt(p(1-p)/n + z²/4n²)) / (1 + z²/n) with p = 0.75, n = 20, z = 1.95996
-    assert found.interval == pytest.approx((0.531299, 0.888138), abs=1e-4)
+    assert found["interval"] == pytest.approx([0.531299, 0.888138], abs=1e-4)
     # five lone falls, all in one engine: 2 · (1/2)^5
-    assert found.p_value == pytest.approx(0.0625)
+    assert found["p_value"] == pytest.approx(0.0625)
     assert outcome_agreement([], [], [], shared=True) is None
-    assert outcome_agreement([True], [True], [0], shared=False).p_value == 1.0
+    assert outcome_agreement([True], [True], [0], shared=False)["p_value"] == 1.0
 
 
 def test_episodes_of_one_seed_are_one_witness_where_they_share_its_noise():
@@ -140,14 +140,14 @@ def test_episodes_of_one_seed_are_one_witness_where_they_share_its_noise():
     reference, compared = np.zeros(30, bool), seeds == 0
     apart = outcome_agreement(reference, compared, seeds, shared=False)
     together = outcome_agreement(reference, compared, seeds, shared=True)
-    assert apart.p_value == pytest.approx(2 * 0.5**10)
-    assert together.p_value == 1.0
-    assert together.interval[0] < 0.2 < apart.interval[0]
-    assert apart.share == together.share
+    assert apart["p_value"] == pytest.approx(2 * 0.5**10)
+    assert together["p_value"] == 1.0
+    assert together["interval"][0] < 0.2 < apart["interval"][0]
+    assert apart["same"] == together["same"]
 
 
 def test_a_share_of_one_seed_could_be_any():
-    assert outcome_agreement([True, True], [True, True], [0, 0], shared=True).interval == (0.0, 1.0)
+    assert outcome_agreement([True, True], [True, True], [0, 0], shared=True)["interval"] == [0.0, 1.0]
 
 
 def test_sign_flips_by_hand():
@@ -168,7 +168,7 @@ def test_false_alarms_of_clustered_outcomes_stay_rare():
         lucky = generator.random((2, 10, 1)) < 0.5
         fell = (generator.random((2, 10, 12)) < np.where(lucky, 0.1, 0.7)).reshape(2, -1)
         for shared in alarms:
-            alarms[shared] += outcome_agreement(*fell, seeds, shared=shared).p_value < 0.05
+            alarms[shared] += outcome_agreement(*fell, seeds, shared=shared)["p_value"] < 0.05
     assert alarms[True] <= 0.08 * 200
     assert alarms[False] > 0.2 * 200
 
@@ -180,7 +180,7 @@ def test_shares_of_clusters_are_covered():
         chance = generator.beta(8.0, 2.0, size=(6, 1))
         same = generator.random((6, 10)) < chance
         found = outcome_agreement([True] * 60, same.ravel(), np.repeat(np.arange(6), 10), shared=True)
-        hits += found.interval[0] <= 0.8 <= found.interval[1]
+        hits += found["interval"][0] <= 0.8 <= found["interval"][1]
     assert 0.92 <= hits / 300 <= 0.995
 
 

@@ -18,7 +18,7 @@ from gaitgauge.gauge.result_check import MOST_ROWS, chance_rules_of
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.gauge.validation import Measurements, ValidationError, validate
-from gaitgauge.gauge.verify import CardError, load_card
+from gaitgauge.gauge.verify import CardError
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.training.configuration import ConfigurationError
 
@@ -45,7 +45,7 @@ def edited(tmp_path):
 def test_an_expected_level_is_no_edited_one(edited):
     """A card of gaitgauge-1 was refused for levels that are no whole numbers."""
     at = next(at for at, row in enumerate(TRUE["environments"]) if row["level"])
-    assert load_card(edited("environments", at, "level", value=5.166667))["environments"][at]["level"] == 5.166667
+    assert load_result(edited("environments", at, "level", value=5.166667))["environments"][at]["level"] == 5.166667
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_an_expected_level_is_no_edited_one(edited):
 )
 def test_every_reader_of_cards_names_the_value(edited, tmp_path, path, value, named):
     file = edited(*path, value=value)
-    for read in (load_result, load_card, lambda card: write_board(card.parent, tmp_path / "board.html")):
+    for read in (load_result, lambda card: write_board(card.parent, tmp_path / "board.html")):
         with pytest.raises(ComparisonError, match=named) as caught:
             read(file)
         assert str(caught.value).isprintable() and "results.json" in str(caught.value)
@@ -109,7 +109,7 @@ def test_rules_of_chance_that_are_none_or_would_take_all_memory(edited, key, val
     with pytest.raises(ComparisonError, match=named):
         compare([load_result(file), TRUE], ["one", "two"])
     with pytest.raises(CardError, match=named):
-        chance_rules_of(load_card(file), "the card", CardError)
+        chance_rules_of(load_result(file), "the card", CardError)
 
 
 def test_many_rows_with_many_replicates_are_too_many(edited):

@@ -3,10 +3,11 @@
 from copy import deepcopy
 
 import pytest
-from gaitgauge.gauge.comparison import ComparisonError
-from gaitgauge.gauge.evaluate import Request, file_digest, identity, prepare
+from gaitgauge.gauge.comparison import ComparisonError, load_result
+from gaitgauge.gauge.evaluate import Request, identity, prepare
+from gaitgauge.gauge.policies import file_digest
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.gauge.verify import CardError, check_coverage, judge, load_card, prepare_replay, with_fresh_seeds
+from gaitgauge.gauge.verify import CardError, check_coverage, judge, prepare_replay, with_fresh_seeds
 from sample_results import sample
 
 
@@ -74,7 +75,7 @@ def test_results_of_something_else_are_no_card(tmp_path):
     path = tmp_path / "half.json"
     path.write_text('{"schema": 2, "environments": [], "suite": {}}')
     with pytest.raises(ComparisonError, match=r"half\.json': it lacks score, backend, robot, pipeline"):
-        load_card(path)
+        load_result(path)
 
 
 @pytest.mark.parametrize("suite", ["gaitgauge-1", "robogauge-1.1"])
