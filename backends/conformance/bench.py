@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields
 from types import SimpleNamespace
 from typing import Any
@@ -115,19 +115,14 @@ class Worlds:
         self,
         targets: ArrayLike | None = None,
         *,
-        delay: ArrayLike | None = None,
-        sample_at: ArrayLike | None = None,
         worlds: ArrayLike | None = None,
         substeps: int | None = None,
+        **when: ArrayLike,
     ) -> None:
-        """``PhysicsBackend.step``."""
-        self.backend.step(
-            None if targets is None else self._tensor(targets),
-            delay=self._whole(delay),
-            sample_at=self._whole(sample_at),
-            worlds=self._mask(worlds),
-            substeps=substeps,
-        )
+        """``PhysicsBackend.step``; ``when``: ``delay`` and ``sample_at``."""
+        asked = None if targets is None else self._tensor(targets)
+        numbers = {name: self._whole(value) for name, value in when.items()}
+        self.backend.step(asked, worlds=self._mask(worlds), substeps=substeps, **numbers)
 
     def run(self, seconds: float) -> None:
         """Step whole control periods with unchanged targets."""
@@ -224,27 +219,10 @@ class Bench:
         )
 
     @contextmanager
-    def worlds(
-        self,
-        parameters: JointParameters | None = None,
-        *,
-        terrains: Sequence[Terrain] = (FLAT,),
-        terrain_index: Sequence[int] | None = None,
-        **physics: Any,
-    ) -> Iterator[Worlds]:
-        """Build a scene in the engine, closed at the end.
-
-        Args:
-            parameters: joint constants, ``soft()`` where None.
-            terrain_index: terrain of each world; None for ``WORLDS`` worlds on the first one.
-            physics: changes to ``physics()``.
-        """
-        scene = self.scene(parameters, terrains=terrains, terrain_index=terrain_index, **physics)
-        backend = self.make(scene, self.device)
-        try:
+    def worlds(self, parameters: JointParameters | None = None, **scene: Any) -> Iterator[Worlds]:
+        """Build a scene, of ``scene``'s arguments, in the engine; closed at the end."""
+        with closing(self.make(self.scene(parameters, **scene), self.device)) as backend:
             yield Worlds(backend)
-        finally:
-            backend.close()
 
     def scene(
         self,
@@ -254,7 +232,13 @@ class Bench:
         terrain_index: Sequence[int] | None = None,
         **physics: Any,
     ) -> Scene:
-        """The scene that ``worlds`` builds."""
+        """A scene that fits the engine.
+
+        Args:
+            parameters: joint constants, ``soft()`` where None.
+            terrain_index: terrain of each world; None for ``WORLDS`` worlds on the first one.
+            physics: changes to ``physics()``.
+        """
         return Scene(
             robot=self.robot,
             parameters=parameters or self.soft(),

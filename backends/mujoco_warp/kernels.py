@@ -10,15 +10,10 @@ of them needs the host.
 import warp as wp
 
 from ..warp.motors import Motors, begin_world, hold_target, motor_torque, reset_world, take_target
-from ..warp.state import StateArrays
+from ..warp.state import POSITION_LIMIT, VELOCITY_LIMIT, StateArrays
 from .arrays import ContactArrays, Motion, Palette, Roles
 
 wp.set_module_options({"enable_backward": False})
-
-POSITION_LIMIT = wp.constant(1.0e5)
-"""A position beyond this [m, rad] means that the world has diverged."""
-VELOCITY_LIMIT = wp.constant(1.0e4)
-"""A velocity beyond this [m/s, rad/s] means that the world has diverged."""
 
 
 @wp.kernel

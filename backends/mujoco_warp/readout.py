@@ -8,7 +8,7 @@ Floating-point sums run inside one thread in the order of the constraint rows: n
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
 
-from ..warp.state import StateArrays
+from ..warp.state import StateArrays, clear_parts
 from .arrays import ContactArrays, Links, Motion, Roles
 
 wp.set_module_options({"enable_backward": False})
@@ -120,13 +120,7 @@ def read_contacts(
     world = wp.tid()
     if select[world] != value:
         return
-    for foot in range(feet):
-        out.foot_contact_force_w[world, foot] = wp.vec3(0.0)
-        out.foot_normal_force[world, foot] = 0.0
-        out.foot_tangential_force[world, foot] = 0.0
-    for body in range(bodies):
-        out.body_contact_force_w[world, body] = wp.vec3(0.0)
-    out.trunk_contact_force_w[world] = wp.vec3(0.0)
+    clear_parts(world, feet, bodies, out)
     # moments are summed about the base, which is near the contacts, to keep single precision, and then moved
     base = wp.vec3(motion.qpos[world, 0], motion.qpos[world, 1], motion.qpos[world, 2])
     force = wp.vec3(0.0)

@@ -14,14 +14,10 @@ velocity, both in the world frame; ``body_qd`` likewise. The contract's are wxyz
 import warp as wp
 
 from ..warp.motors import Motors, begin_world, hold_target, motor_torque, reset_world, take_target
-from ..warp.state import StateArrays
+from ..warp.state import POSITION_LIMIT, VELOCITY_LIMIT, StateArrays
 
 wp.set_module_options({"enable_backward": False})
 
-POSITION_LIMIT = wp.constant(1.0e5)
-"""A coordinate beyond this [m, rad] means that the world has diverged."""
-VELOCITY_LIMIT = wp.constant(1.0e4)
-"""A velocity beyond this [m/s, rad/s] means that the world has diverged."""
 PARKED_HEIGHT = wp.constant(100.0)
 """Where the base of a diverged world waits for its reset [m]."""
 

@@ -11,6 +11,11 @@ from ..base import PhysicsState
 
 wp.set_module_options({"enable_backward": False})
 
+POSITION_LIMIT = wp.constant(1.0e5)
+"""A position beyond this [m, rad] means that the world has diverged."""
+VELOCITY_LIMIT = wp.constant(1.0e4)
+"""A velocity beyond this [m/s, rad/s] means that the world has diverged."""
+
 
 @wp.struct
 class StateArrays:
@@ -62,6 +67,18 @@ def allocate_state(
     return PhysicsState(**tensors), arrays
 
 
+@wp.func
+def clear_parts(world: int, feet: int, bodies: int, out: StateArrays) -> None:
+    """Zero the contact forces of a world's feet and bodies."""
+    for foot in range(feet):
+        out.foot_contact_force_w[world, foot] = wp.vec3(0.0)
+        out.foot_normal_force[world, foot] = 0.0
+        out.foot_tangential_force[world, foot] = 0.0
+    for body in range(bodies):
+        out.body_contact_force_w[world, body] = wp.vec3(0.0)
+    out.trunk_contact_force_w[world] = wp.vec3(0.0)
+
+
 @wp.kernel
 def clear_forces(select: wp.array[int], value: int, joints: int, feet: int, bodies: int, out: StateArrays) -> None:
     """Zero all forces of the worlds whose ``select`` equals ``value``."""
@@ -70,13 +87,7 @@ def clear_forces(select: wp.array[int], value: int, joints: int, feet: int, bodi
         return
     for joint in range(joints):
         out.joint_torque[world, joint] = 0.0
-    for foot in range(feet):
-        out.foot_contact_force_w[world, foot] = wp.vec3(0.0)
-        out.foot_normal_force[world, foot] = 0.0
-        out.foot_tangential_force[world, foot] = 0.0
-    for body in range(bodies):
-        out.body_contact_force_w[world, body] = wp.vec3(0.0)
-    out.trunk_contact_force_w[world] = wp.vec3(0.0)
+    clear_parts(world, feet, bodies, out)
     out.ground_force_w[world] = wp.vec3(0.0)
     out.ground_moment_w[world] = wp.vec3(0.0)
     out.contact_center_w[world] = wp.vec3(0.0)
