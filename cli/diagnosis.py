@@ -34,10 +34,9 @@ def examine_policy(
     json_output: bool,
     trust: bool,
 ) -> bool:
-    """Play a policy as described and otherwise, print what looks wrong and how to mend it; arguments are ``doctor``'s options.
+    """Play a policy as described and otherwise, print what looks wrong and how to mend it; False where something does.
 
-    Returns:
-        Whether nothing looks wrong.
+    Arguments are ``doctor``'s options.
 
     Raises:
         UserError: ``out`` is no ``.toml``, or cannot be written.

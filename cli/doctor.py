@@ -62,11 +62,7 @@ def run_doctor(*, policy: str | None, json_output: bool, **choices: Any) -> None
 
 
 def examine(*, json_output: bool = False) -> bool:
-    """Print a table of all checks, or JSON.
-
-    Returns:
-        False if there is a problem.
-    """
+    """Print a table of all checks, or JSON; False if there is a problem."""
     console = Terminal(stderr=json_output)
     table = make_table("gaitgauge doctor", "check", "status", "found", "what to do")
     findings = []

@@ -38,14 +38,11 @@ def _numbers(command: Command) -> tuple[str, str, str]:
 
 
 def annotate(picture: np.ndarray, readouts: Sequence[Readout]) -> np.ndarray:
-    """A picture with a panel for each robot, whose tiles stand side by side.
+    """A picture with a panel for each robot, whose tiles stand side by side, (height, width, 3) uint8.
 
     Args:
         picture: (height, width, 3) uint8; is not changed.
         readouts: from left to right.
-
-    Returns:
-        (height, width, 3) uint8.
     """
     image = Image.fromarray(picture)
     width = image.width // len(readouts)

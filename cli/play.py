@@ -131,11 +131,7 @@ def _told(sessions: Sequence[PlaySession]) -> str:
 
 
 def _check(asked: PlayRequest) -> str:
-    """The viewer that is asked for, or the best that this machine has.
-
-    Raises:
-        UserError: options that make no sense.
-    """
+    """The viewer that is asked for, or the best that this machine has; ``UserError`` for options that make no sense."""
     films = {"--out": (asked.out, VIDEO_ENDINGS), "--gif": (asked.gif, CLIP_ENDINGS)}
     named = [option for option, (path, _) in films.items() if path is not None]
     viewer = _viewer(asked.viewer, named, several=len(asked.policies) > 1)

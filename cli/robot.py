@@ -130,11 +130,7 @@ def _print(findings: Sequence[Finding]) -> None:
 
 
 def _draw(robot: Robot, quality: Quality, path: Path) -> None:
-    """Write a picture of the standing pose.
-
-    Raises:
-        UserError: it cannot be written.
-    """
+    """Write a picture of the standing pose; ``UserError`` where it cannot be written."""
     import imageio.v3
     import numpy as np
 

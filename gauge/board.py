@@ -21,10 +21,7 @@ from .verify import CardError, check_coverage
 
 
 def write_board(folder: Path, page: Path) -> Path:
-    """Write the board of a folder's cards, all or nothing.
-
-    Args:
-        folder: holds cards as ``*.json``, or folders of evaluations.
+    """Write the board of a folder's cards, ``*.json`` or folders of evaluations, all or nothing.
 
     Raises:
         CardError: there is no card, or one does not hold what it says it holds of a suite that ships.

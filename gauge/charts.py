@@ -178,8 +178,7 @@ def _point(row: Row, axis: str, quantity: str, x_of: Any, y_of: Any) -> dict[str
 def heat(rows: Sequence[Row], *, quantity: str) -> list[dict[str, Any]]:
     """For terrains whose frictions and payloads are crossed: one map each, friction to the right, payload upwards.
 
-    Args:
-        quantity: ``level`` or ``score``; environments without it are left out.
+    Environments without ``quantity`` (``level`` or ``score``) are left out.
     """
     maps = []
     for terrain, group in _by_terrain(rows, quantity).items():

@@ -282,11 +282,7 @@ class ClusterWorkers:
         self._seats[number] = _Seat(begin=begin, losses=seat.losses, failures=seat.failures)
 
     def _look_at_nodes(self) -> None:
-        """See whether anybody is there or can still come.
-
-        Raises:
-            ClusterError: no.
-        """
+        """See whether anybody is there or can still come; ``ClusterError`` where not."""
         try:
             _knock(self._head)
             self._reached = time.monotonic()
@@ -338,11 +334,7 @@ def _actor_class() -> type:
 
 
 def _ray() -> Any:
-    """Ray's module.
-
-    Raises:
-        ClusterError: it is not installed.
-    """
+    """Ray's module; ``ClusterError`` where it is not installed."""
     try:
         return importlib.import_module("ray")
     except ImportError as error:

@@ -39,7 +39,7 @@ def compare_all(
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
 ) -> tuple[dict[str, Any], dict[str, Path]]:
-    """Evaluate what has not been evaluated yet, compare, and write the comparison.
+    """Evaluate what has not been evaluated yet, compare, and write the comparison; returns it as plain data, and its files.
 
     Args:
         contestants: policies, results folders or copies of ``results.json``.
@@ -47,9 +47,6 @@ def compare_all(
         folder: where the comparison goes.
         runs: folder of the evaluations; what it holds is gone on with.
         watch: called a few times a second during an evaluation.
-
-    Returns:
-        The comparison as plain data, and its files.
 
     Raises:
         ComparisonError and those of ``evaluate``: one sentence. What can be known to be wrong is said before anything is played.

@@ -23,10 +23,7 @@ _LONGEST = 100_000
 
 
 def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
-    """Write all files of a comparison, each whole or not at all.
-
-    Returns:
-        Path by kind: ``json``, ``csv``, ``tex``, ``html``.
+    """Write all files of a comparison, each whole or not at all; their paths by kind (``json``, ``csv``, ``tex``, ``html``).
 
     Raises:
         ComparisonError: they cannot be written, or the results hold what no evaluation writes.

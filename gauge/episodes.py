@@ -157,11 +157,8 @@ class Record:
 
 
 def read_records(folder: Path) -> tuple[dict[Episode, Record], list[Path]]:
-    """All records of a folder of episodes. A damaged file is set aside under the ending ``.damaged``, so that its episode is
-    played again.
-
-    Returns:
-        Records by episode, and where the damaged files are now.
+    """All records of a folder of episodes, and where its damaged files are now: set aside under the ending ``.damaged``, so that
+    their episodes are played again.
 
     Raises:
         OSError: a damaged file cannot be renamed.

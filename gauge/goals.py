@@ -101,14 +101,11 @@ class Schedule:
         return self._first[goal, sub_command]
 
     def commands(self, row: torch.Tensor, limits: torch.Tensor) -> torch.Tensor:
-        """Commands of the velocity goals, zero for the target goal.
+        """Commands of the velocity goals, zero for the target goal: forward, lateral [m/s] and yaw [rad/s], (N, 3).
 
         Args:
             row: ``first_row`` of each sub-command, plus the number of the commanded step from 1 on, or 0 while settling, (N,) int64.
             limits: command limits, (N, 3).
-
-        Returns:
-            Forward, lateral [m/s] and yaw [rad/s], (N, 3).
         """
         return self._rows.index_select(0, row) * limits
 
@@ -183,14 +180,13 @@ def target_command(
 ) -> torch.Tensor:
     """Command that leads to the target: proportional turning and side-stepping, full speed ahead once it is in sight.
 
+    Returns forward, lateral [m/s] and yaw [rad/s], (N, 3).
+
     Args:
         offset: see ``target_offset``, (N, 2).
         backward: whether the robot is to walk backwards, (N,) bool.
         speed: forward speed [m/s], (N,).
         yaw_limit: largest yaw rate [rad/s], (N,).
-
-    Returns:
-        Forward, lateral [m/s] and yaw [rad/s], (N, 3).
     """
     sideways = offset[:, 1]
     bearing = torch.atan2(sideways, offset[:, 0])

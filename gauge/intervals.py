@@ -184,8 +184,7 @@ class Evidence:
     def runs(self, columns: Sequence[str]) -> Array:
         """Mean of some columns in every run, (E, S); zeros where an environment has none.
 
-        Args:
-            columns: metrics, ``quality`` or names of sub-commands, whose column is their quality.
+        Columns are metrics, ``quality`` or names of sub-commands, whose column is their quality.
         """
         values = np.zeros((len(self.rows), len(self._rules.seeds)))
         for at in np.flatnonzero(self._played).tolist():

@@ -77,13 +77,8 @@ def _shares(logarithms: Array, axis: int) -> Array:
 
 
 def bisect(passed: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Level that the search finds for each table of outcomes: the way of ``pipelines``, through all tables at once.
-
-    Args:
-        passed: whether each level is passed, (…, levels).
-
-    Returns:
-        Levels, (…,); 0 where none is passed on the way.
+    """Level that the search finds for each table of outcomes, (…, levels) to (…,): the way of ``plan``, through all tables at once;
+    0 where none is passed on the way.
     """
     low = np.zeros(passed.shape[:-1], dtype=np.int64)
     high = np.full_like(low, passed.shape[-1])
@@ -142,7 +137,7 @@ def redraw_levels(
     resamples: int,
     generator: np.random.Generator,
 ) -> Array:
-    """Maximum levels of searches that are done again with other seeds.
+    """Maximum levels of searches that are done again with other seeds, (E, B).
 
     Args:
         curves: chance of success, (E, levels).
@@ -150,9 +145,6 @@ def redraw_levels(
         find: the level for each table of outcomes, (…, levels, seeds) to (…,).
         luck: correlation of a seed's luck between environments, see ``shared_luck``.
         resamples: number of replicates B.
-
-    Returns:
-        (E, B).
     """
     environments, levels = curves.shape
     common = math.sqrt(luck) * generator.standard_normal((resamples, 1, seeds))

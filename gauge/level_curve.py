@@ -112,14 +112,11 @@ def fitted_curve(trials: Mapping[int, Collection[bool]]) -> dict[int, float]:
 
 
 def expected_levels(reached: NDArray[np.bool_], bracket: int) -> NDArray[np.float64]:
-    """The level that ``follow`` finds for each of many tables of outcomes.
+    """The level that ``follow`` finds for each of many tables of outcomes, (…,).
 
     Args:
         reached: whether each seed reaches the target at each level, (…, levels, seeds).
         bracket: seeds that look for the crossing.
-
-    Returns:
-        (…,).
     """
     levels = reached.shape[-2]
     first = reached[..., :bracket].sum(-1)

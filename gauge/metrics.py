@@ -34,7 +34,7 @@ METRIC_NAMES = (
 def linear_velocity(
     quaternion: torch.Tensor, velocity_w: torch.Tensor, command: torch.Tensor, scale: torch.Tensor, kind: str
 ) -> torch.Tensor:
-    """1 - ‖v - v*‖ / scale, with v in the body frame (Lin. Velocity Error).
+    """1 - ‖v - v*‖ / scale, with v in the body frame (Lin. Velocity Error), (N,).
 
     Args:
         quaternion: base orientation wxyz, (N, 4).
@@ -42,9 +42,6 @@ def linear_velocity(
         command: forward, lateral [m/s] and yaw [rad/s], (N, 3).
         scale: error that scores zero [m/s], (N,).
         kind: ``body``: all three components, the vertical one against zero; ``commanded``: the first two.
-
-    Returns:
-        (N,).
     """
     error = rotate_inverse(quaternion, velocity_w)
     error = torch.cat((error[:, :2] - command[:, :2], error[:, 2:]), dim=1)
@@ -56,7 +53,7 @@ def linear_velocity(
 def angular_velocity(
     quaternion: torch.Tensor, velocity_b: torch.Tensor, command: torch.Tensor, scale: torch.Tensor, kind: str
 ) -> torch.Tensor:
-    """1 - ‖ω - ω*‖ / scale (Ang. Velocity Error).
+    """1 - ‖ω - ω*‖ / scale (Ang. Velocity Error), (N,).
 
     Args:
         quaternion: base orientation wxyz, (N, 4).
@@ -65,9 +62,6 @@ def angular_velocity(
         scale: error that scores zero [rad/s], (N,).
         kind: ``body``: all three components, roll and pitch rate against zero; ``commanded``: the yaw rate alone;
             ``twice-rotated``: all three of the body rates turned into the body frame once more, the reference's slip.
-
-    Returns:
-        (N,).
     """
     rate = rotate_inverse(quaternion, velocity_b) if kind == "twice-rotated" else velocity_b
     yaw = rate[:, 2] - command[:, 2]
@@ -194,11 +188,7 @@ class MetricEvaluator:
     """All metrics of a suite for N instants at once."""
 
     def __init__(self, metrics: Metrics, robot: Robot, weight: float, device: torch.device, dtype: torch.dtype) -> None:
-        """Prepare the constants.
-
-        Args:
-            weight: the robot's weight [N].
-        """
+        """Prepare the constants; ``weight`` is that of the robot [N]."""
         self.names = tuple(metrics.weights)
         self.needs_contacts = not {"zmp_margin", "friction_margin"}.isdisjoint(self.names)
         self._metrics = metrics

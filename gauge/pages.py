@@ -41,9 +41,6 @@ def page_of(source: Path, name: str, render: Callable[[dict[str, Any]], str], *,
         source: what the run found, JSON.
         command: of ``gaitgauge`` that writes ``source``, for who lacks it.
 
-    Returns:
-        The path of the page.
-
     Raises:
         StoreError: the folder holds no such file, or a damaged one, or one of another version.
     """

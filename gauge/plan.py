@@ -58,8 +58,7 @@ class Plan:
 def plan(environment: Environment, records: Records, rules: PlanRules) -> Plan:
     """Plan an environment: the level as the suite finds it unless it is given, then the quality episodes.
 
-    Args:
-        records: episodes that have ended, of this environment and of others.
+    ``records`` may hold those of other environments, too.
     """
     if environment.level is None and rules.suite.scoring.level == "curve":
         return _plan_curve(environment, records, rules)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,9 @@ from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
 from .suite import Suite, SuiteError
+
+Watch = Callable[[int, int, str], None]
+"""Called before each turn of a study with the turn's number, their count, and whose it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,15 +59,12 @@ class PoliciesRequest:
 def load_policies(
     names: Sequence[str], robot: str | None = None, *, trust: bool = False
 ) -> tuple[dict[str, Loaded], list[Refused]]:
-    """Load policies.
+    """Policies by label, the shortest that tells them apart, and those that could not be loaded.
 
     Args:
         names: what ``gaitgauge evaluate`` takes; one that is named twice is loaded once.
         robot: name of the robot that they have to fit, or its ``robot.toml``; None for each one's own.
         trust: run programs that files of the project's own format carry inside.
-
-    Returns:
-        Policies by label, the shortest that tells them apart, and those that could not be loaded.
 
     Raises:
         RobotError: the robot that was asked for cannot be had.

@@ -31,14 +31,11 @@ def _draw(what: str, segment: Segment) -> random.Random:
 
 
 def sideways(quaternion: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-    """A force to the left of the heading in world axes.
+    """A force to the left of the heading in world axes, horizontal [N], (N, 3).
 
     Args:
         quaternion: base orientation wxyz, (N, 4).
         force: [N], (N,).
-
-    Returns:
-        [N], (N, 3), horizontal.
     """
     cosine, sine = heading_of(quaternion)
     return torch.stack((-sine * force, cosine * force, torch.zeros_like(force)), dim=1)

@@ -46,9 +46,6 @@ _LONGEST = 400
 def write_report(folder: Path) -> Path:
     """Write ``report.html`` beside the results that it shows, all or nothing.
 
-    Returns:
-        The path of the page.
-
     Raises:
         StoreError: the folder holds no results, or damaged ones, or some of another version.
     """
@@ -99,11 +96,7 @@ def _short_metric_label(name: str) -> str:
 
 
 def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything that the page shows, in the order and the coordinates in which it is shown.
-
-    Returns:
-        Plain data for ``templates/report.html.j2``.
-    """
+    """Everything that ``templates/report.html.j2`` shows, in the order and the coordinates in which it is shown."""
     rows: list[Row] = results["environments"]
     evaluated = results["score"] is not None
     terrains: Mapping[str, Row] = results["terrains"]
@@ -219,11 +212,7 @@ def _places(rows: Sequence[Row], key: str | None) -> list[str]:
 
 
 def metric_matrix(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Mean@50 of each metric on each terrain, at the levels reached and not weighted by them.
-
-    Returns:
-        Value by metric within terrain: the mean over the terrain's environments that were played.
-    """
+    """Mean@50 of each metric on each terrain, over its environments that were played: at the levels reached, not weighted by them."""
     matrix: dict[str, dict[str, float]] = {}
     for terrain in dict.fromkeys(r["terrain"] for r in rows if "metrics" in r):
         played = [r for r in rows if r["terrain"] == terrain and "metrics" in r]

@@ -188,11 +188,7 @@ class Stance:
 
 
 def level_stance(reference: Reference, *, clearance: float = 0.0005) -> Stance:
-    """Fit the plane through the foot centres and turn the base so that it is level.
-
-    Args:
-        clearance: distance of the lowest foot from the ground [m].
-    """
+    """Turn the base so that the plane through the foot centres is level, the lowest foot ``clearance`` [m] above the ground."""
     reference.place((0.0, 0.0, 0.0))
     feet = reference.foot_position
     slope_x, slope_y, _ = np.linalg.lstsq(np.c_[feet[:, :2], np.ones(len(feet))], feet[:, 2], rcond=None)[0]

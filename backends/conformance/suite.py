@@ -139,15 +139,12 @@ def run_conformance(
     only: Sequence[str] = (),
     report: Callable[[CheckResult], None] | None = None,
 ) -> list[CheckResult]:
-    """Run the conformance checks against an engine.
+    """Run the conformance checks against an engine; one result for each.
 
     Args:
         backend, device, robot: as for ``make_bench``.
         only: beginnings of the names of the checks to run (``motors``, ``contact/rest``); empty for all.
         report: called with each result as soon as it is there.
-
-    Returns:
-        One result for each check.
 
     Raises:
         BackendError: no check has such a name, or as ``make_bench``.

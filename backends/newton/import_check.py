@@ -8,15 +8,12 @@ from numpy.typing import NDArray
 
 
 def import_differences(found: mujoco.MjModel, expected: mujoco.MjModel, order: NDArray) -> list[str]:
-    """What a MuJoCo model that Newton made says otherwise than MuJoCo's own compiler, field by field.
+    """What a MuJoCo model that Newton made says otherwise than MuJoCo's own compiler: a sentence for each field that differs.
 
     Args:
         found: the model made by Newton.
         expected: the robot as MuJoCo compiles it.
         order: geom of ``found`` for each geom of ``expected``.
-
-    Returns:
-        One sentence for each field that differs; empty where all is well.
     """
     wrong: list[str] = []
     for name in BODY_AND_JOINT_FIELDS:

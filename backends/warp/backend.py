@@ -30,11 +30,7 @@ class WarpBackend(PhysicsBackend):
     """Whether worlds that must not step are put aside in every control period, so that one graph serves all masks."""
 
     def _open(self, scene: Scene, device: str) -> None:
-        """Find the device; nothing is built yet.
-
-        Raises:
-            BackendError: there is no such device.
-        """
+        """Find the device, or raise ``BackendError``; nothing is built yet."""
         self.scene, self.device, self.dtype = scene, find_device(device, self.name), torch.float32
         self._scope = DeviceScope(self.device)
         self._graphs: dict[tuple[int, bool, bool], wp.Graph] = {}

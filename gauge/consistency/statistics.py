@@ -82,7 +82,7 @@ def tail_probability(seeds: int, freedom: float) -> float:
 
 
 def replicates(values: Array, weights: Array, *, shared: bool, resamples: int, name: str) -> Array:
-    """Bootstrap replicates of the weighted mean over environments of the mean over seeds.
+    """Bootstrap replicates of the weighted mean over environments of the mean over seeds, (B,).
 
     The unit that is drawn with replacement is the seed, with all that an episode holds: its goals and sub-commands stay
     together. Values are paired already (each is the difference, or its magnitude, between two engines in one episode).
@@ -93,9 +93,6 @@ def replicates(values: Array, weights: Array, *, shared: bool, resamples: int, n
         shared: draw the same seeds for all environments (their episodes share random numbers), or anew for each.
         resamples: number of replicates B.
         name: seeds the generator, so that the same question has the same answer.
-
-    Returns:
-        (B,).
     """
     environments, seeds = values.shape
     generator = np.random.default_rng(zlib.crc32(name.encode()))
@@ -218,11 +215,7 @@ def wilson_interval(share: float, trials: float) -> tuple[float, float]:
 
 
 def sign_flip(differences: NDArray[np.int64]) -> float:
-    """Share of all ways to turn signs round in which the sum is at least as far from zero, exactly.
-
-    Args:
-        differences: whole numbers, (N,).
-    """
+    """Share of all ways to turn signs of whole numbers, (N,), round in which the sum is at least as far from zero, exactly."""
     sizes = np.abs(differences[differences != 0])
     ways = np.ones(1)
     for size in sizes.tolist():

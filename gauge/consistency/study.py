@@ -188,13 +188,12 @@ def study(
 ) -> dict[str, Any]:
     """Carry out a study; every finished episode is on disk at once.
 
+    Returns the content of ``consistency.json`` (docs/consistency.md).
+
     Args:
         folder: where ``consistency.json`` and a folder for each engine go (with several policies, one for each of them above).
         resume: go on with what the folder holds.
         watch: called after every control step.
-
-    Returns:
-        The content of ``consistency.json``; ``docs/consistency.md`` explains it.
 
     Raises:
         ConsistencyError, SuiteError, RobotError, PolicyError, ContractError, BackendError, StoreError: one sentence.

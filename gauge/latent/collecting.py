@@ -88,10 +88,7 @@ def collect(
     threads: int = 1,
     make: Callable[..., PhysicsBackend] = make_backend,
 ) -> Notes:
-    """Let a policy's robots walk, and note what its encoder and experts say.
-
-    Args:
-        threads: CPU threads; results do not depend on them.
+    """Let a policy's robots walk, on the CPU, and note what its encoder and experts say; ``threads`` change the time alone.
 
     Raises:
         BackendError: the engine cannot do it.

@@ -19,7 +19,7 @@ from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...robots import RobotError
 from ...terrains.registry import gauge_terrain_names, make_terrain
-from ..policies import Loaded, PoliciesRequest, Refused, describe, load_policies
+from ..policies import Loaded, PoliciesRequest, Refused, Watch, describe, load_policies
 from ..suite import SuiteError, load_suite
 from .collecting import COMMANDS, Notes, Walks, collect
 from .figures import FIGURES, render_figure, render_page
@@ -59,16 +59,12 @@ def study_latents(
     folder: Path,
     *,
     command: Sequence[str] = (),
-    watch: Callable[[int, int, str], None] | None = None,
+    watch: Watch | None = None,
     make: Callable[..., PhysicsBackend] = make_backend,
 ) -> dict[str, Any]:
     """Look at the latents of some policies. What cannot be looked at is said under ``refused``; the others are.
 
-    Args:
-        watch: called before each policy's turn with the turn's number, their count, and its label.
-
-    Returns:
-        The content of ``latent.json`` (docs/latent.md).
+    Returns the content of ``latent.json`` (docs/latent.md).
 
     Raises:
         LatentError: no policy has anything to look at.

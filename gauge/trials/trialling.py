@@ -17,7 +17,7 @@ from ...policy.base import PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
 from ..consistency.statistics import wilson_interval
-from ..policies import PoliciesRequest, Refused, describe, load_policies
+from ..policies import PoliciesRequest, Refused, Watch, describe, load_policies
 from ..suite import SuiteError
 from .page import render_page
 from .running import Trial, run_scenario
@@ -45,16 +45,12 @@ def run_trials(
     folder: Path,
     *,
     command: Sequence[str] = (),
-    watch: Callable[[int, int, str], None] | None = None,
+    watch: Watch | None = None,
     make: Callable[..., PhysicsBackend] = make_backend,
 ) -> dict[str, Any]:
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 
-    Args:
-        watch: called before each policy's turn in each scenario with the turn's number, their count, and its name.
-
-    Returns:
-        The content of ``trials.json`` (docs/trials.md).
+    Returns the content of ``trials.json`` (docs/trials.md).
 
     Raises:
         BackendError, RobotError, ScenarioError: nothing of it can be done; or no such engine, device or robot.
