@@ -65,16 +65,13 @@ _FIRST_FOREIGN_CALL = 0x40000000  # numbers of x86's other set of calls
 
 
 def enclose(kept: int, owner: int, readable: Iterable[Path] = ()) -> tuple[str, ...]:
-    """Lock a process that has just been started by its owner, and whose life it is to work for that one.
+    """``lock`` a process that has just been started by its owner, and whose life it is to work for that one.
 
     It ends when its owner does, hears no Ctrl-C (the owner ends it), and has nothing open of what its owner has.
 
     Args:
         kept: descriptor of the connection with its owner.
         readable: as for ``lock``.
-
-    Returns:
-        As ``lock``.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it reaches all processes of a terminal
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

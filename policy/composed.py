@@ -7,31 +7,17 @@ from typing import Any
 
 import torch
 
-from .layers import EncoderNetwork, Experts, mixed, multilayer_perceptron, unit
+from .layers import EncoderNetwork, GatedExperts, mixed, multilayer_perceptron, unit
 
 _LEAST_LOG_STD, _LARGEST_LOG_STD = -5.0, 2.0
 _LEAST_VARIANCE = 1e-9
 
 
-class GatedActor(Experts):
-    """Actions as a mixture of the experts' actions: a softmax gate on the same input as the experts.
+class GatedActor(GatedExperts):
+    """Actions as a mixture of the experts' actions: a softmax gate on the same input as the experts."""
 
-    State dict: that of ``Experts``, and ``gate.<layer>.*``.
-    """
-
-    def __init__(
-        self,
-        *,
-        inputs: int,
-        num_actions: int,
-        num_experts: int,
-        gate_hidden: Sequence[int],
-        activation: str,
-        **shape: Any,
-    ) -> None:
-        """``shape``: of the experts, as ``Experts`` takes it."""
-        super().__init__(inputs=inputs, outputs=num_actions, num_experts=num_experts, activation=activation, **shape)
-        self.gate = multilayer_perceptron((inputs, *gate_hidden, num_experts), activation=activation)
+    def __init__(self, *, inputs: int, num_actions: int, **shape: Any) -> None:
+        super().__init__(gate_inputs=inputs, inputs=inputs, outputs=num_actions, **shape)
 
     def weigh(self, values: torch.Tensor) -> torch.Tensor:
         """Weights of the experts (N, K), which add up to one, for inputs (N, D)."""
@@ -42,32 +28,18 @@ class GatedActor(Experts):
         return (mixed(weights, self.opinions(values)),)
 
 
-class CompositeActor(Experts):
+class CompositeActor(GatedExperts):
     """Actions as the product of Gaussian primitives, each to the power of its weight (Peng et al., "MCP: Learning Composable
     Hierarchical Control with Multiplicative Compositional Policies", 2019, eq. 5 and 6). The gate sees everything, the primitives
     do not see the command: they are skills, the gate has the goal.
-
-    State dict: that of ``Experts``, and ``gate.<layer>.*``.
     """
 
     seen: torch.Tensor
 
-    def __init__(
-        self,
-        *,
-        inputs: int,
-        num_actions: int,
-        num_experts: int,
-        gate_hidden: Sequence[int],
-        blind_to: Sequence[int],
-        activation: str,
-        **shape: Any,
-    ) -> None:
-        """``shape``: of the primitives, as ``Experts`` takes it."""
-        seen, outputs = [i for i in range(inputs) if i not in set(blind_to)], 2 * num_actions
-        super().__init__(inputs=len(seen), outputs=outputs, num_experts=num_experts, activation=activation, **shape)
+    def __init__(self, *, inputs: int, num_actions: int, blind_to: Sequence[int], **shape: Any) -> None:
+        seen = [i for i in range(inputs) if i not in set(blind_to)]
+        super().__init__(gate_inputs=inputs, inputs=len(seen), outputs=2 * num_actions, **shape)
         self.register_buffer("seen", torch.tensor(seen, dtype=torch.int64), persistent=False)
-        self.gate = multilayer_perceptron((inputs, *gate_hidden, num_experts), activation=activation)
 
     def weigh(self, values: torch.Tensor) -> torch.Tensor:
         """Weights of the primitives (N, K), each in (0, 1), for inputs (N, D)."""

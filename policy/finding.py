@@ -48,9 +48,14 @@ def find_policy(path_or_name: str | Path) -> Path:
         raise PolicyError(f"'{name}' cannot be read: {getattr(error, 'strerror', None) or error}") from error
     names = policy_names()
     if name in names and not path.is_file():
-        found, otherwise = _of_runs(name) if name in _OF_RUNS else _shipped(name)
+        found = _of_runs(name) if name in _OF_RUNS else shipped_policies()[name]
         if found is None:
-            raise PolicyError(f"{otherwise}; give a path")
+            wanted = "best.pt" if name == "best" else "model_<iteration>.pt"
+            raise PolicyError(
+                f"there is no policy '{name}': no run in '{LOG_ROOT}/<experiment>/<run>/' has a {wanted}; give a path"
+            )
+        if not found.is_file():
+            raise PolicyError(f"no {name} policy ships with this installation (looked for '{found}'); give a path")
         return found
     if path.is_dir():
         raise PolicyError(f"'{name}' is a folder; name a policy file in it, or one of: {', '.join(names)}")
@@ -67,20 +72,9 @@ def latest_checkpoint(run: Path) -> Path | None:
     return max(numbered)[1] if numbered else None
 
 
-def _shipped(name: str) -> tuple[Path | None, str]:
-    """The file, and what is to be said if there is none."""
-    path = shipped_policies()[name]
-    return path if path.is_file() else None, f"no {name} policy ships with this installation (looked for '{path}')"
-
-
-def _of_runs(name: str) -> tuple[Path | None, str]:
-    """The same for a checkpoint of the last run that has one."""
+def _of_runs(name: str) -> Path | None:
+    """The last or the best checkpoint of the last run that has one."""
     # Runs are named by their time, so the name's order is that of time.
     runs = sorted((r for r in LOG_ROOT.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True)
-    for run in runs:
-        if name == "best" and (run / "best.pt").is_file():
-            return run / "best.pt", ""
-        if name == "latest" and (last := latest_checkpoint(run)) is not None:
-            return last, ""
-    wanted = "best.pt" if name == "best" else "model_<iteration>.pt"
-    return None, f"there is no policy '{name}': no run in '{LOG_ROOT}/<experiment>/<run>/' has a {wanted}"
+    found = (latest_checkpoint(r) if name == "latest" else r / "best.pt" for r in runs)
+    return next((path for path in found if path is not None and path.is_file()), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import nn
@@ -117,6 +118,26 @@ class Experts(nn.Module):
         head_weight = self.head_weight.expand(self.num_experts, -1, -1)
         head_bias = self.head_bias.expand(self.num_experts, -1)
         return torch.bmm(features.transpose(0, 1), head_weight.transpose(1, 2)) + head_bias[:, None]
+
+
+class GatedExperts(Experts):
+    """Experts with a gate, which may see more than they do.
+
+    State dict: that of ``Experts``, and ``gate.<layer>.*``.
+    """
+
+    def __init__(
+        self,
+        *,
+        gate_inputs: int,
+        gate_hidden: Sequence[int],
+        num_experts: int,
+        activation: str,
+        **shape: Any,
+    ) -> None:
+        """``shape``: of the experts, as ``Experts`` takes it."""
+        super().__init__(num_experts=num_experts, activation=activation, **shape)
+        self.gate = multilayer_perceptron((gate_inputs, *gate_hidden, num_experts), activation=activation)
 
 
 def mixed(weights: torch.Tensor, opinions: torch.Tensor) -> torch.Tensor:

@@ -23,13 +23,14 @@ part of the file format.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import nn
 
 from .composed import AcMoeNetwork, McpNetwork
 from .estimators import DreamwaqNetwork, HimNetwork
-from .layers import ACTIVATIONS, EncoderNetwork, Experts, Perceptron, mixed, multilayer_perceptron, unit
+from .layers import EncoderNetwork, GatedExperts, mixed, multilayer_perceptron, unit
 from .trot import TrotController
 
 
@@ -98,45 +99,29 @@ class CtsNetwork(EncoderNetwork):
         return unit(self.encoder(history.flatten(1))), None
 
 
-class ExpertMixture(Experts):
+class ExpertMixture(GatedExperts):
     """Encoder of the history as a dense mixture of experts (paper, mixture of experts): one shared trunk, a head per
     expert, a gate.
 
     The trunk's last layer is ``num_experts`` blocks of ``expert_width``; head k maps block k to the latent. The gate's
-    softmax weighs the heads. State dict: that of ``Experts``, and ``gate.<layer>.*``.
+    softmax weighs the heads. State dict: that of ``GatedExperts``.
     """
 
     seen: torch.Tensor
 
     def __init__(
-        self,
-        *,
-        frame_width: int,
-        history_length: int,
-        latent_width: int,
-        num_experts: int,
-        expert_width: int,
-        trunk_hidden: Sequence[int],
-        gate_hidden: Sequence[int],
-        shared_head: bool,
-        expert_blind_to: Sequence[int],
-        activation: str,
+        self, *, frame_width: int, history_length: int, latent_width: int, expert_blind_to: Sequence[int], **shape: Any
     ) -> None:
+        """``shape``: of experts and gate, as ``GatedExperts`` takes it."""
         seen = [i for i in range(frame_width) if i not in set(expert_blind_to)]
         super().__init__(
+            gate_inputs=frame_width * history_length,
             inputs=len(seen) * history_length,
-            trunk_hidden=trunk_hidden,
-            num_experts=num_experts,
-            expert_width=expert_width,
             outputs=latent_width,
-            shared_head=shared_head,
-            activation=activation,
+            **shape,
         )
         self.register_buffer("seen", torch.tensor(seen, dtype=torch.int64), persistent=False)
         self.sees_all = len(seen) == frame_width
-        self.gate = multilayer_perceptron(
-            (frame_width * history_length, *gate_hidden, num_experts), activation=activation
-        )
 
     def forward(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mixture of the experts' latents (N, L), not normalised, and gate weights (N, K) for ``history`` (N, H, F)."""
@@ -202,13 +187,10 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
 }
 
 __all__ = [
-    "ACTIVATIONS",
     "ARCHITECTURES",
     "CtsNetwork",
     "ExpertMixture",
     "MlpNetwork",
     "MoeCtsNetwork",
-    "Perceptron",
     "multilayer_perceptron",
-    "unit",
 ]

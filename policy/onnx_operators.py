@@ -118,14 +118,6 @@ def _lp_normalization(node: Node, inputs: Inputs) -> torch.Tensor:
     return torch.where(length == 0.0, torch.zeros_like(inputs[0]), inputs[0] / length)
 
 
-def _divide(node: Node, inputs: Inputs) -> torch.Tensor:
-    return torch.div(*inputs, rounding_mode=None if inputs[0].is_floating_point() else "trunc")
-
-
-def _mod(node: Node, inputs: Inputs) -> torch.Tensor:
-    return (torch.fmod if node.get("fmod", 0) else torch.remainder)(*inputs)
-
-
 def _slice(node: Node, inputs: Inputs) -> torch.Tensor:
     starts, ends = node.listed(1, "starts"), node.listed(2, "ends")
     if starts is None or ends is None:
@@ -184,10 +176,6 @@ def _unsqueeze(node: Node, inputs: Inputs) -> torch.Tensor:
     for axis in sorted(a % rank for a in axes):
         result = result.unsqueeze(axis)
     return result
-
-
-def _expand(node: Node, inputs: Inputs) -> torch.Tensor:
-    return inputs[0].expand(torch.broadcast_shapes(inputs[0].shape, node.listed(1) or []))
 
 
 def _split(node: Node, inputs: Inputs) -> Sequence[torch.Tensor]:
@@ -258,14 +246,6 @@ def _all_of(function: Callable[..., torch.Tensor]) -> Callable[[Node, Inputs], t
     return run
 
 
-def _selu(x: torch.Tensor, alpha: float, gamma: float) -> torch.Tensor:
-    return gamma * torch.where(x > 0.0, x, alpha * torch.expm1(x))
-
-
-def _gelu(node: Node, inputs: Inputs) -> torch.Tensor:
-    return functional.gelu(inputs[0], approximate=node.get("approximate", b"none").decode())
-
-
 _SAME_NAMES = """
 Abs Add Ceil Cos Erf Exp Floor Log Mul Neg Pow Reciprocal Relu Sigmoid Sign Sin Sqrt Sub Tan Tanh Where
 """
@@ -282,15 +262,15 @@ OPERATORS: Mapping[str, Callable[[Node, Inputs], Any]] = {
     "Constant": _constant,
     "ConstantOfShape": _constant_of_shape,
     "Conv": _conv,
-    "Div": _divide,
+    "Div": lambda node, inputs: torch.div(*inputs, rounding_mode=None if inputs[0].is_floating_point() else "trunc"),
     "Dropout": lambda node, inputs: inputs[0],
     "Elu": _plain(functional.elu, alpha=1.0),
     "Equal": _plain(torch.eq),
-    "Expand": _expand,
+    "Expand": lambda node, inputs: inputs[0].expand(torch.broadcast_shapes(inputs[0].shape, node.listed(1) or [])),
     "Flatten": _flatten,
     "Gather": _gather,
     "GatherND": _gather_nd,
-    "Gelu": _gelu,
+    "Gelu": lambda node, inputs: functional.gelu(inputs[0], approximate=node.get("approximate", b"none").decode()),
     "Gemm": _gemm,
     "Greater": _plain(torch.gt),
     "GreaterOrEqual": _plain(torch.ge),
@@ -307,7 +287,7 @@ OPERATORS: Mapping[str, Callable[[Node, Inputs], Any]] = {
     "Max": _all_of(torch.maximum),
     "Min": _all_of(torch.minimum),
     "Mish": _plain(functional.mish),
-    "Mod": _mod,
+    "Mod": lambda node, inputs: (torch.fmod if node.get("fmod", 0) else torch.remainder)(*inputs),
     "NonZero": lambda node, inputs: inputs[0].nonzero().t(),
     "Not": _plain(torch.logical_not),
     "Or": _plain(torch.logical_or),
@@ -321,7 +301,11 @@ OPERATORS: Mapping[str, Callable[[Node, Inputs], Any]] = {
     "ReduceSum": _reduce(torch.sum),
     "ReduceSumSquare": _reduce(lambda x, axes, keep: torch.sum(x * x, axes, keep)),
     "Reshape": _reshape,
-    "Selu": _plain(_selu, alpha=1.67326319217681884765625, gamma=1.05070102214813232421875),
+    "Selu": _plain(
+        lambda x, alpha, gamma: gamma * torch.where(x > 0.0, x, alpha * torch.expm1(x)),
+        alpha=1.67326319217681884765625,
+        gamma=1.05070102214813232421875,
+    ),
     "Shape": _shape,
     "Slice": _slice,
     "Softmax": _softmax(torch.softmax),

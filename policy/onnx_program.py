@@ -24,14 +24,11 @@ _MOST_NUMBERS = 1 << 16
 
 
 def onnx_program(data: bytes, width: int, *, source: str) -> Program:
-    """Follow an ONNX file's graph on one observation.
+    """Follow an ONNX file's graph on one observation; the program has no memory.
 
     Args:
         data: the file, its weights inside.
         width: entries of an observation.
-
-    Returns:
-        The program, which has no memory.
 
     Raises:
         NotUnderstoodError: the graph has an operator that is not known, or a shape that depends on the observation.

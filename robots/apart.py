@@ -30,9 +30,6 @@ def run_apart(work: Callable[[], str | None], mjcf: Path) -> str:
         work: raises ``RobotError`` for what is wrong, or returns a text.
         mjcf: the model; folders of the files that it names can be read.
 
-    Returns:
-        The text.
-
     Raises:
         RobotError: as ``work``, or it takes too much time or memory, or MuJoCo crashes.
     """

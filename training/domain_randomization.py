@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 
 from ..backends.base import PhysicsBackend, Randomization
 from .environment_configuration import RandomizationConfiguration, Range
-from .environment_memory import fitting
 
 MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_offset")
 """Names of the uniform numbers that a reset takes, one column per joint each."""
@@ -56,26 +53,13 @@ class MotorParameters:
         drawn = uniform.view(self.values.shape) * self._span + self._low
         torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
 
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        """Copies by name, (N, J) each."""
-        return {name: values.clone() for name, values in self._by_name().items()}
-
-    def restore(self, snapshot: Mapping[str, torch.Tensor]) -> None:
-        """Copy a snapshot back.
-
-        Raises:
-            ValueError: values are missing or have another shape.
-        """
-        present = self._by_name()
-        for name, values in fitting(snapshot, present).items():
-            present[name].copy_(values)
-
     def apply(self, backend: PhysicsBackend) -> None:
         """Write all worlds' values into the physics.
 
         All rows are written every time: selecting the rows of a mask would wait for the device to count them.
         """
-        backend.randomize(Randomization(**self._by_name()))
+        backend.randomize(Randomization(**self.by_name()))
 
-    def _by_name(self) -> dict[str, torch.Tensor]:
+    def by_name(self) -> dict[str, torch.Tensor]:
+        """The values by the names of ``Randomization``, (N, J) each."""
         return dict(zip(self.NAMES, self.values.unbind(1), strict=True))

@@ -29,7 +29,7 @@ from .configuration import ConfigurationError
 from .curriculum import assign_kinds, build_palette
 from .domain_randomization import draw_bodies
 from .environment_configuration import EnvironmentConfiguration
-from .environment_memory import fitting
+from .environment_memory import copied, fitting, restore
 from .events import EpisodeStart
 from .height_scan import heading
 from .observations import Observations
@@ -169,17 +169,16 @@ class TrainingEnvironment(VecEnv):
 
     def _capture(self) -> None:
         """Record both torch parts; what running them for it changes is put back."""
-        memory, motors = self.parts.memory, self.parts.motors
-        before = memory.snapshot()
-        motors_before = motors.snapshot()
+        memory, motors = self.parts.memory.by_name(), self.parts.motors.by_name()
+        before = copied(memory), copied(motors)
         with torch.no_grad():
             self._after_physics = RecordedFunction(self._after_physics, self.device)
             self._observe = RecordedFunction(self._observe, self.device)
             for _ in range(WARM_UP + 1):
                 self._after_physics()
                 self._observe()
-        memory.restore(before)
-        motors.restore(motors_before)
+        restore(before[0], memory)
+        restore(before[1], motors)
 
     # --- rsl_rl's interface -----------------------------------------------------------------------------------------
 
@@ -274,7 +273,7 @@ class TrainingEnvironment(VecEnv):
             "version": STATE_VERSION,
             "step": self.parts.memory.step.clone(),
             "level": self.parts.memory.level.to(torch.int16),
-            "bodies": {name: value.clone() for name, value in self._bodies.items()},
+            "bodies": copied(self._bodies),
             "common_step_counter": self.common_step_counter,
         }
 
@@ -289,10 +288,10 @@ class TrainingEnvironment(VecEnv):
         state = self.backend.state
         return {
             "version": STATE_VERSION,
-            "memory": self.parts.memory.snapshot(),
-            "motors": self.parts.motors.snapshot(),
-            "bodies": {name: value.clone() for name, value in self._bodies.items()},
-            "observations": {name: value.clone() for name, value in vars(self._observations).items()},
+            "memory": copied(self.parts.memory.by_name()),
+            "motors": copied(self.parts.motors.by_name()),
+            "bodies": copied(self._bodies),
+            "observations": copied(vars(self._observations)),
             "generator": self._generator.get_state(),
             "common_step_counter": self.common_step_counter,
             "physics": {name: getattr(state, name).clone() for name in AFTER_RESET},
@@ -316,10 +315,10 @@ class TrainingEnvironment(VecEnv):
         # A run from before headings were remembered goes on with the robots' own.
         headings = heading(state["physics"]["base_quaternion_w"])
         older = {"commanded_heading": headings, "holds_heading": torch.zeros_like(parts.memory.holds_heading)}
-        parts.memory.restore({**older, **state["memory"]})
+        restore({**older, **state["memory"]}, parts.memory.by_name())
         self._require_below(parts.memory.level, self.palette.num_levels, "level")
         self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")
-        parts.motors.restore(state["motors"])
+        restore(state["motors"], parts.motors.by_name())
         self._take_bodies(state["bodies"])
         parts.motors.apply(self.backend)
         self._observations = Observations(**fitting(state["observations"], vars(self._observations))).clone()

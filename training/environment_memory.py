@@ -191,22 +191,24 @@ class EnvironmentMemory:
         self.command_extreme.masked_fill_(worlds, False)
         self.just_reset.copy_(worlds)
 
-    def _names(self) -> list[str]:
+    def by_name(self) -> dict[str, torch.Tensor]:
         """Everything but the tensors of which others are columns."""
-        return [f.name for f in fields(self) if f.name not in ("episode", "sums")]
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("episode", "sums")}
 
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        """Copies of all tensors by name."""
-        return {name: getattr(self, name).clone() for name in self._names()}
 
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Copy a snapshot back.
+def copied(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Copies by name."""
+    return {name: value.clone() for name, value in tensors.items()}
 
-        Raises:
-            ValueError: a tensor is missing or has another shape.
-        """
-        for name, saved in fitting(snapshot, {name: getattr(self, name) for name in self._names()}).items():
-            getattr(self, name).copy_(saved)
+
+def restore(saved: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> None:
+    """Copy saved tensors into present ones.
+
+    Raises:
+        ValueError: a tensor is missing or has another shape.
+    """
+    for name, value in fitting(saved, present).items():
+        present[name].copy_(value)
 
 
 def fitting(saved: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

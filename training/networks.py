@@ -6,6 +6,7 @@ borrows. Teacher encoder and critic exist in training only.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,6 +58,22 @@ def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason
             f"student_encoder is {network.student_encoder!r}; the method {method!r} {reason} and takes 'mlp'."
         )
     return {**widths.arguments(network.latent_width), "encoder_hidden": list(network.student_hidden)}
+
+
+def composed_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
+    """Arguments of a network of ``policy.composed``.
+
+    Raises:
+        ConfigurationError: the student's encoder is no plain one.
+    """
+    network = configuration.network
+    return {
+        **plain_arguments(configuration, widths, "has its experts in the actor"),
+        "num_experts": network.expert_count,
+        "expert_width": network.expert_width,
+        "trunk_hidden": list(network.actor_hidden),
+        "gate_hidden": list(network.gate_hidden),
+    }
 
 
 def student_architecture(configuration: NetworkConfiguration, widths: Widths) -> tuple[str, dict[str, Any]]:
@@ -175,6 +192,23 @@ class CtsActor(StudentActor):
     def policy_parameters(self) -> list[nn.Parameter]:
         """What reinforcement learning trains: teacher encoder, actor and exploration noise."""
         return [*self.teacher_encoder.parameters(), *super().policy_parameters()]
+
+
+class ComposedActor(CtsActor):
+    """Teacher encoder, and a student whose actor is composed of experts: AC-MoE and MCP."""
+
+    def composed(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[Sequence[torch.Tensor], torch.Tensor]:
+        """What the actor says, and the weights of its experts (N, K), for latents (N, L) and frames (N, F); in float32, since
+        probability ratios live on small differences of actions.
+        """
+        with torch.autocast(latent.device.type, enabled=False):
+            values = torch.cat((latent.float(), policy), dim=-1)
+            weights = self.student.actor.weigh(values)
+            return self.student.actor(values, weights), weights
+
+    def action_mean(self, latent: torch.Tensor, policy: torch.Tensor) -> torch.Tensor:
+        """See ``StudentActor``."""
+        return self.composed(latent, policy)[0][0]
 
 
 class ValueNetwork(nn.Module):

@@ -57,8 +57,10 @@ def ratios(robot: Robot, reference: Robot) -> Ratios:
     )
 
 
-def scaled_environment(environment: EnvironmentConfiguration, source: str) -> EnvironmentConfiguration:
-    """An environment's settings for another robot.
+def scaled(
+    environment: EnvironmentConfiguration, training: TrainingConfiguration, source: str
+) -> tuple[EnvironmentConfiguration, TrainingConfiguration]:
+    """A task's settings for another robot, which explores by the same angles, in an experiment that is named for it.
 
     Scaled are the height of the base with what the legs reach; the place to start on with the stance; masses that are added;
     penalties on torque and power with what the robot must carry; penalties on actions with the angle that an action is;
@@ -68,13 +70,27 @@ def scaled_environment(environment: EnvironmentConfiguration, source: str) -> En
 
     Args:
         environment: settings for ``environment.robot``.
+        training: settings for the same robot.
         source: the other robot's name, or the path of its description.
 
     Raises:
         RobotError: one of the robots cannot be found, or is wrong.
     """
     robot, reference = load_robot(source), load_robot(environment.robot)
-    by = ratios(robot, reference)
+    by, network, name = ratios(robot, reference), training.network, training.run.experiment
+    own = name.startswith(reference.name)
+    named = name.replace(reference.name, robot.name, 1) if own else f"{robot.name}_{name}"
+    learning = replace(
+        training,
+        network=replace(network, initial_std=network.initial_std / by.action),
+        run=replace(training.run, experiment=named),
+    )
+    return _scaled_environment(environment, robot, source, by), learning
+
+
+def _scaled_environment(
+    environment: EnvironmentConfiguration, robot: Robot, source: str, by: Ratios
+) -> EnvironmentConfiguration:
     rewards, randomization, commands = environment.rewards, environment.randomization, environment.commands
     parameters, (length, width) = environment.joints.parameters, environment.reset.footprint
     return replace(
@@ -116,27 +132,6 @@ def scaled_environment(environment: EnvironmentConfiguration, source: str) -> En
                 for tile in environment.terrain.tiles
             ),
         ),
-    )
-
-
-def scaled_training(training: TrainingConfiguration, source: str, reference: str) -> TrainingConfiguration:
-    """How another robot learns the task: exploring by the same angles, in an experiment that is named for it.
-
-    Args:
-        training: settings for the robot ``reference``.
-        source: the other robot's name, or the path of its description.
-        reference: name of the robot that the task was written for.
-
-    Raises:
-        RobotError: one of the robots cannot be found, or is wrong.
-    """
-    robot, its = load_robot(source), load_robot(reference)
-    by, network, name = ratios(robot, its), training.network, training.run.experiment
-    named = name.replace(its.name, robot.name, 1) if name.startswith(its.name) else f"{robot.name}_{name}"
-    return replace(
-        training,
-        network=replace(network, initial_std=network.initial_std / by.action),
-        run=replace(training.run, experiment=named),
     )
 
 

@@ -23,7 +23,7 @@ from .environment_configuration import (
     TerminationConfiguration,
 )
 from .overrides import TaskError, apply_overrides
-from .scaling import scaled_environment, scaled_training
+from .scaling import scaled
 from .terrain_configuration import FLAT_TILE, TerrainConfiguration
 
 
@@ -58,11 +58,8 @@ class Task:
         own, robot = load_robot(self.environment.robot, check=False), load_robot(source)
         if robot_digest(robot) == robot_digest(own):
             return self
-        return replace(
-            self,
-            environment=scaled_environment(self.environment, source),
-            training=scaled_training(self.training, source, self.environment.robot),
-        )
+        environment, training = scaled(self.environment, self.training, source)
+        return replace(self, environment=environment, training=training)
 
     def with_horizon(self) -> Task:
         """The task with schedules spread over exactly the run's own iterations."""

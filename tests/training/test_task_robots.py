@@ -8,7 +8,7 @@ import pytest
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.robots import RobotError, load_robot
 from gaitgauge.robots.body_plan import body_plan, default_pose
-from gaitgauge.training.scaling import ratios, scaled_environment
+from gaitgauge.training.scaling import ratios, scaled
 from gaitgauge.training.tasks import TaskError, find_task
 
 
@@ -93,7 +93,8 @@ def test_the_setting_is_the_same_as_the_option(heavy):
 
 def test_the_tasks_own_robot_changes_nothing():
     assert find_task("go2-sprint", robot="go2") == find_task("go2-sprint")
-    assert scaled_environment(find_task("go2-flat").environment, "go2") == find_task("go2-flat").environment
+    task = find_task("go2-flat")
+    assert scaled(task.environment, task.training, "go2") == (task.environment, task.training)
 
 
 def test_wrong_robots():

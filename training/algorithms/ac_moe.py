@@ -11,8 +11,7 @@ import torch
 
 from ...policy.layers import Experts, mixed
 from ..configuration import NetworkConfiguration, TrainingConfiguration
-from ..networks import StudentActor, ValueNetwork, Widths
-from .composed import ComposedActor, composed_arguments
+from ..networks import ComposedActor, StudentActor, ValueNetwork, Widths, composed_arguments
 from .cts import CTS, CtsLosses
 from .losses import POLICY_LOSSES, load_balance
 

@@ -10,8 +10,7 @@ import torch
 from rsl_rl.modules.distribution import HeteroscedasticGaussianDistribution
 
 from ..configuration import ConfigurationError, TrainingConfiguration
-from ..networks import CtsCritic, StudentActor, ValueNetwork, Widths
-from .composed import ComposedActor, composed_arguments
+from ..networks import ComposedActor, CtsCritic, StudentActor, ValueNetwork, Widths, composed_arguments
 from .cts import CTS
 
 
