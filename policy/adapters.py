@@ -330,16 +330,7 @@ def _checkpoint_network(
     )
     if not isinstance(weights, Mapping) or not all(isinstance(v, torch.Tensor) for v in weights.values()):
         return None
-    actor = {
-        "network." + k.split(".", 1)[1]: v
-        for k, v in weights.items()
-        if re.match(r"(actor|mlp)\.\d+\.(weight|bias)$", k)
-    }
-    encoder = {
-        "encoder." + k.split(".", 1)[1]: v
-        for k, v in weights.items()
-        if re.match(r"student_encoder\.\d+\.(weight|bias)$", k)
-    }
+    actor, encoder = _layers(weights, "actor|mlp", "network"), _layers(weights, "student_encoder", "encoder")
     strange = [k for k in weights if k.startswith(("memory", "rnn", "cnn", "student.", "estimator"))]
     if not actor or strange:
         raise PolicyError(
@@ -361,7 +352,7 @@ def _checkpoint_network(
             encoder_hidden=encoder_widths[1:-1],
             actor_hidden=actor_widths[1:-1],
         )
-        state = {**encoder, **{"actor." + k.split(".", 1)[1]: v for k, v in actor.items()}}
+        state = encoder | _layers(weights, "actor|mlp", "actor")
         return contract, StoredNetwork(architecture="cts", arguments=arguments, state_dict=state)
     if actor_widths[0] != frame or actor_widths[-1] != contract.num_joints:
         raise PolicyError(
@@ -375,6 +366,12 @@ def _checkpoint_network(
         # rsl_rl divides by the standard deviation plus this constant.
         actor["mean"], actor["deviation"] = weights[normalizer + "_mean"], weights[normalizer + "_std"] + 0.01
     return contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=actor)
+
+
+def _layers(weights: Mapping[str, torch.Tensor], names: str, ours: str) -> dict[str, torch.Tensor]:
+    """The layers of the perceptron that is called one of ``names``, called ``ours``."""
+    found = {k: v for k, v in weights.items() if re.match(rf"({names})\.\d+\.(weight|bias)$", k)}
+    return {f"{ours}.{k.split('.', 1)[1]}": v for k, v in found.items()}
 
 
 def _widths(layers: Mapping[str, torch.Tensor]) -> list[int]:

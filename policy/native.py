@@ -82,8 +82,12 @@ class ForeignFile:
 
 def first_line(error: BaseException) -> str:
     """The first line that says anything of an error's message, for messages of one sentence."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0].partition(". ")[0].rstrip(".")[:200] if lines else type(error).__name__
+    return said_lines(error)[0].partition(". ")[0].rstrip(".")[:200]
+
+
+def said_lines(error: BaseException) -> list[str]:
+    """The lines of an error's message that say anything, or its name."""
+    return [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
 
 
 def save_policy(path: str | Path, contract: PolicyContract, network: StoredNetwork | ForeignFile) -> None:

@@ -30,7 +30,7 @@ from .base import (
 from .contract import PolicyContract
 from .fence.operators import OPERATORS
 from .fence.script import CONTRACT_FILE
-from .native import LOAD_ERRORS
+from .native import LOAD_ERRORS, said_lines
 
 _RESET_METHODS = ("reset", "reset_memory")
 
@@ -330,8 +330,7 @@ def _run(module: Any, observation: torch.Tensor, rows: int, contract: PolicyCont
 
 def last_line(error: BaseException) -> str:
     """TorchScript puts its message behind the traceback."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1].rstrip(".")[:200] if lines else type(error).__name__
+    return said_lines(error)[-1].rstrip(".")[:200]
 
 
 def _reset(module: Any) -> None:

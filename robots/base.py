@@ -25,11 +25,6 @@ Inertia = Annotated[float, Field(strict=True, ge=0.0, le=100.0)]
 """Of a rotor, seen at the joint [kg·m²]."""
 _ActionScale = Annotated[float, Field(ge=0.0, le=100.0)]
 _JointSpeed = Annotated[float, Field(ge=0.0, le=1_000.0)]
-_Stiffnesses = Annotated[tuple[Stiffness, ...], Field(min_length=1)]
-_Dampings = Annotated[tuple[Damping, ...], Field(min_length=1)]
-_Torques = Annotated[tuple[Torque, ...], Field(min_length=1)]
-_Inertias = Annotated[tuple[Inertia, ...], Field(min_length=1)]
-_JointSpeeds = Annotated[tuple[_JointSpeed, ...], Field(min_length=1)]
 _Names = Annotated[tuple[Text, ...], Field(min_length=1, max_length=1000)]
 
 
@@ -42,23 +37,23 @@ class JointParameters:
     in the direction of motion falls from ``driving_torque_limit`` at ``full_torque_speed`` to zero at ``no_load_speed``.
     """
 
-    stiffness: _Stiffnesses
+    stiffness: tuple[Stiffness, ...]
     """Proportional gain kp of the motor [N·m/rad]."""
-    damping: _Dampings
+    damping: tuple[Damping, ...]
     """Derivative gain kd of the motor [N·m·s/rad]."""
-    torque_limit: _Torques
+    torque_limit: tuple[Torque, ...]
     """Largest motor torque [N·m]."""
-    armature: _Inertias
+    armature: tuple[Inertia, ...]
     """Rotor inertia seen at the joint [kg·m²]."""
-    joint_damping: _Dampings
+    joint_damping: tuple[Damping, ...]
     """Passive viscous damping of the joint [N·m·s/rad]."""
-    friction_loss: _Torques
+    friction_loss: tuple[Torque, ...]
     """Dry friction of the joint [N·m]."""
-    driving_torque_limit: _Torques | None = None
+    driving_torque_limit: tuple[Torque, ...] | None = None
     """Largest motor torque in the direction of motion [N·m]; None where it is ``torque_limit``, as against it."""
-    full_torque_speed: _JointSpeeds | None = None
+    full_torque_speed: tuple[_JointSpeed, ...] | None = None
     """Joint speed up to which the driving torque is there [rad/s]; None where it is not known."""
-    no_load_speed: _JointSpeeds | None = None
+    no_load_speed: tuple[_JointSpeed, ...] | None = None
     """Joint speed from which the motor drives no more [rad/s]; None where it is not known."""
 
 

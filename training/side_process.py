@@ -91,11 +91,7 @@ class SideProcess:
             process = self._running[1]
             self._running = None
             process.terminate()
-            try:
-                process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            await_end(process, 10.0)
 
     def _start_next(self) -> None:
         if self._running is not None or not self._waiting:
@@ -113,3 +109,12 @@ class SideProcess:
                 self._finished.append(Finished(job=job, failure=failure))
                 return
         self._running = (job, process)
+
+
+def await_end(process: subprocess.Popen[bytes], seconds: float) -> None:
+    """Wait for a process that was asked to end, at most so long [s]; then it is killed."""
+    try:
+        process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

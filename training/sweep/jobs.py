@@ -15,7 +15,7 @@ import torch
 
 from ...files.parsing import one_line
 from ..checkpoint import CheckpointError
-from ..side_process import ENVIRONMENT
+from ..side_process import ENVIRONMENT, await_end
 from ..stopping import StopSignals
 from .file import Sweep
 from .runs import SweepRun
@@ -171,11 +171,7 @@ class Jobs:
             job.process.send_signal(signal.SIGTERM)
         until = time.monotonic() + _PATIENCE
         for job in self._live:
-            try:
-                job.process.wait(max(until - time.monotonic(), 0.1))
-            except subprocess.TimeoutExpired:
-                job.process.kill()
-                job.process.wait()
+            await_end(job.process, max(until - time.monotonic(), 0.1))
         self._live = []
 
 
