@@ -7,24 +7,13 @@ from __future__ import annotations
 import torch
 
 
-def rotate(quaternion: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """Body vectors seen in the world: q v q*. ``quaternion`` (…, 4), ``vector`` (…, 3), leading axes broadcast; returns
-    (…, 3).
-    """
-    return _rotate(quaternion[..., :1], quaternion[..., 1:], vector)
-
-
 def rotate_inverse(quaternion: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
     """World vectors seen in the body: q* v q. ``quaternion`` (…, 4), ``vector`` (…, 3), leading axes broadcast; returns
     (…, 3).
     """
-    return _rotate(quaternion[..., :1], -quaternion[..., 1:], vector)
-
-
-def _rotate(w: torch.Tensor, axis: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    axis, vector = torch.broadcast_tensors(axis, vector)
+    axis, vector = torch.broadcast_tensors(-quaternion[..., 1:], vector)
     twice = 2.0 * torch.linalg.cross(axis, vector)
-    return vector + w * twice + torch.linalg.cross(axis, twice)
+    return vector + quaternion[..., :1] * twice + torch.linalg.cross(axis, twice)
 
 
 def from_yaw(yaw: torch.Tensor) -> torch.Tensor:

@@ -245,24 +245,20 @@ def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False)
     """
     entries = read_checkpoint(source, purpose="use")
     with edited(f"Cannot use '{source}': it", CheckpointError, RuntimeError):
-        _trim(entries, Path(destination), raw=raw)
-
-
-def _trim(entries: Mapping[str, Any], destination: Path, *, raw: bool) -> None:
-    networks = learned_networks(entries, raw=raw)
-    actor, critic = networks["actor_state_dict"], networks["critic_state_dict"]
-    kept = {name: entries[name] for name in ("format", "version", "contract", "network")}
-    if raw:
-        contract = PolicyContract.from_json(entries["contract"])
-        kept["contract"] = replace(contract, provenance={**contract.provenance, "weights": "last update"}).to_json()
-    training = {
-        name: entries["training"][name] for name in ("version", "task", "progress") if name in entries["training"]
-    }
-    write_checkpoint(
-        destination,
-        kept
-        # The student is in there twice; tensors that are the same object are stored once.
-        | {"state_dict": student_state(actor), "actor_state_dict": actor, "critic_state_dict": critic}
-        | {"iter": entries["iter"]}
-        | {"training": training},
-    )
+        networks = learned_networks(entries, raw=raw)
+        actor, critic = networks["actor_state_dict"], networks["critic_state_dict"]
+        kept = {name: entries[name] for name in ("format", "version", "contract", "network")}
+        if raw:
+            contract = PolicyContract.from_json(entries["contract"])
+            kept["contract"] = replace(contract, provenance={**contract.provenance, "weights": "last update"}).to_json()
+        training = {
+            name: entries["training"][name] for name in ("version", "task", "progress") if name in entries["training"]
+        }
+        write_checkpoint(
+            Path(destination),
+            kept
+            # The student is in there twice; tensors that are the same object are stored once.
+            | {"state_dict": student_state(actor), "actor_state_dict": actor, "critic_state_dict": critic}
+            | {"iter": entries["iter"]}
+            | {"training": training},
+        )

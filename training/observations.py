@@ -28,20 +28,10 @@ HEIGHT_SCALE = 2.5
 
 def noise_amplitude(contract: PolicyContract, noise: NoiseConfiguration, device: torch.device | str) -> torch.Tensor:
     """Half-width of the noise on each entry of a frame, in scaled units, (frame width,)."""
-    blocks = []
-    for term in contract.observation:
-        width = TERM_WIDTH[term.name] or contract.num_joints
-        half_width = getattr(noise, _NOISE_FIELD[term.name]) if term.name in _NOISE_FIELD else 0.0
-        blocks.append(torch.tensor(term.scale).abs().expand(width) * half_width)
-    return torch.cat(blocks).to(device)
-
-
-_NOISE_FIELD = {
-    "base_angular_velocity_b": "base_angular_velocity",
-    "projected_gravity_b": "projected_gravity",
-    "joint_position": "joint_position",
-    "joint_velocity": "joint_velocity",
-}
+    terms = [(term, TERM_WIDTH[term.name] or contract.num_joints) for term in contract.observation]
+    scales = [torch.tensor(term.scale).abs().expand(width) for term, width in terms]
+    half_widths = [getattr(noise, term.name.removesuffix("_b"), 0.0) for term, _ in terms]
+    return torch.cat([scale * half_width for scale, half_width in zip(scales, half_widths, strict=True)]).to(device)
 
 
 def push_history(history: torch.Tensor, frame: torch.Tensor, forget: torch.Tensor, *, start: str) -> torch.Tensor:

@@ -108,16 +108,11 @@ def _group(key: str, value: Any) -> TaskError:
 
 def _unknown(key: str, root: Any) -> TaskError:
     known, key = override_keys(root), one_line(key, 80)
+    ends, last = {k: k.rsplit(".", 1)[-1] for k in known}, key.rsplit(".", 1)[-1]
     near = get_close_matches(key, known, n=3, cutoff=0.5)
-    last = key.rsplit(".", 1)[-1]
-    near += [k for k in known if k.rsplit(".", 1)[-1] == last and k not in near][:3]
-    if not near:
-        near = [
-            k
-            for end in get_close_matches(last, {k.rsplit(".", 1)[-1] for k in known}, n=3)
-            for k in known
-            if k.endswith(end)
-        ][:3]
+    near += [k for k, end in ends.items() if end == last and k not in near]
+    similar = [] if near else get_close_matches(last, set(ends.values()), n=3)
+    near += [k for end in similar for k in known if k.endswith(end)]
     if near:
         return TaskError(f"unknown setting '{key}'; the nearest are: {', '.join(near[:3])}")
     groups = sorted({k.split(".", 1)[0] for k in known})

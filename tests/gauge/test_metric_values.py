@@ -21,7 +21,7 @@ from gaitgauge.gauge.metrics import (
 from gaitgauge.gauge.sampling import GRAVITY
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.robots.geometry import total_mass
-from gaitgauge.robots.rotation import rotate
+from gaitgauge.robots.rotation import rotate_inverse
 from metric_states import OWN, REFERENCE, evaluate, rows, scalar, turned
 from scripted_gauge import GO2, fake, short_suite
 
@@ -32,7 +32,7 @@ from scripted_gauge import GO2, fake, short_suite
 @pytest.mark.parametrize("kind", ["body", "commanded"])
 def test_a_velocity_held_in_the_body_frame_is_perfect_under_any_heading(yaw, kind):
     heading = turned(yaw=yaw)
-    velocity_w = rotate(heading, rows(0.8, -0.3, 0.0))
+    velocity_w = rotate_inverse(turned(yaw=-yaw), rows(0.8, -0.3, 0.0))
     value = linear_velocity(heading, velocity_w, rows(0.8, -0.3, 5.0), scalar(math.sqrt(2)), kind)
     assert value.item() == pytest.approx(1.0)
 
