@@ -137,7 +137,6 @@ def _print_pair(console: Terminal, reference: str, label: str, pair: Mapping[str
     title = f"closed loop: quality (mean@50) of the same episodes, {label} against {reference}"
     table = make_table(title, *columns, "same fall", "same reach", numbers=True)
     for place, row in {**pair["terrains"], "overall": pair["overall"]}.items():
-        low, high = row["difference"]["interval"]
         outcomes = [row["outcomes"][k] for k in ("fell", "reached")]
         table.add_row(
             place,
@@ -147,7 +146,7 @@ def _print_pair(console: Terminal, reference: str, label: str, pair: Mapping[str
             "" if row["floor"] is None else _small(row["floor"]["value"]),
             "" if row["excess"] is None else _signed(row["excess"]["value"]),
             _signed(row["difference"]["value"]),
-            _range(low, high),
+            _range(row["difference"]["interval"]),
             row["verdict"],
             *("" if o is None else f"{100 * o['same']:.0f} %" for o in outcomes),
         )
@@ -156,14 +155,13 @@ def _print_pair(console: Terminal, reference: str, label: str, pair: Mapping[str
         "metrics, overall", "metric", reference, label, "difference", "95 % interval", "effect size", numbers=True
     )
     for name, row in pair["overall"]["metrics"].items():
-        low, high = row["difference"]["interval"]
         size = row["effect_size"]
         table.add_row(
             name,
             f"{row['reference']:.4f}",
             f"{row['compared']:.4f}",
             _signed(row["difference"]["value"]),
-            _range(low, high),
+            _range(row["difference"]["interval"]),
             "" if size is None else f"{size:+.2f}",
         )
     console.print(table)
@@ -179,13 +177,18 @@ def _print_attribution(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> 
         if row["not_run"] is not None:
             table.add_row(row["title"], row["engine"], "not run")
             continue
-        low, high = row["difference"]["interval"]
         cells = []
         for engine in engines:
             to = row["to"].get(engine)
             change = "" if to is None else f"{_small(to['gap_before'])} → {_small(to['gap_after'])}, {cause(to)}"
             cells.append(change)
-        table.add_row(row["title"], row["engine"], _signed(row["difference"]["value"]), _range(low, high), *cells)
+        table.add_row(
+            row["title"],
+            row["engine"],
+            _signed(row["difference"]["value"]),
+            _range(row["difference"]["interval"]),
+            *cells,
+        )
     console.print(table)
     for row in rows:
         if row["not_run"] is not None:
@@ -222,5 +225,6 @@ def _signed(value: float) -> str:
     return _small(value) if value <= 0.0 else f"+{_small(value)}"
 
 
-def _range(low: float, high: float) -> str:
+def _range(interval: Sequence[float]) -> str:
+    low, high = interval
     return f"{_signed(low)} to {_signed(high)}"

@@ -16,7 +16,7 @@ from .overlay import annotate
 from .picture import Follower, Quality, Tile
 from .play_session import Command, PlaySession, Readout
 from .scenery import visual_model
-from .video import Film
+from .video import film
 
 FRAME_TIME = 0.04
 """Time between two pictures [s]."""
@@ -69,19 +69,19 @@ def record(wanted: Recording, quality: Quality, progress: Callable[[float], None
         for session in sessions
     ]
     with ExitStack() as stack:
-        video = wanted.video and stack.enter_context(Film(wanted.video, fps=1.0 / FRAME_TIME, size=size))
+        video = wanted.video and stack.enter_context(film(wanted.video, fps=1.0 / FRAME_TIME, size=size))
         slower = 1.0 / (FRAME_TIME * _CLIP_EVERY)
-        clip = wanted.clip and stack.enter_context(Film(wanted.clip, fps=slower, size=small))
+        clip = wanted.clip and stack.enter_context(film(wanted.clip, fps=slower, size=small))
         processes = processes_for(frames // every * len(sessions), quality)
         drawn = stack.enter_context(
             closing(draw(tiles, tile, _shots(sessions, frames, every, wanted.command), processes))
         )
         for picture, (frame, readouts) in drawn:
             if video:
-                video.add(annotate(picture, readouts))
+                video(annotate(picture, readouts))
             if clip and frame % _CLIP_EVERY == 0:
                 reduced = Image.fromarray(picture).resize(small, Image.Resampling.BOX)
-                clip.add(annotate(np.asarray(reduced), readouts))
+                clip(annotate(np.asarray(reduced), readouts))
             progress((frame + 1) / frames)
 
 

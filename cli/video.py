@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -33,23 +34,24 @@ def check_film_path(path: Path, option: str, endings: tuple[str, ...]) -> None:
         raise UserError(f"folder '{path.parent}' of {option} does not exist; create it first")
 
 
-class Film:
-    """Writes pictures to a file in the format that its ending names; the file gets its name when it is whole."""
+@contextmanager
+def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[[np.ndarray], None]]:
+    """Write pictures to a file in the format that its ending names; the file gets its name when it is whole.
 
-    def __init__(self, path: Path, *, fps: float, size: tuple[int, int]) -> None:
-        """Start the encoder for a path that ``check_film_path`` lets pass.
+    Args:
+        path: one that ``check_film_path`` lets pass.
+        fps: pictures a second.
+        size: width and height [pixels].
 
-        Args:
-            fps: pictures a second.
-            size: width and height [pixels].
-        """
-        import imageio_ffmpeg
+    Yields:
+        What adds a picture (height, width, 3) uint8, or raises ``UserError`` where it cannot be written.
+    """
+    import imageio_ffmpeg
 
-        self.path = path
-        codec, pixels, options = _CODECS[path.suffix.lower()]
-        self._whole = replacing(path, UserError, ending=path.suffix)
-        self._writer = imageio_ffmpeg.write_frames(
-            str(self._whole.__enter__()),
+    codec, pixels, options = _CODECS[path.suffix.lower()]
+    with replacing(path, UserError, ending=path.suffix) as partial:
+        writer = imageio_ffmpeg.write_frames(
+            str(partial),
             size,
             fps=fps,
             codec=codec,
@@ -60,24 +62,15 @@ class Film:
             ffmpeg_log_level="error",
             output_params=options,
         )
-        self._writer.send(None)
+        writer.send(None)
 
-    def __enter__(self) -> Film:
-        return self
+        def add(picture: np.ndarray) -> None:
+            try:
+                writer.send(np.ascontiguousarray(picture))
+            except OSError as error:
+                raise UserError(f"cannot write '{path}': {' '.join(str(error).split())[:200]}") from error
 
-    def add(self, picture: np.ndarray) -> None:
-        """Add a picture (height, width, 3) uint8.
-
-        Raises:
-            UserError: it cannot be written.
-        """
         try:
-            self._writer.send(np.ascontiguousarray(picture))
-        except OSError as error:
-            raise UserError(f"cannot write '{self.path}': {' '.join(str(error).split())[:200]}") from error
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.close()
-        self._whole.__exit__(kind, error, trace)
+            yield add
+        finally:
+            writer.close()

@@ -176,23 +176,17 @@ class CounterStream(NoiseStream):
     """A hash of (episode, control step, index): every episode has a stream of its own, with no state to carry."""
 
     def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
-        self._noise, self._joints = noise, joints
+        self._noise = noise
         self._key = torch.zeros(worlds, dtype=torch.int64, device=device)
-        self._widths = {
-            "joint_position": joints,
-            "joint_velocity": joints,
-            "base_angular_velocity_b": 3,
-            "projected_gravity_b": 3,
-            "base_linear_velocity_b": 3,
+        terms = {
+            "joint_position": (joints, noise.joint_position),
+            "joint_velocity": (joints, noise.joint_velocity),
+            "base_angular_velocity_b": (3, noise.base_angular_velocity),
+            "projected_gravity_b": (3, noise.projected_gravity),
+            "base_linear_velocity_b": (3, noise.base_linear_velocity),
         }
-        halves = (
-            noise.joint_position,
-            noise.joint_velocity,
-            noise.base_angular_velocity,
-            noise.projected_gravity,
-            noise.base_linear_velocity,
-        )
-        half = [h for h, width in zip(halves, self._widths.values(), strict=True) for _ in range(width)]
+        self._widths = {name: width for name, (width, _) in terms.items()}
+        half = [value for width, value in terms.values() for _ in range(width)]
         self._half = torch.tensor(half, device=device)
         self._index = torch.arange(len(half) + 1, dtype=torch.int64, device=device)
 

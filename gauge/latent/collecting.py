@@ -19,40 +19,38 @@ from ...robots.rotation import from_yaw, tilt
 from ...terrains.base import Terrain
 from ..episodes import Episode
 from ..motors import joint_parameters
-from ..policies import check_fit
+from ..policies import PoliciesRequest, check_fit
 from ..suite import Suite
 from ..walking import Walk
 
 COMMANDS = {
-    "forward": (1.0, 0.0, 0.0),
-    "backward": (-1.0, 0.0, 0.0),
+    "forward": (0.8, 0.0, 0.0),
+    "backward": (-0.8, 0.0, 0.0),
     "left turn": (0.0, 0.0, 1.0),
     "right turn": (0.0, 0.0, -1.0),
 }
-"""The paper's commands as multiples of ``Walks.speed`` and ``Walks.turn``."""
+"""The paper's commands: forward, lateral [m/s] and yaw [rad/s]."""
 INTERVAL = 0.1
 """Time between two notes [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Walks:
-    """What is walked."""
+class LatentRequest(PoliciesRequest):
+    """Whose latent is looked at, and where."""
 
-    suite: Suite
-    """Gives physics, sensor noise and latency."""
-    terrains: tuple[Terrain, ...]
+    terrains: tuple[str, ...] = ()
+    """Names; none for the gauge's seven."""
+    level: int = 5
+    """Of the terrains that have levels."""
     friction: float = 0.8
+    suite: str = "gaitgauge-1"
+    """Gives physics, sensor noise and latency."""
     settling: float = 1.0
-    """How long robots stand before they are told to walk [s]."""
+    """How long every robot stands before it is told to walk [s]."""
     seconds: float = 5.0
-    """How long each robot walks, and is watched [s]."""
-    speed: float = 0.8
-    """Commanded forward and backward [m/s]."""
-    turn: float = 1.0
-    """Commanded turning speed [rad/s]."""
-    robots: int = 6
-    """Robots for each terrain and command; they differ in noise and latency."""
-    seed: int = 0
+    """How long every robot walks [s]."""
+    robots: int = 4
+    """For each terrain and command, at least 2; they differ in noise and latency."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +64,7 @@ class Notes:
     history: NDArray[np.float64]
     """What the network was given, (N, H·F)."""
     terrain: NDArray[np.int64]
-    """Index into ``Walks.terrains``, (N,)."""
+    """Index into the terrains, (N,)."""
     command: NDArray[np.int64]
     """Index into ``COMMANDS``, (N,)."""
     robot: NDArray[np.int64]
@@ -82,13 +80,13 @@ class Notes:
 def collect(
     policy: Policy,
     robot: Robot,
-    walks: Walks,
+    asked: LatentRequest,
+    suite: Suite,
+    terrains: tuple[Terrain, ...],
     *,
-    backend: str = "mujoco",
-    threads: int = 1,
     make: Callable[..., PhysicsBackend] = make_backend,
 ) -> Notes:
-    """Let a policy's robots walk, on the CPU, and note what its encoder and experts say; ``threads`` change the time alone.
+    """Let a policy's robots walk, on the CPU, and note what its encoder and experts say.
 
     Raises:
         BackendError: the engine cannot do it.
@@ -96,38 +94,36 @@ def collect(
         PolicyError: the policy has neither encoder nor experts, or its output is not finite.
         ContractError: it is not for this robot.
     """
-    check_fit(walks.suite, robot, policy.contract)
-    places = [(t, c, r) for t in range(len(walks.terrains)) for c in range(len(COMMANDS)) for r in range(walks.robots)]
+    check_fit(suite, robot, policy.contract)
+    places = [(t, c, r) for t in range(len(terrains)) for c in range(len(COMMANDS)) for r in range(asked.robots)]
     scene = Scene(
         robot=robot,
-        parameters=joint_parameters(walks.suite, robot, policy.contract),
-        terrains=walks.terrains,
+        parameters=joint_parameters(suite, robot, policy.contract),
+        terrains=terrains,
         terrain_index=tuple(t for t, _, _ in places),
-        physics=walks.suite.physics,
+        physics=suite.physics,
     )
     session, network = watched_session(policy, len(places))
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
     period = scene.physics.control_period
-    stands, steps, every = (round(s / period) for s in (walks.settling, walks.seconds, INTERVAL))
+    stands, steps, every = (round(s / period) for s in (asked.settling, asked.seconds, INTERVAL))
     up: list[torch.Tensor] = []
     seen: list[tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor]] = []
-    with closing(make(backend, scene, device="cpu", threads=threads)) as physics, torch.inference_mode():
-        walk = Walk(policy, physics, walks.suite.noise, _episodes(walks, places), steps=stands + steps, session=session)
-        physics.randomize(Randomization(friction=walk.tensor([walks.friction] * len(places))))
-        poses = [walks.terrains[t].spawns["level_eval"] for t, _, _ in places]
+    with closing(make(asked.backend, scene, device="cpu", threads=asked.threads)) as physics, torch.inference_mode():
+        episodes = _episodes(asked, terrains, places)
+        walk = Walk(policy, physics, suite.noise, episodes, steps=stands + steps, session=session)
+        physics.randomize(Randomization(friction=walk.tensor([asked.friction] * len(places))))
+        poses = [terrains[t].spawns["level_eval"] for t, _, _ in places]
         stand = robot.stand_height
         walk.reset(
             walk.tensor([(*p.position[:2], p.position[2] + stand) for p in poses]),
             from_yaw(walk.tensor([p.yaw for p in poses])),
         )
-        shares = walk.tensor(list(COMMANDS.values()))[torch.tensor([c for _, c, _ in places])]
-        command = shares * walk.tensor([walks.speed, walks.speed, walks.turn])
+        command = walk.tensor(list(COMMANDS.values()))[torch.tensor([c for _, c, _ in places])]
         fallen = torch.zeros(len(places), dtype=torch.bool)
         for step in range(stands + steps):
             walk.step(command if step >= stands else torch.zeros_like(command))
-            fallen = (
-                fallen | physics.state.diverged | (tilt(physics.state.base_quaternion_w) > walks.suite.events.fall_tilt)
-            )
+            fallen = fallen | physics.state.diverged | (tilt(physics.state.base_quaternion_w) > suite.events.fall_tilt)
             if step >= stands and (step - stands + 1) % every == 0:
                 up.append(~fallen)
                 seen.append((network.latent, network.weights, network.history.flatten(1)))
@@ -153,16 +149,18 @@ def _table(parts: Sequence[torch.Tensor]) -> NDArray[np.float64]:
     return found
 
 
-def _episodes(walks: Walks, places: Sequence[tuple[int, int, int]]) -> list[Episode]:
+def _episodes(
+    asked: LatentRequest, terrains: Sequence[Terrain], places: Sequence[tuple[int, int, int]]
+) -> list[Episode]:
     """One for each robot, which gives it noise and latency of its own."""
     commands = list(COMMANDS)
     return [
         Episode(
-            terrain=walks.terrains[t].name,
-            level=walks.terrains[t].level,
-            friction=walks.friction,
+            terrain=terrains[t].name,
+            level=terrains[t].level,
+            friction=asked.friction,
             payload=0.0,
-            seed=walks.seed + r,
+            seed=asked.seed + r,
             stage=f"latent {commands[c]}",
             goals=(),
         )

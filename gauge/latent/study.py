@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,11 @@ from ...files.writing import csv_text, json_text, make_folder, write_atomically
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...robots import RobotError
+from ...terrains.base import Terrain
 from ...terrains.registry import gauge_terrain_names, make_terrain
-from ..policies import Loaded, PoliciesRequest, Refused, Watch, describe, load_policies
-from ..suite import SuiteError, load_suite
-from .collecting import COMMANDS, Notes, Walks, collect
+from ..policies import Loaded, Refused, Watch, describe, load_policies
+from ..suite import Suite, SuiteError, load_suite
+from .collecting import COMMANDS, LatentRequest, Notes, collect
 from .figures import FIGURES, render_figure, render_page
 from .separation import Separation, principal_components, separation
 
@@ -33,25 +34,6 @@ STRIDES = 10
 
 class LatentError(ValueError):
     """Nothing of what was asked for can be looked at."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LatentRequest(PoliciesRequest):
-    """Whose latent is looked at, and where."""
-
-    terrains: tuple[str, ...] = ()
-    """Names; none for the gauge's seven."""
-    level: int = 5
-    """Of the terrains that have levels."""
-    friction: float = 0.8
-    suite: str = "gaitgauge-1"
-    """Gives physics, sensor noise and latency."""
-    settling: float = 1.0
-    """How long every robot stands before it is told to walk [s]."""
-    seconds: float = 5.0
-    """How long every robot walks [s]."""
-    robots: int = 4
-    """For each terrain and command, at least 2."""
 
 
 def study_latents(
@@ -72,7 +54,7 @@ def study_latents(
     """
     began = time.perf_counter()
     find_backend(request.backend, "cpu")
-    walks = _walks(request)
+    suite, terrains = _ground(request)
     policies, refused = load_policies(request.policies, request.robot, trust=request.trust)
     entries: list[dict[str, Any]] = []
     points: list[tuple[str, Notes, dict[str, NDArray[np.float64]]]] = []
@@ -80,10 +62,8 @@ def study_latents(
         if watch is not None:
             watch(number, len(policies), label)
         try:
-            notes = collect(
-                loaded.policy, loaded.robot, walks, backend=request.backend, threads=request.threads, make=make
-            )
-            entry, places = look(label, loaded, notes, walks)
+            notes = collect(loaded.policy, loaded.robot, request, suite, terrains, make=make)
+            entry, places = look(label, loaded, notes, [t.name for t in terrains])
         except (PolicyError, ContractError, BackendError, RobotError, SuiteError, LatentError) as error:
             refused.append(Refused(what=label, reason=str(error)))
         else:
@@ -94,13 +74,13 @@ def study_latents(
     results = {
         "schema": 1,
         "policies": entries,
-        "terrains": [t.name for t in walks.terrains],
+        "terrains": [t.name for t in terrains],
         "commands": list(COMMANDS),
         "level": request.level,
         "friction": request.friction,
         "seconds": request.seconds,
         "robots": request.robots,
-        "suite": {"name": walks.suite.name, "version": walks.suite.version, "digest": walks.suite.digest},
+        "suite": {"name": suite.name, "version": suite.version, "digest": suite.digest},
         "refused": [asdict(r) for r in refused],
         "backend": request.backend,
         "provenance": provenance(
@@ -118,7 +98,8 @@ def study_latents(
     return results
 
 
-def _walks(request: LatentRequest) -> Walks:
+def _ground(request: LatentRequest) -> tuple[Suite, tuple[Terrain, ...]]:
+    """The rules, and what is walked on."""
     suite = load_suite(request.suite)
     if not 0.0 < request.friction <= 10.0:
         raise SuiteError(
@@ -129,19 +110,11 @@ def _walks(request: LatentRequest) -> Walks:
     for terrain in terrains:
         if "level_eval" not in terrain.spawns:
             raise SuiteError(f"terrain '{terrain.name}' has no spawn 'level_eval'; add it, or choose another terrain")
-    return Walks(
-        suite=suite,
-        terrains=terrains,
-        friction=request.friction,
-        settling=request.settling,
-        seconds=request.seconds,
-        robots=request.robots,
-        seed=request.seed,
-    )
+    return suite, terrains
 
 
 def look(
-    label: str, loaded: Loaded, notes: Notes, walks: Walks
+    label: str, loaded: Loaded, notes: Notes, terrains: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     """What ``latent.json`` says of a policy, and its points on the principal axes by figure, (N, 2); NaN where a point is not
     part of it.
@@ -154,7 +127,7 @@ def look(
         "commands": np.ones(len(notes.time), dtype=bool),
     }
     classes = {"terrains": notes.terrain, "commands": notes.command}
-    names = {"terrains": [t.name for t in walks.terrains], "commands": list(COMMANDS)}
+    names = {"terrains": terrains, "commands": list(COMMANDS)}
     spaces = {"latent": notes.latent, "experts": notes.weights, "input": notes.history}
     blocks = _blocks(notes, STRIDES)
     entry: dict[str, Any] = {

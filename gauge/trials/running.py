@@ -194,7 +194,7 @@ class _Run:
         count = len(self._seeds)
         physics.randomize(Randomization(friction=walk.tensor([scenario.friction] * count)))
         self._to_start()
-        timeline = Timeline(scenario, self._period, self._line)
+        timeline = Timeline(scenario, self._period, self._line, physics.state.base_position_w)
         active = torch.ones(count, dtype=torch.bool, device=physics.device)
         lying = walk.tensor([0.0] * count)
         rows: list[tuple[torch.Tensor, ...]] = []

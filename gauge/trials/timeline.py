@@ -19,38 +19,33 @@ _FASTEST_TURN = 1.0
 class Timeline:
     """Each robot's place in the scenario's commands."""
 
-    def __init__(self, scenario: Scenario, period: float, line: tuple[float, float, float]) -> None:
+    def __init__(
+        self, scenario: Scenario, period: float, line: tuple[float, float, float], position: torch.Tensor
+    ) -> None:
         """Begin with the first phase.
 
         Args:
             period: control period [s].
             line: x, y [m] and heading [rad] of the line that steering keeps to.
+            position: of the robots (N, 3), for their number and what they are kept in.
         """
-        phases = scenario.commands
-        self._velocities = [phase.velocity for phase in phases]
-        self._lengths = [phase.steps(period) for phase in phases]
-        self._limits = [float("inf") if phase.until_x is None else phase.until_x for phase in phases]
-        self._steer = [phase.steer for phase in phases]
-        self._line = line
-        self._phase: torch.Tensor | None = None
+        phases, device = scenario.commands, position.device
+        limits = [float("inf") if phase.until_x is None else phase.until_x for phase in phases]
+        columns = (
+            [*(phase.steps(period) for phase in phases), 2**62],
+            [*limits, float("inf")],
+            [*(phase.steer for phase in phases), False],
+        )
+        self._tables = [torch.tensor(column, device=device) for column in columns]  # the last row: all is over
+        velocities = [*(phase.velocity for phase in phases), (0.0, 0.0, 0.0)]
+        self._commands = torch.tensor(velocities, device=device, dtype=position.dtype)
+        self._line, self._last = line, len(phases)
+        self._phase = torch.zeros(len(position), dtype=torch.int64, device=device)
+        self._done = torch.zeros_like(self._phase)
 
     def next(self, state: PhysicsState) -> torch.Tensor:
         """Commands of the coming control step: forward, lateral [m/s] and yaw [rad/s], (N, 3); zero where they are over."""
         position = state.base_position_w
-        if self._phase is None:
-            self._phase = torch.zeros(len(position), dtype=torch.int64, device=position.device)
-            self._done = torch.zeros_like(self._phase)
-            self._tables = [
-                torch.tensor([*rows, end], device=position.device)
-                for rows, end in (
-                    (self._lengths, 2**62),
-                    (self._limits, float("inf")),
-                    (self._steer, False),
-                )
-            ]
-            self._commands = torch.tensor(
-                [*self._velocities, (0.0, 0.0, 0.0)], device=position.device, dtype=position.dtype
-            )
         lengths, limits, steer = self._tables
         ends = (self._done >= lengths[self._phase]) | (position[:, 0] >= limits[self._phase])
         self._phase += ends
@@ -64,8 +59,7 @@ class Timeline:
     @property
     def over(self) -> torch.Tensor:
         """Whether a robot's commands are over, (N,) bool."""
-        assert self._phase is not None
-        return self._phase >= len(self._lengths)
+        return self._phase >= self._last
 
     def _turn(self, state: PhysicsState) -> torch.Tensor:
         """Yaw speed with which an operator brings the robot back to its line, (N, 1) [rad/s]."""

@@ -11,7 +11,7 @@ from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.overlay import annotate, summary, table
 from gaitgauge.cli.picture import PLAIN, RICH, choose_renderer
 from gaitgauge.cli.play_session import Readout
-from gaitgauge.cli.video import Film
+from gaitgauge.cli.video import film
 from PIL import Image
 
 
@@ -19,14 +19,14 @@ def test_video_file_is_whole_or_not_there(tmp_path):
     import imageio.v3 as imageio
 
     path = tmp_path / "walk.mp4"
-    with Film(path, fps=25, size=(64, 48)) as video:
+    with film(path, fps=25, size=(64, 48)) as add:
         for i in range(10):
-            video.add(np.full((48, 64, 3), 20 * i, dtype=np.uint8))
+            add(np.full((48, 64, 3), 20 * i, dtype=np.uint8))
     frames = imageio.imread(path, plugin="FFMPEG")
     assert frames.shape == (10, 48, 64, 3)
     assert frames[9].mean() > frames[0].mean() + 100
-    with pytest.raises(RuntimeError, match="gone"), Film(tmp_path / "half.mp4", fps=25, size=(64, 48)) as video:
-        video.add(np.zeros((48, 64, 3), dtype=np.uint8))
+    with pytest.raises(RuntimeError, match="gone"), film(tmp_path / "half.mp4", fps=25, size=(64, 48)) as add:
+        add(np.zeros((48, 64, 3), dtype=np.uint8))
         raise RuntimeError("gone")
     assert [f.name for f in tmp_path.glob("*.mp4")] == ["walk.mp4"]
 
@@ -82,9 +82,9 @@ def test_every_tile_has_its_panel_and_the_rest_of_the_picture_stays(width, heigh
 @pytest.mark.parametrize("ending", ["gif", "webp"])
 def test_clips_play_by_themselves(tmp_path, ending):
     path = tmp_path / f"walk.{ending}"
-    with Film(path, fps=12.5, size=(64, 48)) as clip:
+    with film(path, fps=12.5, size=(64, 48)) as add:
         for i in range(5):
-            clip.add(np.full((48, 64, 3), 40 * i, dtype=np.uint8))
+            add(np.full((48, 64, 3), 40 * i, dtype=np.uint8))
     with Image.open(path) as read:
         read.seek(1)
         read.load()

@@ -2,12 +2,13 @@
 
 import csv
 import json
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import torch
-from gaitgauge.gauge.latent.collecting import COMMANDS, Notes, Walks, collect
+from gaitgauge.gauge.latent.collecting import Notes, collect
 from gaitgauge.gauge.latent.separation import principal_components, separation, silhouette
 from gaitgauge.gauge.latent.study import LatentError, LatentRequest, _blocks, study_latents
 from gaitgauge.gauge.suite import load_suite
@@ -69,14 +70,14 @@ def test_classes_that_lost_samples_count_as_much_as_the_others():
 
 
 @pytest.fixture(scope="module")
-def walks() -> Walks:
-    terrains = (make_terrain("flat"), make_terrain("slope_bd", 3))
-    return Walks(suite=load_suite("gaitgauge-1"), terrains=terrains, settling=0.2, seconds=0.2, robots=2)
+def walks():
+    asked = LatentRequest(policies=(), settling=0.2, seconds=0.2, robots=2, threads=2)
+    return asked, load_suite("gaitgauge-1"), (make_terrain("flat"), make_terrain("slope_bd", 3))
 
 
 def test_what_robots_noted_belongs_to_where_they_were(walks):
     policy, robot = load_policy("pretrained"), load_robot("go2")
-    notes = collect(policy, robot, walks, threads=2)
+    notes = collect(policy, robot, *walks)
     # two terrains, four commands, two robots, 0.1 s and 0.2 s
     assert notes.walkers == 16 and notes.falls == 0 and len(notes.time) == 32
     assert np.bincount(notes.terrain).tolist() == [16, 16] and np.bincount(notes.command).tolist() == [8] * 4
@@ -85,9 +86,10 @@ def test_what_robots_noted_belongs_to_where_they_were(walks):
     assert np.allclose(notes.weights.sum(axis=1), 1.0, atol=1e-5)
     # the newest frame holds the command, scaled by 2, 2 and 0.25 (protocol §5)
     told = notes.history[:, -45 + 6 : -45 + 9] / (2.0, 2.0, 0.25)
-    expected = np.array(list(COMMANDS.values()))[notes.command] * (walks.speed, walks.speed, walks.turn)
+    expected = np.array([(0.8, 0, 0), (-0.8, 0, 0), (0, 0, 1), (0, 0, -1)])[notes.command]
     assert np.allclose(told, expected, atol=1e-6)
-    again = collect(policy, robot, walks)
+    asked, *places = walks
+    again = collect(policy, robot, replace(asked, threads=1), *places)
     assert np.array_equal(notes.latent, again.latent)
 
 
