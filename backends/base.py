@@ -337,6 +337,15 @@ class PhysicsBackend(ABC):
             worlds: mask (N,) bool of the worlds to reset, None for all.
         """
 
+    def standing(self) -> ResetState:
+        """For ``reset``: every robot upright at its standing height over the origin, in the default pose, which the motors hold."""
+        import torch
+
+        robot, n = self.scene.robot, self.num_worlds
+        rows = ([0.0, 0.0, robot.stand_height], [1.0, 0.0, 0.0, 0.0], robot.default_joint_position)
+        place, upright, pose = (torch.tensor([row], device=self.device, dtype=self.dtype).expand(n, -1) for row in rows)
+        return ResetState(base_position=place, base_quaternion=upright, held_target=pose)
+
     @abstractmethod
     def step(
         self,

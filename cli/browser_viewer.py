@@ -265,7 +265,6 @@ def serve(
     Args:
         sessions: the first worlds, one for each policy; all worlds are closed at the end.
         maker: makes others when they are chosen on the page.
-        chosen: what the first worlds are.
         command: what the robots are told at first; None: to the target, or a tour.
         seconds: simulated time until the end [s]; None: until Ctrl-C.
         host: the interface that is listened on.

@@ -68,13 +68,8 @@ def run_evaluation(
     if clip:
         from .clip import make_clip
 
-        options = [
-            policy,
-            "--suite",
-            suite,
-            *(["--trust"] if request.trust else []),
-            *(["--robot", request.robot] if request.robot else []),
-        ]
+        options = [policy, "--suite", suite] + ["--trust"] * request.trust
+        options += ["--robot", request.robot] if request.robot else []
         if sentence := make_clip(folder, results, options):
             console.say(sentence)
         else:

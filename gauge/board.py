@@ -45,7 +45,6 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
     """Tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first.
 
     Args:
-        cards: contents by file name.
         folder: what the command that checks a card finds the files in.
 
     Returns:

@@ -143,22 +143,20 @@ def sweep(rows: Sequence[Row], *, axis: str, quantity: str) -> list[dict[str, An
         return _linear(value, (0.0, top), (lower, upper))
 
     steps = [top * i / 4 for i in range(5)] if quantity == "score" else [0.0, top / 2, top]
-    panels = []
-    for terrain, fixed, line in series:
-        panels.append(
-            {
-                "terrain": terrain_label(terrain),
-                "axis": axis,
-                "quantity": quantity,
-                "fixed": fixed,
-                "size": (_PANEL_WIDTH, _PANEL_HEIGHT),
-                "frame": (left, right, upper, lower),
-                "x_ticks": [{"x": x_of(v), "label": number(v)} for v in _thin(values)],
-                "y_ticks": [{"y": y_of(v), "label": number(v)} for v in steps],
-                "points": [_point(r, axis, quantity, x_of, y_of) for r in line],
-            }
-        )
-    return panels
+    return [
+        {
+            "terrain": terrain_label(terrain),
+            "axis": axis,
+            "quantity": quantity,
+            "fixed": fixed,
+            "size": (_PANEL_WIDTH, _PANEL_HEIGHT),
+            "frame": (left, right, upper, lower),
+            "x_ticks": [{"x": x_of(v), "label": number(v)} for v in _thin(values)],
+            "y_ticks": [{"y": y_of(v), "label": number(v)} for v in steps],
+            "points": [_point(r, axis, quantity, x_of, y_of) for r in line],
+        }
+        for terrain, fixed, line in series
+    ]
 
 
 def _point(row: Row, axis: str, quantity: str, x_of: Any, y_of: Any) -> dict[str, Any]:

@@ -42,7 +42,6 @@ def compare_all(
     """Evaluate what has not been evaluated yet, compare, and write the comparison; returns it as plain data, and its files.
 
     Args:
-        contestants: policies, results folders or copies of ``results.json``.
         request: how policies are evaluated; its policy is replaced by each.
         folder: where the comparison goes.
         runs: folder of the evaluations; what it holds is gone on with.

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import torch
 
-from ..backends.base import TRAINING_PHYSICS, PhysicsBackend, PhysicsState, Randomization, ResetState, Scene
+from ..backends.base import TRAINING_PHYSICS, PhysicsBackend, PhysicsState, Randomization, Scene
 from ..backends.registry import make_backend
 from ..policy.alternatives import Alternative, alternatives
 from ..policy.base import Policy
@@ -266,11 +266,7 @@ def _to_start(physics: PhysicsBackend, tried: Sequence[Alternative], each: int) 
             column += [[values[i] for i in index]] * each
     kp, kd = (torch.tensor(column, device=device, dtype=dtype) for column in gains)
     physics.randomize(Randomization(stiffness_scale=kp, damping_scale=kd))
-    count = physics.num_worlds
-    place = torch.tensor([[0.0, 0.0, robot.stand_height]], device=device, dtype=dtype).expand(count, 3)
-    upright = torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device, dtype=dtype).expand(count, 4)
-    held = torch.tensor([robot.default_joint_position], device=device, dtype=dtype).expand(count, -1)
-    physics.reset(ResetState(base_position=place, base_quaternion=upright, held_target=held))
+    physics.reset(physics.standing())
 
 
 class _Part:

@@ -210,20 +210,26 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
 
 def identity(prepared: Prepared) -> dict[str, Any]:
     """What decides about the results: a folder that holds another run is refused."""
-    request, suite = prepared.request, prepared.suite
-    return {
-        "suite": f"{suite.name} {suite.version}",
-        "suite_digest": suite.digest,
-        "policy": policy_digest(prepared.policy),
-        "robot_digest": robot_digest(prepared.robot),
+    request, digest = prepared.request, policy_digest(prepared.policy)
+    return common_identity(prepared.suite, digest, prepared.robot, request.device, prepared.seeds) | {
         "pipeline": request.pipeline,
         "backend": request.backend,
-        "device": torch.device(request.device).type,
         "robot": request.robot or prepared.robot.name,
         "level": request.level,
         "environments": [e.key for e in prepared.environments],
-        "seeds": list(prepared.seeds),
         "noise": "by segment",  # runs begun before episodes fell into segments drew theirs otherwise
+    }
+
+
+def common_identity(suite: Suite, policy: str, robot: Robot, device: str, seeds: Sequence[int]) -> dict[str, Any]:
+    """The part of it that every run of episodes has; ``policy`` is its digest."""
+    return {
+        "suite": f"{suite.name} {suite.version}",
+        "suite_digest": suite.digest,
+        "policy": policy,
+        "robot_digest": robot_digest(robot),
+        "device": torch.device(device).type,
+        "seeds": list(seeds),
         "versions": versions(),
         "plugins": plugins(),
     }

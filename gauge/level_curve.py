@@ -46,7 +46,6 @@ def follow(outcomes: Callable[[int], Outcomes], levels: int, seeds: int, bracket
 
     Args:
         outcomes: of every seed at a level.
-        seeds: search seeds at a level.
         bracket: how many of them look for the crossing.
     """
     counts: dict[int, int] = {}

@@ -63,7 +63,6 @@ def render(results: Mapping[str, Any], clip: bytes | None = None) -> str:
     """The page of some results, as HTML text. Whatever they contain is shown as text and never becomes markup.
 
     Args:
-        results: content of ``results.json``.
         clip: a WebP film of the robot.
 
     Raises:
@@ -128,7 +127,7 @@ def report_data(results: Mapping[str, Any]) -> dict[str, Any]:
             name: {
                 **row,
                 "strip": charts.strip(row) if evaluated else None,
-                "environments": _environments_of(rows, name),
+                "environments": sum(r["terrain"] == name for r in rows),
             }
             for name, row in terrains.items()
         },
@@ -277,10 +276,6 @@ def _counts(results: Mapping[str, Any]) -> str:
 
 def _plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
-def _environments_of(rows: Sequence[Row], terrain: str) -> int:
-    return sum(r["terrain"] == terrain for r in rows)
 
 
 def _groups(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -27,7 +27,6 @@ class RunFolder:
 
         Args:
             request: everything that decides about the results (suite, policy hash, engine, environments …), plain data.
-            resume: go on with a run that is already there.
 
         Raises:
             StoreError: the folder belongs to another run, holds a run and ``resume`` is not asked for, is in use, or

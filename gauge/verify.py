@@ -47,7 +47,6 @@ def prepare_replay(
     """What must be played to check a card.
 
     Args:
-        card: content of a ``results.json``.
         policy: the policy's file, where it is not at the card's path.
         suite: name or ``.toml`` file, where the suite is one of the user's own.
         quick: one environment of each terrain, at nominal friction and payload where the card has it, else the card's first.

@@ -166,9 +166,7 @@ class WorldBuffers:
         """Let segments begin in worlds; nothing of the worlds' earlier ones is left.
 
         Args:
-            segments: one for each of them.
             terrain_index: their terrains, indices into ``terrains``.
-            suite, robot, schedule, rules: what decides about a segment.
         """
         device = self.active.device
         at = torch.tensor(worlds, device=device)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from time import perf_counter
 from typing import ClassVar
 
@@ -110,12 +110,7 @@ class MujocoBackend(PhysicsBackend):
         self._deep = layout.penetration
         self._everyone = np.arange(n)
         self._rooms: dict[tuple[int, int], tuple[Array, Records]] = {}
-        stand = torch.tensor([0.0, 0.0, robot.stand_height], dtype=torch.float64).repeat(n, 1)
-        self.reset(
-            ResetState(
-                base_position=stand, base_quaternion=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, 1)
-            )
-        )
+        self.reset(replace(self.standing(), held_target=None))
 
     # ---- layout -------------------------------------------------------------------------------------------------
 

@@ -22,7 +22,6 @@ def bytes_per_world(model: mujoco.MjModel, capacity: Capacity, worlds: int, proc
 
     Args:
         capacity: buffer sizes for ``worlds`` worlds.
-        worlds: number of worlds that the capacity is for.
         processors: multiprocessors of the GPU; an H200's if nothing is said.
     """
 

@@ -291,20 +291,17 @@ def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
 
 def _body(model: mujoco.MjModel, scene: Scene, name: str) -> int:
     """Id of a body of the robot."""
-    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-    if found < 0:
-        raise BackendError(
-            f"body '{name}' of robot '{scene.robot.name}' is not in {scene.robot.mjcf.name}; correct robot.toml"
-        )
-    return int(found)
+    return _find(model, scene, mujoco.mjtObj.mjOBJ_BODY, name, f"body '{name}' of robot '{scene.robot.name}' is not in")
 
 
 def _geom(model: mujoco.MjModel, scene: Scene, name: str) -> int:
     """Id of a foot's geom."""
-    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
+    what = f"foot '{name}' of robot '{scene.robot.name}' is no collision geom of"
+    return _find(model, scene, mujoco.mjtObj.mjOBJ_GEOM, name, what)
+
+
+def _find(model: mujoco.MjModel, scene: Scene, kind: mujoco.mjtObj, name: str, missing: str) -> int:
+    found = mujoco.mj_name2id(model, kind, name)
     if found < 0:
-        raise BackendError(
-            f"foot '{name}' of robot '{scene.robot.name}' is no collision geom of {scene.robot.mjcf.name}; "
-            "correct robot.toml"
-        )
+        raise BackendError(f"{missing} {scene.robot.mjcf.name}; correct robot.toml")
     return int(found)

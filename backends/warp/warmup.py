@@ -18,7 +18,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from ..base import BackendError, Randomization, ResetState, Scene
+from ..base import BackendError, Randomization, Scene
 from ..registry import make_backend
 
 _DEFAULT_BLOCK = 256
@@ -46,10 +46,8 @@ def exercise(backend: str, scenes: Iterable[Scene], device: str) -> None:
         with closing(make_backend(backend, scene, device=device)) as physics:
             count = physics.num_worlds
             options: dict[str, Any] = {"device": physics.device, "dtype": physics.dtype}
-            pose = torch.tensor([scene.robot.default_joint_position], **options).expand(count, -1)
-            place = torch.tensor([[0.0, 0.0, scene.robot.stand_height]], **options).expand(count, 3)
-            upright = torch.tensor([[1.0, 0.0, 0.0, 0.0]], **options).expand(count, 4)
-            start = ResetState(base_position=place, base_quaternion=upright, held_target=pose)
+            start = physics.standing()
+            pose = start.held_target
             half = torch.arange(count, device=physics.device) % 2 == 0
             physics.randomize(Randomization(friction=torch.full((count,), 0.8, **options)))
             physics.reset(start)

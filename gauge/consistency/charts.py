@@ -52,8 +52,6 @@ def curves(
 
     Args:
         series: times [s] and values by label; values that do not exist leave a gap.
-        title: what is shown.
-        unit: of the values.
     """
     known = [abs(v) for _, values in series.values() for v in values if v is not None and abs(v) > SMALLEST]
     low = math.floor(math.log10(min(known, default=SMALLEST)))

@@ -202,8 +202,6 @@ def compare(
     """Compare two runs of the same episodes.
 
     Args:
-        reference: records of the one run.
-        compared: records of the other.
         floor: records of the reference engine put off by a hair, once for each draw: what chaos alone does.
         name: seeds the intervals' generators.
 

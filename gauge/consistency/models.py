@@ -34,7 +34,6 @@ def compare_models(robot: Robot, descriptions: Mapping[str, Description | None],
     Args:
         robot: names the entries.
         descriptions: by variant label; None for an engine that does not describe itself.
-        reference: label of the reference.
 
     Returns:
         Plain data: ``fields`` by name with ``reference`` (mean of the entries' magnitudes, None for no limit) and, by variant,

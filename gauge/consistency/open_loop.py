@@ -8,14 +8,14 @@ gave while it walked in the reference engine.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...backends.base import PhysicsBackend, PhysicsState, Randomization, ResetState, Scene
+from ...backends.base import PhysicsBackend, PhysicsState, Randomization, Scene
 from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...policy.observation import ObservationBuilder
@@ -172,15 +172,12 @@ def _walk(backend: PhysicsBackend, suite: Suite, policy: Policy, friction: float
 
 def _begin(backend: PhysicsBackend, friction: float) -> None:
     """The state from which every test starts: the standing pose, held; ``air`` starts high up."""
-    robot, n = backend.scene.robot, backend.num_worlds
-    kind: dict[str, Any] = {"device": backend.device, "dtype": backend.dtype}
-    backend.randomize(Randomization(friction=torch.full((n,), friction, **kind)))
-    position = torch.zeros(n, 3, **kind)
-    position[:, 2] = robot.stand_height
+    coefficient = torch.full((backend.num_worlds,), friction, device=backend.device, dtype=backend.dtype)
+    backend.randomize(Randomization(friction=coefficient))
+    start = backend.standing()
+    position = start.base_position.clone()
     position[0, 2] = AIR_HEIGHT
-    upright = torch.tensor([1.0, 0.0, 0.0, 0.0], **kind).repeat(n, 1)
-    pose = torch.tensor(robot.default_joint_position, **kind).repeat(n, 1)
-    backend.reset(ResetState(base_position=position, base_quaternion=upright, joint_position=pose, held_target=pose))
+    backend.reset(replace(start, base_position=position))
 
 
 def replay(

@@ -123,12 +123,7 @@ def _policy(block: Mapping[str, Any], reference: str, margin: float) -> dict[str
 
 
 def verdict(overall: Mapping[str, Any], margin: float) -> str:
-    """What a comparison says, in one sentence.
-
-    Args:
-        overall: of a pair of engines.
-        margin: difference of quality that does not matter.
-    """
+    """What a comparison says, in one sentence."""
     difference, excess = overall["difference"], overall["excess"]
     low, high = difference["interval"]
     where = f"{_signed(low)} to {_signed(high)}"

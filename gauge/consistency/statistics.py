@@ -117,9 +117,7 @@ def paired_mean(
     Args:
         values: (E, S).
         terrains: terrain of each environment.
-        shared: see ``replicates``.
-        resamples: see ``replicates``.
-        name: see ``replicates``.
+        shared, resamples, name: see ``replicates``.
         magnitude: the values are magnitudes, so that the interval ends at zero.
 
     Raises:
@@ -165,8 +163,7 @@ def outcome_agreement(
     that is McNemar's exact test.
 
     Args:
-        reference: outcome in the reference engine, (N,).
-        compared: in the other, (N,).
+        reference, compared: outcomes in both engines, (N,).
         seeds: of the episodes, (N,).
         shared: whether episodes of one seed share its random numbers.
 

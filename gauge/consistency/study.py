@@ -13,7 +13,7 @@ import torch
 
 from ...backends.base import BackendError
 from ...backends.registry import make_backend
-from ...files.provenance import plugins, provenance, versions
+from ...files.provenance import provenance
 from ...files.writing import json_text, write_atomically
 from ...policy.digest import policy_digest
 from ...policy.native import FilePolicy
@@ -21,7 +21,7 @@ from ...robots import Robot
 from ...robots.geometry import total_mass
 from ...robots.loading import robot_digest
 from ...terrains.registry import gauge_terrain_names
-from ..evaluate import Request, prepare
+from ..evaluate import Request, common_identity, prepare
 from ..plan import Records
 from ..sampling import GRAVITY
 from ..store import RunFolder, StoreError
@@ -192,7 +192,6 @@ def study(
 
     Args:
         folder: where ``consistency.json`` and a folder for each engine go (with several policies, one for each of them above).
-        resume: go on with what the folder holds.
         watch: called after every control step.
 
     Raises:
@@ -327,19 +326,12 @@ class _Policy:
     def _identity(self, variant: Variant) -> dict[str, Any]:
         """What decides about the records of a variant."""
         prepared = self._prepared
-        return {
-            "suite": f"{prepared.suite.name} {prepared.suite.version}",
-            "suite_digest": prepared.suite.digest,
-            "policy": self._digest,
-            "robot_digest": robot_digest(prepared.robot),
+        shared = common_identity(prepared.suite, self._digest, prepared.robot, variant.device, prepared.seeds)
+        return shared | {
             "pipeline": "consistency",
             "variant": variant.label,
-            "device": torch.device(variant.device).type,
             "robot": prepared.request.robot or prepared.robot.name,
             "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in prepared.cells],
-            "seeds": list(prepared.seeds),
-            "versions": versions(),
-            "plugins": plugins(),
         }
 
     # ---- attribution ----------------------------------------------------------------------------------------------

@@ -38,7 +38,6 @@ def principal_components(points: Array, count: int = 2) -> tuple[Array, Array]:
 
     Args:
         points: (N, D).
-        count: number of axes.
 
     Returns:
         (N, count), each axis with the sign that makes its largest coefficient positive, and each axis's share of the
