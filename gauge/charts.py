@@ -121,7 +121,7 @@ def sweep(rows: Sequence[Row], *, axis: str, quantity: str) -> list[dict[str, An
         the axis that does not vary. A terrain with fewer than two values along the axis, or whose axes are crossed, has
         none.
     """
-    other = _other(axis)
+    other = "payload" if axis == "friction" else "friction"
     series: list[tuple[str, float, list[Row]]] = []
     for terrain, group in _by_terrain(rows, quantity).items():
         lines = [[r for r in group if r[other] == v] for v in sorted({r[other] for r in group})]
@@ -307,10 +307,6 @@ def _by_terrain(rows: Sequence[Row], quantity: str) -> dict[str, list[Row]]:
         if row.get(quantity) is not None:
             found.setdefault(row["terrain"], []).append(row)
     return found
-
-
-def _other(axis: str) -> str:
-    return "payload" if axis == "friction" else "friction"
 
 
 def _top(rows: Sequence[Row], quantity: str) -> float:

@@ -83,14 +83,9 @@ class Worlds:
         self.count = backend.num_worlds
         self.default_pose = np.tile(np.asarray(self.robot.default_joint_position), (self.count, 1))
 
-    @property
-    def single_precision(self) -> bool:
-        """Whether the engine computes in float32."""
-        return self.backend.dtype == torch.float32
-
     def precision(self, double: float, single: float) -> float:
         """A tolerance that depends on the engine's floating-point type only."""
-        return single if self.single_precision else double
+        return single if self.backend.dtype == torch.float32 else double
 
     def read(self) -> SimpleNamespace:
         """Copies of all fields of the present state; floating point as float64."""

@@ -41,10 +41,6 @@ def _joints(bench: Bench) -> tuple[int, ...]:
     return (bench.robot.num_joints,)
 
 
-def _cuda(bench: Bench) -> None:
-    bench.make(bench.scene(), "cuda").close()
-
-
 REQUESTS: dict[str, Callable[[Bench], None]] = {
     "plane": lambda bench: _build(bench, terrains=(FLAT,)),
     "boxes": lambda bench: _build(bench, terrains=(_BOX,)),
@@ -73,7 +69,7 @@ REQUESTS: dict[str, Callable[[Bench], None]] = {
     "self_collision": lambda bench: _build(bench, self_collision=True),
     "penetration": lambda bench: _build(bench, watch_penetration=0.02),
     "deterministic": lambda bench: _build(bench, deterministic=True),
-    "gpu": _cuda,
+    "gpu": lambda bench: bench.make(bench.scene(), "cuda").close(),
 }
 """What to ask an engine for, by the capability that it takes; nobody asks for contact forces, they are just there."""
 

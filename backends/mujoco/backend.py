@@ -84,8 +84,7 @@ class MujocoBackend(PhysicsBackend):
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         tilt = scene.physics.watch_tilt
         self._tilt_bound = 0.0 if tilt is None else 0.5 * (1.0 - np.cos(tilt))
-        self._ctrl, self._applied = self._batch.bind("ctrl"), self._batch.bind("xfrc_applied")
-        self._time = self._batch.bind("time")
+        self._applied, self._time = self._batch.bind("xfrc_applied"), self._batch.bind("time")
         self._index_model(nominal)
         self._randomized: dict[int, dict[str, Array]] = {}
         joints = robot.num_joints

@@ -39,11 +39,8 @@ class Variant:
     def label(self) -> str:
         """Name for people, and the text that ``parse_variant`` reads back but for perturbations."""
         changed = "".join(f"@{name}={_shown(value)}" for name, value in self.overrides)
-        return self.backend + changed + self._perturbation
-
-    @property
-    def _perturbation(self) -> str:
-        return f"~{self.perturbation:g}{'r' if self.rounding else ''}#{self.draw}" if self.perturbation else ""
+        off = f"~{self.perturbation:g}{'r' if self.rounding else ''}#{self.draw}" if self.perturbation else ""
+        return self.backend + changed + off
 
     @property
     def folder(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jinja2
@@ -11,7 +12,7 @@ import markupsafe
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pages import page_template
+from ..pages import fixed, page_template
 from .collecting import Notes
 
 FIGURES = ("terrains", "commands", "experts")
@@ -88,12 +89,11 @@ def render_page(results: Mapping[str, Any], pictures: Mapping[str, str]) -> str:
     return _template("latent.html.j2").render(results=results, figures=figures, spaces=SPACES)
 
 
+_fixed = partial(fixed, digits=2)
+
+
 def _template(name: str) -> jinja2.Template:
     return page_template(name, label=label, fixed=_fixed)
-
-
-def _fixed(value: float) -> str:
-    return f"{value:.2f}".replace("-", "−")
 
 
 def _scatter(name: str, entry: Mapping[str, Any], notes: Notes, places: NDArray[np.float64]) -> dict[str, Any]:

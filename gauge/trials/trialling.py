@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import compress
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -141,12 +142,8 @@ def profile(terrain: Any, x: float, y: float, beyond: float | None) -> list[tupl
     if max(heights) - min(heights) < 1e-6:
         return []
     line = [(round(a, 3), round(b, 3)) for a, b in zip(places, heights, strict=True)]
-    inner = [p for before, p, after in zip(line, line[1:], line[2:], strict=False) if not _straight(before, p, after)]
-    return [line[0], *inner, line[-1]]
-
-
-def _straight(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    return abs((b[1] - a[1]) - (c[1] - b[1])) < 2e-3
+    bends = [abs((b[1] - a[1]) - (c[1] - b[1])) >= 2e-3 for a, b, c in zip(line, line[1:], line[2:], strict=False)]
+    return [line[0], *compress(line[1:], bends), line[-1]]
 
 
 def summary(label: str, contract: PolicyContract, scenario: Scenario, trials: Sequence[Trial]) -> dict[str, Any]:
