@@ -11,7 +11,7 @@ from headings import Changes, Walk, ground
 
 @pytest.mark.slow
 def test_levels_stay_and_commands_lead_straight_ahead():
-    played = FixedLevels("pretrained", kind="stairs_up", levels=(3, 7), worlds=4, speed=0.8, settings=())
+    played = FixedLevels("pretrained", kind="stairs_up", levels=(3, 7), worlds=4, speeds=(0.8, 0.0), settings=())
     environment, memory = played.environment, played.environment.parts.memory
     memory.farthest.fill_(9.0)  # the rule would move them up
     memory.moves_level.fill_(True)

@@ -1,6 +1,6 @@
 """What all methods share: PPO on a rollout, then supervised learning of the deployed network's encoder on the same rollout.
 
-A method is a class derived from ``PPO``: its networks, its storage, what the actor is given of an observation, and the losses
+A method is a class derived from ``PPO``: its networks, what the actor is given of an observation, and the losses
 (``losses.Losses``) of the encoder. Nothing in the passes waits for the device.
 """
 

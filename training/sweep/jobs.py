@@ -41,7 +41,6 @@ class SweepOutcome:
 @dataclass(kw_only=True)
 class _Job:
     run: SweepRun
-    gauges: bool
     place: str
     process: subprocess.Popen[bytes]
     log: Path
@@ -150,19 +149,19 @@ class Jobs:
                 env=environment,
                 start_new_session=True,
             )
-        self._live.append(_Job(run=run, gauges=place == "gauge", place=place, process=process, log=log))
+        self._live.append(_Job(run=run, place=place, process=process, log=log))
         self._say(sentence)
 
     def _collect(self) -> None:
         """Take what has ended and sort it on."""
         for job in [j for j in self._live if j.process.poll() is not None]:
             self._live.remove(job)
-            run, code = job.run, job.process.returncode
+            run, code, gauged = job.run, job.process.returncode, job.place == "gauge"
             if code:
                 self._failures[run.label] = f"{_last_line(job.log) or f'exit code {code}'} (see '{job.log}')"
                 self._say(f"{run.label} failed: {self._failures[run.label]}")
-            elif job.gauges or run.trained:
-                self._say(f"{run.label} has been {'gauged' if job.gauges else 'trained'}")
+            elif gauged or run.trained:
+                self._say(f"{run.label} has been {'gauged' if gauged else 'trained'}")
                 self._sort(run)
 
     def _stop(self) -> None:
