@@ -294,7 +294,7 @@ def evaluate(
             "damping": list(motors.damping),
             "note": gains_note(suite, prepared.robot, prepared.policy.contract),
         }
-        results["health"] = dict(health(outcomes))
+        results["health"] = health([record for outcome in outcomes for record in outcome.records])
         results["solver"] = dict(find_backend(request.backend, request.device).solver_settings(suite.physics))
         results["provenance"] = provenance(
             command=command,

@@ -20,16 +20,8 @@ from .suite import Suite, SuiteError
 
 Watch = Callable[[int, int, str], None]
 """Called before each turn of a study with the turn's number, their count, and whose it is."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Refused:
-    """Something that was asked for and cannot be done; the rest was."""
-
-    what: str
-    """A policy, a scenario …, as the user named it."""
-    reason: str
-    """One sentence."""
+Refused = dict[str, str]
+"""``what`` was asked for and cannot be done while the rest was, as the user named it, and the ``reason``, one sentence."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,7 +71,7 @@ def load_policies(
             policy = load_policy(name, asked, trust=trust)
             loaded = Loaded(policy=policy, robot=robot_for(policy.contract, robot))
         except (PolicyError, ContractError, RobotError) as error:
-            refused.append(Refused(what=name, reason=str(error)))
+            refused.append({"what": name, "reason": str(error)})
         else:
             found[stem if short.count(stem) == 1 else one_line(name, 4096)] = loaded
     return found, refused

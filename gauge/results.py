@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -196,8 +196,7 @@ def _environment(
     row["quality"] = {s: _number(v) for s, v in zip(STATISTICS, plain[columns[-1]], strict=True)}
     row["score"] = _number(statistics["score"][2])
     row["metrics"] = {c: {s: _number(v) for s, v in zip(STATISTICS, plain[c], strict=True)} for c in columns[:-1]}
-    for name in ("falls",):
-        row[name] = sum(getattr(r, name) for r in environment.records)
+    row["falls"] = sum(r.falls for r in environment.records)
     for name in ("diverged", "overflowed", "restarted"):
         row[name] = sum(bool(getattr(r, name)) for r in environment.records)
     return row, statistics
@@ -272,9 +271,8 @@ def _numbers(names: Sequence[str], values: Sequence[Array]) -> dict[str, float]:
     return dict(zip(names, (_number(v) for v in np.ravel(np.asarray(values))), strict=bool(values)))
 
 
-def health(environments: Sequence[EnvironmentResult]) -> Mapping[str, int]:
-    """How many quality episodes fell, diverged or overflowed."""
-    records = [r for e in environments for r in e.records]
+def health(records: Collection[Record]) -> dict[str, int]:
+    """How many episodes there are, and how many of them fell, diverged or dropped contacts."""
     return {
         "episodes": len(records),
         "falls": sum(r.falls for r in records),

@@ -280,17 +280,6 @@ def _by_terrain(design: Design, block: Callable[[Sequence[int], str], dict[str, 
     }
 
 
-def health_of(records: Records) -> dict[str, int]:
-    """How many episodes there are, and how many of them fell, diverged or dropped contacts."""
-    found = list(records.values())
-    return {
-        "episodes": len(found),
-        "falls": sum(r.falls > 0 for r in found),
-        "diverged": sum(r.diverged for r in found),
-        "overflowed": sum(r.overflowed for r in found),
-    }
-
-
 def _outcomes(design: Design, reference: Records, compared: Records, rows: Sequence[int]) -> dict[str, Any]:
     """Agreement on falls in quality episodes, and on targets reached in crossings."""
     pairs = [

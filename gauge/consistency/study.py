@@ -23,11 +23,12 @@ from ...robots.loading import robot_digest
 from ...terrains.registry import gauge_terrain_names
 from ..evaluate import Request, common_identity, prepare
 from ..plan import Records
+from ..results import health
 from ..sampling import GRAVITY
 from ..store import RunFolder, StoreError
 from ..suite import Suite, SuiteError, load_suite
 from .attribution import FLOOR_DRAWS, Factor, choose_factors, effect_of_switch, rounded
-from .closed_loop import Cell, Design, compare, floor_only, gap_only, health_of, make_cells, play_variant
+from .closed_loop import Cell, Design, compare, floor_only, gap_only, make_cells, play_variant
 from .models import compare_models
 from .open_loop import Trajectory, compare_trajectories, record_targets, replay
 from .request import ConsistencyError, StudyRequest, StudyStatus
@@ -290,7 +291,7 @@ class _Policy:
             "floor": floor_only(design, self._records[reference], floor, f"{self._name}/floor"),
             "pairs": pairs,
             "attribution": attribution,
-            "health": {label: health_of(records) for label, records in self._records.items()},
+            "health": {label: health(records.values()) for label, records in self._records.items()},
         }
 
     # ---- closed loop ----------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from ...policy.contract import ContractError
 from ...robots import RobotError
 from ...terrains.base import Terrain
 from ...terrains.registry import gauge_terrain_names, make_terrain
-from ..policies import Loaded, Refused, Watch, describe, load_policies
+from ..policies import Loaded, Watch, describe, load_policies
 from ..suite import Suite, SuiteError, load_suite
 from .collecting import COMMANDS, LatentRequest, Notes, collect
 from .figures import FIGURES, render_figure, render_page
@@ -65,12 +65,12 @@ def study_latents(
             notes = collect(loaded.policy, loaded.robot, request, suite, terrains, make=make)
             entry, places = look(label, loaded, notes, [t.name for t in terrains])
         except (PolicyError, ContractError, BackendError, RobotError, SuiteError, LatentError) as error:
-            refused.append(Refused(what=label, reason=str(error)))
+            refused.append({"what": label, "reason": str(error)})
         else:
             entries.append(entry)
             points.append((label, notes, places))
     if not entries:
-        raise LatentError("; ".join(r.reason for r in refused) or "there is nothing to look at; name a policy")
+        raise LatentError("; ".join(r["reason"] for r in refused) or "there is nothing to look at; name a policy")
     results = {
         "schema": 1,
         "policies": entries,
@@ -81,7 +81,7 @@ def study_latents(
         "seconds": request.seconds,
         "robots": request.robots,
         "suite": {"name": suite.name, "version": suite.version, "digest": suite.digest},
-        "refused": [asdict(r) for r in refused],
+        "refused": refused,
         "backend": request.backend,
         "provenance": provenance(
             command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)

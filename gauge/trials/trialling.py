@@ -18,7 +18,7 @@ from ...policy.base import PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
 from ..consistency.statistics import wilson_interval
-from ..policies import PoliciesRequest, Refused, Watch, describe, load_policies
+from ..policies import PoliciesRequest, Watch, describe, load_policies
 from ..suite import SuiteError
 from .page import render_page
 from .running import Trial, run_scenario
@@ -70,7 +70,7 @@ def run_trials(
                 )
             scenarios[scenario.name] = scenario
         except ScenarioError as error:
-            refused.append(Refused(what=name, reason=str(error)))
+            refused.append({"what": name, "reason": str(error)})
     entries = [_about(scenario) for scenario in scenarios.values()]
     turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]
     for number, (scenario, entry, label) in enumerate(turns, 1):
@@ -89,16 +89,16 @@ def run_trials(
                 make=make,
             )
         except (BackendError, ContractError, PolicyError, RobotError, SuiteError) as error:
-            refused.append(Refused(what=f"{label} in {scenario.name}", reason=str(error)))
+            refused.append({"what": f"{label} in {scenario.name}", "reason": str(error)})
         else:
             entry["results"].append(summary(label, policies[label].policy.contract, scenario, trials))
     if not any(entry["results"] for entry in entries):
-        raise ScenarioError("; ".join(r.reason for r in refused) or "there is nothing to try; name a scenario")
+        raise ScenarioError("; ".join(r["reason"] for r in refused) or "there is nothing to try; name a scenario")
     results = {
         "schema": 1,
         "policies": [describe(label, loaded) for label, loaded in policies.items()],
         "scenarios": entries,
-        "refused": [asdict(r) for r in refused],
+        "refused": refused,
         "backend": request.backend,
         "provenance": provenance(
             command=command,

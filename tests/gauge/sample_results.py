@@ -68,7 +68,7 @@ def _sample(pipeline, suite, resamples, reach=None, **choices):
         "pipeline": pipeline,
         "backend": "mujoco",
         "robot": "go2",
-        "health": dict(health(environments)),
+        "health": health([r for e in environments for r in e.records]),
         "provenance": {
             "versions": {"python": "3.11.2", "gaitgauge": "0.1.0", "mujoco": "3.17.0", "torch": "2.13.0"},
             "command": "gaitgauge evaluate policies/go2_cts.pt --suite robogauge-1.1",
