@@ -26,7 +26,6 @@ from typing import Any
 import torch
 from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge import workers
-from gaitgauge.gauge.dispatcher import Speculation
 from gaitgauge.gauge.episodes import Episode
 from gaitgauge.gauge.goals import TARGET
 from gaitgauge.gauge.rollout import POLL_INTERVAL, Rollout
@@ -224,7 +223,9 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
         Rollout, poll_interval=arguments.poll_interval, capture=not arguments.no_capture
     )
     workers.Job.rollout = build  # type: ignore[method-assign]
-    at_once = Speculation(at_work=arguments.worlds or 4096, test_probability=0.02, quality_probability=0.5)
+    speculation = evaluation.GPU_SPECULATION
+    at_once = replace(speculation, at_work=arguments.worlds or speculation.at_work)
+    evaluation.GPU_SPECULATION = at_once
     evaluation.Speculation = lambda **options: at_once  # type: ignore[misc, assignment]
     request = evaluation.Request(
         policy=arguments.policy,

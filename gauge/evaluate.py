@@ -51,6 +51,9 @@ _WORLDS = 24
 """Worlds of a worker on the CPU: more share the loop's cost, fewer keep more workers busy to the end."""
 _GPU_WORLDS = 4096
 """Largest number of worlds on a GPU."""
+GPU_SPECULATION = Speculation(at_work=_GPU_WORLDS, test_probability=0.02, quality_probability=0.25)
+"""A GPU plays nearly every level of every search at once, and quality while the last level tests run: what lasts is the number of
+control steps in a row, and at the end most worlds have nothing to do."""
 _EARLY = 16
 """Episodes of a worker on the CPU up to which it plays others speculatively: more of them slow those that are required."""
 _WATCH_INTERVAL = 0.2
@@ -339,8 +342,7 @@ def _workers(
     else:
         count = local_workers(request.backend, request.device, threads=threads, most=most)
     if on_gpu:
-        # a GPU plays nearly every level of every search at once: a few long batches instead of many short ones
-        speculation = Speculation(at_work=_GPU_WORLDS, test_probability=0.02, quality_probability=0.5)
+        speculation = GPU_SPECULATION
         worlds = min(
             max(sum(count_segments(e, suite) for e in (*required, *speculation.choose(plans, required))), 1),
             _GPU_WORLDS,

@@ -154,18 +154,17 @@ def test_what_is_required_once_stays_counted_and_was_possible_before():
 
 
 def test_a_gpu_plays_every_level_at_once_but_no_quality_before_the_crossing_is_near():
-    from gaitgauge.gauge.dispatcher import Speculation
+    from gaitgauge.gauge.evaluate import GPU_SPECULATION
 
-    speculation = Speculation(at_work=4096, test_probability=0.02, quality_probability=0.5)
     first = plan(WAVE, {}, RULES)
-    ahead = speculation.choose([first], first.required)
+    ahead = GPU_SPECULATION.choose([first], first.required)
     assert len(ahead) == 10 * SEEDS - 2 and {e.stage for e in ahead} == {"search"}
-    # one trial of a narrow crossing is left: its levels' quality begins
+    # one trial of a narrow crossing is left: quality begins at its levels (0.8 probable) and at those beside them (0.4)
     records, _ = play(WAVE, RULES, outcome(table(6, 6, 6, 6, 6, 6)))
     records = {e: r for e, r in records.items() if e.stage == "search" and (e.level, e.seed) != (7, 105)}
     nearly = plan(WAVE, records, RULES)
-    ahead = speculation.choose([nearly], nearly.required)
-    assert {e.level for e in ahead if e.stage == "eval"} == {6, 7}
+    ahead = GPU_SPECULATION.choose([nearly], nearly.required)
+    assert {e.level for e in ahead if e.stage == "eval"} == {5, 6, 7, 8}
 
 
 def test_quality_follows_at_both_levels_with_every_seed():
