@@ -149,7 +149,7 @@ class AlgorithmConfiguration:
     cuda_graphs: bool | None = None
     """Replay a minibatch step as CUDA graphs. None: on a GPU."""
     compile_mode: str = "auto"
-    """Mode of ``torch.compile`` for the loss functions: ``none``, ``default``, ``max-autotune-no-cudagraphs``, or
+    """Mode of ``torch.compile`` for the loss functions: ``none``, ``default``, or
     ``auto``: ``default`` on a GPU, ``none`` elsewhere. Compiling takes about half a minute at the start."""
 
     def __post_init__(self) -> None:
