@@ -149,8 +149,8 @@ class AlgorithmConfiguration:
     cuda_graphs: bool | None = None
     """Replay a minibatch step as CUDA graphs. None: on a GPU."""
     compile_mode: str = "auto"
-    """Mode of ``torch.compile`` for the loss functions: ``none``, ``default``, or
-    ``auto``: ``default`` on a GPU, ``none`` elsewhere. Compiling takes about half a minute at the start."""
+    """Mode of ``torch.compile`` for the loss functions: ``none``, ``default``, or ``auto``: ``default`` on a GPU, ``none`` elsewhere.
+    Compiling takes about half a minute at the start."""
 
     def __post_init__(self) -> None:
         _choose("method", self.method, METHODS)
