@@ -1,5 +1,5 @@
 """Velocity commands: the curriculum of ranges, and the dynamic, extreme, opposite and stationary draws (paper,
-command design).
+command design); and crossings, which last an episode.
 """
 
 from __future__ import annotations
@@ -13,7 +13,14 @@ from .configuration import ConfigurationError
 from .environment_configuration import CommandConfiguration
 from .schedules import RampTable
 
-COMMAND_COLUMNS = {"command_magnitude": 3, "command_sign": 2, "command_kind": 4, "command_corner": 3, "command_side": 1}
+COMMAND_COLUMNS = {
+    "command_magnitude": 3,
+    "command_sign": 2,
+    "command_kind": 4,
+    "command_corner": 3,
+    "command_side": 1,
+    "command_crossing": 3,
+}
 """Uniform numbers that one draw takes, by name."""
 
 
@@ -189,6 +196,15 @@ class CommandGenerator:
         drawn = torch.where(is_opposite[:, None], opposite, drawn)
         steps = torch.where(is_stationary, stationary_steps, self._interval)
         holds_heading = straight & ~is_stationary & ~is_extreme
+
+        if settings.crossing_probability > 0.0:
+            chance, side, speed = uniform["command_crossing"].unbind(1)
+            crosses = (episode_length == 0) & (chance < settings.crossing_probability)
+            straight_on = torch.zeros_like(drawn)
+            straight_on[:, 0] = torch.where(side < 0.5, low[:, 0], high[:, 0]) * (0.5 + 0.5 * speed)
+            drawn = torch.where(crosses[:, None], straight_on, drawn)
+            steps = torch.where(crosses, remaining, steps)
+            is_extreme, holds_heading = is_extreme & ~crosses, holds_heading | crosses
         return CommandDraw(command=drawn, steps=steps, extreme=is_extreme, holds_heading=holds_heading)
 
     def held_yaw_rate(self, off: torch.Tensor, *, kind: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:

@@ -305,6 +305,9 @@ class CommandConfiguration:
     """Chance that a stationary command keeps its yaw rate, so that the robot turns on the spot. Published: always."""
     stationary_longest: NotNegative = 3.0
     """Longest stationary command [s]."""
+    crossing_probability: Share = 0.0
+    """Share of the episodes with one command throughout, straight ahead or straight back at half the highest speed or more: the
+    robot is to leave its tile, as the gauge's level tests ask, and has time to climb tall steps."""
     generator: str = "gaitgauge.training.commands:CommandGenerator"
     """``module:class`` that draws commands, this one or one derived from it."""
 

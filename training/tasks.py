@@ -86,7 +86,7 @@ _ALL_TERRAINS = EnvironmentConfiguration(
         foot_regulation=-0.1,
         foot_height_scale=0.05,
     ),
-    commands=CommandConfiguration(straight_probability=0.5, heading_gain=1.0),
+    commands=CommandConfiguration(straight_probability=0.5, heading_gain=1.0, crossing_probability=0.5),
     termination=TerminationConfiguration(stuck=8.0),
 )
 _ALL_TERRAINS_LEARNING = AlgorithmConfiguration(

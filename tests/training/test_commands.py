@@ -158,3 +158,18 @@ def test_straight_share():
 def test_stages_must_be_in_order():
     with pytest.raises(ValueError, match="first must begin at 0"):
         draw(replace(PLAIN, stages=STAGES[1:]), count=2)
+
+
+def test_crossings_go_straight_on_or_back_for_the_whole_episode():
+    crossing = replace(PLAIN, crossing_probability=0.4, extreme_probability=0.3)
+    drawn = draw(crossing, progress=0.5)
+    crosses = drawn.steps == 1250
+    assert share(crosses) == pytest.approx(0.4, abs=0.01)
+    forward, lateral, yaw = drawn.command[crosses].unbind(1)
+    assert not lateral.any() and not yaw.any()
+    assert drawn.holds_heading[crosses].all() and not drawn.extreme[crosses].any()
+    assert share(forward > 0) == pytest.approx(0.5, abs=0.02)
+    assert forward.abs().aminmax() == pytest.approx((0.75, 1.5), rel=1e-3)
+    assert share(drawn.extreme[~crosses]) == pytest.approx(0.3, abs=0.01), "other episodes as without"
+    later = draw(crossing, progress=0.5, episode_length=torch.ones(COUNT, dtype=torch.int64))
+    assert later.steps.unique().tolist() == [250], "an episode that has begun is none"
