@@ -93,6 +93,7 @@ class CommandGenerator:
         configuration: CommandConfiguration,
         *,
         terrain_limits: Sequence[tuple[float, float, float]],
+        terrain_ends: Sequence[bool],
         control_period: float,
         max_episode_length: int,
         device: torch.device | str,
@@ -101,6 +102,7 @@ class CommandGenerator:
 
         Args:
             terrain_limits: largest forward, lateral and yaw speed of each kind of terrain.
+            terrain_ends: whether the kind has an edge to be crossed.
             control_period: [s].
             max_episode_length: control steps in the longest episode.
 
@@ -116,6 +118,7 @@ class CommandGenerator:
         begins = [stage.begin for stage in configuration.drawn_stages]
         self._begins = torch.tensor(begins, dtype=torch.float32, device=device)
         self._table = _range_table(configuration, terrain_limits, control_period).to(device)
+        self._ends = torch.tensor(list(terrain_ends), device=device)
         shares = (
             configuration.extreme_probability,
             configuration.straight_probability,
@@ -199,7 +202,7 @@ class CommandGenerator:
 
         if settings.crossing_probability > 0.0:
             chance, side, speed = uniform["command_crossing"].unbind(1)
-            crosses = (episode_length == 0) & (chance < settings.crossing_probability)
+            crosses = (episode_length == 0) & (chance < settings.crossing_probability) & self._ends[kind]
             straight_on = torch.zeros_like(drawn)
             straight_on[:, 0] = torch.where(side < 0.5, low[:, 0], high[:, 0]) * (0.5 + 0.5 * speed)
             drawn = torch.where(crosses[:, None], straight_on, drawn)

@@ -306,8 +306,8 @@ class CommandConfiguration:
     stationary_longest: NotNegative = 3.0
     """Longest stationary command [s]."""
     crossing_probability: Share = 0.0
-    """Share of the episodes with one command throughout, straight ahead or straight back at half the highest speed or more: the
-    robot is to leave its tile, as the gauge's level tests ask, and has time to climb tall steps."""
+    """Share of the episodes, on tiles with an edge, with one command throughout, straight ahead or straight back at half the highest
+    speed or more: the robot is to leave its tile, as the gauge's level tests ask, and has time to climb tall steps."""
     generator: str = "gaitgauge.training.commands:CommandGenerator"
     """``module:class`` that draws commands, this one or one derived from it."""
 

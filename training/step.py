@@ -96,6 +96,7 @@ class EnvironmentStep:
         self.commands = make_commands(
             configuration.commands,
             terrain_limits=[tile.command_limits for tile in palette.tiles],
+            terrain_ends=[tile.ends for tile in palette.tiles],
             control_period=period,
             max_episode_length=self.max_episode_length,
             device=device,

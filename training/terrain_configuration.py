@@ -24,7 +24,7 @@ class TileConfiguration:
     sigma: Positive
     """Largest tracking sigma on this kind (``RewardConfiguration.dynamic_sigma``)."""
     ends: bool = True
-    """Whether the kind has an edge at which ``TerrainConfiguration.leave_distance`` acts."""
+    """Whether the kind has an edge: at which ``TerrainConfiguration.leave_distance`` acts, and which crossings lead to."""
 
 
 _MODERATE, _SLOW, _STRAIGHT = (1.5, 1.0, 1.5), (1.0, 1.0, 1.5), (1.0, 0.5, 1.5)

@@ -25,7 +25,12 @@ PLAIN = CommandConfiguration(
 
 def draw(configuration, *, progress=0.0, kind=0, count=COUNT, **changes):
     generator = CommandGenerator(
-        configuration, terrain_limits=LIMITS, control_period=0.02, max_episode_length=1250, device="cpu"
+        configuration,
+        terrain_limits=LIMITS,
+        terrain_ends=(True, False),
+        control_period=0.02,
+        max_episode_length=1250,
+        device="cpu",
     )
     random = torch.Generator().manual_seed(1)
     state = {
@@ -173,3 +178,5 @@ def test_crossings_go_straight_on_or_back_for_the_whole_episode():
     assert share(drawn.extreme[~crosses]) == pytest.approx(0.3, abs=0.01), "other episodes as without"
     later = draw(crossing, progress=0.5, episode_length=torch.ones(COUNT, dtype=torch.int64))
     assert later.steps.unique().tolist() == [250], "an episode that has begun is none"
+    endless = draw(crossing, progress=0.5, kind=1)
+    assert endless.steps.unique().tolist() == [250], "ground without an edge is not crossed"
