@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-from ..backends.base import PhysicsBackend
 from ..backends.mujoco import MujocoBackend
 from ..backends.registry import find_backend, make_backend
 from ..files.parsing import one_line, shown
@@ -245,7 +244,6 @@ def evaluate(
     resume: bool = False,
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
-    make: Callable[..., PhysicsBackend] = make_backend,
 ) -> dict[str, Any]:
     """Evaluate a policy; every finished episode is on disk at once, so that nothing is lost when the process is killed.
 
@@ -273,7 +271,7 @@ def evaluate(
         cluster = None if request.cluster is None else stack.enter_context(closing(Cluster(request.cluster)))
         store = stack.enter_context(RunFolder(folder, identity(prepared), resume=resume))
         plans = [planner(store.records) for planner in planners]
-        job, count, speculation = _workers(prepared, plans, make, cluster)
+        job, count, speculation = _workers(prepared, plans, cluster)
         with closing(cluster.workers(job, count) if cluster else start_workers(job, count)) as workers:
             effort = play(planners, store.records, store.put, workers, speculation=speculation, watch=on_progress)
         outcomes = [environment_result(environment, store.records, rules) for environment in prepared.environments]
@@ -324,9 +322,7 @@ def evaluate(
     return results
 
 
-def _workers(
-    prepared: Prepared, plans: Sequence[Plan], make: Callable[..., PhysicsBackend], cluster: Cluster | None
-) -> tuple[Job, int, Speculation]:
+def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None) -> tuple[Job, int, Speculation]:
     """What to play with, how many workers play, and what they play speculatively."""
     request, suite = prepared.request, prepared.suite
     places = [
@@ -360,7 +356,7 @@ def _workers(
         robot=prepared.robot,
         places=tuple(dict.fromkeys(places)),
         worlds=worlds,
-        build=partial(make, request.backend, device=request.device),
+        build=partial(make_backend, request.backend, device=request.device),
         threads=1 if cluster is not None else max(threads // count, 1),
     )
     return job, count, speculation

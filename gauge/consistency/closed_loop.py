@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...robots import Robot
 from ..dispatcher import Dispatcher, Speculation, play
@@ -28,7 +27,7 @@ from ..segments import count_segments
 from ..suite import Suite
 from ..workers import Job, local_workers, start_workers
 from .statistics import MARGIN, Array, Estimate, effect_size, outcome_agreement, paired_mean
-from .variants import MakeBackend, Variant
+from .variants import Variant
 
 _WORLDS = 24
 """Worlds on the CPU."""
@@ -88,7 +87,6 @@ def play_variant(
     records: dict[Episode, Record],
     keep: Callable[[Record], None],
     threads: int = 1,
-    make: MakeBackend = make_backend,
     watch: Callable[[int], None] | None = None,
 ) -> None:
     """Play the episodes of which there is no record yet, as an evaluation plays those that its plans require.
@@ -114,7 +112,7 @@ def play_variant(
         robot=robot,
         places=tuple(dict.fromkeys((e.terrain, e.level) for e in episodes)),
         worlds=min(sum(count_segments(e, suite) for e in waiting), most),
-        build=partial(variant.worlds, make=make),
+        build=variant.worlds,
         threads=max(threads // count, 1),
     )
 

@@ -16,14 +16,13 @@ import torch
 from numpy.typing import NDArray
 
 from ...backends.base import PhysicsBackend, PhysicsState, Randomization, Scene
-from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...policy.observation import ObservationBuilder
 from ...robots import Robot
 from ...terrains.registry import make_terrain
 from ..suite import Suite
 from .models import finite
-from .variants import MakeBackend, Variant
+from .variants import Variant
 
 Array = NDArray[np.float64]
 
@@ -119,14 +118,7 @@ class EnergyMeter:
 
 
 def record_targets(
-    variant: Variant,
-    *,
-    suite: Suite,
-    robot: Robot,
-    policy: Policy,
-    friction: float,
-    threads: int = 1,
-    make: MakeBackend = make_backend,
+    variant: Variant, *, suite: Suite, robot: Robot, policy: Policy, friction: float, threads: int = 1
 ) -> Array:
     """Targets of every test, (T, 3, J) [rad]; those of ``walk`` come from the policy walking in ``variant``, without noise.
 
@@ -135,7 +127,7 @@ def record_targets(
     """
     scene = open_loop_scene(suite, robot)
     steps = round(DURATION / scene.physics.control_period)
-    backend = variant.worlds(scene, threads=threads, make=make)
+    backend = variant.worlds(scene, threads=threads)
     try:
         with torch.inference_mode():
             walk = _walk(backend, suite, policy, friction, steps)
@@ -181,14 +173,7 @@ def _begin(backend: PhysicsBackend, friction: float) -> None:
 
 
 def replay(
-    variant: Variant,
-    targets: Array,
-    *,
-    suite: Suite,
-    robot: Robot,
-    friction: float,
-    threads: int = 1,
-    make: MakeBackend = make_backend,
+    variant: Variant, targets: Array, *, suite: Suite, robot: Robot, friction: float, threads: int = 1
 ) -> tuple[Trajectory, Mapping[str, list[float]] | None]:
     """Play targets (T, 3, J) in an engine.
 
@@ -200,7 +185,7 @@ def replay(
     """
     scene = open_loop_scene(suite, robot)
     meter = EnergyMeter(scene)
-    backend = variant.worlds(scene, threads=threads, make=make)
+    backend = variant.worlds(scene, threads=threads)
     rows: dict[str, list[Array]] = {name: [] for name in ("position", "quaternion", "joints", "ground_force", "energy")}
     try:
         with torch.inference_mode():

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 
 from ...backends.base import BackendError
-from ...backends.registry import make_backend
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_atomically
 from ...policy.digest import policy_digest
@@ -32,7 +31,7 @@ from .closed_loop import Cell, Design, compare, floor_only, gap_only, make_cells
 from .models import compare_models
 from .open_loop import Trajectory, compare_trajectories, record_targets, replay
 from .request import ConsistencyError, StudyRequest, StudyStatus
-from .variants import MakeBackend, Variant, parse_variant, place
+from .variants import Variant, parse_variant, place
 
 SCHEMA = 2
 LEVEL = 3
@@ -185,7 +184,6 @@ def study(
     resume: bool = False,
     command: Sequence[str] = (),
     watch: Watch | None = None,
-    make: MakeBackend = make_backend,
 ) -> dict[str, Any]:
     """Carry out a study; every finished episode is on disk at once.
 
@@ -205,7 +203,7 @@ def study(
     blocks = []
     for number, (name, policy) in enumerate(prepared.policies):
         home = folder / f"{number + 1}-{Path(name).name}" if several else folder
-        blocks.append(_Policy(prepared, name, policy, home, resume=resume, watch=watch, make=make).run())
+        blocks.append(_Policy(prepared, name, policy, home, resume=resume, watch=watch).run())
     results: dict[str, Any] = {
         "schema": SCHEMA,
         "suite": {"name": prepared.suite.name, "version": prepared.suite.version, "title": prepared.suite.title},
@@ -241,10 +239,9 @@ class _Policy:
         *,
         resume: bool,
         watch: Watch | None,
-        make: MakeBackend,
     ) -> None:
         self._prepared, self._name, self._policy, self._folder = prepared, name, policy, folder
-        self._resume, self._watch, self._make = resume, watch, make
+        self._resume, self._watch = resume, watch
         self._records: dict[str, Records] = {}
         self._unable: dict[str, str] = {}
         self._part, self._parts = 0, len(prepared.engines)
@@ -318,7 +315,6 @@ class _Policy:
                 records=store.records,
                 keep=store.put,
                 threads=prepared.request.threads,
-                make=self._make,
                 watch=on_progress,
             )
         self._records[variant.label] = store.records
@@ -380,7 +376,6 @@ class _Policy:
             "robot": prepared.robot,
             "friction": prepared.cells[0].friction,
             "threads": prepared.request.threads,
-            "make": self._make,
         }
         targets = record_targets(prepared.reference, policy=self._policy, **settings)
         runs: dict[str, Trajectory] = {}

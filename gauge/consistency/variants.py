@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, get_type_hints
 
@@ -12,9 +11,6 @@ from ...backends.registry import choose_device, find_backend, make_backend
 from ...files.parsing import from_text, one_line, shown
 from .request import ConsistencyError
 from .wrapping import PerturbedBackend, RetimedBackend
-
-MakeBackend = Callable[..., PhysicsBackend]
-"""Called as ``make_backend`` is."""
 
 Value = bool | int | float | str | None
 
@@ -69,14 +65,14 @@ class Variant:
             )
         return replace(changed, substeps=round(count))
 
-    def worlds(self, scene: Scene, *, threads: int, make: MakeBackend = make_backend) -> PhysicsBackend:
+    def worlds(self, scene: Scene, *, threads: int) -> PhysicsBackend:
         """Build the worlds of a scene, whose physics options are the suite's.
 
         Raises:
             BackendError: the engine cannot do what the scene or the variant asks for.
         """
         physics = self.physics(scene.physics)
-        backend = make(self.backend, replace(scene, physics=physics), device=self.device, threads=threads)
+        backend = make_backend(self.backend, replace(scene, physics=physics), device=self.device, threads=threads)
         if physics.timestep != scene.physics.timestep:
             backend = RetimedBackend(backend, scene)
         if self.perturbation:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...backends.base import PhysicsBackend, Randomization, Scene
+from ...backends.base import Randomization, Scene
 from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...policy.watching import watched_session
@@ -77,15 +77,7 @@ class Notes:
     """Robots in all."""
 
 
-def collect(
-    policy: Policy,
-    robot: Robot,
-    asked: LatentRequest,
-    suite: Suite,
-    terrains: tuple[Terrain, ...],
-    *,
-    make: Callable[..., PhysicsBackend] = make_backend,
-) -> Notes:
+def collect(policy: Policy, robot: Robot, asked: LatentRequest, suite: Suite, terrains: tuple[Terrain, ...]) -> Notes:
     """Let a policy's robots walk, on the CPU, and note what its encoder and experts say.
 
     Raises:
@@ -109,7 +101,10 @@ def collect(
     stands, steps, every = (round(s / period) for s in (asked.settling, asked.seconds, INTERVAL))
     up: list[torch.Tensor] = []
     seen: list[tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor]] = []
-    with closing(make(asked.backend, scene, device="cpu", threads=asked.threads)) as physics, torch.inference_mode():
+    with (
+        closing(make_backend(asked.backend, scene, device="cpu", threads=asked.threads)) as physics,
+        torch.inference_mode(),
+    ):
         episodes = _episodes(asked, terrains, places)
         walk = Walk(policy, physics, suite.noise, episodes, steps=stands + steps, session=session)
         physics.randomize(Randomization(friction=walk.tensor([asked.friction] * len(places))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backends.base import BackendError, PhysicsBackend
-from ...backends.registry import find_backend, make_backend
+from ...backends.base import BackendError
+from ...backends.registry import find_backend
 from ...files.provenance import provenance
 from ...files.writing import csv_text, json_text, make_folder, write_atomically
 from ...policy.base import PolicyError
@@ -42,7 +42,6 @@ def study_latents(
     *,
     command: Sequence[str] = (),
     watch: Watch | None = None,
-    make: Callable[..., PhysicsBackend] = make_backend,
 ) -> dict[str, Any]:
     """Look at the latents of some policies. What cannot be looked at is said under ``refused``; the others are.
 
@@ -62,7 +61,7 @@ def study_latents(
         if watch is not None:
             watch(number, len(policies), label)
         try:
-            notes = collect(loaded.policy, loaded.robot, request, suite, terrains, make=make)
+            notes = collect(loaded.policy, loaded.robot, request, suite, terrains)
             entry, places = look(label, loaded, notes, [t.name for t in terrains])
         except (PolicyError, ContractError, BackendError, RobotError, SuiteError, LatentError) as error:
             refused.append({"what": label, "reason": str(error)})

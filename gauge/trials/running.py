@@ -116,7 +116,6 @@ def run_scenario(
     backend: str = "mujoco",
     device: str = "cpu",
     threads: int = 1,
-    make: Callable[..., PhysicsBackend] = make_backend,
     watch: Watch | None = None,
 ) -> list[Trial]:
     """Send a robot through a scenario for each seed.
@@ -134,7 +133,7 @@ def run_scenario(
     scene = make_scene(scenario, robot, policy, len(seeds))
     if torch.device(device).type == "cpu":
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
-    with closing(make(backend, scene, device=device, threads=threads)) as physics, torch.inference_mode():
+    with closing(make_backend(backend, scene, device=device, threads=threads)) as physics, torch.inference_mode():
         return _Run(policy, scenario, seeds, physics).play(watch)
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import compress
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ...backends.base import BackendError, PhysicsBackend
-from ...backends.registry import find_backend, make_backend
+from ...backends.base import BackendError
+from ...backends.registry import find_backend
 from ...files.provenance import provenance
 from ...files.writing import csv_text, json_text, make_folder, write_atomically
 from ...policy.base import PolicyError
@@ -47,7 +47,6 @@ def run_trials(
     *,
     command: Sequence[str] = (),
     watch: Watch | None = None,
-    make: Callable[..., PhysicsBackend] = make_backend,
 ) -> dict[str, Any]:
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 
@@ -86,7 +85,6 @@ def run_trials(
                 backend=request.backend,
                 device=request.device,
                 threads=request.threads,
-                make=make,
             )
         except (BackendError, ContractError, PolicyError, RobotError, SuiteError) as error:
             refused.append({"what": f"{label} in {scenario.name}", "reason": str(error)})

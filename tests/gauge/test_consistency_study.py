@@ -4,18 +4,19 @@ import dataclasses
 import json
 import re
 import zlib
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends.base import BackendError
-from gaitgauge.gauge.consistency import open_loop
+from gaitgauge.backends import BackendError, make_backend
+from gaitgauge.gauge.consistency import open_loop, variants
+from gaitgauge.gauge.consistency import study as studying
 from gaitgauge.gauge.consistency.attribution import choose_factors
 from gaitgauge.gauge.consistency.closed_loop import Design, make_cells
 from gaitgauge.gauge.consistency.page import render, verdict, write_page
 from gaitgauge.gauge.consistency.request import ConsistencyError, StudyRequest
 from gaitgauge.gauge.consistency.statistics import Estimate
-from gaitgauge.gauge.consistency.study import study
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
@@ -102,6 +103,12 @@ def engine(*, shifted=None, **shift):
         return FakeBackend(scene, script=shifted if special else FakeScript(joint_law="track"))
 
     return make
+
+
+def study(request, folder, *, make=make_backend, **options):
+    """A study whose engines are built by ``make``."""
+    with patch.object(variants, "make_backend", make):
+        return studying.study(request, folder, **options)
 
 
 def only_pair(results):

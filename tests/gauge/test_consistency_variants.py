@@ -4,6 +4,7 @@ import pytest
 import torch
 from gaitgauge.backends import ResetState, Scene
 from gaitgauge.backends.base import BackendError, PhysicsOptions
+from gaitgauge.gauge.consistency import variants
 from gaitgauge.gauge.consistency.request import ConsistencyError
 from gaitgauge.gauge.consistency.variants import Variant, parse_variant, place
 from gaitgauge.gauge.consistency.wrapping import PerturbedBackend, RetimedBackend
@@ -185,17 +186,18 @@ def test_rounding_puts_every_target_off_and_begins_anew_with_a_reset():
     plain.step(None, substeps=1)
 
 
-def test_variant_builds_what_it_says():
+def test_variant_builds_what_it_says(monkeypatch):
     made = []
 
     def make(name, asked, *, device, threads):
         made.append((name, asked.physics, device, threads))
         return FakeBackend(asked)
 
-    plain = Variant(backend="fake").worlds(scene(), threads=2, make=make)
+    monkeypatch.setattr(variants, "make_backend", make)
+    plain = Variant(backend="fake").worlds(scene(), threads=2)
     assert isinstance(plain, FakeBackend)
     variant = parse_variant("fake@timestep=0.004")
-    assert isinstance(variant.worlds(scene(), threads=1, make=make), RetimedBackend)
+    assert isinstance(variant.worlds(scene(), threads=1), RetimedBackend)
     assert made[1][1].substeps == 5
     wobbly = Variant(backend="fake", perturbation=1e-7)
-    assert isinstance(wobbly.worlds(scene(), threads=1, make=make), PerturbedBackend)
+    assert isinstance(wobbly.worlds(scene(), threads=1), PerturbedBackend)

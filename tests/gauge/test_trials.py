@@ -3,11 +3,13 @@
 import math
 from dataclasses import replace
 from functools import partial
+from unittest.mock import patch
 
 import pytest
 import torch
 from gaitgauge.gauge.consistency.statistics import wilson_interval
 from gaitgauge.gauge.suite import SuiteError
+from gaitgauge.gauge.trials import running
 from gaitgauge.gauge.trials.running import Trial, draws, run_scenario
 from gaitgauge.gauge.trials.scenario import Failure, Force, Ground, Leg, Scenario, Start, Success
 from gaitgauge.policy.loading import load_policy
@@ -58,7 +60,8 @@ def play(
         )
 
     make = partial(_fake, script=FakeScript(motion=motion, **script))
-    return run_scenario(policy, GO2, trial, range(robots), make=make), forces
+    with patch.object(running, "make_backend", make):
+        return run_scenario(policy, GO2, trial, range(robots)), forces
 
 
 def _fake(name: str, scene: object, *, device: str, threads: int, script: FakeScript) -> FakeBackend:
@@ -147,7 +150,8 @@ def test_lying_on_the_ground_is_a_fall_unless_it_is_allowed():
 
         trial = scenario(replace(STAND, seconds=1.0), failure=Failure(lying=False if allowed else 0.5))
         make = lambda name, scene, **_: Lying(scene)  # noqa: E731
-        return run_scenario(ScriptedPolicy(), GO2, trial, [0], make=make)[0].outcome
+        with patch.object(running, "make_backend", make):
+            return run_scenario(ScriptedPolicy(), GO2, trial, [0])[0].outcome
 
     assert (lies(False), lies(True)) == ("fell", "success")
 

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from unittest.mock import patch
 
 import torch
 from gaitgauge.backends import make_backend
@@ -72,7 +73,8 @@ def puppets(name, scene, *, device="cpu", threads=1):
 def evaluate(request, folder, *, make=None, **options):
     """An evaluation, on the engine without physics where a request names that."""
     make = make or (puppets if getattr(request, "backend", "fake") == "fake" else make_backend)
-    return evaluation.evaluate(request, folder, make=make, **options)
+    with patch.object(evaluation, "make_backend", make):
+        return evaluation.evaluate(request, folder, **options)
 
 
 def without_provenance(folder: Path) -> str:
