@@ -15,7 +15,7 @@ from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.geometry import total_mass
+from gaitgauge.robots.body_plan import total_mass
 
 # The Go2's legs, as its model file has them [m].
 GEOMETRY: dict[str, Any] = {

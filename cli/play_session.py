@@ -20,7 +20,7 @@ from ..gauge.walking import Walk
 from ..policy.adapters import assumptions
 from ..policy.base import Policy
 from ..robots import Robot
-from ..robots.geometry import model_joint_order
+from ..robots.body_plan import model_joint_order
 from ..robots.rotation import from_yaw, yaw_of
 from ..terrains.base import Terrain
 from .errors import UserError

@@ -18,7 +18,7 @@ from ..backends.base import BackendError, PhysicsBackend, ResetState, unsupporte
 from ..policy.base import Policy
 from ..policy.observation import ObservationBuilder
 from ..policy.steady import steady_session
-from ..robots.geometry import total_mass
+from ..robots.body_plan import total_mass
 from .episodes import Episode
 from .goals import LATERAL_SPEED, Schedule, target_command, target_offset
 from .noise import NoiseReader, make_stream

@@ -24,7 +24,6 @@ from ..files.parsing import one_line, shown
 from ..files.provenance import plugins, provenance, source_digest, versions
 from ..files.writing import json_text, write_atomically
 from ..policy.contract import kind_of_observations
-from ..policy.digest import policy_digest
 from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
@@ -212,8 +211,8 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
 
 def identity(prepared: Prepared) -> dict[str, Any]:
     """What decides about the results: a folder that holds another run is refused."""
-    request, digest = prepared.request, policy_digest(prepared.policy)
-    return common_identity(prepared.suite, digest, prepared.robot, request.device, prepared.seeds) | {
+    request = prepared.request
+    return common_identity(prepared.suite, prepared.policy.digest, prepared.robot, request.device, prepared.seeds) | {
         "pipeline": request.pipeline,
         "backend": request.backend,
         "robot": request.robot or prepared.robot.name,
@@ -302,7 +301,7 @@ def evaluate(
             device=request.device,
             threads=request.threads or count,
             digests={
-                "policy": policy_digest(prepared.policy),
+                "policy": prepared.policy.digest,
                 "robot": robot_digest(prepared.robot),
                 "suite": suite.digest,
                 "source": source_digest(),

@@ -14,8 +14,7 @@ import torch
 
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
-from ..robots.body_plan import LEG_PARTS, body_plan
-from ..robots.geometry import joint_ranges, stance_span
+from ..robots.body_plan import LEG_PARTS, body_plan, joint_ranges, stance_span
 from ..robots.rotation import projected_gravity, rotate_inverse
 from .suite import Metrics, SuiteError
 

@@ -299,6 +299,24 @@ class FilePolicy(Policy):
     not_rebuilt: str = ""
     """Why a foreign file's own code is run in each step, which is slow; empty where it is not."""
 
+    @property
+    def digest(self) -> str:
+        """SHA-256, hexadecimal, over the contract and the whole network.
+
+        A file's own digest would not do: weights may lie beside an ONNX file, gains in a ``deploy.yaml``, and the activation of a
+        checkpoint in an ``agent.yaml``.
+        """
+        total, stored = hashlib.sha256(self.contract.hash.encode()), self.stored
+        if isinstance(stored, ForeignFile):
+            total.update(stored.kind.encode())
+            total.update(stored.data)
+            return total.hexdigest()
+        total.update(json.dumps([stored.architecture, dict(stored.arguments)], sort_keys=True).encode())
+        for name, tensor in sorted(stored.state_dict.items()):
+            total.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
+            total.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+        return total.hexdigest()
+
 
 class NativePolicy(FilePolicy):
     """A policy whose network is one of ``networks.py``."""

@@ -1,4 +1,4 @@
-"""How a legged robot is built, read off its MuJoCo model in the default pose: legs, mirror images, sizes.
+"""How a legged robot is built, read off its MuJoCo model in the default pose: legs, mirror images, sizes, joint ranges, mass.
 
 Nothing here goes by names. Frames are the base's: x forward, y left, z up, origin at the base.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -153,6 +154,32 @@ def _no_image(robot: Robot, kind: str, name: str, image: NDArray[np.float64]) ->
         f"robot '{robot.name}': in the default pose the {kind} '{name}' has no counterpart at its mirror image "
         f"({x}, {y}, {z}) m; mend default_joint_position or the model, or train with training.algorithm.symmetry=none"
     )
+
+
+def joint_ranges(robot: Robot) -> NDArray[np.float64]:
+    """Lower and upper limit of every joint in the robot's order [rad], (J, 2); infinite where a joint has none."""
+    model = robot_model(robot)
+    ids = [model.joint(name).id for name in robot.joint_names]
+    return np.where(model.jnt_limited[ids, None], model.jnt_range[ids], [-np.inf, np.inf])
+
+
+def model_joint_order(robot: Robot) -> list[int]:
+    """The robot's joints in the order in which the model has them behind the free joint: indices into ``joint_names``."""
+    model = robot_model(robot)
+    address = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
+    return sorted(range(robot.num_joints), key=address.__getitem__)
+
+
+def stance_span(robot: Robot) -> float:
+    """Largest horizontal distance between two feet in the default pose [m]: the diagonal stance span."""
+    _, data = default_pose(robot)
+    feet = [data.geom(name).xpos[:2] for name in robot.foot_geoms]
+    return float(max(np.linalg.norm(a - b) for a, b in combinations(feet, 2)))
+
+
+def total_mass(robot: Robot) -> float:
+    """Mass of the whole robot [kg]."""
+    return float(robot_model(robot).body_mass.sum())
 
 
 def robot_model(robot: Robot) -> mujoco.MjModel:

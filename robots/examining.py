@@ -13,9 +13,8 @@ import numpy as np
 from ..files.parsing import build, parse_json
 from .apart import run_apart
 from .base import JointParameters, Robot
-from .body_plan import body_plan, default_pose, mirror_image
+from .body_plan import body_plan, default_pose, joint_ranges, mirror_image
 from .checking import ModelChecks
-from .geometry import joint_ranges
 from .loading import RobotError
 
 STANDING_SECONDS = 2.0

@@ -13,7 +13,7 @@ import torch
 
 from ..backends.base import PhysicsOptions, PhysicsState
 from ..robots.base import Robot
-from ..robots.geometry import joint_ranges
+from ..robots.body_plan import joint_ranges
 from ..robots.rotation import from_yaw
 from .environment_configuration import PushConfiguration, RandomizationConfiguration, ResetConfiguration
 from .environment_memory import EnvironmentMemory

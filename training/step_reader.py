@@ -9,8 +9,7 @@ import torch
 
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
-from ..robots.body_plan import body_plan, mirror_image
-from ..robots.geometry import joint_ranges
+from ..robots.body_plan import body_plan, joint_ranges, mirror_image
 from ..robots.rotation import rotate_inverse
 from .configuration import ConfigurationError
 from .curriculum import TrainingPalette

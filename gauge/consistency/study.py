@@ -14,10 +14,9 @@ import torch
 from ...backends.base import BackendError
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_atomically
-from ...policy.digest import policy_digest
 from ...policy.native import FilePolicy
 from ...robots import Robot
-from ...robots.geometry import total_mass
+from ...robots.body_plan import total_mass
 from ...robots.loading import robot_digest
 from ...terrains.registry import gauge_terrain_names
 from ..evaluate import Request, common_identity, prepare
@@ -245,7 +244,7 @@ class _Policy:
         self._records: dict[str, Records] = {}
         self._unable: dict[str, str] = {}
         self._part, self._parts = 0, len(prepared.engines)
-        self._digest = policy_digest(policy)
+        self._digest = policy.digest
 
     def run(self) -> dict[str, Any]:
         """All layers; the closed loop comes first, since it finds out which engines can play these terrains."""

@@ -21,7 +21,7 @@ from gaitgauge.gauge.consistency.open_loop import (
 from gaitgauge.gauge.consistency.variants import parse_variant
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.geometry import total_mass
+from gaitgauge.robots.body_plan import total_mass
 
 GO2 = load_robot("go2")
 SUITE = load_suite("robogauge-1.1")

@@ -20,7 +20,7 @@ from gaitgauge.gauge.metrics import (
 )
 from gaitgauge.gauge.sampling import GRAVITY
 from gaitgauge.gauge.suite import SuiteError
-from gaitgauge.robots.geometry import total_mass
+from gaitgauge.robots.body_plan import total_mass
 from gaitgauge.robots.rotation import rotate_inverse
 from metric_states import OWN, REFERENCE, evaluate, rows, scalar, turned
 from scripted_gauge import GO2, fake, short_suite

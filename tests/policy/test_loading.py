@@ -12,7 +12,6 @@ import torch
 from gaitgauge.policy import finding
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import ContractError, PolicyContract
-from gaitgauge.policy.digest import policy_digest
 from gaitgauge.policy.finding import find_policy
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
@@ -205,9 +204,9 @@ def test_bare_checkpoint_with_normalization_and_activation(tmp_path, observation
     with torch.no_grad():
         expected = layers((observations[0] - 0.5) / 2.0)
         torch.testing.assert_close(load_policy(path).session(4).act(observations[0]), expected)
-    before = policy_digest(load_policy(path))
+    before = load_policy(path).digest
     (tmp_path / "params" / "agent.yaml").write_text("actor:\n  hidden_dims: [16]\n  activation: relu\n")
-    assert policy_digest(load_policy(path)) != before
+    assert load_policy(path).digest != before
 
 
 def test_bare_checkpoint_of_a_student(tmp_path, cts_network: CtsNetwork, observations, run, cts_file):

@@ -10,7 +10,6 @@ import torch
 import yaml
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import History
-from gaitgauge.policy.digest import policy_digest
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import first_line
@@ -323,11 +322,11 @@ def test_weights_beside_the_file_and_import(tmp_path):
     expected = load_policy(tmp_path / "inside.onnx").session(EPISODES).act(observation)
     assert torch.equal(load_policy(path).session(EPISODES).act(observation), expected)
     stored = import_policy(path, tmp_path / "own.gauge.pt")
-    digest = policy_digest(load_policy(path))
-    assert digest == policy_digest(load_policy(path))
+    digest = load_policy(path).digest
+    assert digest == load_policy(path).digest
     weights = tmp_path / "source" / "policy.onnx.data"
     weights.write_bytes(bytes([weights.read_bytes()[0] ^ 1]) + weights.read_bytes()[1:])
-    assert policy_digest(load_policy(path)) != digest
+    assert load_policy(path).digest != digest
     (tmp_path / "source" / "policy.onnx.data").unlink()
     own = load_policy(tmp_path / "own.gauge.pt", trust=True)
     assert own.contract == stored

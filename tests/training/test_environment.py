@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.robots.geometry import joint_ranges
+from gaitgauge.robots.body_plan import joint_ranges
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
     CommandConfiguration,
