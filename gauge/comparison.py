@@ -122,6 +122,7 @@ class Comparison:
         }
 
 
+@edited("one of the results", ComparisonError)
 def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None = None) -> Comparison:
     """Compare all pairs of some results.
 
@@ -132,11 +133,6 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
     Raises:
         ComparisonError: results of different suites, engines, robots or environments, or without scores.
     """
-    with edited("one of the results", ComparisonError):
-        return _compare(results, labels)
-
-
-def _compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None) -> Comparison:
     if len(results) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results, not {len(results)}")
     labels = list(labels) if labels else _labels(results)

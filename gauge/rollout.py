@@ -291,10 +291,15 @@ def _outcome(
     )
     if not counts.penetrated or aims:
         return outcome
-    beginning = outcome.cut_short(
-        samples=int(keep[: counts.penetration_samples].sum()),
+    # the beginning, up to a penetration after which its goal starts again
+    beginning = replace(
+        outcome,
+        samples=outcome.samples[: int(keep[: counts.penetration_samples].sum())],
         control_steps=counts.penetration_control_steps,
         physics_steps=counts.penetration_substeps,
         overflowed=counts.penetration_overflowed,
+        falls=0,
+        diverged=False,
+        restarted=True,
     )
     return replace(outcome, until_penetration=beginning)

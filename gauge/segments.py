@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,20 +58,6 @@ class SegmentOutcome:
     """Whether a penetration made a target goal start again."""
     until_penetration: SegmentOutcome | None = None
     """What a velocity segment was when the robot first went too deep, if it did and if that matters; all of it ran on."""
-
-    def cut_short(self, *, samples: int, control_steps: int, physics_steps: int, overflowed: bool) -> SegmentOutcome:
-        """The beginning of a velocity segment, up to a penetration, after which its goal starts again."""
-        return replace(
-            self,
-            samples=self.samples[:samples],
-            control_steps=control_steps,
-            physics_steps=physics_steps,
-            overflowed=overflowed,
-            falls=0,
-            diverged=False,
-            restarted=True,
-            until_penetration=None,
-        )
 
 
 class SegmentRules:

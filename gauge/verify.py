@@ -163,6 +163,7 @@ def verify(
     return judge(card, evaluate(prepared, folder, resume=True, command=command, watch=watch)) | {"fresh": fresh}
 
 
+@edited("the card", CardError)
 def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
     """Whether a card holds, given the results of a replay of all or some of its environments.
 
@@ -175,11 +176,6 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
         ``score``, ``interval`` and ``band`` of the card and the ``replayed`` score over what was played, and ``levels``: for each
         environment whose level differs its terrain, friction, payload, ``card`` and ``here``.
     """
-    with edited("the card", CardError):
-        return _judge(card, replay)
-
-
-def _judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
     by_key = {_key(row): row for row in card["environments"]}
     pairs = [(by_key[_key(row)], row) for row in replay["environments"]]
     equal = all(old.get(key) == new.get(key) for old, new in pairs for key in _OUTCOME)

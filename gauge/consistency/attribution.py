@@ -48,12 +48,7 @@ class Factor:
         """The engine with the factor switched."""
         if self.option:
             return variant.switched(self.option, self.value)
-        return perturbed(variant, self.perturbation) if self.perturbation else rounded(variant)
-
-
-def perturbed(variant: Variant, magnitude: float) -> Variant:
-    """The same engine from states put off by a relative amount."""
-    return replace(variant, perturbation=magnitude, draw=1)
+        return replace(variant, perturbation=self.perturbation, draw=1) if self.perturbation else rounded(variant)
 
 
 def rounded(variant: Variant, draw: int = 1) -> Variant:

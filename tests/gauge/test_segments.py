@@ -1,6 +1,7 @@
 """Segments played side by side make up the very record that playing them in a row would give."""
 
 import random
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -90,8 +91,17 @@ def outcome_of(told, segment, restarts):
     if not restarts or deep is None or segment.again:
         return whole
     early = it["overflow"] is not None and it["overflow"] < deep
-    cut = whole.cut_short(samples=deep, control_steps=deep, physics_steps=10 * deep, overflowed=early)
-    return SegmentOutcome(**{**vars(whole), "until_penetration": cut})
+    cut = replace(
+        whole,
+        samples=whole.samples[:deep],
+        control_steps=deep,
+        physics_steps=10 * deep,
+        overflowed=early,
+        falls=0,
+        diverged=False,
+        restarted=True,
+    )
+    return replace(whole, until_penetration=cut)
 
 
 @pytest.mark.parametrize("name", [REFERENCE, OWN])
