@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,14 @@ def filled(kind: Any, *sources: object, **values: Any) -> Any:
     """A structure of Warp's with every field from ``values``, or from the first source that has something of that name.
 
     NumPy's arrays are copied to the current Warp device, in the field's type.
+
+    Raises:
+        TypeError: none of them has something for a field.
     """
     made = kind()
     for name, field in kind.vars.items():
-        value = values[name] if name in values else next(getattr(s, name) for s in sources if hasattr(s, name))
+        if not (given := [s for s in (SimpleNamespace(**values), *sources) if hasattr(s, name)]):
+            raise TypeError(f"nothing gives the field '{name}' of {kind.key} a value")
+        value = getattr(given[0], name)
         setattr(made, name, to_warp(value, field.type.dtype) if isinstance(value, np.ndarray) else value)
     return made

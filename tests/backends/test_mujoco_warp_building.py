@@ -13,15 +13,22 @@ import torch
 import warp_throughput
 from gaitgauge.backends import BackendError
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
+from gaitgauge.backends.mujoco_warp.arrays import Palette
 from gaitgauge.backends.mujoco_warp.memory import bytes_per_world
 from gaitgauge.backends.mujoco_warp.model import PARKED, buffer_capacity, build_shared_model
 from gaitgauge.backends.warp.device import DeviceScope, is_memory_error, memory_advice
+from gaitgauge.backends.warp.structures import filled
 from mujoco_warp_scenes import BLOCK, BOXES, COARSE, FINE, FLAT, ROBOT, WALL, scene
 
 ROOT = Path(__file__).parents[2]
 
 
 # ---- tables --------------------------------------------------------------------------------------------------------
+
+
+def test_a_structure_that_is_not_filled_says_which_field():
+    with pytest.raises(TypeError, match=r"nothing gives the field 'position' of Palette a value"):
+        filled(Palette, object(), rotation=None)
 
 
 def test_palette_parks_unused_slots_and_bounds_the_used():
