@@ -16,7 +16,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from ..backends.base import PhysicsBackend, Randomization, ResetState, Scene
+from ..backends.base import Randomization, ResetState, Scene
 from ..backends.registry import make_backend
 from ..backends.warp.graphs import WARM_UP, RecordedFunction
 from ..policy.contract import History, PolicyContract, standard_contract
@@ -39,8 +39,6 @@ from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
 
 STATE_VERSION = 1
 
-BackendMaker = Callable[[Scene], PhysicsBackend]
-
 
 class TrainingEnvironment(VecEnv):
     """Vectorized locomotion environment. Observation groups: ``policy``, ``history`` and ``privileged``.
@@ -55,7 +53,7 @@ class TrainingEnvironment(VecEnv):
         self,
         configuration: EnvironmentConfiguration,
         *,
-        backend: str | BackendMaker = "mujoco-warp",
+        backend: str = "mujoco-warp",
         device: str = "cuda:0",
         threads: int = 1,
         capture: bool = False,
@@ -64,7 +62,7 @@ class TrainingEnvironment(VecEnv):
         """Build the worlds and begin their first episodes.
 
         Args:
-            backend: an engine's registry name, or a function that makes one from a scene.
+            backend: an engine's registry name.
             device: torch device of the physics and of everything else.
             threads: CPU threads for engines that use them.
             capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
@@ -95,9 +93,7 @@ class TrainingEnvironment(VecEnv):
             terrain_index=tuple(self.palette.index[kind, level, 0].tolist()),
             physics=configuration.physics,
         )
-        self.backend = (
-            make_backend(backend, scene, device=device, threads=threads) if isinstance(backend, str) else backend(scene)
-        )
+        self.backend = make_backend(backend, scene, device=device, threads=threads)
         self.device = self.backend.device
         self.num_envs = configuration.num_envs
         self.num_actions = self.robot.num_joints

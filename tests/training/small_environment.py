@@ -1,8 +1,10 @@
 """Small training environments on the scripted engine, for the tests of this folder."""
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import torch
+from gaitgauge.training import environment
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
     EnvironmentConfiguration,
@@ -38,7 +40,13 @@ def make(num_envs=8, *, script=None, physics=None, seed=0, **settings):
     configuration = EnvironmentConfiguration(num_envs=num_envs, seed=seed, **settings)
     if physics is not None:
         configuration = replace(configuration, physics=replace(configuration.physics, **physics))
-    return TrainingEnvironment(configuration, backend=lambda scene: FakeBackend(scene, script=script or FakeScript()))
+    return scripted_environment(configuration, script or FakeScript())
+
+
+def scripted_environment(configuration, script):
+    """An environment whose robots do as a script says."""
+    with patch.object(environment, "make_backend", lambda name, scene, **_: FakeBackend(scene, script=script)):
+        return TrainingEnvironment(configuration)
 
 
 def gliding(forward=0.0, lateral=0.0, yaw=0.0):

@@ -18,7 +18,7 @@ from gaitgauge.training.environment_configuration import (
     RewardConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge_fake_engine import FakeBackend, FakeScript
+from gaitgauge_fake_engine import FakeScript
 from small_environment import FLAT, STAIRS, gliding, idle, make
 
 NEVER = math.inf
@@ -344,7 +344,7 @@ def test_joint_constants_can_be_overridden():
 def test_mistakes():
     with pytest.raises(ValueError, match="capture=True needs a CUDA device"):
         TrainingEnvironment(
-            EnvironmentConfiguration(num_envs=2, terrain=FLAT), backend=FakeBackend, device="cpu", capture=True
+            EnvironmentConfiguration(num_envs=2, terrain=FLAT), backend="fake", device="cpu", capture=True
         )
     with pytest.raises(ValueError, match="num_envs is 0"):
         make(0)

@@ -11,7 +11,7 @@ from gaitgauge.terrains import training_tiles
 from gaitgauge.training.algorithms.symmetry import SymmetryError, build_mirror
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.curriculum import build_palette
-from gaitgauge.training.environment import TrainingEnvironment, training_contract
+from gaitgauge.training.environment import training_contract
 from gaitgauge.training.environment_configuration import (
     EnvironmentConfiguration,
     OwnEvent,
@@ -24,8 +24,8 @@ from gaitgauge.training.environment_configuration import (
 from gaitgauge.training.own_terms import resolve
 from gaitgauge.training.tasks import TaskError, find_task
 from gaitgauge.training.terrain_configuration import TerrainConfiguration, TileConfiguration
-from gaitgauge_fake_engine import FakeBackend, FakeScript
-from small_environment import FLAT, idle, make
+from gaitgauge_fake_engine import FakeScript
+from small_environment import FLAT, idle, make, scripted_environment
 
 FOLDER = Path(__file__).parents[2] / "examples" / "own_task"
 
@@ -39,7 +39,7 @@ def example(monkeypatch):
 
 def environment_of(task, script):
     settings = replace(task.environment, num_envs=4)
-    return TrainingEnvironment(settings, backend=lambda scene: FakeBackend(scene, script=script))
+    return scripted_environment(settings, script)
 
 
 def test_the_example_trains_with_its_own_terms(example):
