@@ -8,22 +8,8 @@ import torch
 
 from .base import PolicySession, check_observation
 from .contract import PolicyContract
-from .fence.child import Child, Program
+from .fence.child import Child
 from .native import FilePolicy, ForeignFile
-
-
-def script_program(data: bytes, source: str) -> Program:
-    """Load a TorchScript file that has been looked through; this happens where it runs."""
-    from .torchscript import ScriptProgram
-
-    return ScriptProgram(data, source)
-
-
-def graph_program(data: bytes, source: str) -> Program:
-    """Load an ONNX file that has been looked through; this happens where it runs."""
-    from .onnx_file import GraphProgram
-
-    return GraphProgram(data, source)
 
 
 class FencedPolicy(FilePolicy):

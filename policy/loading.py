@@ -121,25 +121,27 @@ def _foreign(
     """Load a TorchScript or ONNX file; ``contract`` is the one that was stored with it, None to look for one."""
     # Only those who load such a file wait for what it needs.
     from .fence.child import Child
-    from .fenced import FencedPolicy, graph_program, script_program
+    from .fenced import FencedPolicy
 
     metadata: dict[str, str] = {}
     if file.kind == "torchscript":
         from .fence.script import check_script
+        from .torchscript import ScriptProgram
 
         script = check_script(file.data, source=source)
-        child, attributes = Child(script_program, script.data, source=source), script.attributes
+        child, attributes = Child(ScriptProgram, script.data, source=source), script.attributes
         if script.contract:
             metadata["contract"] = script.contract
     else:
-        import onnxruntime  # noqa: F401  (the child, which is forked, may not load libraries any more)
-
         from .fence.graph import check_graph
+        from .onnx_file import (
+            GraphProgram,  # with onnxruntime: the child, which is forked, may not load libraries any more
+        )
 
         model = check_graph(file.data, source=source, folder=path.parent)
         metadata = {entry.key: entry.value for entry in model.metadata_props}
         file = ForeignFile(kind=file.kind, data=model.SerializeToString())
-        child, attributes = Child(graph_program, file.data, source=source), frozenset()
+        child, attributes = Child(GraphProgram, file.data, source=source), frozenset()
     contract = contract or _foreign_contract(child, file.kind, metadata, path, source, robot)
     return FencedPolicy(file, child, contract, path=source, attributes=attributes)
 

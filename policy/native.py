@@ -397,16 +397,12 @@ class NativeSession(PolicySession):
         self._history = torch.full((num_episodes, frames, width), self._unseen, device=device)
         self._initial: torch.Tensor | None = None
         if hasattr(network, "initial_state"):
-            self._initial = self._network.initial_state(num_episodes).to(device)
-            self._state = self._initial.clone()
+            self._state = self._initial = self._network.initial_state(num_episodes).to(device)
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """See ``PolicySession``: the history becomes unseen, the state initial."""
         if episodes is None:
-            self._history = torch.full_like(self._history, self._unseen)
-            if self._initial is not None:
-                self._state = self._initial.clone()
-            return
+            episodes = torch.ones(self._num_episodes, dtype=torch.bool, device=self._history.device)
         self._history = self._history.masked_fill(episodes[:, None, None], self._unseen)
         if self._initial is not None:
             self._state = torch.where(episodes[:, None], self._initial, self._state)

@@ -160,11 +160,10 @@ class GraphProgram:
 
     def session(self, rows: int, *, rowwise: bool = False) -> PolicySession:
         """Start work on so many episodes, all at once or each alone."""
-        if rowwise:
+        if rowwise or (self._batch is None and rows > 1):
             return RowwiseSession(self.session, rows)
-        batched = self._batch is not None
-        runner = _Runner(self._batch or self.file.data, self.file, self.contract)
-        return OnnxSession(runner, rows, self.contract, batched=batched)
+        runner = self._rows if self._batch is None else _Runner(self._batch, self.file, self.contract)
+        return OnnxSession(runner, rows, self.contract)
 
     def _proved_batch(self) -> bytes | None:
         generator = np.random.default_rng(0)
@@ -207,9 +206,8 @@ class _Runner:
 class OnnxSession(PolicySession):
     """Runs an ONNX file; it has no memory."""
 
-    def __init__(self, runner: _Runner, num_episodes: int, contract: PolicyContract, *, batched: bool) -> None:
-        """Keep a runner; ``batched`` says whether it takes all episodes at once."""
-        self.batched = batched
+    def __init__(self, runner: _Runner, num_episodes: int, contract: PolicyContract) -> None:
+        """Keep a runner, which takes all episodes at once."""
         self._runner = runner
         self._num_episodes = num_episodes
         self._contract = contract
@@ -220,9 +218,4 @@ class OnnxSession(PolicySession):
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
         check_observation(observation, self._num_episodes, self._contract, self._runner._source)
-        inputs = observation.numpy()
-        if self.batched:
-            actions = self._runner.run(inputs)
-        else:
-            actions = np.concatenate([self._runner.run(inputs[i : i + 1]) for i in range(len(inputs))])
-        return torch.from_numpy(actions)
+        return torch.from_numpy(self._runner.run(observation.numpy()))

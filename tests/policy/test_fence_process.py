@@ -14,8 +14,9 @@ import torch
 from foreign_programs import Plain, refused, script
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.fence import child as fence_child
-from gaitgauge.policy.fenced import FencedPolicy, FencedSession, script_program
+from gaitgauge.policy.fenced import FencedPolicy, FencedSession
 from gaitgauge.policy.loading import load_policy
+from gaitgauge.policy.torchscript import ScriptProgram
 from torch import nn
 
 
@@ -285,7 +286,7 @@ class Changing(Plain):
 @pytest.mark.parametrize("inference", [True, False])
 def test_a_program_acts_to_the_last_bit_as_in_its_owner(contract, module, inference):
     data = script(module())
-    child, here = fence_child.Child(script_program, data, source="policy"), script_program(data, "policy")
+    child, here = fence_child.Child(ScriptProgram, data, source="policy"), ScriptProgram(data, "policy")
     details = {"contract": contract.to_json(), "attributes": ["last", "seen"]}
     assert child.ask("prepare", **details) == here.answer({"do": "prepare", **details}) == {"batched": True}
     fenced, alone = FencedSession(child, 5, contract, "policy", device=torch.device("cpu")), here.session(5)
