@@ -87,7 +87,7 @@ def play_variant(
     records: dict[Episode, Record],
     keep: Callable[[Record], None],
     threads: int = 1,
-    watch: Callable[[int], None] | None = None,
+    watch: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Play the episodes of which there is no record yet, as an evaluation plays those that its plans require.
 
@@ -117,8 +117,7 @@ def play_variant(
     )
 
     def on_progress(dispatcher: Dispatcher) -> None:
-        if watch is not None:
-            watch(len(episodes) - len(dispatcher.plans[0].required))
+        watch(len(episodes) - len(dispatcher.plans[0].required))
 
     with closing(start_workers(job, count)) as workers:
         play([partial(plan_list, episodes)], records, keep, workers, speculation=Speculation(), watch=on_progress)

@@ -182,7 +182,7 @@ def study(
     *,
     resume: bool = False,
     command: Sequence[str] = (),
-    watch: Watch | None = None,
+    watch: Watch = lambda _: None,
 ) -> dict[str, Any]:
     """Carry out a study; every finished episode is on disk at once.
 
@@ -237,7 +237,7 @@ class _Policy:
         folder: Path,
         *,
         resume: bool,
-        watch: Watch | None,
+        watch: Watch,
     ) -> None:
         self._prepared, self._name, self._policy, self._folder = prepared, name, policy, folder
         self._resume, self._watch = resume, watch
@@ -301,8 +301,7 @@ class _Policy:
         episodes = prepared.design.episodes()
 
         def on_progress(done: int) -> None:
-            if self._watch is not None:
-                self._watch(StudyStatus(self._name, variant.label, self._part, self._parts, done, len(episodes)))
+            self._watch(StudyStatus(self._name, variant.label, self._part, self._parts, done, len(episodes)))
 
         with RunFolder(self._folder / variant.folder, self._identity(variant), resume=self._resume) as store:
             play_variant(

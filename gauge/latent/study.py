@@ -41,7 +41,7 @@ def study_latents(
     folder: Path,
     *,
     command: Sequence[str] = (),
-    watch: Watch | None = None,
+    watch: Watch = lambda *_: None,
 ) -> dict[str, Any]:
     """Look at the latents of some policies. What cannot be looked at is said under ``refused``; the others are.
 
@@ -58,8 +58,7 @@ def study_latents(
     entries: list[dict[str, Any]] = []
     points: list[tuple[str, Notes, dict[str, NDArray[np.float64]]]] = []
     for number, (label, loaded) in enumerate(policies.items(), 1):
-        if watch is not None:
-            watch(number, len(policies), label)
+        watch(number, len(policies), label)
         try:
             notes = collect(loaded.policy, loaded.robot, request, suite, terrains)
             entry, places = look(label, loaded, notes, [t.name for t in terrains])

@@ -46,7 +46,7 @@ def run_trials(
     folder: Path,
     *,
     command: Sequence[str] = (),
-    watch: Watch | None = None,
+    watch: Watch = lambda *_: None,
 ) -> dict[str, Any]:
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 
@@ -73,8 +73,7 @@ def run_trials(
     entries = [_about(scenario) for scenario in scenarios.values()]
     turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]
     for number, (scenario, entry, label) in enumerate(turns, 1):
-        if watch is not None:
-            watch(number, len(turns), f"{label} in {scenario.name}")
+        watch(number, len(turns), f"{label} in {scenario.name}")
         seeds = range(request.seed, request.seed + (request.repeats or scenario.repeats))
         try:
             trials = run_scenario(
