@@ -50,22 +50,24 @@ def import_file(
     trainable = trainable or raw
     if trainable and contract is not None:
         raise UserError("a training checkpoint has its contract inside; leave out --contract")
+    from ..policy.native import ForeignFile
+
     if trainable:
         from ..policy.finding import find_policy
         from ..policy.loading import load_policy
         from ..training.checkpoint import trim_checkpoint
 
         trim_checkpoint(find_policy(source), destination, raw=raw)
-        stored = load_policy(str(destination)).contract
+        policy = load_policy(str(destination))
     else:
-        from ..policy.importing import carries_program, import_policy
+        from ..policy.importing import import_policy
 
-        stored = import_policy(source, destination, robot, trust=trust, contract_file=contract)
+        policy = import_policy(source, destination, robot, trust=trust, contract_file=contract)
     console = Terminal()
     console.say(f"wrote {destination}")
-    if not trainable and carries_program(destination):
+    if isinstance(policy.stored, ForeignFile):
         console.say("it carries the program of its source, not weights alone: commands that run it need --trust")
-    console.print(contract_table(stored))
+    console.print(contract_table(policy.contract))
 
 
 def contract_table(contract: PolicyContract) -> Table:
@@ -176,18 +178,15 @@ def _backends() -> Table:
 
 
 def _suites() -> Table:
+    from ..gauge.pipelines import make_environments
     from ..gauge.suite import load_suite, suite_names
 
     table = make_table("suites (--suite NAME, or a .toml file)", "name", "version", "title", "metrics", "environments")
     for name in suite_names():
         suite = load_suite(name)
-        matrix = suite.matrix
-        if matrix.crossed:
-            conditions = len(matrix.frictions) * len(matrix.payloads)
-        else:
-            conditions = len(matrix.frictions) + sum(p != matrix.nominal_payload for p in matrix.payloads)
-        environments = len(matrix.terrains) * conditions
-        shape = f"{environments} ({len(matrix.terrains)} terrains × {conditions} conditions)"
+        terrains = suite.matrix.terrains
+        count = len(make_environments(suite, terrains=terrains, frictions=None, payloads=None, level=None))
+        shape = f"{count} ({len(terrains)} terrains × {count // len(terrains)} conditions)"
         table.add_row(name, suite.version, suite.title, str(len(suite.metrics.weights)), shape)
     return table
 

@@ -7,10 +7,9 @@ from pathlib import Path
 
 from ..robots import load_robot
 from ..robots.identity import identify
-from .contract import PolicyContract
 from .its_robot import REMEMBERED
 from .loading import load_policy
-from .native import ForeignFile, load_entries, read_policy, save_policy
+from .native import FilePolicy, save_policy
 
 
 def import_policy(
@@ -20,7 +19,7 @@ def import_policy(
     *,
     trust: bool = False,
     contract_file: Path | None = None,
-) -> PolicyContract:
+) -> FilePolicy:
     """Write a policy and its contract into one file of the project's own format; its actions stay the same.
 
     Networks that the project knows are stored as weights; a TorchScript or ONNX file is carried inside unchanged, and run from
@@ -34,7 +33,7 @@ def import_policy(
         contract_file: as in ``load_policy``.
 
     Returns:
-        The contract that was stored.
+        The policy, with the contract that was stored.
 
     Raises:
         PolicyError: the source cannot be loaded, or the destination cannot be written.
@@ -45,16 +44,6 @@ def import_policy(
     provenance = {**policy.contract.provenance, "imported_from": Path(policy.path).name}
     if asked is not None and robot is not None:
         provenance[REMEMBERED] = identify(asked, robot)
-    contract = replace(policy.contract, provenance=provenance)
-    save_policy(destination, contract, policy.stored)
-    return contract
-
-
-def carries_program(path: str | Path) -> bool:
-    """Whether a file of the project's own format carries a program of another format, so that it is run only if trusted.
-
-    Raises:
-        PolicyError: it is no such file.
-    """
-    entries = load_entries(Path(path).read_bytes(), source=str(path))
-    return isinstance(read_policy(entries, source=str(path))[1], ForeignFile)
+    policy.contract = replace(policy.contract, provenance=provenance)
+    save_policy(destination, policy.contract, policy.stored)
+    return policy

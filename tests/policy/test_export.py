@@ -249,7 +249,8 @@ def test_a_contract_file_says_how_a_file_is_run(moe_onnx, tmp_path):
         '[[observation]]\nname = "joint_velocity"\nscale = [0.05]\n'
         '[[observation]]\nname = "last_action"\nscale = [1.0]\n'
     )
-    policy = import_policy(moe_onnx[1], tmp_path / "mine.gauge.pt", contract_file=tmp_path / "contract.toml")
+    imported = import_policy(moe_onnx[1], tmp_path / "mine.gauge.pt", contract_file=tmp_path / "contract.toml")
+    policy = imported.contract
     assert policy.history == History(length=5, order="frame-major-newest-first", start="repeat")
     assert policy.observation[0].name == "command" and policy.action_scale == (0.5,) * 12
     assert policy.stiffness == standard_contract(load_robot("go2")).stiffness and "assumed" not in policy.provenance

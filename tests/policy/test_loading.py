@@ -232,7 +232,7 @@ def test_bare_checkpoints_of_other_kinds(tmp_path):
 def test_import_makes_a_file_of_our_own(tmp_path, observations):
     layers = multilayer_perceptron((45, 16, 12))
     path = checkpoint(tmp_path / "model_5.pt", layers, "actor.", "model_state_dict")
-    contract = import_policy(path, tmp_path / "made" / "own.gauge.pt")
+    contract = import_policy(path, tmp_path / "made" / "own.gauge.pt").contract
     own = load_policy(tmp_path / "made" / "own.gauge.pt")
     assert own.contract == contract
     assert contract.provenance["imported_from"] == "model_5.pt"

@@ -321,7 +321,7 @@ def test_weights_beside_the_file_and_import(tmp_path):
     observation = torch.randn(EPISODES, 45)
     expected = load_policy(tmp_path / "inside.onnx").session(EPISODES).act(observation)
     assert torch.equal(load_policy(path).session(EPISODES).act(observation), expected)
-    stored = import_policy(path, tmp_path / "own.gauge.pt")
+    stored = import_policy(path, tmp_path / "own.gauge.pt").contract
     digest = load_policy(path).digest
     assert digest == load_policy(path).digest
     weights = tmp_path / "source" / "policy.onnx.data"

@@ -347,7 +347,7 @@ def test_import_keeps_actions_and_needs_no_sidecar(tmp_path, contract, cts_netwo
     path = save(modules(cts_network)[name], tmp_path / "source" / "policy.pt")
     described = replace(contract, control_period=0.01)
     (tmp_path / "source" / "contract.json").write_text(described.to_json())
-    stored = import_policy(path, tmp_path / "own.gauge.pt")
+    stored = import_policy(path, tmp_path / "own.gauge.pt").contract
     own = load_policy(tmp_path / "own.gauge.pt", trust=True)
     assert own.contract == stored
     assert own.contract.hash == described.hash
