@@ -29,7 +29,7 @@ from .logger import RunLogger, make_writer
 from .processes import Processes, ProcessLostError
 from .resuming import TrainingDivergedError, save_run, write_learned
 from .run_directory import read_run_json, update_run_json
-from .scoring import Scorer, ScoreReport
+from .scoring import Scorer
 from .stopping import Progress, StopSignals, TrainingOutcome
 
 
@@ -282,7 +282,7 @@ class TrainingRunner:
             save_run(self, written)
         if due(run.gauge_interval):
             self._submit(written)
-        self._take_reports(self.scorer.poll() if self.scorer else [])
+        self._take_reports()
         if self.filmer is not None and written is not None and due(run.video_interval):
             self.filmer.submit(written, self.iteration)
         self._take_videos()
@@ -293,8 +293,7 @@ class TrainingRunner:
         names = (("gauge", self.scorer), ("video", self.filmer))
         if waiting := [name for name, side in names if side is not None and side.pending and seconds > 0.0]:
             self.message(f"Waiting for the {' and the '.join(waiting)}.")
-        if self.scorer is not None:
-            self._take_reports(self.scorer.drain(seconds, stop))
+        self._take_reports(seconds, stop)
         self._take_videos(seconds, stop)
 
     def _take_videos(self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False) -> None:
@@ -336,10 +335,11 @@ class TrainingRunner:
         self._submitted = self.iteration
         self.scorer.submit(checkpoint, self.iteration)
 
-    def _take_reports(self, reports: list[ScoreReport]) -> None:
-        """Log scores at the iteration they belong to, and keep the best checkpoint."""
-        for report in reports:
-            assert self.scorer is not None
+    def _take_reports(self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False) -> None:
+        """Log scores at the iteration they belong to, after a wait of at most ``seconds``, and keep the best checkpoint."""
+        if self.scorer is None:
+            return
+        for report in self.scorer.drain(seconds, stop):
             if report.failure:
                 self.message(f"No gauge score for iteration {report.iteration}: {report.failure}.")
                 continue

@@ -59,17 +59,15 @@ class Scorer:
         command, output = [*PROGRAM, "evaluate", str(path), *options], self._folder / f"{path.stem}.json"
         self._side.submit(Job(command=command, checkpoint=path, iteration=iteration, output=output))
 
-    def poll(self) -> list[ScoreReport]:
-        """Reports that arrived since the last call, without waiting."""
-        return self.drain(0.0)
-
     @property
     def pending(self) -> int:
         """How many submitted checkpoints have not been reported."""
         return self._side.pending
 
     def drain(self, seconds: float, stop: Callable[[], bool] = lambda: False) -> list[ScoreReport]:
-        """Wait for everything that is pending, at most ``seconds`` [s], until ``stop`` says so."""
+        """Reports that arrived since the last call, after waiting for all that is pending, at most ``seconds`` [s], until ``stop``
+        says so.
+        """
         return [_report(finished) for finished in self._side.drain(seconds, stop)]
 
     def close(self) -> None:

@@ -427,7 +427,7 @@ def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):
     assert command[command.index("--threads") + 1] == "3"
     assert environment["CUDA_VISIBLE_DEVICES"] == ""
     assert not old.exists(), "results of the same iteration before a resume would be refused"
-    (skipped,) = scorer.poll()
+    (skipped,) = scorer.drain(0.0)
     assert skipped.iteration == 6
     assert "skipped" in skipped.failure
 

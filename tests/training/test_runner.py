@@ -201,9 +201,6 @@ class SlowScorer:
         reports, self.waiting = self.waiting, []
         return reports
 
-    def poll(self):
-        return self.drain(0.0)
-
     @property
     def pending(self):
         return len(self.waiting)
