@@ -360,7 +360,6 @@ class MujocoBackend(PhysicsBackend):
         model, nominal = self._models[row], self._palette[self._terrain[row]]
         if "friction" in values:
             model.geom_friction[:, 0] = values["friction"]
-        inertial = False
         model.body_mass[:] = nominal.body_mass
         model.body_inertia[:] = nominal.body_inertia
         if "link_mass_scale" in values:
@@ -368,14 +367,11 @@ class MujocoBackend(PhysicsBackend):
             scale = values["link_mass_scale"][others]
             model.body_mass[self._bodies[others]] *= scale
             model.body_inertia[self._bodies[others]] *= scale[:, None]
-            inertial = True
         if "base_mass_offset" in values:
             model.body_mass[self._base] = max(float(nominal.body_mass[self._base] + values["base_mass_offset"]), 0.01)
-            inertial = True
         if "base_com_offset" in values:
             model.body_ipos[self._base] = nominal.body_ipos[self._base] + values["base_com_offset"]
-            inertial = True
-        if inertial:
+        if not values.keys().isdisjoint(("link_mass_scale", "base_mass_offset", "base_com_offset")):
             mujoco.mj_setConst(model, mujoco.MjData(model))
         ones = np.ones(self.scene.robot.num_joints)
         strength = values.get("motor_strength", ones)

@@ -202,10 +202,6 @@ class _Machine:
         else:
             target.extend(values)
 
-    def append(self, _: Any) -> None:
-        value = self._stack.pop()
-        self.extend([value])
-
     def keep(self, index: int | None) -> None:
         self._memo[len(self._memo) if index is None else index] = self._stack[-1]
 
@@ -238,7 +234,7 @@ _STEPS: dict[str, Any] = {
     "BINPERSID": _Machine.persistent,
     "SETITEM": _Machine.set_item,
     "SETITEMS": lambda m, a: m.set_items(m.above_mark()),
-    "APPEND": _Machine.append,
+    "APPEND": lambda m, a: m.extend([m._stack.pop()]),
     "APPENDS": lambda m, a: m.extend(m.above_mark()),
     "MEMOIZE": lambda m, a: m.keep(None),
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), _Machine.keep),
