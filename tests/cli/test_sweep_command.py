@@ -6,26 +6,7 @@ import sys
 import pytest
 import torch
 from small_run import SMALL
-
-SUITE = """
-extends = "gaitgauge-1"
-name = "tiny"
-title = "a few seconds"
-goals = [{ name = "max_velocity", phases = [0.2, 0.1] }, { name = "target_pos_velocity", phases = [] }]
-
-[matrix]
-terrains = ["flat", "slope_fd"]
-frictions = [0.6]
-payloads = [0.0]
-seeds = [0, 1]
-search_seeds = [100, 101]
-
-[commands]
-target_time = { slope = 0.3, wave = 0.3, stairs = 0.3, obstacle = 0.3 }
-
-[settling]
-longest = 0.2
-"""
+from tiny_suite import SUITE
 
 
 def sweep(**entries: str) -> str:
