@@ -9,7 +9,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from operator import attrgetter
 from typing import Any, ClassVar
 
 import torch
@@ -20,16 +19,12 @@ from ...backends.base import (
     Capability,
     PhysicsBackend,
     PhysicsState,
+    Randomization,
     ResetState,
     Scene,
     Support,
 )
 from ..noise import uniform_hash
-
-
-def _of_inner(name: str) -> Any:
-    """The method or property of that name, of the engine behind."""
-    return property(attrgetter(f"inner.{name}"))
 
 
 class WrappedBackend(PhysicsBackend):
@@ -49,9 +44,43 @@ class WrappedBackend(PhysicsBackend):
         self.scene = scene or inner.scene
         self.device, self.dtype = inner.device, inner.dtype
 
-    state, sample, describe, close = map(_of_inner, ("state", "sample", "describe", "close"))
-    reset, step, randomize = map(_of_inner, ("reset", "step", "randomize"))
-    push, apply_force = map(_of_inner, ("push", "apply_force"))
+    @property
+    def state(self) -> PhysicsState:
+        """See ``PhysicsBackend.state``."""
+        return self.inner.state
+
+    @property
+    def sample(self) -> PhysicsState:
+        """See ``PhysicsBackend.sample``."""
+        return self.inner.sample
+
+    def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
+        """See ``PhysicsBackend.reset``."""
+        self.inner.reset(start, worlds)
+
+    def step(self, joint_targets: torch.Tensor | None, **arguments: Any) -> None:
+        """See ``PhysicsBackend.step``."""
+        self.inner.step(joint_targets, **arguments)
+
+    def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
+        """See ``PhysicsBackend.randomize``."""
+        self.inner.randomize(randomization, worlds)
+
+    def push(self, worlds: torch.Tensor | None = None, **velocities: Any) -> None:
+        """See ``PhysicsBackend.push``."""
+        self.inner.push(worlds, **velocities)
+
+    def apply_force(self, force_w: torch.Tensor) -> None:
+        """See ``PhysicsBackend.apply_force``."""
+        self.inner.apply_force(force_w)
+
+    def describe(self) -> Mapping[str, list[float]] | None:
+        """See ``PhysicsBackend.describe``."""
+        return self.inner.describe()
+
+    def close(self) -> None:
+        """See ``PhysicsBackend.close``."""
+        self.inner.close()
 
 
 class PerturbedBackend(WrappedBackend):
