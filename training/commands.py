@@ -200,11 +200,14 @@ class CommandGenerator:
         steps = torch.where(is_stationary, stationary_steps, self._interval)
         holds_heading = straight & ~is_stationary & ~is_extreme
 
+        # Crossing: straight on or back for the whole episode, on ground that has an edge to come to.
         if settings.crossing_probability > 0.0:
             chance, side, speed = uniform["command_crossing"].unbind(1)
             crosses = (episode_length == 0) & (chance < settings.crossing_probability) & self._ends[kind]
+            least, most = low[:, 0], high[:, 0]
+            back = (most <= 0.0) | ((side < 0.5) & (least < 0.0))
             straight_on = torch.zeros_like(drawn)
-            straight_on[:, 0] = torch.where(side < 0.5, low[:, 0], high[:, 0]) * (0.5 + 0.5 * speed)
+            straight_on[:, 0] = torch.clamp(torch.where(back, least, most) * (0.5 + 0.5 * speed), least, most)
             drawn = torch.where(crosses[:, None], straight_on, drawn)
             steps = torch.where(crosses, remaining, steps)
             is_extreme, holds_heading = is_extreme & ~crosses, holds_heading | crosses

@@ -180,3 +180,10 @@ def test_crossings_go_straight_on_or_back_for_the_whole_episode():
     assert later.steps.unique().tolist() == [250], "an episode that has begun is none"
     endless = draw(crossing, progress=0.5, kind=1)
     assert endless.steps.unique().tolist() == [250], "ground without an edge is not crossed"
+
+
+def test_crossings_keep_to_a_range_that_goes_one_way():
+    for bounds, expected in (((0.0, 1.2), (0.6, 1.2)), ((0.8, 1.2), (0.8, 1.2)), ((-1.2, 0.0), (-1.2, -0.6))):
+        stage = replace(STAGES[1], begin=0.0, forward=bounds)
+        forward = draw(replace(PLAIN, stages=(stage,), crossing_probability=1.0)).command[:, 0]
+        assert forward.aminmax() == pytest.approx(expected, abs=1e-3)
