@@ -134,9 +134,7 @@ def _foreign(
             metadata["contract"] = script.contract
     else:
         from .fence.graph import check_graph
-        from .onnx_file import (
-            GraphProgram,  # with onnxruntime: the child, which is forked, may not load libraries any more
-        )
+        from .onnx_file import GraphProgram  # with onnxruntime, which the forked child may not load any more
 
         model = check_graph(file.data, source=source, folder=path.parent)
         metadata = {entry.key: entry.value for entry in model.metadata_props}

@@ -397,7 +397,8 @@ class NativeSession(PolicySession):
         self._history = torch.full((num_episodes, frames, width), self._unseen, device=device)
         self._initial: torch.Tensor | None = None
         if hasattr(network, "initial_state"):
-            self._state = self._initial = self._network.initial_state(num_episodes).to(device)
+            self._initial = self._network.initial_state(num_episodes).to(device)
+            self._state = self._initial.clone()
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """See ``PolicySession``: the history becomes unseen, the state initial."""

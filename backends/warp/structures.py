@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,9 @@ def filled(kind: Any, *sources: object, **values: Any) -> Any:
     """
     made = kind()
     for name, field in kind.vars.items():
-        if not (given := [s for s in (SimpleNamespace(**values), *sources) if hasattr(s, name)]):
+        source = next((s for s in sources if hasattr(s, name)), None)
+        if name not in values and source is None:
             raise TypeError(f"nothing gives the field '{name}' of {kind.key} a value")
-        value = getattr(given[0], name)
+        value = values[name] if name in values else getattr(source, name)
         setattr(made, name, to_warp(value, field.type.dtype) if isinstance(value, np.ndarray) else value)
     return made
