@@ -207,6 +207,8 @@ class Randomization:
     """Factor on kd, (W, J)."""
     motor_strength: torch.Tensor | None = None
     """Factor on the motor torque after its limit, (W, J)."""
+    motor_speed: torch.Tensor | None = None
+    """Factor on the speeds at which a motor's torque falls and ends, (W, J); without a limit by speed it does nothing."""
     motor_offset: torch.Tensor | None = None
     """Added to the position error inside the motor law [rad], (W, J)."""
 
@@ -239,6 +241,7 @@ CAPABILITY_NAMES: tuple[str, ...] = (
     "base_com",
     "gains",
     "motor_strength",
+    "motor_speed",
     "motor_offset",
     "latency",
     "push",

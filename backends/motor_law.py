@@ -3,7 +3,8 @@
 Torque = kp (target + offset − q) − kd q̇, clipped to limits, then multiplied by the motor strength. With
 ``PhysicsOptions.torque_speed_limit`` the limits follow the joint's speed: in the direction of motion a motor gives its
 driving torque up to the speed of full torque, from there a torque that falls linearly to zero at the no-load speed;
-against the motion it keeps its whole torque at any speed. A joint at rest counts as driven.
+against the motion it keeps its whole torque at any speed. A joint at rest counts as driven. ``Randomization.motor_speed``
+multiplies both speeds.
 """
 
 from __future__ import annotations
@@ -80,7 +81,9 @@ class MotorLimits:
         return where(velocity <= 0, -driving, -self.torque), where(velocity >= 0, driving, self.torque)
 
 
-def motor_torque(error: Any, velocity: Any, *, stiffness: Any, damping: Any, strength: Any, limits: MotorLimits) -> Any:
+def motor_torque(
+    error: Any, velocity: Any, *, stiffness: Any, damping: Any, strength: Any, limits: MotorLimits, speed: Any = 1.0
+) -> Any:
     """Torque of the motors [N·m], (…, J); NaN where an argument is.
 
     Args:
@@ -90,5 +93,6 @@ def motor_torque(error: Any, velocity: Any, *, stiffness: Any, damping: Any, str
         damping: kd [N·m·s/rad].
         strength: factor on the torque after its limit.
         limits: of the same kind of arrays.
+        speed: factor on the speeds of the limits.
     """
-    return (stiffness * error - damping * velocity).clip(*limits.bounds(velocity)) * strength
+    return (stiffness * error - damping * velocity).clip(*limits.bounds(velocity / speed)) * strength

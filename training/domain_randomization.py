@@ -7,7 +7,7 @@ import torch
 from ..backends.base import PhysicsBackend, Randomization
 from .environment_configuration import RandomizationConfiguration, Range
 
-MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_offset")
+MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_speed", "motor_offset")
 """Names of the uniform numbers that a reset takes, one column per joint each."""
 
 
@@ -34,7 +34,7 @@ def draw_bodies(
 class MotorParameters:
     """Drawn anew at every reset of a world."""
 
-    NAMES = ("stiffness_scale", "damping_scale", "motor_strength", "motor_offset")
+    NAMES = ("stiffness_scale", "damping_scale", "motor_strength", "motor_speed", "motor_offset")
     """Fields of ``Randomization``, in the order of ``MOTOR_COLUMNS``; offsets in rad."""
 
     def __init__(
@@ -45,11 +45,11 @@ class MotorParameters:
         self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
         self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]
         self.values = torch.ones(num_envs, len(self.NAMES), num_joints, device=device)
-        """All of them, (N, 4, J)."""
+        """All of them, (N, 5, J)."""
         self.values[:, self.NAMES.index("motor_offset")] = 0.0
 
     def redraw(self, uniform: torch.Tensor, worlds: torch.Tensor) -> None:
-        """New values, in place, for the masked worlds, from uniform numbers (N, 4 J)."""
+        """New values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
         drawn = uniform.view(self.values.shape) * self._span + self._low
         torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
 

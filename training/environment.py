@@ -79,6 +79,12 @@ class TrainingEnvironment(VecEnv):
             )
         if configuration.num_envs < 1:
             raise ConfigurationError(f"num_envs is {configuration.num_envs}; an environment needs at least 1 world")
+        slow, fast = configuration.randomization.motor_speed
+        if (slow, fast) != (1.0, 1.0) and not configuration.physics.torque_speed_limit:
+            raise ConfigurationError(
+                f"randomization.motor_speed is {slow:g} to {fast:g} while physics.torque_speed_limit is off, without which "
+                "it does nothing; turn the limit on, or leave motor_speed at 1,1"
+            )
         self.cfg = configuration
         self.configuration = configuration
         self.robot = load_robot(configuration.robot)
@@ -308,13 +314,14 @@ class TrainingEnvironment(VecEnv):
             self._begin_from(state)
             return
         parts, now = self.parts, self.backend.state
-        # A run from before headings were remembered goes on with the robots' own.
+        # A run from before headings were remembered goes on with the robots' own, one from before motor speeds with 1.
         headings = heading(state["physics"]["base_quaternion_w"])
         older = {"commanded_heading": headings, "holds_heading": torch.zeros_like(parts.memory.holds_heading)}
         restore({**older, **state["memory"]}, parts.memory.by_name())
         self._require_below(parts.memory.level, self.palette.num_levels, "level")
         self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")
-        restore(state["motors"], parts.motors.by_name())
+        motors = parts.motors.by_name()
+        restore({"motor_speed": torch.ones_like(motors["motor_speed"]), **state["motors"]}, motors)
         self._take_bodies(state["bodies"])
         parts.motors.apply(self.backend)
         self._observations = Observations(**fitting(state["observations"], vars(self._observations))).clone()

@@ -19,6 +19,7 @@ from .terrain_configuration import TRAINING_TERRAIN, TerrainConfiguration
 
 Range = tuple[float, float]
 _Factor = Annotated[float, Field(ge=0.0, le=100.0)]
+_SpeedFactor = Annotated[float, Field(ge=0.01, le=100.0)]
 _Friction = Annotated[float, Field(ge=0.0, le=10.0)]
 _Kilograms = Annotated[float, Field(ge=-1_000.0, le=1_000.0)]
 _Shift = Annotated[float, Field(ge=-10.0, le=10.0)]
@@ -354,6 +355,8 @@ class RandomizationConfiguration:
     """Added to the motor's position error per joint [rad], every reset."""
     motor_strength: tuple[_Factor, _Factor] = (0.8, 1.2)
     """Factor on the torque per joint after its limit, every reset."""
+    motor_speed: tuple[_SpeedFactor, _SpeedFactor] = (1.0, 1.0)
+    """Factor on the speeds at which a motor's torque falls and ends, per joint, every reset; needs torque_speed_limit to act."""
     delay: tuple[_Delay, _Delay] = (0.0, 0.02)
     """Time for which the previous target still acts [s], in whole substeps, every control step."""
 

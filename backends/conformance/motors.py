@@ -91,6 +91,29 @@ def motor_speed_limit(bench: Bench) -> str:
     return f"largest error {error:.1e} N·m"
 
 
+@check("motors/speed", "torque_limits", "torque_speed_limit", "motor_speed")
+def motor_speed(bench: Bench) -> str:
+    """The motor speed scales the speeds at which the driving torque falls and ends; torque at rest and in braking stays."""
+    parameters = bench.soft(
+        torque_limit=20.0, driving_torque_limit=16.0, full_torque_speed=10.0, no_load_speed=20.0, damping=0.0
+    )
+    factor = np.array([0.5, 1.0, 1.5, 2.0])[:, None].repeat(bench.robot.num_joints, 1)
+    # 15 rad/s is beyond 10, half-way from 10 to 20, the end of full torque of 15 to 30, and below it for 20 to 40
+    driving, still = (np.array(torques)[:, None] for torques in ([0.0, 8.0, 16.0, 16.0], [16.0] * 4))
+    with bench.worlds(parameters, torque_limits=True, torque_speed_limit=True) as worlds:
+        worlds.randomize(motor_speed=factor)
+        for speed, reach, wanted in (
+            (15.0, 100.0, driving),
+            (15.0, -100.0, np.full((4, 1), -20.0)),
+            (0.0, 100.0, still),
+        ):
+            worlds.reset(joint_position=worlds.default_pose, joint_velocity=np.full_like(factor, speed))
+            worlds.step(worlds.default_pose + reach, substeps=1)
+            torque = worlds.read().joint_torque
+            expect_close("joint_torque with scaled speeds [N·m]", torque, np.broadcast_to(wanted, factor.shape), 4e-3)
+    return ""
+
+
 @check("motors/gains", "gains")
 def motor_gains(bench: Bench) -> str:
     """Stiffness and damping are scaled for each world and joint on their own."""

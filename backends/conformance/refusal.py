@@ -52,6 +52,7 @@ REQUESTS: dict[str, Callable[[Bench], None]] = {
     "base_com": _randomize("base_com_offset", 0.01, lambda bench: (3,)),
     "gains": _randomize("stiffness_scale", 1.1, _joints),
     "motor_strength": _randomize("motor_strength", 0.9, _joints),
+    "motor_speed": _randomize("motor_speed", 1.5, _joints),
     "motor_offset": _randomize("motor_offset", 0.01, _joints),
     "latency": lambda bench: _ask(bench, lambda w: w.step(w.default_pose, delay=[1] * w.count)),
     "push": lambda bench: _ask(bench, lambda w: w.push(linear_velocity_w=np.ones((w.count, 3)))),

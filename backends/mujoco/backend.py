@@ -92,6 +92,7 @@ class MujocoBackend(PhysicsBackend):
         self._offset = np.zeros((n, joints))
         self._limp = np.ones(n, dtype=bool)
         self._gain, self._strength = np.zeros((n, joints)), np.ones((n, joints))
+        self._speed = np.ones((n, joints))
         self._kd_over_kp = np.zeros((n, joints))
         self._read_gains(range(n))
         self._warned = np.zeros((n, 2), dtype=np.int64)
@@ -293,7 +294,7 @@ class MujocoBackend(PhysicsBackend):
             if self._limits.by_speed:
                 gain, strength = self._gain[rows], self._strength[rows]
                 asked = gain * (target - free)
-                lower, upper = self._limits.bounds(velocity)
+                lower, upper = self._limits.bounds(velocity / self._speed[rows])
                 given = asked.clip(lower * strength, upper * strength)
                 cut = (given != asked) & (gain > 0.0)
                 target = np.where(cut, free + np.divide(given, gain, out=np.zeros_like(gain), where=cut), target)
@@ -379,6 +380,7 @@ class MujocoBackend(PhysicsBackend):
         model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
         model.actuator_biasprm[:, 2] = nominal.actuator_biasprm[:, 2] * values.get("damping_scale", ones) * strength
         model.actuator_forcerange[:] = nominal.actuator_forcerange * strength[:, None]
+        self._speed[row] = values.get("motor_speed", 1.0)
         self._offset[row] = values.get("motor_offset", 0.0)
 
     def _read_gains(self, rows: range | NDArray[np.int64]) -> None:

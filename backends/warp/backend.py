@@ -255,6 +255,7 @@ class WarpBackend(PhysicsBackend):
             ("stiffness_scale", motors.stiffness, motors.nominal_stiffness),
             ("damping_scale", motors.damping, motors.nominal_damping),
             ("motor_strength", motors.strength, 1.0),
+            ("motor_speed", motors.speed, 1.0),
             ("motor_offset", motors.offset, 1.0),
         ):
             if name in rows:

@@ -25,6 +25,7 @@ class Motors:
     stiffness: wp.array2d[float]
     damping: wp.array2d[float]
     strength: wp.array2d[float]
+    speed: wp.array2d[float]
     offset: wp.array2d[float]
     requested: wp.array2d[float]
     """Targets handed to the present step or reset."""
@@ -56,13 +57,14 @@ class MotorTensors:
         self.stiffness = self.nominal_stiffness.repeat(shape[0], 1)
         self.damping = self.nominal_damping.repeat(shape[0], 1)
         self.strength = torch.ones(shape, dtype=torch.float32, device=device)
+        self.speed = torch.ones(shape, dtype=torch.float32, device=device)
         self.offset = torch.zeros(shape, dtype=torch.float32, device=device)
         self.requested = torch.zeros(shape, dtype=torch.float32, device=device)
         """Targets of the present step or reset, (N, J)."""
         self.delay = torch.zeros(shape[0], dtype=torch.int32, device=device)
         """Substeps for which the previous target still acts, (N,)."""
         self.arrays = arrays = Motors()
-        for name in ("torque_limit", "stiffness", "damping", "strength", "offset", "requested", "delay"):
+        for name in ("torque_limit", "stiffness", "damping", "strength", "speed", "offset", "requested", "delay"):
             setattr(arrays, name, wp.from_torch(getattr(self, name)))
         self._speed = [tensor(getattr(limits, name)) for name in ("driving", "no_load_speed", "fall")]
         arrays.driving_limit, arrays.no_load_speed, arrays.fall = map(wp.from_torch, self._speed)
@@ -127,7 +129,8 @@ def motor_torque(motors: Motors, world: int, joint: int, substep: int, position:
     torque = motors.stiffness[world, joint] * error - motors.damping[world, joint] * velocity
     if wp.isnan(torque):
         return torque
-    share = wp.clamp((motors.no_load_speed[joint] - wp.abs(velocity)) / motors.fall[joint], 0.0, 1.0)
+    turning = wp.abs(velocity) / motors.speed[world, joint]
+    share = wp.clamp((motors.no_load_speed[joint] - turning) / motors.fall[joint], 0.0, 1.0)
     driving = motors.driving_limit[joint] * share
     lower = -motors.torque_limit[joint]
     upper = motors.torque_limit[joint]

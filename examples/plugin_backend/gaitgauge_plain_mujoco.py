@@ -29,7 +29,7 @@ CANNOT = {
     "link_mass": "only the base's mass can be changed",
     "penetration": "contacts are read at the end of a step only",
 }
-MOTOR_FIELDS = ("stiffness_scale", "damping_scale", "motor_strength", "motor_offset")
+MOTOR_FIELDS = ("stiffness_scale", "damping_scale", "motor_strength", "motor_speed", "motor_offset")
 
 
 _BODY_FORCES = ("body_contact_force_w", "trunk_contact_force_w")
@@ -208,6 +208,7 @@ class PlainMujocoBackend(PhysicsBackend):
                 stiffness=self._kp * motors["stiffness_scale"],
                 damping=self._kd * motors["damping_scale"],
                 strength=motors["motor_strength"],
+                speed=motors["motor_speed"],
                 limits=self._limits,
             )
         self._arrays["joint_torque"][row] = torque

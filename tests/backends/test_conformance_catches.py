@@ -175,6 +175,11 @@ class BrakesAsItDrives(SceneFault):
         return replace(scene, parameters=replace(scene.parameters, torque_limit=driving))
 
 
+class MotorSpeedIgnored(RandomizationFault):
+    def spoil(self, randomization):
+        return replace(randomization, motor_speed=None)
+
+
 class SpeedOfThePeriod(MujocoBackend):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
@@ -226,6 +231,7 @@ FAULTS = [
     (SpeedIgnored, "motors/speed_limit"),
     (BrakesAsItDrives, "motors/speed_limit"),
     (SpeedOfThePeriod, "motors/speed_limit"),
+    (MotorSpeedIgnored, "motors/speed"),
     (LateSample, "stepping/sample_at"),
     (StepsEverybody, "stepping/mask"),
     (ResetsForceNever, "disturbance/force_reset"),

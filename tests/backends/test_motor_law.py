@@ -56,6 +56,28 @@ def test_the_law_is_the_same_in_torch_and_hides_no_invalid_number():
     assert np.argwhere(np.isnan(torque)).tolist() == [[0, 0], [1, 1]]
 
 
+def test_a_motor_s_speed_stretches_the_limit_by_speed():
+    limits = MotorLimits.of(scene(**BOTH))
+    constants = {"stiffness": 1000.0, "damping": 0.0, "strength": 0.8}
+    factor = np.random.default_rng(0).uniform(0.5, 2.5, (4, 12))
+    for velocity in (np.full((4, 12), 25.0), np.full((4, 12), -25.0), np.zeros((4, 12))):
+        lower, upper = limits.bounds(velocity / factor)
+        for error, bound in ((1.0, upper), (-1.0, lower)):
+            torque = motor_torque(np.full((4, 12), error), velocity, **constants, speed=factor, limits=limits)
+            np.testing.assert_array_equal(torque, 0.8 * bound)
+            same = motor_torque(
+                torch.full((4, 12), error, dtype=torch.float64),
+                torch.tensor(velocity),
+                **constants,
+                speed=torch.tensor(factor),
+                limits=limits.to(device=torch.device("cpu"), dtype=torch.float64),
+            )
+            np.testing.assert_array_equal(torque, same.numpy())
+    # 25 rad/s at twice the speed is 12.5 rad/s: below 13.5; calf 38.72 · (31.3 − 25) / (31.3 − 14.08) = 14.17 N·m
+    twice = motor_torque(np.ones(12), np.full(12, 25.0), **{**constants, "strength": 1.0}, speed=2.0, limits=limits)
+    np.testing.assert_allclose(twice, [20.2, 20.2, 14.17] * 4, atol=5e-3)
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "fake"])
 def test_a_robot_whose_motors_are_unknown_is_refused_in_a_sentence(engine):
     unknown = replace(GO2.parameters["gauge"], full_torque_speed=None, no_load_speed=None)

@@ -113,7 +113,15 @@ class FakeBackend(PhysicsBackend):
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:
         """Only what concerns motors and bookkeeping is real."""
-        motors = ("gains", "motor_strength", "motor_offset", "latency", "torque_limits", "torque_speed_limit")
+        motors = (
+            "gains",
+            "motor_strength",
+            "motor_speed",
+            "motor_offset",
+            "latency",
+            "torque_limits",
+            "torque_speed_limit",
+        )
         exact = (*motors, "push", "deterministic", "gpu")
         noted = Capability(
             support=Support.APPROXIMATE, note="accepted and recorded, without effect: there is no physics"
@@ -163,6 +171,7 @@ class FakeBackend(PhysicsBackend):
             stiffness_scale=full(1.0, self.joint_count),
             damping_scale=full(1.0, self.joint_count),
             motor_strength=full(1.0, self.joint_count),
+            motor_speed=full(1.0, self.joint_count),
             motor_offset=full(0.0, self.joint_count),
         )
         count = full(0.0).long()
@@ -372,13 +381,14 @@ class FakeBackend(PhysicsBackend):
         """Motor law of ``JointParameters`` with the randomized factors, (N, J) [N·m]."""
         state, model = self._state, self.randomized
         assert model.stiffness_scale is not None and model.damping_scale is not None
-        assert model.motor_strength is not None and model.motor_offset is not None
+        assert model.motor_strength is not None and model.motor_offset is not None and model.motor_speed is not None
         torque = motor_torque(
             self.targets - state.joint_position + model.motor_offset,
             state.joint_velocity,
             stiffness=self.stiffness * model.stiffness_scale,
             damping=self.damping * model.damping_scale,
             strength=model.motor_strength,
+            speed=model.motor_speed,
             limits=self.limits,
         )
         return torch.where(self.limp[:, None], torch.zeros_like(torque), torque)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from gaitgauge.robots.body_plan import joint_ranges
+from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
     CommandConfiguration,
@@ -240,7 +241,9 @@ def test_pushes_add_or_replace():
 
 
 def test_randomization_ranges():
-    ranges = RandomizationConfiguration(friction=(0.3, 0.9), stiffness=(0.8, 1.1), motor_offset=(-0.02, 0.05))
+    ranges = RandomizationConfiguration(
+        friction=(0.3, 0.9), stiffness=(0.8, 1.1), motor_offset=(-0.02, 0.05), motor_speed=(1.0, 2.5)
+    )
     environment = make(2000, randomization=ranges)
     drawn = environment.backend.randomized
     for values, (low, high) in (
@@ -251,11 +254,22 @@ def test_randomization_ranges():
         (drawn.stiffness_scale, (0.8, 1.1)),
         (drawn.damping_scale, (0.9, 1.1)),
         (drawn.motor_strength, (0.8, 1.2)),
+        (drawn.motor_speed, (1.0, 2.5)),
         (drawn.motor_offset, (-0.02, 0.05)),
     ):
         assert low - 1e-6 <= values.min() < low + 0.05 * (high - low)
         assert high - 0.05 * (high - low) < values.max() <= high + 1e-6
         assert float(values.mean()) == pytest.approx((low + high) / 2, abs=0.03 * (high - low))
+
+
+def test_motor_speeds_that_would_do_nothing_are_refused():
+    faster = RandomizationConfiguration(motor_speed=(1.0, 2.5))
+    with pytest.raises(
+        ConfigurationError,
+        match=r"^randomization\.motor_speed is 1 to 2\.5 while physics\.torque_speed_limit is off, .* leave .* at 1,1$",
+    ):
+        make(randomization=faster, physics={"torque_speed_limit": False})
+    make(physics={"torque_speed_limit": False})
 
 
 def test_motors_are_redrawn_for_reset_worlds_only():
@@ -268,6 +282,15 @@ def test_motors_are_redrawn_for_reset_worlds_only():
         changed = (getattr(drawn, name) != before[name]).any(dim=1)
         assert changed.tolist() == [True, False, False, True]
     assert torch.equal(drawn.friction, before["friction"])
+
+
+def test_a_run_from_before_motor_speeds_goes_on_with_those_of_the_data_sheet():
+    speeds = RandomizationConfiguration(motor_speed=(2.0, 3.0))
+    environment = make(4, randomization=speeds)
+    saved = environment.state_dict()
+    del saved["motors"]["motor_speed"]
+    environment.load_state_dict(saved)
+    assert environment.backend.randomized.motor_speed.unique().tolist() == [1.0]
 
 
 def test_commands_hold_for_their_interval():

@@ -97,6 +97,15 @@ def test_mistakes_are_named(override, message):
     [
         ("environment.randomization.stiffness=-1,1", r"'environment.randomization.stiffness' is '-1'"),
         ("environment.randomization.damping=0.5,1e300", r"'environment.randomization.damping' is '1e300'"),
+        (
+            "environment.randomization.motor_speed=0,1",
+            r"^'environment.randomization.motor_speed' is '0'; it must be greater than or equal to 0.01$",
+        ),
+        (
+            "environment.randomization.motor_speed=1,101",
+            r"motor_speed' is '101'; it must be less than or equal to 100$",
+        ),
+        ("environment.randomization.motor_speed=2,1", r"motor_speed is 2 to 1; it must rise"),
         ("environment.randomization.friction=2,1", r"friction is 2 to 1; it must rise"),
         ("environment.randomization.delay=-0.1,0", r"'environment.randomization.delay' is '-0.1'"),
         ("environment.commands.stages.0.forward=1,-1", r"forward is 1 to -1; it must rise"),
