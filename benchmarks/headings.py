@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from gaitgauge.backends.base import TRAINING_PHYSICS, PhysicsBackend, Randomization, ResetState, Scene
@@ -39,6 +40,8 @@ class Changes:
     """Physics and joints of training."""
     speed_limit: bool = True
     """Whether training's motors lose torque with speed."""
+    motor_limits: Literal["torque", "speed"] | None = None
+    """Limits of the gauge's motors: of torque, or also of torque over speed; None for the suite's own."""
     riser: float | None = None
     """Height of a step [m]."""
     tread: float | None = None
@@ -76,7 +79,10 @@ class Walk:
         robot, suite = robot_for(loaded.contract), load_suite("robogauge-1.1")
         own = TRAINING_PHYSICS if changes.speed_limit else replace(TRAINING_PHYSICS, torque_speed_limit=False)
         parameters = "training" if changes.training and "training" in robot.parameters else robot.default_parameters
-        self.physics = own if changes.training else suite.physics
+        by_speed = changes.motor_limits == "speed"
+        limited = replace(suite.physics, torque_limits=True, torque_speed_limit=by_speed)
+        gauge = limited if changes.motor_limits else suite.physics
+        self.physics = own if changes.training else gauge
         self.terrain, self.changes, self.speed = terrain, changes, suite.commands.target_speed[terrain.family]
         self.target = torch.tensor(terrain.target, dtype=torch.float64)
         self.random = torch.Generator().manual_seed(seed)
