@@ -66,8 +66,8 @@ class MotorTensors:
         self.arrays = arrays = Motors()
         for name in ("torque_limit", "stiffness", "damping", "strength", "speed", "offset", "requested", "delay"):
             setattr(arrays, name, wp.from_torch(getattr(self, name)))
-        self._speed = [tensor(getattr(limits, name)) for name in ("driving", "no_load_speed", "fall")]
-        arrays.driving_limit, arrays.no_load_speed, arrays.fall = map(wp.from_torch, self._speed)
+        self._limits = [tensor(getattr(limits, name)) for name in ("driving", "no_load_speed", "fall")]
+        arrays.driving_limit, arrays.no_load_speed, arrays.fall = map(wp.from_torch, self._limits)
         for name in ("current", "previous", "torque"):
             setattr(arrays, name, wp.zeros(shape, dtype=float, device=on))
         arrays.limp, arrays.limp_before = (wp.ones(shape[0], dtype=int, device=on) for _ in range(2))
