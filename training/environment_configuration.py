@@ -207,6 +207,9 @@ class RewardConfiguration:
     """The base touches something; head and chin too."""
     joint_limits: float = -2.0
     """Joint angle beyond the soft limits [rad]."""
+    joint_speed_limits: float = 0.0
+    """Joint speed beyond the soft limit of the motor's own [rad/s]. An engine whose motors have no limit over speed, as the
+    published gauge, otherwise sees legs that the robot cannot have."""
     foot_regulation: float = -0.05
     """Squared foot speed close to the ground."""
     hip_regulation: float = -0.05
@@ -243,6 +246,8 @@ class RewardConfiguration:
     """Contact force from which a thigh, a calf or the base counts as touching [N]."""
     soft_limit: Share = 0.9
     """Share of a joint's range, about its middle, that is free of the joint-limit penalty."""
+    soft_speed_limit: Share = 0.9
+    """Share of the motors' no-load speed that is free of the penalty on joint speeds."""
     own: tuple[OwnReward, ...] = ()
     """Terms of one's own."""
 

@@ -117,6 +117,11 @@ def joint_limits(inputs: StepInputs) -> torch.Tensor:
     return (below + above).sum(dim=1)
 
 
+def joint_speed_limits(inputs: StepInputs) -> torch.Tensor:
+    """Sum of the joint speeds beyond the soft limits of the motors [rad/s]."""
+    return (inputs.joint_velocity.abs() - inputs.soft_speed).clamp_min(0.0).sum(dim=1)
+
+
 def foot_regulation(inputs: StepInputs) -> torch.Tensor:
     """Sum over the feet of squared horizontal speed times exp(−height/length)."""
     speed = inputs.foot_velocity_w[..., :2].square().sum(dim=-1)
@@ -180,6 +185,7 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
         collision,
         base_collision,
         joint_limits,
+        joint_speed_limits,
         foot_regulation,
         hip_regulation,
         hip_symmetry,

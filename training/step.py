@@ -87,7 +87,15 @@ class EnvironmentStep:
         edge = terrain.leave_distance or terrain.promotion_distance
         rasters = HeightRasters(palette.terrains, half_size=edge + reach, cell=seen.scan_cell, device=device)
 
-        self.read = StepReader(configuration, robot=robot, palette=palette, kind=kind, scan=self.scan, rasters=rasters)
+        self.read = StepReader(
+            configuration,
+            robot=robot,
+            parameters=parameters,
+            palette=palette,
+            kind=kind,
+            scan=self.scan,
+            rasters=rasters,
+        )
         self.rewards = RewardFunction(configuration.rewards, period, device)
         self.terminations = Terminations(configuration.termination)
         make_commands = resolve_class(

@@ -66,6 +66,8 @@ class StepInputs:
     """Lower soft joint limit [rad], (J,)."""
     soft_upper: torch.Tensor
     """Upper soft joint limit [rad], (J,)."""
+    soft_speed: torch.Tensor
+    """Soft limit of the joint speeds [rad/s], (J,); infinity where the reward ``joint_speed_limits`` has no weight."""
     hip_joints: torch.Tensor
     """Indices of the hip joints, which swing legs sideways, (H,) int64."""
     hip_pairs: torch.Tensor

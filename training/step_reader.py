@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from ..backends.base import PhysicsState
-from ..robots.base import Robot
+from ..robots.base import JointParameters, Robot
 from ..robots.body_plan import body_plan, joint_ranges, mirror_image
 from ..robots.rotation import rotate_inverse
 from .configuration import ConfigurationError
@@ -27,6 +27,7 @@ class StepReader:
         configuration: EnvironmentConfiguration,
         *,
         robot: Robot,
+        parameters: JointParameters,
         palette: TrainingPalette,
         kind: torch.Tensor,
         scan: torch.Tensor,
@@ -37,6 +38,10 @@ class StepReader:
         Args:
             kind: kind of tile of every world, (N,) int64.
             scan: points of the height scan about the base [m], (P, 2).
+
+        Raises:
+            ConfigurationError: no point of the scan is below the trunk, or joint speeds are judged of motors whose no-load
+                speeds nobody knows.
         """
         self._settings, self._rasters = configuration.rewards, rasters
         self._joint_velocity_limit = configuration.termination.joint_velocity
@@ -57,6 +62,7 @@ class StepReader:
         limited = ranges.isfinite().all(dim=1)
         self._soft_lower = torch.where(limited, middle - half, lower)
         self._soft_upper = torch.where(limited, middle + half, upper)
+        self._soft_speed = self._speed_limit(robot, parameters)
         plan = body_plan(robot)
         self._hips = self._indices(plan.abduction)
         pairs: list[tuple[int, int, float]] = []
@@ -78,6 +84,17 @@ class StepReader:
         leave = configuration.terrain.leave_distance
         distance = [leave if leave is not None and tile.ends else math.inf for tile in tiles]
         self._leave = torch.tensor(distance, device=device)[kind]
+
+    def _speed_limit(self, robot: Robot, parameters: JointParameters) -> torch.Tensor:
+        if not self._settings.joint_speed_limits:
+            return torch.full((robot.num_joints,), math.inf, device=self._device)
+        if parameters.no_load_speed is None:
+            raise ConfigurationError(
+                f"rewards.joint_speed_limits is {self._settings.joint_speed_limits:g}, but this parameter set of robot "
+                f"'{robot.name}' does not say how fast its motors turn; add full_torque_speed and no_load_speed to "
+                "robot.toml, or set it to 0"
+            )
+        return torch.tensor(parameters.no_load_speed, device=self._device) * self._settings.soft_speed_limit
 
     def _indices(self, found: Sequence[int] | Sequence[tuple[int, int]]) -> torch.Tensor:
         return torch.tensor(found, dtype=torch.int64, device=self._device)
@@ -133,6 +150,7 @@ class StepReader:
             default_joint_position=self._default_pose,
             soft_lower=self._soft_lower,
             soft_upper=self._soft_upper,
+            soft_speed=self._soft_speed,
             hip_joints=self._hips,
             hip_pairs=self._hip_pairs,
             hip_signs=self._hip_signs,

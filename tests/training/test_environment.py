@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from gaitgauge.robots.body_plan import joint_ranges
+from gaitgauge.robots.registry import load_robot
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
@@ -270,6 +271,23 @@ def test_motor_speeds_that_would_do_nothing_are_refused():
     ):
         make(randomization=faster, physics={"torque_speed_limit": False})
     make(physics={"torque_speed_limit": False})
+
+
+def test_soft_limits_of_joint_speeds_are_a_share_of_the_motors_own():
+    weights = RewardConfiguration(joint_speed_limits=-0.3, soft_speed_limit=0.8)
+    reader = make(rewards=weights).parts.read
+    assert reader._soft_speed.reshape(4, 3).unique().tolist() == pytest.approx([0.8 * 15.65, 0.8 * 30.0])
+    assert make().parts.read._soft_speed.isinf().all()
+
+
+def test_joint_speeds_of_motors_that_nobody_knows_are_not_judged(monkeypatch):
+    weights = RewardConfiguration(joint_speed_limits=-0.3)
+    nobody_knows = replace(load_robot("go2").parameters["training"], no_load_speed=None, full_torque_speed=None)
+    monkeypatch.setattr("gaitgauge.training.environment.joint_parameters", lambda *_: nobody_knows)
+    with pytest.raises(
+        ConfigurationError, match=r"^rewards\.joint_speed_limits is -0\.3, but .* 'go2' does not say .*, or set it to 0$"
+    ):
+        make(rewards=weights, physics={"torque_speed_limit": False})
 
 
 def test_motors_are_redrawn_for_reset_worlds_only():

@@ -29,6 +29,7 @@ def quiet():
         default_joint_position=torch.zeros(12),
         soft_lower=torch.full((12,), -1.0),
         soft_upper=torch.full((12,), 1.0),
+        soft_speed=torch.full((12,), 10.0),
         hip_joints=torch.tensor([0, 3, 6, 9]),
         hip_pairs=torch.tensor([[0, 3], [6, 9]]),
         hip_signs=torch.tensor([-1.0, -1.0]),
@@ -122,6 +123,7 @@ CASES = {
     "collision": ({"touching_bodies": torch.tensor([3.0, 0.0])}, 3.0, 0.0),
     "base_collision": ({"base_touching": torch.tensor([1.0, 0.0])}, 1.0, 0.0),
     "joint_limits": ({"joint_position": joints(1.25, -1.5, 0.9)}, 0.75, 0.0),
+    "joint_speed_limits": ({"joint_velocity": joints(11.0, -12.5, 9.9)}, 3.5, 0.0),
     "foot_regulation": (
         {
             "foot_velocity_w": feet([[1.0, 1.0, 9.0], [3.0, 0.0, 0.0], [0.0, 2.0, 0.0], [9.0, 0.0, 0.0]]),
@@ -182,7 +184,7 @@ def test_weights_follow_progress(quiet):
 def test_every_weight_names_a_term():
     settings = {"tracking_sigma", "dynamic_sigma", "sigma_linear_range", "sigma_yaw_range", "base_height_target"}
     settings |= {"foot_height_scale", "foot_height_over", "collision_force", "soft_limit", "own", "trunk_area"}
-    settings |= {"progress_along"}
+    settings |= {"progress_along", "soft_speed_limit"}
     assert {f.name for f in fields(RewardConfiguration)} - settings == set(REWARD_TERMS)
 
 
