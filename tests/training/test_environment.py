@@ -285,7 +285,8 @@ def test_joint_speeds_of_motors_that_nobody_knows_are_not_judged(monkeypatch):
     nobody_knows = replace(load_robot("go2").parameters["training"], no_load_speed=None, full_torque_speed=None)
     monkeypatch.setattr("gaitgauge.training.environment.joint_parameters", lambda *_: nobody_knows)
     with pytest.raises(
-        ConfigurationError, match=r"^rewards\.joint_speed_limits is -0\.3, but .* 'go2' does not say .*, or set it to 0$"
+        ConfigurationError,
+        match=r"^rewards\.joint_speed_limits is -0\.3, but .* 'go2' does not say .*, or set it to 0$",
     ):
         make(rewards=weights, physics={"torque_speed_limit": False})
 
