@@ -208,8 +208,8 @@ class RewardConfiguration:
     joint_limits: float = -2.0
     """Joint angle beyond the soft limits [rad]."""
     joint_speed_limits: float = 0.0
-    """Joint speed beyond the soft limit of the motor's own [rad/s]. An engine whose motors have no limit over speed, as the
-    published gauge, otherwise sees legs that the robot cannot have."""
+    """Joint speed beyond the soft limit of the motor's own [rad/s]. In suites without a limit of torque over speed, as the
+    published one, a policy may otherwise move its legs faster than the robot's motors can."""
     foot_regulation: float = -0.05
     """Squared foot speed close to the ground."""
     hip_regulation: float = -0.05
