@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from ..backends.base import PhysicsBackend, Randomization
@@ -34,8 +36,14 @@ def draw_bodies(
 class MotorParameters:
     """Drawn anew at every reset of a world."""
 
-    NAMES = ("stiffness_scale", "damping_scale", "motor_strength", "motor_speed", "motor_offset")
-    """Fields of ``Randomization``, in the order of ``MOTOR_COLUMNS``; offsets in rad."""
+    NEUTRAL: ClassVar[dict[str, float]] = {
+        "stiffness_scale": 1.0,
+        "damping_scale": 1.0,
+        "motor_strength": 1.0,
+        "motor_speed": 1.0,
+        "motor_offset": 0.0,
+    }
+    """Fields of ``Randomization`` in the order of ``MOTOR_COLUMNS``, as motors are that nobody varies; offsets in rad."""
 
     def __init__(
         self, ranges: RandomizationConfiguration, num_envs: int, num_joints: int, device: torch.device | str
@@ -44,9 +52,12 @@ class MotorParameters:
         bounds = [getattr(ranges, name) for name in MOTOR_COLUMNS]
         self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
         self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]
-        self.values = torch.ones(num_envs, len(self.NAMES), num_joints, device=device)
+        neutral = torch.tensor(list(self.NEUTRAL.values()), device=device)[:, None]
+        self._varied = [
+            name for name, bound in zip(self.NEUTRAL, bounds, strict=True) if set(bound) != {self.NEUTRAL[name]}
+        ]
+        self.values = neutral.repeat(num_envs, 1, num_joints)
         """All of them, (N, 5, J)."""
-        self.values[:, self.NAMES.index("motor_offset")] = 0.0
 
     def redraw(self, uniform: torch.Tensor, worlds: torch.Tensor) -> None:
         """New values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
@@ -54,12 +65,13 @@ class MotorParameters:
         torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
 
     def apply(self, backend: PhysicsBackend) -> None:
-        """Write all worlds' values into the physics.
+        """Write all worlds' values into the physics, of what varies: an engine need not be able to do the rest.
 
         All rows are written every time: selecting the rows of a mask would wait for the device to count them.
         """
-        backend.randomize(Randomization(**self.by_name()))
+        values = self.by_name()
+        backend.randomize(Randomization(**{name: values[name] for name in self._varied}))
 
     def by_name(self) -> dict[str, torch.Tensor]:
         """The values by the names of ``Randomization``, (N, J) each."""
-        return dict(zip(self.NAMES, self.values.unbind(1), strict=True))
+        return dict(zip(self.NEUTRAL, self.values.unbind(1), strict=True))

@@ -1,13 +1,14 @@
 """The training environment as rsl_rl and the learner see it, on the scripted engine."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
 from gaitgauge.robots.body_plan import joint_ranges
 from gaitgauge.robots.registry import load_robot
 from gaitgauge.training.configuration import ConfigurationError
+from gaitgauge.training.domain_randomization import MotorParameters
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import (
     CommandConfiguration,
@@ -20,7 +21,7 @@ from gaitgauge.training.environment_configuration import (
     RewardConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge_fake_engine import FakeScript
+from gaitgauge_fake_engine import FakeBackend, FakeScript
 from small_environment import FLAT, STAIRS, gliding, idle, make
 
 NEVER = math.inf
@@ -263,6 +264,20 @@ def test_randomization_ranges():
         assert float(values.mean()) == pytest.approx((low + high) / 2, abs=0.03 * (high - low))
 
 
+def test_motors_that_nobody_varies_are_not_written(monkeypatch):
+    """An engine that cannot vary them can be trained on."""
+    written = set()
+    really = FakeBackend.randomize
+
+    def randomize(engine, randomization, worlds=None):
+        written.update(f.name for f in fields(randomization) if getattr(randomization, f.name) is not None)
+        really(engine, randomization, worlds)
+
+    monkeypatch.setattr(FakeBackend, "randomize", randomize)
+    make(randomization=RandomizationConfiguration(motor_strength=(0.9, 0.9), motor_offset=(0.0, 0.0)))
+    assert written & set(MotorParameters.NEUTRAL) == {"stiffness_scale", "damping_scale", "motor_strength"}
+
+
 def test_motor_speeds_that_would_do_nothing_are_refused():
     faster = RandomizationConfiguration(motor_speed=(1.0, 2.5))
     with pytest.raises(
@@ -274,10 +289,13 @@ def test_motor_speeds_that_would_do_nothing_are_refused():
 
 
 def test_soft_limits_of_joint_speeds_are_a_share_of_the_motors_own():
+    def limits(environment):
+        parts = environment.parts
+        return parts.read(environment.backend.state, parts.memory, parts.action, parts.progress()).soft_speed
+
     weights = RewardConfiguration(joint_speed_limits=-0.3, soft_speed_limit=0.8)
-    reader = make(rewards=weights).parts.read
-    assert reader._soft_speed.reshape(4, 3).unique().tolist() == pytest.approx([0.8 * 15.65, 0.8 * 30.0])
-    assert make().parts.read._soft_speed.isinf().all()
+    assert limits(make(rewards=weights)).reshape(4, 3).unique().tolist() == pytest.approx([0.8 * 15.65, 0.8 * 30.0])
+    assert limits(make()).isinf().all()
 
 
 def test_joint_speeds_of_motors_that_nobody_knows_are_not_judged(monkeypatch):
