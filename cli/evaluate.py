@@ -106,15 +106,13 @@ def shower(display: ProgressDisplay) -> Callable[[Status], None]:
     """What an evaluation is watched with."""
 
     def show(status: Status) -> None:
-        done = 1.0 - status.remaining_work
-        left = (
-            f"about {duration(status.seconds * status.remaining_work / done)} left"
-            if done > 0.02
-            else "estimating time"
-        )
+        seconds = status.seconds_left
+        left = "estimating time" if seconds is None else f"about {duration(seconds)} left"
         places = sorted({f"{e.terrain} L{e.level}" if e.level else e.terrain for e in status.active})
         running = ", ".join(places[:5]) + (f" and {len(places) - 5} more" if len(places) > 5 else "")
-        display.update(done, f"{status.done} of about {status.expected} episodes, {left}", {"now:": running})
+        display.update(
+            1.0 - status.remaining_work, f"{status.done} of about {status.expected} episodes, {left}", {"now:": running}
+        )
 
     return show
 

@@ -33,12 +33,13 @@ from ..terrains.registry import make_terrain, terrain_names
 from .cluster import Cluster, ClusterError, ClusterWorkers, check_address
 from .coverage import coverage
 from .dispatcher import Dispatcher, Speculation, play
-from .episodes import QUALITY, Episode
+from .episodes import QUALITY
 from .goals import TARGET, check_terrain, count_sub_commands
 from .motors import gains_note, joint_parameters
 from .pipelines import PIPELINES, Environment, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
 from .policies import check_fit, file_digest
+from .progress import ProgressMeter, Status
 from .results import fold, health, rows_csv
 from .segments import count_segments
 from .store import RunFolder, StoreError
@@ -80,21 +81,6 @@ class Request:
     """Run the program that a policy file of the project's own format carries inside."""
     cluster: str | None = None
     """Address of a Ray cluster that plays, in as many workers as ``threads``; None for this machine. It changes the time alone."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Status:
-    """How far an evaluation is, for the progress display."""
-
-    done: int
-    """Counted episodes that have ended, those of an earlier run included."""
-    expected: int
-    """Episodes expected in all, those of searches that are still open by their probability."""
-    active: tuple[Episode, ...]
-    """Episodes at work."""
-    seconds: float
-    remaining_work: float
-    """Estimated share of the work that is left, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -367,39 +353,14 @@ def _watcher(
     """Tells ``watch`` now and then how far playing is."""
     if watch is None:
         return None
-    suite = prepared.suite
-    # control steps that a goal usually takes; a target is reached, or missed, in part of the time that it may take
-    crossing = 0.4 * max(suite.commands.target_time.values(), default=25.0)
-    settling = suite.settling.shortest
-    usual: dict[str, float] = {
-        g.name: sum(
-            sum([p.seconds for p in g.sub_commands[part]] if g.sub_commands else g.phases or (crossing,)) + settling
-            for part in range(count_sub_commands(suite, g.name))
-        )
-        / suite.physics.control_period
-        for g in suite.goals
-    }
+    meter = ProgressMeter(prepared.suite, began)
     next_time = began
 
     def on_progress(dispatcher: Dispatcher) -> None:
         nonlocal next_time
         if time.perf_counter() < next_time:
             return
-        plans, active = dispatcher.plans, dispatcher.active()
-        required = {episode for found in plans for episode in found.required}
-        done = sum(len(found.counted) - len(found.required) for found in plans)
-        left = len(required) + sum(probability for found in plans for probability in found.possible.values())
-        total = done + left
-        left -= sum(min(age / sum(usual[g] for g in e.goals), 0.95) for e, age in active.items() if e in required)
-        watch(
-            Status(
-                done=done,
-                expected=round(total),
-                active=tuple(active),
-                seconds=time.perf_counter() - began,
-                remaining_work=max(left, 0.0) / total if total else 0.0,
-            )
-        )
+        watch(meter.look(dispatcher.plans, dispatcher.active()))
         next_time = time.perf_counter() + _WATCH_INTERVAL
 
     return on_progress
