@@ -23,6 +23,7 @@ import import_public_cts
 import make_trot_policy
 import numpy as np
 import torch
+from gaitgauge.files.provenance import without_place
 from gaitgauge.files.writing import json_text, write_atomically
 from gaitgauge.gauge.comparison import load_result
 from gaitgauge.gauge.evaluate import Request, evaluate
@@ -77,7 +78,7 @@ def card_of(
     """
     path = name if name in shipped_policies() else f"{name}.gauge.pt"
     suite = results["suite"]["name"]
-    provenance = {k: v for k, v in results["provenance"].items() if k not in ("host", "command")}
+    provenance = without_place(results["provenance"])
     provenance["command"] = f"gaitgauge evaluate {path} --suite {suite}"
     provenance["host"] = ""
     provenance["commit"] = provenance.get("commit") or commit

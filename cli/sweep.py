@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time as clock
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ import typer
 
 from ..files.writing import lock_folder, make_folder
 from ..gauge.cluster import check_address
-from ..training.sweep.file import SweepError, load_sweep
+from ..training.sweep.file import Sweep, SweepError, load_sweep
 from ..training.sweep.folding import fold_sweep
 from ..training.sweep.jobs import Jobs
-from ..training.sweep.runs import plan_runs
+from ..training.sweep.keeping import keep_runs
+from ..training.sweep.runs import SweepRun, plan_runs
 from .console import Terminal, make_table, shell_command
 from .errors import complain
 from .train import parse_duration
@@ -30,9 +31,13 @@ def run_sweep(
     cluster: str | None,
     time: str | None,
     report: bool,
+    keep: Path | None,
     json_output: bool,
 ) -> None:
-    """Run what is left of a sweep, and print its table; exit code 1 where an entry could not be done, 128 + signal where stopped."""
+    """Run what is left of a sweep, print its table, and keep what is done.
+
+    The exit code is 1 where an entry could not be done, 128 + signal where it was stopped.
+    """
     began = clock.monotonic()
     sweep = load_sweep(file)
     folder = (out or Path("results") / f"sweep-{sweep.name}").absolute()
@@ -47,7 +52,7 @@ def run_sweep(
     make_folder(folder, SweepError)
     lock = lock_folder(folder, SweepError)
     try:
-        runs, refused = plan_runs(sweep, folder)
+        runs, refused = plan_runs(sweep, folder, to_train=not report)
         if not runs:
             raise SweepError(next(iter(refused.values())))
         for name, sentence in refused.items():
@@ -56,6 +61,8 @@ def run_sweep(
         jobs = Jobs(sweep, threads=threads, deadline=deadline, say=errors.say, gauging=gauging)
         outcome = jobs.work([] if report else runs)
         found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
+        if keep is not None:
+            errors.say(_keep(sweep, runs, keep.absolute()))
     finally:
         lock.release()
     if json_output:
@@ -72,6 +79,20 @@ def run_sweep(
         raise typer.Exit(128 + outcome.stopped)
     if refused or outcome.failures:
         raise typer.Exit(1)
+
+
+def _keep(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> str:
+    """Keep what is done in a folder, with a page and a table of all that it holds; one sentence on what was kept."""
+    make_folder(folder, SweepError, option="--keep")
+    lock = lock_folder(folder, SweepError)
+    try:
+        labels = keep_runs(sweep, runs, folder)
+        there, refused = plan_runs(sweep, folder, to_train=False)
+        found = fold_sweep(sweep, there, refused, {}, folder)
+    finally:
+        lock.release()
+    done = sum(row["state"] == "gauged" for row in found["runs"])
+    return f"kept {len(labels)} more runs, {done} of {len(runs)} are in {folder}"
 
 
 def print_sweep(console: Terminal, found: Mapping[str, Any]) -> None:

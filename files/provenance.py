@@ -51,6 +51,11 @@ def provenance(
     } | measured
 
 
+def without_place(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Provenance that names no machine and, since commands hold paths, no command: what may be given to everybody."""
+    return {name: value for name, value in found.items() if name not in ("host", "command")}
+
+
 @cache
 def versions() -> dict[str, str]:
     """Versions of the programs that decide about results."""

@@ -145,11 +145,16 @@ def sweep(
     report: Annotated[
         bool, typer.Option("--report", help="Train and gauge nothing: tables and curves of what there is.")
     ] = False,
+    keep: Annotated[
+        Path | None,
+        typer.Option(help="Keep what is done in this folder too, small: policies, curves, results; no checkpoints."),
+    ] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print sweep.json instead of a table.")] = False,
 ) -> None:
     """Train a list of tasks, settings and seeds on the GPUs there are, gauge each, and compare; goes on where it stopped.
 
     Examples:
-      gaitgauge sweep benchmarks/sweeps/methods.toml
+      gaitgauge sweep benchmarks/sweeps/baselines.toml
       gaitgauge sweep trainings.toml --report
+      gaitgauge sweep trainings.toml --time 25m --keep finished
     """

@@ -78,3 +78,12 @@ def test_a_whole_sweep(run, tiny):
     told = run("sweep", "sweep.toml", "--out", "out", "--report")
     assert told.exit_code == 1 and "sweep.html" in told.stdout and "HIM" in told.stdout
     assert json.loads((tiny / "out" / "sweep.json").read_text()) == found
+    keeps = run("sweep", "sweep.toml", "--out", "out", "--report", "--keep", "kept")
+    assert "kept 2 more runs, 2 of 2 are in" in keeps.stderr
+    elsewhere = run("sweep", "sweep.toml", "--out", "kept", "--json")
+    assert "is trained" not in elsewhere.stderr and "is gauged" not in elsewhere.stderr
+    scores = [(r["entry"], r["state"], r["score"]) for r in json.loads(elsewhere.stdout)["runs"]]
+    assert scores == [(r["entry"], r["state"], r["score"]) for r in found["runs"]]
+    kept = tiny / "kept" / "runs" / "HIM" / "seed-0" / "kept"
+    checked = run("verify", kept / "results.json", "--policy", kept / "policy.gauge.pt", "--suite", "tiny.toml", "--json")
+    assert checked.exit_code == 0 and json.loads(checked.stdout)["holds"], checked.output

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ...files.parsing import one_line, read_text
 from ...files.writing import csv_text
+from .file import SweepError
+from .runs import KEPT_CURVES
 
 Curve = tuple[list[float], list[float]]
 """Environment steps [millions] and values."""
@@ -17,10 +22,17 @@ FIGURES = (SCORE, *TAGS.values())
 """Titles of the charts, in order."""
 _MOST = 400
 """Points of a curve."""
+_KEPT_HEAD = ("figure", "environment_steps_millions", "value")
 
 
 def learning_curves(run: Path) -> dict[str, Curve]:
-    """Curves of a run directory by their titles, those that its log has; long ones are thinned out."""
+    """Curves of a run directory by their titles, those that its log has, or of what was kept of it; long ones are thinned out.
+
+    Raises:
+        SweepError: the kept curves are damaged.
+    """
+    if (kept := run / KEPT_CURVES).is_file():
+        return _read_curves(kept)
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run), size_guidance={"scalars": 0})
@@ -50,6 +62,36 @@ def curves_csv(curves: Mapping[tuple[str, int], Mapping[str, Curve]]) -> str:
         for figure, points in figures.items():
             rows += [(entry, seed, figure, f"{x:.6g}", f"{y:.6g}") for x, y in zip(*points, strict=True)]
     return csv_text(rows)
+
+
+def kept_curves_csv(curves: Mapping[str, Curve]) -> str:
+    """A row for each point of one run's curves: figure, environment steps and value."""
+    rows: list[Sequence[object]] = [_KEPT_HEAD]
+    for figure, points in curves.items():
+        rows += [(figure, f"{x:.6g}", f"{y:.6g}") for x, y in zip(*points, strict=True)]
+    return csv_text(rows)
+
+
+def _read_curves(path: Path) -> dict[str, Curve]:
+    """What ``kept_curves_csv`` wrote."""
+    found: dict[str, Curve] = {}
+    text = read_text(path, "learning curves", SweepError)
+    try:
+        rows = [tuple(row) for row in csv.reader(text.splitlines())]
+        if rows[:1] != [_KEPT_HEAD]:
+            raise ValueError
+        for figure, *point in rows[1:]:
+            steps, value = map(float, point)
+            if figure not in FIGURES or not math.isfinite(steps + value):
+                raise ValueError
+            for values, number in zip(found.setdefault(figure, ([], [])), (steps, value), strict=True):
+                values.append(number)
+    except (ValueError, csv.Error) as error:
+        raise SweepError(
+            f"the learning curves '{one_line(path)}' are damaged: each row has a figure ({', '.join(FIGURES)}) and two numbers; "
+            "keep the run again"
+        ) from error
+    return found
 
 
 def by_figure(

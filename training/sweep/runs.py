@@ -20,6 +20,11 @@ from ..run_directory import read_run_json
 from ..side_process import PROGRAM
 from .file import NO_SUITE, Sweep, SweepEntry, SweepError
 
+KEPT = "kept"
+"""Folder of a run's small form (``keeping``)."""
+KEPT_CURVES = "curves.csv"
+KEPT_POLICY = "policy.gauge.pt"
+
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRun:
@@ -51,9 +56,15 @@ class SweepRun:
 
     @property
     def directory(self) -> Path | None:
-        """Its run directory, the latest with a checkpoint; None before the first checkpoint."""
+        """Its run directory, the latest with a checkpoint, or what was kept of it; None before the first checkpoint."""
         found = [run for run in self.folder.glob("logs/*/*") if latest_checkpoint(run)]
+        if not found and (self._kept / "results.json").is_file():
+            return self._kept
         return max(found, key=lambda run: run.name) if found else None
+
+    @property
+    def _kept(self) -> Path:
+        return self.folder / KEPT
 
     @property
     def trained(self) -> bool:
@@ -67,15 +78,19 @@ class SweepRun:
         return noted.get("outcome") == "finished" and noted.get("iteration", 0) >= self.iterations
 
     def policy(self, sweep: Sweep) -> Path | None:
-        """What of it is gauged; None before it is trained."""
+        """What of it is gauged; None before it is trained, and where it was not kept."""
         run = self.directory
         if run is None:
             return None
+        if run == self._kept:
+            return run / KEPT_POLICY if (run / KEPT_POLICY).is_file() else None
         best = run / "best.pt"
         return best if sweep.checkpoint == "best" and best.is_file() else latest_checkpoint(run)
 
     def results(self, sweep: Sweep) -> Path | None:
         """Where the gauging of its policy goes; None before it is trained."""
+        if self.directory == self._kept:
+            return self._kept
         policy = self.policy(sweep)
         return self.folder / "gauge" / policy.stem if policy else None
 
@@ -129,8 +144,11 @@ class SweepRun:
             )
 
 
-def plan_runs(sweep: Sweep, folder: Path) -> tuple[list[SweepRun], dict[str, str]]:
+def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[list[SweepRun], dict[str, str]]:
     """The runs of a sweep, those of the first seed first, and of each entry that cannot start one sentence on why.
+
+    Args:
+        to_train: whether this machine must be able to train them; what was trained elsewhere can be reported without a GPU.
 
     Raises:
         SuiteError: no such suite.
@@ -146,7 +164,7 @@ def plan_runs(sweep: Sweep, folder: Path) -> tuple[list[SweepRun], dict[str, str
             task=entry.task,
             overrides=settings,
             backend=backend,
-            device=entry.device,
+            device=entry.device if to_train else "cpu",
             init_from=init_from,
             score_suite=None,
         )
