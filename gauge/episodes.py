@@ -59,6 +59,8 @@ class Record:
     success: bool | None = None
     """Whether the target was reached; None where there was none."""
     falls: int = 0
+    fallen: tuple[tuple[int, int], ...] | None = None
+    """Goal, index into ``episode.goals``, and sub-command of each fall; None in files that do not say."""
     diverged: bool = False
     """The physics became invalid; counts as a fall."""
     overflowed: bool = False
@@ -121,7 +123,12 @@ class Record:
             episode = build(Episode, {n: head[n] for n in names}, "its head", RecordError)
             if episode.key != path.stem:
                 raise RecordError(f"it holds episode {one_line(episode.key)}")
-            rest = build(_Outcome, {n: head[n] for n in _HEAD}, "its head", RecordError)
+            rest = build(
+                _Outcome,
+                {**{n: head[n] for n in _HEAD if n != "fallen"}, "fallen": head.get("fallen")},
+                "its head",
+                RecordError,
+            )
             record = cls(episode=episode, **vars(rest), **arrays)
             record.check_samples()
             return record
@@ -154,6 +161,8 @@ class Record:
             raise RecordError("goal_index is out of range")
         if count and self.part_index.min() < 0:
             raise RecordError("part_index is out of range")
+        if self.fallen is not None and len(self.fallen) != self.falls:
+            raise RecordError(f"fallen has {len(self.fallen)} falls, not {self.falls}")
 
 
 def read_records(folder: Path) -> tuple[dict[Episode, Record], list[Path]]:
@@ -181,6 +190,7 @@ class _Outcome:
 
     success: bool | None
     falls: Count
+    fallen: tuple[tuple[Count, Count], ...] | None
     diverged: bool
     overflowed: bool
     restarted: bool

@@ -242,7 +242,7 @@ def rows_csv(records: Sequence[Record]) -> str:
 
     Every metric and the quality have three columns, ``_mean``, ``_mean25`` and ``_mean50``, as measured and without the weight of
     the level: of the whole episode as its score takes them, averaged over goals; of a sub-command over its samples. They are empty
-    in the rows of level tests, which take no samples.
+    in the rows of level tests, which take no samples. Falls of a sub-command are empty where a record does not say.
     """
     text = io.StringIO()
     columns = next((r.columns for r in records if r.columns), ())
@@ -257,6 +257,8 @@ def rows_csv(records: Sequence[Record]) -> str:
             name = record.episode.goals[goal]
             count = int(((record.goal_index == goal) & (record.part_index == part)).sum())
             row = asdict(record.episode) | {"goals": name, "command": command_name(name, part), "samples": count}
+            if record.fallen is not None:
+                row["falls"] = record.fallen.count((goal, part))
             rows.append(row | _numbers(names, [values[goal, part] for values in of_columns]))
     if rows:
         head = list(dict.fromkeys(key for key in rows[0] if key not in names))

@@ -192,6 +192,7 @@ class OpenEpisode:
             episode=self.episode,
             success=any(o.reached for o in outcomes) if has_target else None,
             falls=sum(o.falls for o in outcomes),
+            fallen=tuple((s.goal_index, s.sub_command) for s, o in counted for _ in range(o.falls)),
             diverged=any(o.diverged for o in outcomes),
             overflowed=any(o.overflowed for o in outcomes),
             restarted=restarted,

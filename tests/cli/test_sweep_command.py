@@ -85,5 +85,7 @@ def test_a_whole_sweep(run, tiny):
     scores = [(r["entry"], r["state"], r["score"]) for r in json.loads(elsewhere.stdout)["runs"]]
     assert scores == [(r["entry"], r["state"], r["score"]) for r in found["runs"]]
     kept = tiny / "kept" / "runs" / "HIM" / "seed-0" / "kept"
-    checked = run("verify", kept / "results.json", "--policy", kept / "policy.gauge.pt", "--suite", "tiny.toml", "--json")
+    checked = run(
+        "verify", kept / "results.json", "--policy", kept / "policy.gauge.pt", "--suite", "tiny.toml", "--json"
+    )
     assert checked.exit_code == 0 and json.loads(checked.stdout)["holds"], checked.output

@@ -52,6 +52,9 @@ def edited(tmp_path):
     [
         ({"falls": "many"}, {}, "its head: falls is 'many'; it must be a whole number"),
         ({"falls": -1}, {}, "falls is -1"),
+        ({"fallen": [[0, 7]]}, {}, "fallen has 1 falls, not 0"),
+        ({"falls": 1, "fallen": [[0]]}, {}, "fallen"),
+        ({"falls": 1, "fallen": [[0, -7]]}, {}, "fallen"),
         ({"diverged": 1}, {}, "diverged is 1; it must be true or false"),
         ({"columns": 3}, {}, "columns is 3"),
         ({"columns": ["one"]}, {}, r"samples is float32 \[3, 2\], not float32 \[3, 1\]"),
@@ -78,6 +81,10 @@ def test_an_edited_record_is_one_sentence(edited, head, arrays, sentence):
     with pytest.raises(RecordError, match=sentence) as caught:
         Record.load(path)
     assert str(caught.value).isprintable() and path.name in str(caught.value)
+
+
+def test_a_record_of_before_does_not_say_where_it_fell(edited):
+    assert Record.load(edited({"falls": 2, "fallen": "gone"})).fallen is None
 
 
 @pytest.mark.parametrize("head", [b"", b"[]", b"3", b"{" * 5000, b"\xff", b'{"terrain": "\\ud800"}', b"9" * 5000])

@@ -56,7 +56,7 @@ def tale(chance, falls, penetrations):
 
 def in_a_row(told, goals, closes, restarts):
     """Goal after goal, part after part; a step has one sample, which says where it belongs."""
-    samples, falls, restarted, overflowed = [], 0, False, False
+    samples, fallen, restarted, overflowed = [], [], False, False
     for number, goal in enumerate(goals):
         part, again = 0, False
         while part < PARTS[goal]:
@@ -69,11 +69,11 @@ def in_a_row(told, goals, closes, restarts):
             if interrupted:
                 restarted, again, part = True, True, 0
                 continue
-            falls += told_now["fell"]
+            fallen += [(number, part)] * told_now["fell"]
             if told_now["fell"] and closes:
                 break
             part += 1
-    return samples, falls, restarted, overflowed
+    return samples, tuple(fallen), restarted, overflowed
 
 
 def outcome_of(told, segment, restarts):
@@ -112,7 +112,7 @@ def test_any_order_of_completion_gives_what_playing_in_a_row_gives(name, falls, 
     for _ in range(60):
         goals = chance.choice([(DIAGONAL, MAXIMUM), (MAXIMUM,), (DIAGONAL,)])
         told = tale(chance, falls, penetrations)
-        samples, fell, restarted, overflowed = in_a_row(told, goals, closes, restarts)
+        samples, fallen, restarted, overflowed = in_a_row(told, goals, closes, restarts)
         opened = OpenEpisode(episode(*goals), rules)
         playing = opened.start()
         assert len(playing) == sum(PARTS[g] for g in goals)
@@ -129,8 +129,9 @@ def test_any_order_of_completion_gives_what_playing_in_a_row_gives(name, falls, 
         assert [tuple(row) for row in record.samples.astype(int).tolist()] == samples
         assert record.goal_index.tolist() == [s[0] for s in samples]
         assert record.part_index.tolist() == [s[1] for s in samples]
-        assert (record.falls, record.restarted, record.overflowed) == (fell, restarted, overflowed)
-        assert record.diverged == (fell > 0)
+        assert (record.fallen, record.restarted, record.overflowed) == (fallen, restarted, overflowed)
+        assert record.falls == len(fallen)
+        assert record.diverged == (len(fallen) > 0)
         assert (record.control_steps, record.physics_steps) == (len(samples), 10 * len(samples))
         assert record.success is None
         assert played <= 2 * sum(PARTS[g] for g in goals)

@@ -33,6 +33,7 @@ def full_record(**changes):
     options = {
         "episode": episode(DIAGONAL, MAXIMUM, friction=0.1 + 0.2, terrain="wave", level=3),
         "falls": 2,
+        "fallen": ((0, 7), (0, 7)),
         "diverged": True,
         "control_steps": 12,
         "physics_steps": 125,
@@ -47,7 +48,7 @@ def full_record(**changes):
 def same(one, other):
     assert one.summary() == other.summary()
     assert one.episode == other.episode
-    assert one.columns == other.columns
+    assert (one.columns, one.fallen) == (other.columns, other.fallen)
     for name in ("samples", "goal_index", "part_index"):
         assert getattr(one, name).dtype == getattr(other, name).dtype
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
