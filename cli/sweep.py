@@ -53,7 +53,7 @@ def run_sweep(
     lock = lock_folder(folder, SweepError)
     try:
         runs, refused = plan_runs(sweep, folder, to_train=not report)
-        if not runs:
+        if not runs and len(set(refused.values())) == 1:
             raise SweepError(next(iter(refused.values())))
         for name, sentence in refused.items():
             complain(f"gaitgauge: entry '{name}' cannot start: {sentence}")

@@ -38,6 +38,15 @@ def test_a_machine_without_a_gpu(refused, tiny):
     assert "wants a GPU and this machine has none" in refused("sweep", "sweep.toml")
 
 
+def test_entries_that_cannot_start_for_different_reasons_are_all_named(run, tiny):
+    text = sweep(one='task = "go2-ctss"', two='task = "go2-cts"\nsettings = ["environment.num_env=3"]')
+    (tiny / "sweep.toml").write_text(text)
+    result = run("sweep", "sweep.toml", "--out", "out")
+    told = [line for line in result.stderr.splitlines() if line.startswith("gaitgauge: ")]
+    assert result.exit_code == 1 and len(told) == 2
+    assert "'one' cannot start: unknown task" in told[0] and "'two' cannot start" in told[1] and "num_envs" in told[1]
+
+
 def test_a_suite_that_is_not_there(refused, tmp_path):
     (tmp_path / "sweep.toml").write_text(sweep(one='task = "go2-cts"').replace("tiny.toml", "robogauge-1.2"))
     assert "robogauge-1.2" in refused("sweep", "sweep.toml")
