@@ -34,7 +34,7 @@ def run_sweep(
     keep: Path | None,
     json_output: bool,
 ) -> None:
-    """Run what is left of a sweep, print its table, and keep what is done.
+    """Run what is left of a sweep, print its table, and keep what is trained.
 
     The exit code is 1 where an entry could not be done, 128 + signal where it was stopped.
     """
@@ -82,7 +82,7 @@ def run_sweep(
 
 
 def _keep(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> str:
-    """Keep what is done in a folder, with a page and a table of all that it holds; one sentence on what was kept."""
+    """Keep what is trained in a folder, with a page and a table of all that it holds; one sentence on what was kept."""
     make_folder(folder, SweepError, option="--keep")
     lock = lock_folder(folder, SweepError)
     try:
@@ -91,8 +91,10 @@ def _keep(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> str:
         found = fold_sweep(sweep, there, refused, {}, folder)
     finally:
         lock.release()
-    done = sum(row["state"] == "gauged" for row in found["runs"])
-    return f"kept {len(labels)} more runs, {done} of {len(runs)} are in {folder}"
+    states = [row["state"] for row in found["runs"]]
+    there_now = f"{states.count('gauged') + states.count('trained')} of {len(runs)} are in {folder}"
+    to_gauge = f", {states.count('trained')} of them not gauged yet" if "trained" in states else ""
+    return f"kept {len(labels)} runs; {there_now}{to_gauge}"
 
 
 def print_sweep(console: Terminal, found: Mapping[str, Any]) -> None:

@@ -147,7 +147,7 @@ def sweep(
     ] = False,
     keep: Annotated[
         Path | None,
-        typer.Option(help="Keep what is done in this folder too, small: policies, curves, results; no checkpoints."),
+        typer.Option(help="Keep what is trained in this folder too, small: policies, curves, results; no checkpoints."),
     ] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print sweep.json instead of a table.")] = False,
 ) -> None:

@@ -88,7 +88,7 @@ def test_a_whole_sweep(run, tiny):
     assert told.exit_code == 1 and "sweep.html" in told.stdout and "HIM" in told.stdout
     assert json.loads((tiny / "out" / "sweep.json").read_text()) == found
     keeps = run("sweep", "sweep.toml", "--out", "out", "--report", "--keep", "kept")
-    assert "kept 2 more runs, 2 of 2 are in" in keeps.stderr
+    assert "kept 2 runs; 2 of 2 are in" in keeps.stderr
     elsewhere = run("sweep", "sweep.toml", "--out", "kept", "--json")
     assert "is trained" not in elsewhere.stderr and "is gauged" not in elsewhere.stderr
     scores = [(r["entry"], r["state"], r["score"]) for r in json.loads(elsewhere.stdout)["runs"]]

@@ -109,6 +109,31 @@ def test_without_its_policy_a_kept_run_is_still_done(finished, kept):
     assert keep_runs(SWEEP, [run], finished.with_name("elsewhere")) == ["one, seed 0"]
 
 
+def test_what_is_not_gauged_yet_is_kept_and_gauged_where_there_is_no_gpu(finished, tmp_path):
+    alone = replace(SWEEP, entry=(replace(SWEEP.entry[0], device=None),))
+    bare, kept = tmp_path / "bare", tmp_path / "kept"
+    shutil.copytree(finished, bare)
+    results = bare / "runs" / "one" / "seed-0" / "gauge" / "model_3" / "results.json"
+    results.rename(tmp_path / "results.json")
+    runs, _ = plan_runs(alone, bare, to_train=False)
+    assert keep_runs(alone, runs, kept) == ["one, seed 0"] and keep_runs(alone, runs, kept) == []
+    (run,), refused = plan_runs(alone, kept)
+    assert refused == {} and run.trained and not run.gauged(alone)
+    command = run.gauging_command(alone, where=[])
+    policy, out = run.folder / "kept" / "policy.gauge.pt", run.folder / "gauge" / "policy.gauge"
+    assert command[3:5] == ["evaluate", str(policy)] and command[command.index("--out") + 1] == str(out)
+    # once it is gauged, here or where it was trained, its results are kept too
+    (tmp_path / "results.json").rename(results)
+    assert keep_runs(alone, runs, kept) == ["one, seed 0"]
+    assert run.gauged(alone) and run.results(alone) == run.folder / "kept"
+
+
+def test_half_of_a_small_form_is_none(kept):
+    (kept / "runs" / "one" / "seed-0" / "kept" / "run.json").unlink()
+    (run, _), _ = plan_runs(SWEEP, kept, to_train=False)
+    assert run.directory is None and not run.trained
+
+
 def test_what_was_kept_before_stays(finished, kept):
     runs, _ = plan_runs(SWEEP, finished, to_train=False)
     before = {path: path.stat().st_mtime_ns for path in kept.rglob("*")}

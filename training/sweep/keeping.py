@@ -1,8 +1,8 @@
-"""What is kept of runs that are done, small enough to carry home and to commit.
+"""What is kept of runs that are trained, small enough to carry home and to commit.
 
-``runs/<entry>/seed-<n>/kept/`` holds ``run.json`` with the settings, ``curves.csv``, ``policy.gauge.pt`` and the gauging's
-``results.json``, a score card of that policy; no checkpoints, no episodes, no name of a machine or folder. To a sweep such a run
-is done: it goes on with the others, and reports on all.
+``runs/<entry>/seed-<n>/kept/`` holds ``run.json`` with the settings, ``curves.csv``, ``policy.gauge.pt`` and, where it was gauged,
+``results.json``, a score card of that policy; no checkpoints, no episodes, no name of a machine or folder. A sweep does not train
+such a run again: it gauges it where that is left, goes on with the others, and reports on all.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from ...policy.importing import import_policy
 from ..run_directory import read_run_json
 from .curves import kept_curves_csv, learning_curves
 from .file import Sweep, SweepError
-from .runs import KEPT, KEPT_CURVES, KEPT_POLICY, SweepRun
+from .runs import KEPT, KEPT_CURVES, KEPT_POLICY, KEPT_RESULTS, SweepRun
 
 
 def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> list[str]:
-    """Keep what is done in another folder, beside what it holds already.
+    """Keep what is trained in another folder, beside what it holds already.
 
     Args:
         folder: of a sweep of the same trainings.
@@ -37,29 +37,31 @@ def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> list[str]
     """
     kept = []
     for run in runs:
-        if not (run.trained and run.gauged(sweep)):
+        if not run.trained:
             continue
         target = replace(run, folder=folder / "runs" / run.entry.name / f"seed-{run.seed}")
         if target.folder.resolve() == run.folder.resolve():
             raise SweepError(f"'{folder}' is the sweep's own folder; give another one to keep its runs in")
         target.claim()
-        if not target.gauged(sweep):
+        if not target.trained or (run.gauged(sweep) and not target.gauged(sweep)):
             _keep(sweep, run, target.folder / KEPT)
             kept.append(run.label)
     return kept
 
 
 def _keep(sweep: Sweep, run: SweepRun, place: Path) -> None:
-    """Write the small form of a run; the results, by which it is known to be done, come last."""
+    """Write the small form of a run; its description, by which it is known, comes last."""
     directory, results, policy = run.directory, run.results(sweep), run.policy(sweep)
-    assert directory is not None and results is not None
+    assert directory is not None
     make_folder(place, SweepError)
-    write_atomically(place / "run.json", json_text(without_place(read_run_json(directory))), SweepError)
     write_atomically(place / KEPT_CURVES, kept_curves_csv(learning_curves(directory)), SweepError)
-    card = load_result(results)
-    if policy is not None:  # a kept run may have been left without
+    if policy is not None:  # a run that was kept and gauged may have been left without
         import_policy(policy, place / KEPT_POLICY)
-        of_policy = {"path": KEPT_POLICY, "file_sha256": file_digest(str(place / KEPT_POLICY))}
-        card["policy"] = {**card["policy"], **of_policy}
-    card["provenance"] = without_place(card["provenance"])
-    write_atomically(place / "results.json", json_text(card), SweepError)
+    if results is not None and run.gauged(sweep):
+        card = load_result(results)
+        if policy is not None:
+            of_policy = {"path": KEPT_POLICY, "file_sha256": file_digest(str(place / KEPT_POLICY))}
+            card["policy"] = {**card["policy"], **of_policy}
+        card["provenance"] = without_place(card["provenance"])
+        write_atomically(place / KEPT_RESULTS, json_text(card), SweepError)
+    write_atomically(place / "run.json", json_text(without_place(read_run_json(directory))), SweepError)

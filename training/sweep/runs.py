@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ KEPT = "kept"
 """Folder of a run's small form (``keeping``)."""
 KEPT_CURVES = "curves.csv"
 KEPT_POLICY = "policy.gauge.pt"
+KEPT_RESULTS = "results.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +59,12 @@ class SweepRun:
     def directory(self) -> Path | None:
         """Its run directory, the latest with a checkpoint, or what was kept of it; None before the first checkpoint."""
         found = [run for run in self.folder.glob("logs/*/*") if latest_checkpoint(run)]
-        if not found and (self._kept / "results.json").is_file():
-            return self._kept
-        return max(found, key=lambda run: run.name) if found else None
+        if found:
+            return max(found, key=lambda run: run.name)
+        whole = (self._kept / "run.json").is_file() and any(
+            (self._kept / name).is_file() for name in (KEPT_POLICY, KEPT_RESULTS)
+        )
+        return self._kept if whole else None
 
     @property
     def _kept(self) -> Path:
@@ -89,7 +93,7 @@ class SweepRun:
 
     def results(self, sweep: Sweep) -> Path | None:
         """Where the gauging of its policy goes; None before it is trained."""
-        if self.directory == self._kept:
+        if self.directory == self._kept and (self._kept / KEPT_RESULTS).is_file():
             return self._kept
         policy = self.policy(sweep)
         return self.folder / "gauge" / policy.stem if policy else None
@@ -97,7 +101,7 @@ class SweepRun:
     def gauged(self, sweep: Sweep) -> bool:
         """Whether its policy has been gauged."""
         results = self.results(sweep)
-        return results is not None and (results / "results.json").is_file()
+        return results is not None and (results / KEPT_RESULTS).is_file()
 
     def training_command(self, sweep: Sweep, *, seconds: float | None, score_threads: int) -> list[str]:
         """Begins the training or goes on with it; ``seconds`` is its wall-clock limit [s]."""
@@ -144,11 +148,20 @@ class SweepRun:
             )
 
 
+def _is_trained(run: SweepRun) -> bool:
+    """Whether nothing of a run is left to train; one whose description is damaged is told of when it is to go on."""
+    try:
+        return run.trained
+    except CheckpointError:
+        return False
+
+
 def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[list[SweepRun], dict[str, str]]:
     """The runs of a sweep, those of the first seed first, and of each entry that cannot start one sentence on why.
 
     Args:
-        to_train: whether this machine must be able to train them; what was trained elsewhere can be reported without a GPU.
+        to_train: whether this machine must be able to train what is left to train. What was trained elsewhere can be gauged and
+            reported on any.
 
     Raises:
         SuiteError: no such suite.
@@ -164,12 +177,12 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
             task=entry.task,
             overrides=settings,
             backend=backend,
-            device=entry.device if to_train else "cpu",
+            device=entry.device,
             init_from=init_from,
             score_suite=None,
         )
         try:
-            plan = prepare(request)
+            plan = prepare(replace(request, device="cpu"))
             own = []
             for turn, seed in enumerate(sweep.seeds if entry.seeds is None else entry.seeds):
                 run = SweepRun(
@@ -177,13 +190,17 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
                     seed=seed,
                     settings=settings,
                     backend=backend,
-                    on_gpu=plan.device.startswith("cuda"),
+                    on_gpu=False,
                     iterations=plan.task.training.run.iterations,
                     init_from=init_from,
                     folder=folder / "runs" / entry.name / f"seed-{seed}",
                 )
-                run.claim()
                 own.append((turn, run))
+            if to_train and not all(_is_trained(run) for _, run in own):
+                on_gpu = prepare(request).device.startswith("cuda")  # refuses what this machine cannot train
+                own = [(turn, replace(run, on_gpu=on_gpu)) for turn, run in own]
+            for _, run in own:
+                run.claim()
         except (TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError, SweepError) as error:
             refused[entry.name] = str(error)
             continue
