@@ -50,6 +50,10 @@ def run_sweep(
     if folder.exists() and not folder.is_dir():
         raise SweepError(f"'{folder}' is a file; give another folder with --out")
     make_folder(folder, SweepError)
+    if keep is not None:  # what is wrong with it is said before hours of training
+        make_folder(keep, SweepError, option="--keep")
+        if keep.samefile(folder):
+            raise SweepError(f"--keep is '{keep}', the sweep's own folder; give another one")
     lock = lock_folder(folder, SweepError)
     try:
         runs, refused = plan_runs(sweep, folder, to_train=not report)
@@ -83,7 +87,6 @@ def run_sweep(
 
 def _keep(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> str:
     """Keep what is trained in a folder, with a page and a table of all that it holds; one sentence on what was kept."""
-    make_folder(folder, SweepError, option="--keep")
     lock = lock_folder(folder, SweepError)
     try:
         labels = keep_runs(sweep, runs, folder)

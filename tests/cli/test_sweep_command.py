@@ -38,6 +38,13 @@ def test_a_machine_without_a_gpu(refused, tiny):
     assert "wants a GPU and this machine has none" in refused("sweep", "sweep.toml")
 
 
+def test_a_folder_to_keep_runs_in_that_cannot_be_is_told_at_once(refused, tiny):
+    (tiny / "sweep.toml").write_text(sweep(one='task = "go2-cts"'))
+    (tiny / "file").touch()
+    assert "--keep is 'out', the sweep's own folder" in refused("sweep", "sweep.toml", "--out", "out", "--keep", "out")
+    assert "choose another --keep" in refused("sweep", "sweep.toml", "--out", "out", "--keep", "file")
+
+
 def test_entries_that_cannot_start_for_different_reasons_are_all_named(run, tiny):
     text = sweep(one='task = "go2-ctss"', two='task = "go2-cts"\nsettings = ["environment.num_env=3"]')
     (tiny / "sweep.toml").write_text(text)

@@ -141,12 +141,6 @@ def test_what_was_kept_before_stays(finished, kept):
     assert {path: path.stat().st_mtime_ns for path in kept.rglob("*")} == before
 
 
-def test_its_own_folder_is_refused(finished):
-    runs, _ = plan_runs(SWEEP, finished, to_train=False)
-    with pytest.raises(SweepError, match="own folder; give another"):
-        keep_runs(SWEEP, runs, finished)
-
-
 @pytest.mark.parametrize(
     "text",
     [

@@ -26,13 +26,13 @@ def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> list[str]
     """Keep what is trained in another folder, beside what it holds already.
 
     Args:
-        folder: of a sweep of the same trainings.
+        folder: another one, of a sweep of the same trainings.
 
     Returns:
         Labels of the runs that were kept now; what was kept before is left as it is.
 
     Raises:
-        SweepError: the folder is the sweep's own, holds trainings with other settings, or cannot be written to.
+        SweepError: the folder holds trainings with other settings, or cannot be written to.
         CheckpointError, ComparisonError, PolicyError: a file of a run is damaged.
     """
     kept = []
@@ -40,8 +40,6 @@ def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> list[str]
         if not run.trained:
             continue
         target = replace(run, folder=folder / "runs" / run.entry.name / f"seed-{run.seed}")
-        if target.folder.resolve() == run.folder.resolve():
-            raise SweepError(f"'{folder}' is the sweep's own folder; give another one to keep its runs in")
         target.claim()
         if not target.trained or (run.gauged(sweep) and not target.gauged(sweep)):
             _keep(sweep, run, target.folder / KEPT)
