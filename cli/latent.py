@@ -39,7 +39,9 @@ def print_latents(console: Terminal, results: Mapping[str, Any]) -> None:
                     table.add_row(entry["label"], name, *(f"{n:.2f}" for n in numbers))
         console.print(table)
     for entry in results["policies"]:
-        if (experts := entry["experts"]) is not None:
+        if (experts := entry["experts"]) is None:
+            console.say(f"{entry['label']} has no experts, so there are no weights of them to show")
+        else:
             count = len(next(iter(experts["terrains"].values())))
             console.say(
                 f"{entry['label']}: {experts['at_once']:.1f} of {count} experts count at once, {experts['in_all']:.1f} in all"

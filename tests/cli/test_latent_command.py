@@ -2,6 +2,9 @@
 
 import json
 
+from gaitgauge.cli.console import Terminal
+from gaitgauge.cli.latent import print_latents
+
 SHORT = ("--terrain", "flat", "--terrain", "wave", "--seconds", 0.2, "--robots", 2, "--threads", 1)
 
 
@@ -20,3 +23,9 @@ def test_one_sentence_for_a_policy_with_nothing_to_look_at(refused, policy):
         f"'{policy}' has neither an encoder nor experts (network 'mlp'), so there is no latent to look at; give a policy of "
         "another network, such as cts or moe_cts"
     )
+
+
+def test_a_policy_without_experts_is_told_so(capsys):
+    plain = {"label": "plain", "terrains": {}, "commands": {}, "experts": None, "falls": 0, "walkers": 2}
+    print_latents(Terminal(), {"terrains": ["flat"], "commands": ["forward"], "policies": [plain]})
+    assert "plain has no experts, so there are no weights of them to show" in capsys.readouterr().out
