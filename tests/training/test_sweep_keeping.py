@@ -128,6 +128,14 @@ def test_what_is_not_gauged_yet_is_kept_and_gauged_where_there_is_no_gpu(finishe
     assert run.gauged(alone) and run.results(alone) == run.folder / "kept"
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_seed_that_is_trained_is_gauged_where_the_other_cannot_be_trained(finished):
+    both = replace(SWEEP, entry=(replace(SWEEP.entry[0], device=None, seeds=(0, 1)),))
+    runs, refused = plan_runs(both, finished)
+    assert [run.label for run in runs] == ["one, seed 0"]
+    assert "this machine has none" in refused["one"]
+
+
 def test_half_of_a_small_form_is_none(kept):
     (kept / "runs" / "one" / "seed-0" / "kept" / "run.json").unlink()
     (run, _), _ = plan_runs(SWEEP, kept, to_train=False)

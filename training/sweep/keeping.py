@@ -1,7 +1,7 @@
 """What is kept of runs that are trained, small enough to carry home and to commit.
 
 ``runs/<entry>/seed-<n>/kept/`` holds ``run.json`` with the settings, ``curves.csv``, ``policy.gauge.pt`` and, where it was gauged,
-``results.json``, a score card of that policy; no checkpoints, no episodes, no name of a machine or folder. A sweep does not train
+``results.json``, a score card of that policy; no checkpoints, no episodes, no machine's name and no command. A sweep does not train
 such a run again: it gauges it where that is left, goes on with the others, and reports on all.
 """
 
@@ -19,7 +19,7 @@ from ...policy.importing import import_policy
 from ..run_directory import read_run_json
 from .curves import kept_curves_csv, learning_curves
 from .file import Sweep, SweepError
-from .runs import KEPT, KEPT_CURVES, KEPT_POLICY, KEPT_RESULTS, SweepRun
+from .runs import KEPT, KEPT_CURVES, KEPT_POLICY, RESULTS, SweepRun
 
 
 def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> list[str]:
@@ -61,5 +61,5 @@ def _keep(sweep: Sweep, run: SweepRun, place: Path) -> None:
             of_policy = {"path": KEPT_POLICY, "file_sha256": file_digest(str(place / KEPT_POLICY))}
             card["policy"] = {**card["policy"], **of_policy}
         card["provenance"] = without_place(card["provenance"])
-        write_atomically(place / KEPT_RESULTS, json_text(card), SweepError)
+        write_atomically(place / RESULTS, json_text(card), SweepError)
     write_atomically(place / "run.json", json_text(without_place(read_run_json(directory))), SweepError)

@@ -24,7 +24,7 @@ KEPT = "kept"
 """Folder of a run's small form (``keeping``)."""
 KEPT_CURVES = "curves.csv"
 KEPT_POLICY = "policy.gauge.pt"
-KEPT_RESULTS = "results.json"
+RESULTS = "results.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class SweepRun:
         if found:
             return max(found, key=lambda run: run.name)
         whole = (self._kept / "run.json").is_file() and any(
-            (self._kept / name).is_file() for name in (KEPT_POLICY, KEPT_RESULTS)
+            (self._kept / name).is_file() for name in (KEPT_POLICY, RESULTS)
         )
         return self._kept if whole else None
 
@@ -93,7 +93,7 @@ class SweepRun:
 
     def results(self, sweep: Sweep) -> Path | None:
         """Where the gauging of its policy goes; None before it is trained."""
-        if self.directory == self._kept and (self._kept / KEPT_RESULTS).is_file():
+        if self.directory == self._kept and (self._kept / RESULTS).is_file():
             return self._kept
         policy = self.policy(sweep)
         return self.folder / "gauge" / policy.stem if policy else None
@@ -101,7 +101,7 @@ class SweepRun:
     def gauged(self, sweep: Sweep) -> bool:
         """Whether its policy has been gauged."""
         results = self.results(sweep)
-        return results is not None and (results / KEPT_RESULTS).is_file()
+        return results is not None and (results / RESULTS).is_file()
 
     def training_command(self, sweep: Sweep, *, seconds: float | None, score_threads: int) -> list[str]:
         """Begins the training or goes on with it; ``seconds`` is its wall-clock limit [s]."""
@@ -182,27 +182,32 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
             score_suite=None,
         )
         try:
-            plan = prepare(replace(request, device="cpu"))
-            own = []
-            for turn, seed in enumerate(sweep.seeds if entry.seeds is None else entry.seeds):
-                run = SweepRun(
+            iterations = prepare(replace(request, device="cpu")).task.training.run.iterations
+            own = [
+                SweepRun(
                     entry=entry,
                     seed=seed,
                     settings=settings,
                     backend=backend,
                     on_gpu=False,
-                    iterations=plan.task.training.run.iterations,
+                    iterations=iterations,
                     init_from=init_from,
                     folder=folder / "runs" / entry.name / f"seed-{seed}",
                 )
-                own.append((turn, run))
-            if to_train and not all(_is_trained(run) for _, run in own):
-                on_gpu = prepare(request).device.startswith("cuda")  # refuses what this machine cannot train
-                own = [(turn, replace(run, on_gpu=on_gpu)) for turn, run in own]
-            for _, run in own:
+                for seed in (sweep.seeds if entry.seeds is None else entry.seeds)
+            ]
+            if to_train and not all(map(_is_trained, own)):
+                try:
+                    on_gpu = prepare(request).device.startswith("cuda")
+                except BackendError as error:  # what was trained elsewhere can be gauged all the same
+                    refused[entry.name] = str(error)
+                    own = [run for run in own if _is_trained(run)]
+                else:
+                    own = [replace(run, on_gpu=on_gpu) for run in own]
+            for run in own:
                 run.claim()
         except (TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError, SweepError) as error:
             refused[entry.name] = str(error)
             continue
-        runs += own
+        runs += enumerate(own)
     return [run for _, run in sorted(runs, key=lambda item: item[0])], refused
