@@ -16,7 +16,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
         "pipeline", "suite", "scenarios", "terrain", "terrains", "level", "levels", "friction", "frictions", "payloads", "seed",
         "seeds", "repeats", "robots", "robot", "command", "seconds", "quick", "factors", "attribution", "margin",
     ),
-    "Where it runs": ("backend", "backends", "reference", "device", "threads", "num_envs", "capture", "fuse", "cluster"),
+    "Where it runs": ("backend", "backends", "reference", "device", "threads", "per_gpu", "num_envs", "capture", "fuse", "cluster"),
     "How it is watched": ("viewer", "port", "host", "gamepad"),
     "Beginning and end of a run": ("iterations", "time", "init_from"),
     "Scores while it learns": ("score", "score_every", "score_suite", "score_threads"),

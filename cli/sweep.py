@@ -28,6 +28,7 @@ def run_sweep(
     file: Path,
     out: Path | None,
     threads: int | None,
+    per_gpu: int,
     cluster: str | None,
     time: str | None,
     report: bool,
@@ -62,7 +63,7 @@ def run_sweep(
         for name, sentence in refused.items():
             complain(f"gaitgauge: entry '{name}' cannot start: {sentence}")
         threads = threads or max((os.cpu_count() or 2) // 2, 1)
-        jobs = Jobs(sweep, threads=threads, deadline=deadline, say=errors.say, gauging=gauging)
+        jobs = Jobs(sweep, threads=threads, deadline=deadline, say=errors.say, per_gpu=per_gpu, gauging=gauging)
         outcome = jobs.work([] if report else runs)
         found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
         if keep is not None:

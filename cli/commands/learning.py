@@ -140,6 +140,9 @@ def sweep(
     threads: Annotated[
         int | None, typer.Option(min=1, max=MOST_THREADS, help="CPU threads of the gauge. Default: half of the cores.")
     ] = None,
+    per_gpu: Annotated[
+        int, typer.Option(min=1, max=16, help="Trainings side by side on each GPU; faster together where MPS runs.")
+    ] = 1,
     cluster: options.Cluster = None,
     time: Annotated[str | None, typer.Option(help="Stop after this wall-clock time: seconds, 9m, 2h or 1h30m.")] = None,
     report: Annotated[

@@ -231,9 +231,9 @@ def scripted(folder: Path, name: str, *, seed: int = 0, on_gpu: bool = True) -> 
     )
 
 
-def work(runs, *, gpus=("3", "5"), deadline=None):
+def work(runs, *, gpus=("3", "5"), per_gpu=1, deadline=None):
     said = []
-    outcome = Jobs(SWEEP, threads=1, deadline=deadline, say=said.append, gpus=gpus).work(runs)
+    outcome = Jobs(SWEEP, threads=1, deadline=deadline, say=said.append, gpus=gpus, per_gpu=per_gpu).work(runs)
     return outcome, said
 
 
@@ -251,6 +251,17 @@ def test_each_gpu_has_one_training_and_a_failure_stops_nothing(tmp_path):
     (tmp_path / "order").unlink()
     assert list(work(runs)[0].failures) == ["broken, seed 0"]
     assert (tmp_path / "order").read_text().startswith("broken, seed 0")
+
+
+def test_a_gpu_may_have_several_trainings(tmp_path):
+    """All GPUs get one before any gets two."""
+    runs = [scripted(tmp_path, name) for name in ("slow-1", "slow-2", "slow-3", "slow-4", "last")]
+    outcome, said = work(runs, per_gpu=2)
+    places = [s.partition(" is trained on ")[2].partition(";")[0] for s in said if " is trained on " in s]
+    assert places[:4] == ["GPU 3", "GPU 5", "GPU 3, beside 1", "GPU 5, beside 1"]
+    order = dict(line.split(" on ") for line in (tmp_path / "order").read_text().splitlines())
+    assert [order[f"slow-{n}, seed 0"] for n in (1, 2, 3, 4)] == ["3", "5", "3", "5"]
+    assert outcome.failures == {} and outcome.unfinished == []
 
 
 def test_what_is_at_work_when_time_is_up_is_gone_on_with(tmp_path):

@@ -1,4 +1,4 @@
-"""Trainings and gaugings as processes, each in a place of its own: one training on a GPU, one on the CPU, one gauging beside them."""
+"""Trainings and gaugings as processes, each in a place of its own: some on each GPU, one on the CPU, one gauging beside them."""
 
 from __future__ import annotations
 
@@ -64,6 +64,7 @@ class Jobs:
         deadline: float | None,
         say: Callable[[str], None],
         gpus: Sequence[str] | None = None,
+        per_gpu: int = 1,
         gauging: Sequence[str] | None = None,
     ) -> None:
         """Prepare.
@@ -74,13 +75,18 @@ class Jobs:
             deadline: value of ``time.monotonic()`` at which to stop, None for no limit.
             say: called with a sentence now and then.
             gpus: as ``visible_gpus``, which is the default.
+            per_gpu: trainings side by side on each GPU.
             gauging: options of ``evaluate`` on who plays a gauging; None for the threads.
         """
         self._sweep, self._deadline, self._say = sweep, deadline, say
         self._gauging = ("--threads", str(threads)) if gauging is None else gauging
         gpus = visible_gpus() if gpus is None else gpus
-        self._places = {f"GPU {gpu}": {"CUDA_VISIBLE_DEVICES": gpu, "OMP_NUM_THREADS": "1"} for gpu in gpus}
-        self._score_threads = max(threads // max(len(gpus), 1), 1)
+        self._places = {
+            f"GPU {gpu}" + (f", beside {beside}" if beside else ""): {"CUDA_VISIBLE_DEVICES": gpu, "OMP_NUM_THREADS": "1"}
+            for beside in range(per_gpu)
+            for gpu in gpus
+        }
+        self._score_threads = max(threads // max(len(self._places), 1), 1)
         self._to_train: deque[SweepRun] = deque()
         self._to_gauge: deque[SweepRun] = deque()
         self._live: list[_Job] = []
