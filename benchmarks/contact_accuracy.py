@@ -2,8 +2,9 @@
 
     python benchmarks/contact_accuracy.py                                    # MuJoCo, all settings, all grounds
     python benchmarks/contact_accuracy.py --engine mujoco-warp --worlds 8 --seconds 2 --settings pyramidal,1,6
+    python benchmarks/contact_accuracy.py --settings elliptic,10,6 --foot-condim 4 --self-collision
 
-Robots walk with the shipped policy in the physics of training (``TRAINING_PHYSICS`` but for what is varied; no torque
+Robots walk with a policy, the shipped one, in the physics of training (``TRAINING_PHYSICS`` but for what is varied; no torque
 limits by speed, which the policy was not trained with) on flat ground, on stairs (forwards level 7, backwards level 5)
 and on a height field (waves, level 6). Every physics step after the first half second counts until a robot falls.
 Printed are, for each ground and setting: the force on a foot that 99 % and 99.9 % of all feet and steps stay below and
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -76,19 +78,21 @@ class Contacts:
         )
 
 
-def options(setting: str) -> PhysicsOptions:
-    """Training's physics with ``CONE,IMPRATIO,ITERATIONS``."""
+def options(setting: str, **changes: Any) -> PhysicsOptions:
+    """Training's physics with ``CONE,IMPRATIO,ITERATIONS`` and other changes."""
     cone, impratio, iterations = setting.split(",")
-    physics = replace(TRAINING_PHYSICS, cone=cone, impratio=float(impratio), torque_speed_limit=False)
+    physics = replace(TRAINING_PHYSICS, cone=cone, impratio=float(impratio), torque_speed_limit=False, **changes)
     if iterations == "converged":
         return replace(physics, iterations=200, ls_iterations=100, tolerance=1e-10)
     return replace(physics, iterations=int(iterations))
 
 
-def walk(engine: str, ground: str, physics: PhysicsOptions, *, worlds: int, seconds: float) -> Contacts:
+def walk(
+    engine: str, ground: str, physics: PhysicsOptions, *, worlds: int, seconds: float, path: str = "pretrained"
+) -> Contacts:
     """Let robots walk, each with another command, and look at their feet after every physics step."""
     robot = load_robot("go2")
-    policy = load_policy("pretrained", robot)
+    policy = load_policy(path, robot)
     terrains = [make_terrain(name, level) for name, level in GROUNDS[ground]]
     index = tuple(i % len(terrains) for i in range(worlds))
     scene = Scene(
@@ -148,15 +152,26 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=4.0, help="time walked")
     parser.add_argument("--ground", nargs="+", choices=GROUNDS, default=list(GROUNDS))
     parser.add_argument("--settings", nargs="+", default=SETTINGS, metavar="CONE,IMPRATIO,ITERATIONS")
+    parser.add_argument("--policy", default="pretrained")
+    parser.add_argument("--foot-condim", type=int, default=TRAINING_PHYSICS.foot_condim)
+    parser.add_argument("--self-collision", action="store_true", default=TRAINING_PHYSICS.self_collision)
     arguments = parser.parse_args(argv)
+    changes = {"foot_condim": arguments.foot_condim, "self_collision": arguments.self_collision}
     print(COLUMNS)
     for ground in arguments.ground:
-        rows = [(setting, options(setting)) for setting in arguments.settings]
+        rows = [(setting, options(setting, **changes)) for setting in arguments.settings]
         if arguments.engine == "mujoco":
-            fine = replace(options("elliptic,1,converged"), timestep=0.001, substeps=20)
+            fine = replace(options("elliptic,1,converged", **changes), timestep=0.001, substeps=20)
             rows.insert(0, ("elliptic,1,1 ms", fine))
         for setting, physics in rows:
-            found = walk(arguments.engine, ground, physics, worlds=arguments.worlds, seconds=arguments.seconds)
+            found = walk(
+                arguments.engine,
+                ground,
+                physics,
+                worlds=arguments.worlds,
+                seconds=arguments.seconds,
+                path=arguments.policy,
+            )
             cone, impratio, iterations = setting.split(",")
             print(f"{ground:7} {cone:9} {impratio:>8} {iterations:>10} | {found.row()}", flush=True)
 
