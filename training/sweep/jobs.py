@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -81,11 +82,10 @@ class Jobs:
         self._sweep, self._deadline, self._say = sweep, deadline, say
         self._gauging = ("--threads", str(threads)) if gauging is None else gauging
         gpus = visible_gpus() if gpus is None else gpus
-        self._places = {
-            f"GPU {gpu}" + (f", beside {beside}" if beside else ""): {"CUDA_VISIBLE_DEVICES": gpu, "OMP_NUM_THREADS": "1"}
-            for beside in range(per_gpu)
-            for gpu in gpus
-        }
+        self._places: dict[str, dict[str, str]] = {}
+        for beside, gpu in itertools.product(range(per_gpu), gpus):  # every GPU has one before any has two
+            place = f"GPU {gpu}, beside {beside}" if beside else f"GPU {gpu}"
+            self._places[place] = {"CUDA_VISIBLE_DEVICES": gpu, "OMP_NUM_THREADS": "1"}
         self._score_threads = max(threads // max(len(self._places), 1), 1)
         self._to_train: deque[SweepRun] = deque()
         self._to_gauge: deque[SweepRun] = deque()
