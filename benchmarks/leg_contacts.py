@@ -2,16 +2,18 @@
 
     python benchmarks/leg_contacts.py pretrained other.gauge.pt --friction 1.0
 
-Robots walk with full and half commands for 5 s, with noise, latency and physics of a suite, once as it is and once with parts of the
-robot that pass through each other. Prints the share of control steps at whose end parts of a robot touch, the mean error of the
-yaw rate, and the pairs that touch most often.
+Robots walk with full and half commands for 5 s, with noise, latency and physics of a suite, once as it is and once with
+parts of the robot that pass through each other. Prints the share of control steps at whose end parts of a robot touch, the
+mean error of the yaw rate, the pairs that touch most often, and how many robots fell; what has fallen is not watched.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import torch
@@ -20,9 +22,10 @@ from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge.episodes import Episode
 from gaitgauge.gauge.suite import Suite, load_suite
 from gaitgauge.gauge.walking import Walk
+from gaitgauge.policy.base import Policy
 from gaitgauge.policy.its_robot import robot_for
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.robots import Robot
+from gaitgauge.robots.rotation import tilt
 from gaitgauge.terrains.gauge_terrains import flat
 
 DIRECTIONS = {
@@ -49,7 +52,18 @@ class Watched:
     """Steps at whose end parts of the robot touched."""
     yaw_error: float = 0.0
     """Sum over steps [rad/s]."""
-    pairs: Counter[str]
+    pairs: Counter[str] = field(default_factory=Counter)
+    falls: int = 0
+
+    @property
+    def touching_share(self) -> float:
+        """Share of the steps in which parts touched, NaN where none was watched."""
+        return self.touching / self.steps if self.steps else math.nan
+
+    @property
+    def mean_yaw_error(self) -> float:
+        """[rad/s], NaN where no step was watched."""
+        return self.yaw_error / self.steps if self.steps else math.nan
 
 
 def self_contacts(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
@@ -61,55 +75,61 @@ def self_contacts(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
 
 
 def walk(
-    path: str, robot: Robot, suite: Suite, commands: torch.Tensor, options: argparse.Namespace, *, self_collision: bool
+    policy: Policy, suite: Suite, commands: torch.Tensor, options: argparse.Namespace, *, self_collision: bool
 ) -> list[Watched]:
     """Let robots walk with each of the commands, (N, 3), and watch them."""
-    count, each = len(commands), options.robots
-    scene = Scene(
-        robot=robot,
-        parameters=robot.parameters[suite.parameters],
-        terrains=(flat(),),
-        terrain_index=(0,) * (count * each),
-        physics=replace(suite.physics, self_collision=self_collision),
-    )
-    backend = make_backend("mujoco", scene, device="cpu")
-    backend.randomize(Randomization(friction=torch.full((count * each,), options.friction)))
+    robot = robot_for(policy.contract)
+    command_of = [command for command in range(len(commands)) for _ in range(options.robots)]
     episodes = [
         Episode(
             terrain="flat",
             level=0,
             friction=options.friction,
             payload=0.0,
-            seed=seed,
+            seed=world % options.robots,
             stage="legs",
             goals=(str(command),),
         )
-        for command in range(count)
-        for seed in range(each)
+        for world, command in enumerate(command_of)
     ]
-    steps = SETTLED + round(options.seconds / suite.physics.control_period)
-    robots = Walk(load_policy(path), backend, suite.noise, episodes, steps=steps)
-    position = torch.zeros(count * each, 3, dtype=backend.dtype)
-    position[:, 2] = robot.stand_height
-    robots.reset(position, torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=backend.dtype).expand(count * each, -1))
-    told = commands.repeat_interleave(each, 0)
+    scene = Scene(
+        robot=robot,
+        parameters=robot.parameters[suite.parameters],
+        terrains=(flat(),),
+        terrain_index=(0,) * len(episodes),
+        physics=replace(suite.physics, self_collision=self_collision),
+    )
     model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
     data = mujoco.MjData(model)
     joints = [model.joint(name).qposadr[0] for name in robot.joint_names]
-    found = [Watched(pairs=Counter()) for _ in range(count)]
-    for step in range(steps):
-        robots.step(told * (step >= STANDING))
-        if step < SETTLED:
-            continue
-        yaw_error = (robots.state.base_angular_velocity_b[:, 2] - told[:, 2]).abs()
-        for world in range(count * each):
-            data.qpos[joints] = robots.state.joint_position[world]
-            pairs = self_contacts(model, data)
-            watched = found[world // each]
-            watched.steps += 1
-            watched.touching += bool(pairs)
-            watched.yaw_error += float(yaw_error[world])
-            watched.pairs.update(pairs)
+    steps = SETTLED + round(options.seconds / scene.physics.control_period)
+    found = [Watched() for _ in commands]
+    with closing(make_backend("mujoco", scene, device="cpu")) as physics:
+        robots = Walk(policy, physics, suite.noise, episodes, steps=steps)
+        physics.randomize(Randomization(friction=robots.tensor([options.friction] * len(episodes))))
+        robots.reset(
+            robots.tensor([(0.0, 0.0, robot.stand_height)] * len(episodes)),
+            robots.tensor([(1.0, 0.0, 0.0, 0.0)] * len(episodes)),
+        )
+        told = commands[command_of]
+        fallen = torch.zeros(len(episodes), dtype=torch.bool)
+        for step in range(steps):
+            robots.step(told * (step >= STANDING))
+            state = robots.state
+            fallen |= state.diverged | (tilt(state.base_quaternion_w) > suite.events.fall_tilt)
+            if step < SETTLED:
+                continue
+            yaw_error = (state.base_angular_velocity_b[:, 2] - told[:, 2]).abs()
+            for world in (~fallen).nonzero()[:, 0].tolist():
+                data.qpos[joints] = state.joint_position[world]
+                pairs = self_contacts(model, data)
+                watched = found[command_of[world]]
+                watched.steps += 1
+                watched.touching += bool(pairs)
+                watched.yaw_error += float(yaw_error[world])
+                watched.pairs.update(pairs)
+    for world in fallen.nonzero()[:, 0].tolist():
+        found[command_of[world]].falls += 1
     return found
 
 
@@ -125,18 +145,20 @@ def main() -> None:
     options = parser.parse_args()
     suite = load_suite(options.suite)
     for path in options.policies:
-        contract = load_policy(path).contract
-        robot = robot_for(contract)
-        limits = torch.tensor(robot.command_limits)
+        policy = load_policy(path)
+        limits = torch.tensor(robot_for(policy.contract).command_limits)
         names = [f"{name}, {share:g}" for share in options.shares for name in DIRECTIONS]
         commands = torch.cat([share * limits * torch.tensor(list(DIRECTIONS.values())) for share in options.shares])
         print(f"{path}, friction {options.friction:g}: with self-collision, and without", flush=True)
-        both = [walk(path, robot, suite, commands, options, self_collision=on) for on in (True, False)]
+        both = [walk(policy, suite, commands, options, self_collision=on) for on in (True, False)]
         for name, on, off in zip(names, *both, strict=True):
-            pairs = ", ".join(f"{pair} {100 * n / on.steps:.0f} %" for pair, n in on.pairs.most_common(3))
-            shares = " and ".join(f"{100 * w.touching / w.steps:5.1f} %" for w in (on, off))
-            errors = " and ".join(f"{w.yaw_error / w.steps:.2f}" for w in (on, off))
-            print(f"  {name:16} touching {shares}, yaw rate off by {errors} rad/s  {pairs}", flush=True)
+            pairs = "".join(f", {pair} {100 * n / on.steps:.0f} %" for pair, n in on.pairs.most_common(3))
+            shares = " and ".join(f"{100 * w.touching_share:5.1f} %" for w in (on, off))
+            errors = " and ".join(f"{w.mean_yaw_error:.2f}" for w in (on, off))
+            print(
+                f"  {name:16} touching {shares}, yaw rate off by {errors} rad/s, {on.falls} and {off.falls} fell{pairs}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":
