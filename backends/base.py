@@ -48,9 +48,9 @@ class PhysicsOptions:
     tolerance: Annotated[float, Field(ge=0.0, le=1.0)] = 1e-8
     """Solver tolerance."""
     foot_condim: Annotated[int, Field(ge=1, le=6)] | None = None
-    """Contact dimension of the feet (3 sliding, 6 with torsion and rolling); None keeps the robot file's."""
-    self_collision: bool = True
-    """Whether the robot's own bodies collide with each other."""
+    """Contact dimension of the feet (3 sliding, 4 with torsion, 6 with rolling too); None keeps the robot file's."""
+    self_collision: Literal[True, False, "feet"] = True
+    """Whether the robot's own parts meet each other; with ``feet`` only where one of the two is a foot."""
     torque_limits: bool = True
     """Whether motor torque is clipped to the parameter set's ``torque_limit``."""
     torque_speed_limit: bool = False

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from ...robots.body_plan import body_plan
 from ...terrains.base import Box, Terrain
 from ..base import TRAINING_PHYSICS, BackendError, PhysicsOptions
-from .bench import FLAT, Bench, Worlds, expect, expect_close
-from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, level_stance
+from .bench import FLAT, WORLDS, Bench, Worlds, expect, expect_close
+from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, level_stance, rotated
 from .suite import check
 
 
@@ -244,6 +244,62 @@ def hold_to_converged(bench: Bench, physics: PhysicsOptions) -> str:
         expect_close(f"foot force that {share:.1%} stay below [N]", force, wanted, allowed * wanted)
         said.append(f"{share:.1%} of the foot forces below {force:.0f} N ({wanted:.0f} N)")
     return ", ".join(said)
+
+
+@check("contact/torsion", "foot_condim_6", "plane")
+def torsion(bench: Bench) -> str:
+    """Spinning on one foot below its centre of mass, a robot slows down as the reference does: by torsional friction of dimension 4."""
+    parameters, seconds = bench.stiff(), 0.1
+    rates = 3.0 * (-1.0) ** np.arange(WORLDS)
+    starts = [
+        spun(Reference(bench.robot, parameters), foot=row % len(bench.robot.foot_names), rate=rate)
+        for row, rate in enumerate(rates)
+    ]
+    reset = {name: [start[name] for start in starts] for name in starts[0]}
+    found, expected = {}, {}
+    for condim in (3, 4):
+        physics = bench.physics(foot_condim=condim)
+        with bench.worlds(parameters, foot_condim=condim) as worlds:
+            worlds.reset(**reset, held_target=worlds.default_pose)
+            worlds.run(seconds)
+            found[condim] = yaw_rate(worlds.read())
+        expected[condim] = np.zeros(WORLDS)
+        for row, start in enumerate(starts):
+            reference = Reference(bench.robot, parameters, timestep=physics.timestep, ground=physics)
+            reference.place(**start)
+            reference.step(bench.robot.default_joint_position, substeps=round(seconds / physics.timestep))
+            expected[condim][row] = rotated(reference.base_quaternion, reference.base_angular_velocity)[2]
+    slowed = np.abs(expected[3] - expected[4])
+    what = f"yaw rate after {seconds} s on a foot of dimension {{}} [rad/s]"
+    error = max(
+        expect_close(what.format(condim), rate, expected[condim], 0.02 * slowed + 0.001)
+        for condim, rate in found.items()
+    )
+    return f"torsional friction takes {slowed.min():.3f} to {slowed.max():.3f} of 3 rad/s, to {error:.1e} rad/s"
+
+
+def spun(reference: Reference, *, foot: int, rate: float) -> dict[str, np.ndarray]:
+    """Arguments of a reset: a robot in its default pose, turned until its centre of mass is above a foot, which touches the ground,
+    and spinning about the vertical through both at ``rate`` [rad/s].
+    """
+    reference.place((0.0, 0.0, 0.0))
+    to_foot = reference.foot_position[foot]
+    upwards = reference.center_of_mass - to_foot
+    axis = np.cross(upwards, [0.0, 0.0, 1.0])
+    turn = axis_angle(axis, float(np.arctan2(np.linalg.norm(axis), upwards[2])))
+    arm, spin = -rotated(turn, to_foot), np.array([0.0, 0.0, rate])
+    return {
+        "base_position": arm + np.array([0.0, 0.0, reference.foot_radius]),
+        "base_quaternion": turn,
+        "base_linear_velocity": np.cross(spin, arm),
+        "base_angular_velocity": rotated(turn * [1.0, -1.0, -1.0, -1.0], spin),
+    }
+
+
+def yaw_rate(state: SimpleNamespace) -> np.ndarray:
+    """Angular velocity about the vertical [rad/s], (N,)."""
+    pairs = zip(state.base_quaternion_w, state.base_angular_velocity_b, strict=True)
+    return np.array([rotated(turn, rate)[2] for turn, rate in pairs])
 
 
 def trunk_pillar(reference: Reference) -> tuple[Terrain, float]:

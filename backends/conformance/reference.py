@@ -120,6 +120,11 @@ class Reference:
         return self.data.qpos[3:7].copy()
 
     @property
+    def base_angular_velocity(self) -> Array:
+        """Body frame [rad/s], (3,)."""
+        return self.data.qvel[3:6].copy()
+
+    @property
     def joint_position(self) -> Array:
         """[rad], (J,)."""
         return self.data.qpos[self.at_position]
@@ -135,15 +140,18 @@ class Reference:
         return self.data.geom_xpos[self.feet].copy()
 
     @property
+    def foot_jacobian(self) -> Array:
+        """Of the foot centres, world frame, by the model's degrees of freedom, (F, 3, V)."""
+        jacobian = np.zeros((len(self.feet), 3, self.model.nv))
+        for of_foot, foot in zip(jacobian, self.feet, strict=True):
+            point, body = self.data.geom_xpos[foot], int(self.model.geom_bodyid[foot])
+            mujoco.mj_jac(self.model, self.data, of_foot, None, point, body)
+        return jacobian
+
+    @property
     def foot_velocity(self) -> Array:
         """Velocities of the foot centres, world frame [m/s], (F, 3)."""
-        velocity = []
-        for foot in self.feet:
-            jacobian = np.zeros((3, self.model.nv))
-            point, body = self.data.geom_xpos[foot], int(self.model.geom_bodyid[foot])
-            mujoco.mj_jac(self.model, self.data, jacobian, None, point, body)
-            velocity.append(jacobian @ self.data.qvel)
-        return np.array(velocity)
+        return self.foot_jacobian @ self.data.qvel
 
     @property
     def foot_force(self) -> Array:
@@ -168,8 +176,10 @@ def _add_ground(spec: mujoco.MjSpec, robot: Robot, physics: PhysicsOptions) -> N
     for geom in spec.geoms:
         if geom.name in robot.foot_geoms and physics.foot_condim is not None:
             geom.condim = physics.foot_condim
-        if not physics.self_collision and (geom.contype or geom.conaffinity):
-            geom.contype, geom.conaffinity = 0, 1
+        if physics.self_collision in (False, "feet") and (geom.contype or geom.conaffinity):
+            # bit 1 is the ground's, with bit 2 a foot meets all parts
+            foot = physics.self_collision == "feet" and geom.name in robot.foot_geoms
+            geom.contype, geom.conaffinity = 2 if foot else 0, 3
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
     option, pyramidal = spec.option, physics.cone == "pyramidal"
     option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL if pyramidal else mujoco.mjtCone.mjCONE_ELLIPTIC

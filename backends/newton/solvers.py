@@ -68,7 +68,7 @@ class SolverAdapter(ABC):
         for capability, asked, change in (
             ("height_field", any(t.height_field is not None for t in scene.terrains), "use terrains of boxes"),
             ("boxes", any(t.boxes for t in scene.terrains), "use flat terrains"),
-            ("foot_condim_6", physics.foot_condim == 6, "use PhysicsOptions(foot_condim=3), or None"),
+            ("foot_condim_6", (physics.foot_condim or 3) > 3, "use PhysicsOptions(foot_condim=3), or None"),
             ("elliptic_cone", physics.cone == "elliptic", "use PhysicsOptions(cone='pyramidal')"),
             ("deterministic", physics.deterministic, "use PhysicsOptions(deterministic=False)"),
         ):

@@ -2,10 +2,12 @@
 
 from dataclasses import fields, replace
 
+import mujoco
 import pytest
 import torch
-from gaitgauge.backends.base import BackendError, PhysicsOptions, PhysicsState, ResetState, Scene
+from gaitgauge.backends.base import TRAINING_PHYSICS, BackendError, PhysicsOptions, PhysicsState, ResetState, Scene
 from gaitgauge.backends.mujoco import MujocoBackend
+from gaitgauge.backends.mujoco.model import build_models
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains import make_terrain
 
@@ -119,3 +121,54 @@ def test_targets_that_are_not_finite_leave_the_old_ones_in_force(scene: Scene):
     whole.step(kept)
     assert broken.state.diverged.tolist() == [False, False, False, True, False]
     assert torch.isnan(spoilt[3, 5]) and torch.equal(broken.state.joint_position, whole.state.joint_position)
+
+
+def meeting(model: mujoco.MjModel) -> set[frozenset[str]]:
+    """Pairs of geoms, of which at least one moves, whose masks let them meet."""
+    return {
+        frozenset((model.geom(a).name, model.geom(b).name))
+        for a in range(model.ngeom)
+        for b in range(a)
+        if (model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a])
+        and (model.body_weldid[model.geom_bodyid[[a, b]]] > 0).any()
+    }
+
+
+@pytest.mark.parametrize("name", ["go2", "go1", "anymal_c"])
+def test_feet_meet_all_parts_and_other_parts_the_ground_alone(name: str):
+    """On flat ground and on a wave, whose models hold the other's boxes and field where they meet nothing."""
+    robot = load_robot(name)
+    terrains = make_terrain("flat"), make_terrain("stairs_fd", 3), make_terrain("wave", 3)
+    feet = set(robot.foot_geoms)
+
+    def pairs(option):
+        scene = Scene(
+            robot=robot,
+            parameters=robot.parameters[robot.default_parameters],
+            terrains=terrains,
+            terrain_index=(0,),
+            physics=PhysicsOptions(self_collision=option),
+        )
+        return [meeting(model) for model in build_models(scene)]
+
+    for none, some, every in zip(pairs(False), pairs("feet"), pairs(True), strict=True):
+        assert none < some < every
+        assert some - none == {pair for pair in every - none if pair & feet}
+        assert len(some - none) > len(feet)
+
+
+def test_where_no_legs_meet_self_collision_of_the_feet_changes_no_bit(scene: Scene):
+    generator = torch.Generator().manual_seed(3)
+    pose = torch.tensor(scene.robot.default_joint_position, dtype=torch.float64).repeat(WORLDS, 1)
+    targets = [pose + 0.2 * torch.randn(WORLDS, 12, generator=generator, dtype=torch.float64) for _ in range(50)]
+    off, on = (
+        MujocoBackend(replace(scene, physics=replace(TRAINING_PHYSICS, self_collision=option)))
+        for option in (False, "feet")
+    )
+    for backend in (off, on):
+        start(scene, pose, None, backend)
+    for target in targets:
+        for backend in (off, on):
+            backend.step(target)
+        assert all(torch.equal(getattr(off.state, name), getattr(on.state, name)) for name in NAMES)
+    assert (off.state.contact_count > 0).any()

@@ -76,6 +76,7 @@ def test_solver_names():
     ("solver", "physics", "says"),
     [
         ("steel", {"foot_condim": 6}, "foot_condim_6"),
+        ("steel", {"foot_condim": 4}, "foot_condim_6"),
         ("steel", {"cone": "pyramidal"}, "pyramidal"),
         ("mujoco", {"contacts_per_world": 0}, "contacts_per_world is 0"),
     ],
