@@ -15,11 +15,11 @@ from collections import Counter
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 
-import mujoco
 import torch
 from gaitgauge.backends.base import Randomization, Scene
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge.episodes import Episode
+from gaitgauge.gauge.self_contact import SelfContact
 from gaitgauge.gauge.suite import Suite, load_suite
 from gaitgauge.gauge.walking import Walk
 from gaitgauge.policy.base import Policy
@@ -66,14 +66,6 @@ class Watched:
         return self.yaw_error / self.steps if self.steps else math.nan
 
 
-def self_contacts(model: mujoco.MjModel, data: mujoco.MjData) -> set[str]:
-    """Pairs of the robot's geoms that overlap; there is nothing else in the model."""
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_collision(model, data)
-    touching = (c for c in data.contact[: data.ncon] if c.dist < 0.0)
-    return {"–".join(sorted((model.geom(c.geom1).name, model.geom(c.geom2).name))) for c in touching}
-
-
 def walk(
     policy: Policy, suite: Suite, commands: torch.Tensor, options: argparse.Namespace, *, self_collision: bool
 ) -> list[Watched]:
@@ -99,9 +91,7 @@ def walk(
         terrain_index=(0,) * len(episodes),
         physics=replace(suite.physics, self_collision=self_collision),
     )
-    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
-    data = mujoco.MjData(model)
-    joints = [model.joint(name).qposadr[0] for name in robot.joint_names]
+    contact = SelfContact(robot)
     steps = SETTLED + round(options.seconds / scene.physics.control_period)
     found = [Watched() for _ in commands]
     with closing(make_backend("mujoco", scene, device="cpu")) as physics:
@@ -121,8 +111,7 @@ def walk(
                 continue
             yaw_error = (state.base_angular_velocity_b[:, 2] - told[:, 2]).abs()
             for world in (~fallen).nonzero()[:, 0].tolist():
-                data.qpos[joints] = state.joint_position[world]
-                pairs = self_contacts(model, data)
+                pairs = contact.pairs(state.joint_position[world].numpy())
                 watched = found[command_of[world]]
                 watched.steps += 1
                 watched.touching += bool(pairs)

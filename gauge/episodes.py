@@ -77,6 +77,8 @@ class Record:
     """Goal of each sample, index into ``episode.goals``, (T,)."""
     part_index: NDArray[np.int16] = field(default_factory=lambda: np.zeros(0, np.int16))
     """Sub-command of each sample, (T,)."""
+    touching: NDArray[np.bool_] | None = None
+    """Whether parts of the robot touch each other in each sample, (T,); None in files that do not say."""
 
     def summary(self) -> dict[str, Any]:
         """One flat row without the samples."""
@@ -89,17 +91,14 @@ class Record:
     def save(self, folder: Path) -> None:
         """Write the record as one file, all or nothing. It survives the death of the process at once, and that of the machine soon."""
         head = {k: v for k, v in vars(self).items() if k in _HEAD} | asdict(self.episode)
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+        if self.touching is not None:
+            arrays["touching"] = self.touching
         with (
             replacing(folder / f"{self.episode.key}.npz", RecordError, durable=False) as partial,
             partial.open("wb") as file,
         ):
-            np.savez(
-                file,
-                head=np.frombuffer(json.dumps(head).encode(), dtype=np.uint8),
-                samples=self.samples,
-                goal_index=self.goal_index,
-                part_index=self.part_index,
-            )
+            np.savez(file, head=np.frombuffer(json.dumps(head).encode(), dtype=np.uint8), **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Record:
@@ -116,7 +115,9 @@ class Record:
                     raise RecordError(f"it unpacks to more than {_LARGEST / 1e6:g} MB")
             with np.load(path, allow_pickle=False) as data:
                 head = parse_json(data["head"].tobytes(), "its head", RecordError)
-                arrays = {k: data[k] for k in ("samples", "goal_index", "part_index")}
+                arrays = {k: data[k] for k in _ARRAYS}
+                if "touching" in data:
+                    arrays["touching"] = data["touching"]
             if not isinstance(head, dict):
                 raise RecordError("its head is no table")
             names = [f.name for f in fields(Episode)]
@@ -154,6 +155,8 @@ class Record:
             "goal_index": (self.goal_index, np.int16, (count,)),
             "part_index": (self.part_index, np.int16, (count,)),
         }
+        if self.touching is not None:
+            expected["touching"] = (self.touching, np.bool_, (count,))
         for name, (array, kind, shape) in expected.items():
             if array.dtype != kind or array.shape != shape:
                 raise RecordError(f"{name} is {array.dtype} {list(array.shape)}, not {np.dtype(kind)} {list(shape)}")
@@ -200,6 +203,7 @@ class _Outcome:
 
 
 _HEAD = [f.name for f in fields(_Outcome)]
+_ARRAYS = ("samples", "goal_index", "part_index")
 _READ_ERRORS = (
     *(OSError, LookupError, ValueError, TypeError, EOFError, MemoryError, ArithmeticError, RuntimeError, SyntaxError),
     *(zipfile.BadZipFile, zlib.error),

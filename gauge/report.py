@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -177,6 +177,11 @@ def warnings(results: Mapping[str, Any]) -> list[dict[str, Any]]:
         headline = f"{_plural(health['falls'], 'fall')} in {total}"
         meaning = "The robot tilted beyond the suite's limit; the suite says what that ends and what it costs."
         found.append(_warning("grave", headline, meaning, _places(rows, "falls")))
+    touching = health.get("self_contact")  # cards from before do not say
+    if touching:
+        headline = f"parts of the robot touch each other in {_percent(touching)} of the samples"
+        meaning = "Legs that strike each other can break on a robot; episodes.csv says at which commands."
+        found.append(_warning("note", headline, meaning, _places(rows, "self_contact", _percent)))
     failed = [r for r in rows if r["level"] == 0]
     if failed:
         searched = sum("search" in r for r in rows)
@@ -198,16 +203,20 @@ def _warning(severity: str, headline: str, meaning: str, places: list[str]) -> d
     return {"severity": severity, "headline": headline, "meaning": meaning, "places": places}
 
 
-def _places(rows: Sequence[Row], key: str | None) -> list[str]:
-    """Names of environments, those with the highest count of ``key`` first, cut to a readable number."""
+def _places(rows: Sequence[Row], key: str | None, said: Callable[[Any], str] = str) -> list[str]:
+    """Names of environments, those with the most of ``key`` first and how much that is, cut to a readable number."""
     chosen = list(rows) if key is None else sorted((r for r in rows if r.get(key)), key=lambda r: -r[key])
     payloads = len({r["payload"] for r in rows}) > 1
     names = []
     for row in chosen[:_SHOWN]:
         name = f"{terrain_label(row['terrain'])}, μ {number(row['friction'])}"
         name += f", {number(row['payload'])} kg" if payloads else ""
-        names.append(name + (f" ({row[key]})" if key else ""))
+        names.append(name + (f" ({said(row[key])})" if key else ""))
     return names + ([f"and {len(chosen) - _SHOWN} more"] if len(chosen) > _SHOWN else [])
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
 
 
 def metric_matrix(rows: Sequence[Row]) -> dict[str, dict[str, float]]:

@@ -199,6 +199,7 @@ def _environment(
     row["falls"] = sum(r.falls for r in environment.records)
     for name in ("diverged", "overflowed", "restarted"):
         row[name] = sum(bool(getattr(r, name)) for r in environment.records)
+    row["self_contact"] = self_contact(environment.records)
     return row, statistics
 
 
@@ -242,7 +243,7 @@ def rows_csv(records: Sequence[Record]) -> str:
 
     Every metric and the quality have three columns, ``_mean``, ``_mean25`` and ``_mean50``, as measured and without the weight of
     the level: of the whole episode as its score takes them, averaged over goals; of a sub-command over its samples. They are empty
-    in the rows of level tests, which take no samples. Falls of a sub-command are empty where a record does not say.
+    in the rows of level tests, which take no samples. Falls of a sub-command and self-contact are empty where a record does not say.
     """
     text = io.StringIO()
     columns = next((r.columns for r in records if r.columns), ())
@@ -251,18 +252,24 @@ def rows_csv(records: Sequence[Record]) -> str:
     for record in sorted(records, key=lambda r: r.episode.key):
         sampled = range(len(columns)) if len(record.samples) else ()
         whole = [run_statistics(record, column) for column in sampled]
-        rows.append({**record.summary(), "command": ALL, "samples": len(record.samples), **_numbers(names, whole)})
+        head = {"command": ALL, "samples": len(record.samples), "self_contact": self_contact([record])}
+        rows.append({**record.summary(), **head, **_numbers(names, whole)})
         of_columns = [command_statistics(record, column) for column in sampled]
         for goal, part in of_columns[0] if of_columns else ():
             name = record.episode.goals[goal]
-            count = int(((record.goal_index == goal) & (record.part_index == part)).sum())
-            row = asdict(record.episode) | {"goals": name, "command": command_name(name, part), "samples": count}
+            mine = (record.goal_index == goal) & (record.part_index == part)
+            row = asdict(record.episode) | {
+                "goals": name,
+                "command": command_name(name, part),
+                "samples": int(mine.sum()),
+            }
+            row["self_contact"] = None if record.touching is None else _number(record.touching[mine].mean())
             if record.fallen is not None:
                 row["falls"] = record.fallen.count((goal, part))
             rows.append(row | _numbers(names, [values[goal, part] for values in of_columns]))
     if rows:
-        head = list(dict.fromkeys(key for key in rows[0] if key not in names))
-        writer = csv.DictWriter(text, [*head, *names])
+        fields = list(dict.fromkeys(key for key in rows[0] if key not in names))
+        writer = csv.DictWriter(text, [*fields, *names])
         writer.writeheader()
         writer.writerows(rows)
     return text.getvalue()
@@ -273,11 +280,19 @@ def _numbers(names: Sequence[str], values: Sequence[Array]) -> dict[str, float]:
     return dict(zip(names, (_number(v) for v in np.ravel(np.asarray(values))), strict=bool(values)))
 
 
-def health(records: Collection[Record]) -> dict[str, int]:
-    """How many episodes there are, and how many of them fell, diverged or dropped contacts."""
+def self_contact(records: Collection[Record]) -> float | None:
+    """Share of the samples in which parts of the robot touch each other; None where there are none, or a record does not say."""
+    touching = [r.touching for r in records if len(r.samples)]
+    known = [t for t in touching if t is not None]
+    return _number(np.concatenate(known).mean()) if known and len(known) == len(touching) else None
+
+
+def health(records: Collection[Record]) -> dict[str, float | None]:
+    """How many episodes there are, how many of them fell, diverged or dropped contacts, and how often parts of the robot touched."""
     return {
         "episodes": len(records),
         "falls": sum(r.falls for r in records),
         "diverged": sum(r.diverged for r in records),
         "overflowed": sum(r.overflowed for r in records),
+        "self_contact": self_contact(records),
     }

@@ -268,19 +268,25 @@ class Rollout:
         if sampled:
             tables = table.read(list(sampled), list(sampled.values()), buffers.limits, buffers.friction)
             samples = dict(zip(sampled, tables, strict=True))
-        nothing = np.zeros((0, self._columns), dtype=np.float32), np.zeros(0, dtype=np.bool_)
+        none = np.zeros(0, dtype=np.bool_)
+        nothing = np.zeros((0, self._columns), dtype=np.float32), none, none
         segments = self._segments
         return {segments[w]: _outcome(segments[w], c, *samples.get(w, nothing)) for w, c in counts.items()}
 
 
 def _outcome(
-    segment: Segment, counts: SegmentCounts, values: NDArray[np.float32], keep: NDArray[np.bool_]
+    segment: Segment,
+    counts: SegmentCounts,
+    values: NDArray[np.float32],
+    keep: NDArray[np.bool_],
+    touching: NDArray[np.bool_],
 ) -> SegmentOutcome:
     """What came of a segment: its counts, and its samples, (T, columns), of which those to keep, (T,), count."""
     aims = segment.goal == TARGET
     lost = np.zeros((counts.lost_samples, values.shape[1]), dtype=np.float32)
     outcome = SegmentOutcome(
         samples=np.concatenate((values[keep], lost)),
+        touching=np.concatenate((touching[keep], np.zeros(len(lost), dtype=np.bool_))),
         control_steps=counts.control_steps,
         physics_steps=counts.substeps,
         falls=counts.falls,
@@ -292,9 +298,11 @@ def _outcome(
     if not counts.penetrated or aims:
         return outcome
     # the beginning, up to a penetration after which its goal starts again
+    before = int(keep[: counts.penetration_samples].sum())
     beginning = replace(
         outcome,
-        samples=outcome.samples[: int(keep[: counts.penetration_samples].sum())],
+        samples=outcome.samples[:before],
+        touching=outcome.touching[:before],
         control_steps=counts.penetration_control_steps,
         physics_steps=counts.penetration_substeps,
         overflowed=counts.penetration_overflowed,

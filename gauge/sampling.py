@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
 from .metrics import MetricEvaluator, SampledState
+from .self_contact import SelfContact
 from .suite import Suite
 
 GRAVITY = 9.81
@@ -19,8 +20,9 @@ _MOTION = ("base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity
 _JOINTS = ("joint_position", "joint_velocity", "joint_torque")
 _CONTACTS = ("ground_moment_w", "ground_force_w", "foot_normal_force", "foot_tangential_force")
 
-Samples = tuple[NDArray[np.float32], NDArray[np.bool_]]
-"""Metrics and quality of T samples, (T, columns), NaN where a metric is not defined, and which of them count, (T,)."""
+Samples = tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]
+"""Metrics and quality of T samples, (T, columns), NaN where a metric is not defined; which of them count, and in which parts of the
+robot touch each other, (T,)."""
 
 
 class SampleTable:
@@ -46,6 +48,7 @@ class SampleTable:
         """
         self._metrics = MetricEvaluator(suite.metrics, robot, weight, device, dtype)
         self.names = self._metrics.names
+        self._self_contact = SelfContact(robot)
         self._between_samples = suite.metrics.smoothness == "samples"
         joints, feet = robot.num_joints, len(robot.foot_names)
         self._fields: tuple[str, ...] = _MOTION + _JOINTS
@@ -126,10 +129,15 @@ class SampleTable:
         first = np.repeat(np.asarray(worlds) * (self.capacity + 1) - np.cumsum(counts) + counts, counts)
         at, world = torch.tensor(np.stack((first + np.arange(len(owner)), owner)), device=self._device)
         batches = [[count] for count in counts] if self._one_by_one else [list(counts)]
-        rows = [x.split([sum(batch) for batch in batches]) for x in (self.rows[at], limits[world], friction[world])]
+        mine = self.rows[at]
+        rows = [x.split([sum(batch) for batch in batches]) for x in (mine, limits[world], friction[world])]
         values = torch.cat([self._evaluate(*batch) for batch in zip(*rows, batches, strict=True)])
-        pieces = np.split(values.cpu().numpy(), np.cumsum(counts)[:-1])
-        return [(piece[:, :-1], piece[:, -1] > 0) for piece in pieces]
+        poses = mine.split(self._split, dim=1)[self._fields.index("joint_position")].cpu().numpy()
+        ends = np.cumsum(counts)[:-1]
+        pieces = zip(
+            np.split(values.cpu().numpy(), ends), np.split(self._self_contact.touching(poses), ends), strict=True
+        )
+        return [(piece[:, :-1], piece[:, -1] > 0, touching) for piece, touching in pieces]
 
     def _evaluate(
         self, rows: torch.Tensor, limits: torch.Tensor, friction: torch.Tensor, counts: Sequence[int]

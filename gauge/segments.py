@@ -47,6 +47,8 @@ class SegmentOutcome:
 
     samples: NDArray[np.float32]
     """(T, columns)."""
+    touching: NDArray[np.bool_]
+    """Whether parts of the robot touch each other, (T,)."""
     control_steps: int
     physics_steps: int
     falls: int = 0
@@ -200,6 +202,7 @@ class OpenEpisode:
             physics_steps=sum(o.physics_steps for o in outcomes),
             columns=columns if has_samples else (),
             samples=np.concatenate([o.samples for o in outcomes]),
+            touching=np.concatenate([o.touching for o in outcomes]),
             goal_index=index([s.goal_index for s, _ in counted]),
             part_index=index([s.sub_command for s, _ in counted]),
         )

@@ -73,6 +73,8 @@ def edited(tmp_path):
         ({}, {"goal_index": np.array([0, 0, 2], np.int16)}, "goal_index is out of range"),
         ({}, {"goal_index": np.array([0, 0], np.int16)}, "goal_index is int16"),
         ({}, {"part_index": np.array([0, -1, 0], np.int16)}, "part_index is out of range"),
+        ({}, {"touching": np.zeros(2, np.bool_)}, r"touching is bool \[2\], not bool \[3\]"),
+        ({}, {"touching": np.zeros(3)}, "touching is float64"),
         ({}, {"part_index": None}, "part_index"),
     ],
 )

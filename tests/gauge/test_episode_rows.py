@@ -36,3 +36,19 @@ def test_falls_stand_with_the_sub_command_in_which_they_happened(fallen, told):
     assert whole["command"] == "all" and int(whole["falls"]) == record.falls
     assert [row["goals"] for row in parts] == ["diagonal_velocity", "diagonal_velocity", "max_velocity"]
     assert [row["falls"] for row in parts] == told
+
+
+@pytest.mark.parametrize(
+    ("touching", "told"),
+    [(None, ["", "", "", ""]), ([True, False, False, False, True, True], ["0.5", "0.5", "0.0", "1.0"])],
+)
+def test_self_contact_stands_with_the_sub_command_in_which_it_happened(touching, told):
+    record = Record(
+        episode=EPISODE,
+        columns=("quality",),
+        samples=np.full((6, 1), 0.5, np.float32),
+        goal_index=np.array([0, 0, 0, 0, 1, 1], np.int16),
+        part_index=np.array([0, 0, 1, 1, 3, 3], np.int16),
+        touching=None if touching is None else np.array(touching),
+    )
+    assert [row["self_contact"] for row in csv.DictReader(rows_csv([record]).splitlines())] == told

@@ -203,6 +203,9 @@ def test_missing_or_damaged_results_are_one_clear_sentence(tmp_path, content, wo
     assert (tmp_path / "report.html").read_text() == "earlier"
 
 
+HEALTHY = {"episodes": 9, "falls": 0, "diverged": 0, "overflowed": 0}
+
+
 def test_warnings_name_what_failed_and_where():
     rows = [
         row(level=0, search={"1": False}),
@@ -215,6 +218,19 @@ def test_warnings_name_what_failed_and_where():
     assert found[1]["places"] == ["slope, forward, μ 0.6 (5)", "stairs, forward, μ 0.6 (2)"]
     assert found[2]["headline"] == "not even level 1 passed in 1 of 1 searched environments"
     assert found[3]["places"] == ["slope, forward, μ 0.6 (3)"]
+
+
+def test_parts_that_touch_are_told_with_the_worst_places_first():
+    rows = [row("wave", self_contact=0.004), row("stairs_fd", self_contact=0.0), row("flat", self_contact=0.118)]
+    (warning,) = warnings({"environments": rows, "health": HEALTHY | {"self_contact": 0.041}})
+    assert warning["severity"] == "note"
+    assert warning["headline"] == "parts of the robot touch each other in 4.1 % of the samples"
+    assert warning["places"] == ["flat, μ 0.6 (11.8 %)", "wave, μ 0.6 (0.4 %)"]
+
+
+def test_nothing_is_told_of_parts_that_never_touch_or_of_cards_that_do_not_say():
+    for said in ({}, {"self_contact": None}, {"self_contact": 0.0}):
+        assert warnings({"environments": [row("flat")], "health": HEALTHY | said}) == []
 
 
 def test_long_lists_of_places_are_cut():

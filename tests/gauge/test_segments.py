@@ -79,8 +79,10 @@ def in_a_row(told, goals, closes, restarts):
 def outcome_of(told, segment, restarts):
     it = told[segment.goal, segment.sub_command, segment.again]
     rows = [(segment.goal_index, segment.sub_command, segment.again, step) for step in range(it["steps"])]
+    samples = np.asarray(rows, dtype=np.float32)
     whole = SegmentOutcome(
-        samples=np.asarray(rows, dtype=np.float32),
+        samples=samples,
+        touching=samples[:, 3] % 2 == 0,
         control_steps=it["steps"],
         physics_steps=10 * it["steps"],
         falls=int(it["fell"]),
@@ -94,6 +96,7 @@ def outcome_of(told, segment, restarts):
     cut = replace(
         whole,
         samples=whole.samples[:deep],
+        touching=whole.touching[:deep],
         control_steps=deep,
         physics_steps=10 * deep,
         overflowed=early,
@@ -129,6 +132,7 @@ def test_any_order_of_completion_gives_what_playing_in_a_row_gives(name, falls, 
         assert [tuple(row) for row in record.samples.astype(int).tolist()] == samples
         assert record.goal_index.tolist() == [s[0] for s in samples]
         assert record.part_index.tolist() == [s[1] for s in samples]
+        assert record.touching.tolist() == [s[3] % 2 == 0 for s in samples]
         assert (record.fallen, record.restarted, record.overflowed) == (fallen, restarted, overflowed)
         assert record.falls == len(fallen)
         assert record.diverged == (len(fallen) > 0)
@@ -153,7 +157,9 @@ def test_a_target_goal_waits_for_what_comes_before_it_and_has_no_second_penetrat
             waiting = [s for s in waiting[1:] + opened.start() if s in opened.missing()]
         assert waiting[0].again is (deep is not None)
         zeros = np.zeros((1, 4), dtype=np.float32)
-        opened.outcomes[waiting[0]] = SegmentOutcome(samples=zeros, control_steps=1, physics_steps=10, reached=True)
+        opened.outcomes[waiting[0]] = SegmentOutcome(
+            samples=zeros, touching=zeros[:, 0] > 0, control_steps=1, physics_steps=10, reached=True
+        )
         record = opened.record(("a", "b", "c", "d"))
         assert record.success is True
         assert record.restarted is (deep is not None)

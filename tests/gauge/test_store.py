@@ -41,6 +41,7 @@ def full_record(**changes):
         "samples": values,
         "goal_index": np.array([0, 0, 1], dtype=np.int16),
         "part_index": np.array([0, 7, 2], dtype=np.int16),
+        "touching": np.array([False, True, False]),
     }
     return Record(**{**options, **changes})
 
@@ -52,6 +53,8 @@ def same(one, other):
     for name in ("samples", "goal_index", "part_index"):
         assert getattr(one, name).dtype == getattr(other, name).dtype
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+    assert (one.touching is None) == (other.touching is None)
+    assert one.touching is None or one.touching.tolist() == other.touching.tolist()
 
 
 @pytest.mark.parametrize("success", [None, True, False])
