@@ -48,7 +48,7 @@ def results(suite="robogauge-1.1", version="1.1.0", kind="complete", score=0.6, 
 
 def test_references_are_of_the_same_suite_and_beside_whole_runs_alone():
     scores = [r.score for r in references_for(results())]
-    assert scores == [0.7226, 0.6739, 0.6713, 0.5149]
+    assert scores == [0.7307, 0.6739, 0.6713, 0.5149]
     ours = next(r for r in reference_table().reference if r.file_sha256)
     assert [r.score for r in references_for(results(sha=ours.file_sha256))] == [0.6739, 0.6713, 0.5149]
     for other in ({"suite": "quick"}, {"version": "2.0.0"}, {"kind": "part"}, {"score": None}):
