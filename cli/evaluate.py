@@ -140,7 +140,9 @@ def print_results(console: Terminal, results: Mapping[str, Any]) -> None:
     for note in notes(results):
         console.say(note)
     health = results["health"]
-    troubles = [f"{v} {k}" for k, v in health.items() if k != "episodes" and v]
+    troubles = [f"{health[k]} {k}" for k in ("falls", "diverged", "overflowed") if health[k]]
+    if health.get("self_contact"):
+        troubles.append(f"parts of the robot touch each other in {100 * health['self_contact']:.1f} % of the samples")
     if troubles:
         console.say(f"in {health['episodes']} quality episodes: {', '.join(troubles)}")
     if results["score"] is not None:

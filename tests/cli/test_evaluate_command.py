@@ -3,9 +3,10 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from gaitgauge.cli.evaluate import doubtful_assumptions
+from gaitgauge.cli.evaluate import doubtful_assumptions, print_results
 from gaitgauge.gauge.suite import load_suite
 from tiny_suite import SUITE
 
@@ -22,6 +23,21 @@ def reproducible(folder: Path) -> tuple[dict, bytes]:
     results = json.loads((folder / "results.json").read_text())
     del results["provenance"]
     return results, (folder / "episodes.csv").read_bytes()
+
+
+def test_what_went_wrong_is_said_in_words(run, tmp_path, policy, tiny):
+    part = ("--terrain", "flat", "--friction", 0.6, "--seed", 0)
+    assert run("evaluate", policy, "--suite", tiny, *part, "--out", tmp_path / "run", "--threads", 1).exit_code == 0
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    said = []
+    console = SimpleNamespace(print=lambda *_: None, say=lambda text: said.append(str(text)))
+    results["health"] = {"episodes": 3, "falls": 2, "diverged": 0, "overflowed": 0, "self_contact": 0.0429}
+    print_results(console, results)
+    assert "in 3 quality episodes: 2 falls, parts of the robot touch each other in 4.3 % of the samples" in said
+    said.clear()
+    results["health"] = {"episodes": 3, "falls": 0, "diverged": 0, "overflowed": 0, "self_contact": None}
+    print_results(console, results)
+    assert not any("quality episodes" in line for line in said)
 
 
 @pytest.mark.parametrize(
