@@ -38,7 +38,7 @@ def test_a_whole_run(request_for, tmp_path, base):
     assert results["score_interval"][0] <= results["score"] <= results["score_interval"][1]
     assert set(results["groups"]) == set(results["groups_interval"]) == {"tracking", "safety", "quality"}
     assert results["terrains"]["slope_fd"]["score"] == pytest.approx(0.09 + 0.19 * slope["quality"]["mean50"], abs=2e-4)
-    assert results["health"] == {"episodes": 4, "falls": 0, "diverged": 0, "overflowed": 0}
+    assert results["health"] == {"episodes": 4, "falls": 0, "diverged": 0, "overflowed": 0, "self_contact": 0.0}
     assert results["suite"]["digest"] == results["provenance"]["digests"]["suite"]
     assert {len(d) for d in results["provenance"]["digests"].values()} == {64}
     assert results["provenance"]["digests"].keys() == {"policy", "suite", "robot", "source"}
