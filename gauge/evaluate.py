@@ -38,7 +38,7 @@ from .goals import TARGET, check_terrain, count_sub_commands
 from .motors import gains_note, joint_parameters
 from .pipelines import PIPELINES, Environment, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
-from .policies import check_fit, file_digest
+from .policies import check_fit
 from .progress import ProgressMeter, Status
 from .results import fold, health, rows_csv
 from .segments import count_segments
@@ -265,7 +265,7 @@ def evaluate(
         results["policy"] = {
             "path": prepared.policy.path,
             "contract_hash": prepared.policy.contract.hash,
-            "file_sha256": file_digest(request.policy),
+            "file_sha256": prepared.policy.file_sha256,
             "observations": [term.name for term in prepared.policy.contract.observation],
             "kind_of_observations": kind_of_observations(prepared.policy.contract),
             "provenance": without_copy(prepared.policy.contract.provenance),

@@ -108,7 +108,7 @@ def describe(label: str, loaded: Loaded) -> dict[str, Any]:
     return {
         "label": label,
         "path": policy.path,
-        "file_sha256": file_digest(policy.path),
+        "file_sha256": policy.file_sha256,
         "robot": loaded.robot.name,
         "contract_hash": policy.contract.hash,
         "command_limits": list(policy.contract.command_limits),

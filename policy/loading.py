@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Mapping
 from functools import cache
@@ -63,6 +64,7 @@ def load_policy(
     stand_in = robot or load_robot(DEFAULT_ROBOT)
     contract = None if contract_file is None else described_contract(contract_file, stand_in)
     policy = rebuilt(_load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract))
+    policy.file_sha256 = hashlib.sha256(data).hexdigest()
     if sentence := assumptions(policy.contract):
         _say(policy.path, sentence)
     if robot is not None:

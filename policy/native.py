@@ -298,6 +298,8 @@ class FilePolicy(Policy):
     """Its network, for ``save_policy``."""
     not_rebuilt: str = ""
     """Why a foreign file's own code is run in each step, which is slow; empty where it is not."""
+    file_sha256: str = ""
+    """SHA-256 of the file's bytes as they were loaded, hexadecimal, as ``sha256sum`` prints it; empty where it came out of none."""
 
     @property
     def digest(self) -> str:

@@ -1,6 +1,7 @@
 """From a request to results, and what is refused."""
 
 import csv
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -21,6 +22,17 @@ from gaitgauge.robots import RobotError
 from gaitgauge.terrains.registry import TerrainError
 from scripted_gauge import GO2, Puppet
 from tiny_runs import SMALL, TINY, evaluate, without_provenance
+
+
+@pytest.mark.parametrize("change", [lambda path: path.unlink(), lambda path: path.write_bytes(b"another file")])
+def test_results_name_the_file_that_was_played_whatever_became_of_it(request_for, tmp_path, change):
+    request = request_for()
+    path = Path(request.policy)
+    expected = hashlib.sha256(path.read_bytes()).hexdigest()
+    prepared = prepare(request)
+    change(path)
+    results = evaluate(prepared, tmp_path / "run")
+    assert results["policy"]["file_sha256"] == expected
 
 
 @pytest.mark.parametrize("base", ["robogauge-1.1", "gaitgauge-1"])
