@@ -26,16 +26,20 @@ class SelfContact:
         return {"–".join(sorted(self._model.geom(geom).name for geom in pair)) for pair in found}
 
     def touching(self, joint_position: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Whether any parts overlap in poses, (T, J) [rad]; (T,)."""
-        return np.array([bool(self._overlapping(pose) - self._always) for pose in joint_position], dtype=np.bool_)
+        """Whether any parts overlap in poses, (T, J) [rad], none in one that is not finite; (T,)."""
+        finite = np.isfinite(joint_position).all(axis=1)
+        poses = zip(joint_position, finite, strict=True)
+        return np.array(
+            [known and bool(self._overlapping(pose) - self._always) for pose, known in poses], dtype=np.bool_
+        )
 
     def _overlapping(self, joint_position: NDArray[np.floating]) -> set[tuple[int, int]]:
-        """Pairs of geoms that overlap in a pose; none where it is not finite."""
-        if not np.isfinite(joint_position).all():
-            return set()
+        """Pairs of geoms that overlap in a pose."""
         self._data.qpos[self._joints] = joint_position
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)
+        if not self._data.ncon:  # nearly always
+            return set()
         contacts = self._data.contact
         return {
             (int(a), int(b)) for (a, b), distance in zip(contacts.geom, contacts.dist, strict=True) if distance < 0.0
