@@ -185,7 +185,9 @@ def main() -> None:
     )
     parser.add_argument("--action-scale", type=float, default=0.5, help="standard deviation of the random actions")
     parser.add_argument("--capture", action="store_true", help="replay the torch parts as CUDA graphs")
-    parser.add_argument("--fuse", action="store_true", help="compile the torch parts")
+    parser.add_argument(
+        "--fuse", action=argparse.BooleanOptionalAction, help="compile the torch parts; default: on a GPU"
+    )
     parser.add_argument("--count", action="store_true", help="count torch kernels instead")
     parser.add_argument("--out", type=Path, help="file for the numbers as JSON")
     parser.add_argument("overrides", nargs="*", help="settings of the task, key=value")

@@ -41,7 +41,7 @@ def measure(count: int, options: argparse.Namespace) -> dict[str, float]:
         command = [sys.executable, *launcher, "-m", "gaitgauge.cli.main", "train", options.task, "--no-score"]
         command += ["--device", options.device, "--backend", options.backend, "--num-envs", str(options.num_envs)]
         command += ["--iterations", str(options.iterations), "--log-root", logs, "training.run.keep_episodes=false"]
-        command += ["--fuse"] if options.fuse else []
+        command += [] if options.fuse is None else ["--fuse" if options.fuse else "--no-fuse"]
         done = subprocess.run(
             [*command, *options.settings], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )
@@ -66,7 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--skip", type=int, default=20, help="iterations that do not count")
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     parser.add_argument("--backend", default="mujoco-warp")
-    parser.add_argument("--fuse", action="store_true", help="compile the environment's torch parts")
+    parser.add_argument(
+        "--fuse", action=argparse.BooleanOptionalAction, help="compile the environment's torch parts; default: on a GPU"
+    )
     parser.add_argument("--out", type=Path)
     parser.add_argument("settings", nargs="*", metavar="key=value", help="settings of the task")
     options = parser.parse_intermixed_args(arguments)

@@ -8,7 +8,8 @@ in a step waits for the device.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from tensordict import TensorDict
 from ..backends.base import Randomization, ResetState, Scene
 from ..backends.registry import make_backend
 from ..backends.warp.graphs import WARM_UP, RecordedFunction
+from ..files.parsing import shown
 from ..policy.contract import History, PolicyContract, standard_contract
 from ..policy.its_robot import REMEMBERED
 from ..robots.base import JointParameters, Robot
@@ -47,6 +49,7 @@ class TrainingEnvironment(VecEnv):
         contract: the interface of the policies trained here, one frame of observation.
         backend: the physics.
         common_step_counter: environment steps taken in the run.
+        unfused: why the torch parts are not compiled though they should have been, a sentence; empty otherwise.
     """
 
     def __init__(
@@ -57,7 +60,7 @@ class TrainingEnvironment(VecEnv):
         device: str = "cuda:0",
         threads: int = 1,
         capture: bool = False,
-        fuse: bool = False,
+        fuse: bool | None = None,
     ) -> None:
         """Build the worlds and begin their first episodes.
 
@@ -67,10 +70,12 @@ class TrainingEnvironment(VecEnv):
             threads: CPU threads for engines that use them.
             capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
             fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels
-                into a few; takes a minute or two at the start, and numbers differ in the last digits.
+                into a few; numbers differ in the last digits. None: on a GPU, unless a function of one's own cannot be
+                compiled, which ``unfused`` then says.
 
         Raises:
-            ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device.
+            ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device, or ``fuse`` for a
+                function that cannot be compiled.
             BackendError: the engine cannot do what is asked.
         """
         if capture and torch.device(device).type != "cuda":
@@ -133,9 +138,9 @@ class TrainingEnvironment(VecEnv):
         self._begin(level.to(self.device))
         self._after_physics: Callable[[], StepResult] = self.parts.after_physics
         self._observe: Callable[[], Observations] = self.parts.observe
-        if fuse:
-            self._after_physics = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
-            self._observe = torch.compile(self._observe, fullgraph=True, dynamic=False)
+        self.unfused = ""
+        if fuse or (fuse is None and self.device.type == "cuda"):
+            self._fuse(required=fuse is not None)
         if capture:
             self._capture()
 
@@ -169,18 +174,47 @@ class TrainingEnvironment(VecEnv):
         self._read(AFTER_STEP)
         self._observations = self.parts.observe().clone()
 
-    def _capture(self) -> None:
-        """Record both torch parts; what running them for it changes is put back."""
+    @contextmanager
+    def _trial(self) -> Iterator[None]:
+        """Inside, both torch parts may run: what that changes is put back."""
         memory, motors = self.parts.memory.by_name(), self.parts.motors.by_name()
         before = copied(memory), copied(motors)
-        with torch.no_grad():
+        try:
+            with torch.no_grad():
+                yield
+        finally:
+            restore(before[0], memory)
+            restore(before[1], motors)
+
+    def _fuse(self, *, required: bool) -> None:
+        """Compile both torch parts; where that is impossible, refuse if it is ``required``, or say so in ``unfused``."""
+        from torch._dynamo.exc import TorchDynamoException  # loading it takes seconds
+
+        after_physics = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
+        observe = torch.compile(self._observe, fullgraph=True, dynamic=False)
+        try:
+            with self._trial():
+                after_physics()
+                observe()
+        except TorchDynamoException as error:
+            reason = next(line.strip() for line in str(error).splitlines() if line.strip())
+            sentence = f"the environment's torch parts cannot be compiled ({shown(reason)})"
+            if required:
+                raise ConfigurationError(f"{sentence}; use fuse=False, on the command line --no-fuse") from error
+            self.unfused = (
+                f"{sentence} and run as they are, which is slower; a function of your own in the task may be the cause"
+            )
+            return
+        self._after_physics, self._observe = after_physics, observe
+
+    def _capture(self) -> None:
+        """Record both torch parts."""
+        with self._trial():
             self._after_physics = RecordedFunction(self._after_physics, self.device)
             self._observe = RecordedFunction(self._observe, self.device)
             for _ in range(WARM_UP + 1):
                 self._after_physics()
                 self._observe()
-        restore(before[0], memory)
-        restore(before[1], motors)
 
     # --- rsl_rl's interface -----------------------------------------------------------------------------------------
 

@@ -92,8 +92,8 @@ class TrainRequest:
     log_root: Path = LOG_ROOT
     capture: bool | None = None
     """CUDA graphs in the environment; None: on a GPU."""
-    fuse: bool = False
-    """Compile the environment's torch parts."""
+    fuse: bool | None = None
+    """Compile the environment's torch parts; None: on a GPU, if they can be."""
     logger: str | None = None
     """``tensorboard``, ``wandb`` or ``neptune``."""
     video_every: int | None = None
@@ -341,6 +341,8 @@ def train(
                 fuse=request.fuse,
             )
             closing.callback(env.close)
+            if env.unfused:
+                message(env.unfused)
             if run is not None:
                 _describe(plan, run, env)
             processes = Processes.join(device)

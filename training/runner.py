@@ -186,11 +186,7 @@ class TrainingRunner:
         self._nonfinite.zero_()
         with torch.inference_mode():
             for _ in range(self.configuration.run.steps_per_iteration):
-                actions = self.alg.act(obs)
-                obs, rewards, dones, extras = self.env.step(actions.to(self.env.device))
-                obs, rewards, dones = self._guard(obs.to(self.device), rewards.to(self.device), dones.to(self.device))
-                self.alg.store_outcome(rewards, dones, extras)
-                self.logger.add_step(rewards, dones, extras)
+                obs = self.rollout_step(obs)
             if torch.device(self.device).type == "cuda":
                 # Only so that the two times below are told apart.
                 torch.cuda.synchronize(self.device)
@@ -213,6 +209,15 @@ class TrainingRunner:
         self._check_finite(losses)
         if self.processes.several:
             self._kept.keep(self.learned(), self.iteration, self.device)
+        return obs
+
+    def rollout_step(self, obs: TensorDict) -> TensorDict:
+        """Act, step and store; returns the next observations. Nothing in it waits for the device."""
+        actions = self.alg.act(obs)
+        obs, rewards, dones, extras = self.env.step(actions.to(self.env.device))
+        obs, rewards, dones = self._guard(obs.to(self.device), rewards.to(self.device), dones.to(self.device))
+        self.alg.store_outcome(rewards, dones, extras)
+        self.logger.add_step(rewards, dones, extras)
         return obs
 
     def _guard(

@@ -86,8 +86,8 @@ def train(
         bool | None, typer.Option("--capture/--no-capture", help="CUDA graphs in the environment. Default: on a GPU.")
     ] = None,
     fuse: Annotated[
-        bool, typer.Option("--fuse/--no-fuse", help="Compile the environment's torch parts; faster, starts slower.")
-    ] = False,
+        bool | None, typer.Option("--fuse/--no-fuse", help="Compile the environment's torch parts. Default: on a GPU.")
+    ] = None,
     threads: Annotated[
         int, typer.Option(min=1, max=MOST_THREADS, help="CPU threads of an engine that runs on the CPU.")
     ] = 1,

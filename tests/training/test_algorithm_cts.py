@@ -4,7 +4,7 @@ from itertools import pairwise
 import pytest
 import torch
 from gaitgauge.training.algorithms.cts import CTS
-from gaitgauge.training.algorithms.optimization import clip_gradients
+from gaitgauge.training.algorithms.optimization import FlatGradients
 from gaitgauge.training.algorithms.symmetry import passes
 from gaitgauge.training.configuration import ConfigurationError, NetworkConfiguration
 from gaitgauge.training.environment_configuration import Ramp
@@ -233,11 +233,18 @@ def test_gradient_clip_and_non_finite_gradients():
     parameters = algorithm.actor.student_parameters()
     for p in parameters:
         p.grad = torch.full_like(p, 3.0)
-    norm, skipped = clip_gradients(parameters, 1.0)
-    assert float(norm) > 1.0 and float(skipped) == 0.0
+    gradients = FlatGradients(parameters, extra=2)
+    gradients.extra.fill_(5.0)
+    gradients.gather()
+    norm, skipped = gradients.clip(1.0)
+    assert gradients.extra.tolist() == [5.0, 5.0]
+    assert (
+        float(norm) == pytest.approx(3.0 * sum(p.numel() for p in parameters) ** 0.5, rel=1e-5)
+        and float(skipped) == 0.0
+    )
     assert torch.nn.utils.get_total_norm([p.grad for p in parameters]) == pytest.approx(1.0, rel=1e-3)
     parameters[0].grad[0] = float("inf")
-    _, skipped = clip_gradients(parameters, 1.0)
+    _, skipped = gradients.clip(1.0)
     assert float(skipped) == 1.0 and all(bool((p.grad == 0).all()) for p in parameters)
 
 

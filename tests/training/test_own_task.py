@@ -1,5 +1,6 @@
 """A task of one's own, with a reward, an end, an observation and an event of its own: the example is the test."""
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -213,3 +214,42 @@ def test_the_guide_shows_the_example_and_its_tile_can_be_built(monkeypatch):
     assert [float(tile.height(x, 0.0)) for x in (0.0, 2.5, 3.5)] == [0.0, pytest.approx(0.2), 0.0]
     kinds = (TileConfiguration(name="kerb", share=1.0, command_limits=(1.0, 0.5, 1.5), sigma=0.5),)
     assert build_palette(TerrainConfiguration(tiles=kinds, levels=3)).index[0, 2].unique().numel() == 1
+
+
+LOOKING = """
+import torch
+def looks(inputs):
+    if inputs.base_height.mean().item() > 100.0:
+        print("high")
+    return inputs.base_height
+"""
+
+
+@pytest.fixture
+def looking(tmp_path, monkeypatch):
+    """A task's environment with a reward that asks the device for a number, and decides by it."""
+    (tmp_path / "looking.py").write_text(LOOKING)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    own = (OwnReward(name="mine", function="looking:looks", weight=1.0),)
+    yield lambda: make(2, rewards=RewardConfiguration(own=own))
+    sys.modules.pop("looking", None)
+
+
+def test_what_cannot_be_compiled_runs_as_it_is_and_is_said(looking):
+    environment, plain = looking(), looking()
+    before = environment.state_dict()["memory"]
+    environment._fuse(required=False)
+    assert re.fullmatch(
+        r"the environment's torch parts cannot be compiled \(.+\) and run as they are, which is slower; a function of your "
+        r"own in the task may be the cause",
+        environment.unfused,
+    )
+    assert all(torch.equal(value, before[name]) for name, value in environment.parts.memory.by_name().items())
+    assert torch.equal(idle(environment, 3)[1], idle(plain, 3)[1])
+
+
+def test_compiling_can_be_insisted_on(looking):
+    with pytest.raises(
+        ConfigurationError, match=r"cannot be compiled \(.+\); use fuse=False, on the command line --no-fuse"
+    ):
+        looking()._fuse(required=True)

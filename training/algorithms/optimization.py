@@ -5,41 +5,24 @@ moments out of a checkpoint, which somebody else may have written: what does not
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import nn
 
 
-def clip_gradients(parameters: Iterable[nn.Parameter], limit: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Limit the joint gradient norm, in place; gradients that are not finite become zero.
-
-    Args:
-        parameters: those without a gradient are left out.
-
-    Returns:
-        The norm before, and 1.0 if the gradients were dropped, else 0.0; both ().
-    """
-    gradients = [p.grad for p in parameters if p.grad is not None]
-    norm = nn.utils.get_total_norm(gradients)
-    finite = torch.isfinite(norm)
-    factor = torch.where(finite, (limit / (norm + 1e-6)).clamp(max=1.0), torch.zeros_like(norm))
-    torch._foreach_mul_(gradients, factor)
-    for gradient in gradients:
-        gradient.nan_to_num_(0.0, 0.0, 0.0)
-    return norm, (~finite).float()
-
-
 class FlatGradients:
-    """All gradients of an optimizer, and a few more numbers, in one tensor: one message between processes."""
+    """All gradients of an optimizer, and a few more numbers, in one tensor: one message between processes, one kernel to limit them."""
 
     def __init__(self, parameters: Sequence[nn.Parameter], *, extra: int = 0) -> None:
         """Allocate; ``extra`` numbers travel with the gradients."""
         self._parameters = parameters
         self.values = torch.zeros(sum(p.numel() for p in parameters) + extra, device=parameters[0].device)
         """What the processes average."""
-        *views, self.extra = self.values.split([*(p.numel() for p in parameters), extra])
+        sizes = [p.numel() for p in parameters]
+        self._gradients, self.extra = self.values.split([sum(sizes), extra])
+        views = self._gradients.split(sizes)
         self._views = [view.view_as(p) for view, p in zip(views, parameters, strict=True)]
 
     def gather(self) -> None:
@@ -48,6 +31,18 @@ class FlatGradients:
         torch._foreach_copy_(self._views, gradients)
         for parameter, view in zip(self._parameters, self._views, strict=True):
             parameter.grad = view
+
+    def clip(self, limit: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Limit the joint norm of the gathered gradients, in place; gradients that are not finite become zero.
+
+        Returns:
+            The norm before, and 1.0 if the gradients were dropped, else 0.0; both ().
+        """
+        norm = torch.linalg.vector_norm(self._gradients)
+        finite = torch.isfinite(norm)
+        factor = torch.where(finite, (limit / (norm + 1e-6)).clamp(max=1.0), torch.zeros_like(norm))
+        self._gradients.mul_(factor).nan_to_num_(0.0, 0.0, 0.0)
+        return norm, (~finite).float()
 
 
 def load_moments(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> float:

@@ -20,7 +20,7 @@ from ..processes import Processes
 from ..schedules import RampTable
 from .bootstrap import Bootstrap
 from .losses import Losses
-from .optimization import FlatGradients, clip_gradients, load_moments
+from .optimization import FlatGradients, load_moments
 from .storage import EnvironmentSplit, RolloutStorage
 from .symmetry import Mirror, passes
 
@@ -220,8 +220,9 @@ class PPO:
             decision, weights = actor.decide(latent, policy)
             values = self.critic.value(latent, privileged, weights).float()
         actor.distribution.update(decision.float())
-        actions = actor.distribution.sample()
         action_mean, action_std = actor.distribution.params
+        # Not ``distribution.sample()``: torch asks the device whether a deviation is negative, and waits for the answer.
+        actions = action_mean + action_std * torch.randn_like(action_mean)
         self.storage.add(
             policy=policy,
             privileged=privileged,
@@ -374,12 +375,12 @@ class PPO:
     def _apply_policy(self) -> None:
         metrics = self._policy_gradients.extra
         self._adapt_learning_rate(metrics[self.losses.policy_names.index("kl")])
-        norm, skipped = clip_gradients(self._policy_parameters, self.configuration.max_gradient_norm)
+        norm, skipped = self._policy_gradients.clip(self.configuration.max_gradient_norm)
         self.optimizer.step()
         self._policy_metrics += torch.nan_to_num(torch.cat((metrics, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
 
     def _apply_student(self) -> None:
-        _, skipped = clip_gradients(self.actor.student_parameters(), self.configuration.max_gradient_norm)
+        _, skipped = self._student_gradients.clip(self.configuration.max_gradient_norm)
         self.student_optimizer.step()
         metrics = torch.cat((self._student_gradients.extra, skipped[None]))
         self._student_metrics += torch.nan_to_num(metrics, 0.0, 0.0, 0.0)
