@@ -49,8 +49,8 @@ class PhysicsOptions:
     """Solver tolerance."""
     foot_condim: Annotated[int, Field(ge=1, le=6)] | None = None
     """Contact dimension of the feet (3 sliding, 4 with torsion, 6 with rolling too); None keeps the robot file's."""
-    self_collision: Literal[True, False, "feet"] = True
-    """Whether the robot's own parts meet each other; with ``feet`` only where one of the two is a foot."""
+    self_collision: bool = True
+    """Whether the robot's own parts meet each other."""
     torque_limits: bool = True
     """Whether motor torque is clipped to the parameter set's ``torque_limit``."""
     torque_speed_limit: bool = False
@@ -80,12 +80,12 @@ TRAINING_PHYSICS = PhysicsOptions(
     ls_iterations=20,
     tolerance=1e-6,
     foot_condim=3,
-    self_collision=False,
     torque_limits=True,
     torque_speed_limit=True,
 )
-"""Physics that is fast and has converged: 200 Hz, four substeps, sliding friction only. A pyramidal cone with a high ``impratio``
-needs many more iterations: with 100 and 6, contacts kick. The conformance check ``contact/training`` holds engines to it."""
+"""Physics that is fast and has converged: 200 Hz, four substeps, sliding friction only; legs meet each other. A pyramidal cone with
+a high ``impratio`` needs many more iterations: with 100 and 6, contacts kick. The conformance check ``contact/training`` holds
+engines to it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -156,12 +156,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--policy", default="pretrained")
     parser.add_argument("--foot-condim", type=int, default=TRAINING_PHYSICS.foot_condim)
     parser.add_argument(
-        "--self-collision",
-        nargs="?",
-        type=lambda text: {"true": True, "false": False}.get(text.lower(), text),
-        choices=[True, False, "feet"],
-        const=True,
-        default=TRAINING_PHYSICS.self_collision,
+        "--self-collision", action=argparse.BooleanOptionalAction, default=TRAINING_PHYSICS.self_collision
     )
     arguments = parser.parse_args(argv)
     changes = {"foot_condim": arguments.foot_condim, "self_collision": arguments.self_collision}

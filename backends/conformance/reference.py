@@ -176,10 +176,8 @@ def _add_ground(spec: mujoco.MjSpec, robot: Robot, physics: PhysicsOptions) -> N
     for geom in spec.geoms:
         if geom.name in robot.foot_geoms and physics.foot_condim is not None:
             geom.condim = physics.foot_condim
-        if physics.self_collision in (False, "feet") and (geom.contype or geom.conaffinity):
-            # bit 1 is the ground's, with bit 2 a foot meets all parts
-            foot = physics.self_collision == "feet" and geom.name in robot.foot_geoms
-            geom.contype, geom.conaffinity = 2 if foot else 0, 3
+        if not physics.self_collision and (geom.contype or geom.conaffinity):
+            geom.contype, geom.conaffinity = 0, 1
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
     option, pyramidal = spec.option, physics.cone == "pyramidal"
     option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL if pyramidal else mujoco.mjtCone.mjCONE_ELLIPTIC

@@ -63,19 +63,9 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
             continue
         if geom.name in robot.foot_geoms and physics.foot_condim is not None:
             geom.condim = physics.foot_condim
-        feet_meet = physics.self_collision == "feet"
-        if feet_meet or not physics.self_collision:
-            _leave_to_pass(geom, meets=feet_meet and geom.name in robot.foot_geoms)
+        if not physics.self_collision:
+            geom.contype, geom.conaffinity = 0, 1  # the ground's contype 1 still meets it, other robot geoms do not
     return spec
-
-
-def _leave_to_pass(geom: mujoco.MjsGeom, *, meets: bool) -> None:
-    """Let a colliding shape of the robot pass through its other shapes, but for those that are given ``meets``: these meet all.
-
-    Two geoms meet where one's contype shares a bit with the other's conaffinity. Every shape has the conaffinity 1; the contype 1
-    is that of the ground, which is met as ever, and of the shapes that meet all. What does not move never meets its like.
-    """
-    geom.contype, geom.conaffinity = int(meets), 1
 
 
 def _mark_feet(spec: mujoco.MjSpec, robot: Robot) -> None:

@@ -92,9 +92,8 @@ class PlainMujocoBackend(PhysicsBackend):
         for geom in spec.geoms:
             if geom.name in robot.foot_names and physics.foot_condim is not None:
                 geom.condim = physics.foot_condim
-            if physics.self_collision in (False, "feet") and geom.contype:
-                meets = physics.self_collision == "feet" and geom.name in robot.foot_names
-                geom.contype, geom.conaffinity = 3 if meets else 2, 1
+            if not physics.self_collision and geom.contype:
+                geom.contype, geom.conaffinity = 2, 1
         for j, name in enumerate(robot.joint_names):
             joint = spec.joint(name)
             joint.armature, joint.frictionloss = constants.armature[j], constants.friction_loss[j]

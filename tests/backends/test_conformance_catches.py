@@ -209,20 +209,6 @@ class LegsPass(SceneFault):
         return replace(scene, physics=replace(scene.physics, self_collision=False))
 
 
-class FeetAreTakenForAllParts(SceneFault):
-    def spoil(self, scene):
-        return replace(scene, physics=replace(scene.physics, self_collision=bool(scene.physics.self_collision)))
-
-
-class FeetMissShanks(MujocoBackend):
-    def __init__(self, scene, **rest):
-        super().__init__(scene, **rest)
-        if scene.physics.self_collision == "feet":
-            for model in (*self._palette, *self._models):
-                feet = [model.geom(name).id for name in scene.robot.foot_geoms]
-                model.geom_contype[feet], model.geom_conaffinity[feet] = 4, 5
-
-
 class CondimIgnored(SceneFault):
     def spoil(self, scene):
         return replace(scene, physics=replace(scene.physics, foot_condim=None))
@@ -256,8 +242,6 @@ FAULTS = [
     (KickingContacts, "contact/training"),
     (TooFewIterations, "contact/training"),
     (LegsPass, "contact/legs"),
-    (FeetAreTakenForAllParts, "contact/legs"),
-    (FeetMissShanks, "contact/legs"),
     (CondimIgnored, "contact/torsion"),
     (CondimNeverAboveThree, "contact/torsion"),
     (DivergenceHidden, "health/divergence"),
@@ -301,14 +285,3 @@ def test_what_an_engine_cannot_do_is_neither_passed_nor_failed():
     result = run_check(CHECKS["disturbance/force"], make_bench(SwallowsRequests))
     assert result.outcome is Outcome.NOT_SUPPORTED
     assert "external_force" in result.detail
-
-
-def test_an_engine_may_refuse_that_the_feet_alone_meet_other_parts():
-    class AllOrNothing(MujocoBackend):
-        def __init__(self, scene, **rest):
-            if scene.physics.self_collision == "feet":
-                raise BackendError("this engine has all contacts or none; use PhysicsOptions(self_collision=True)")
-            super().__init__(scene, **rest)
-
-    result = run_check(CHECKS["contact/legs"], make_bench(AllOrNothing))
-    assert result.outcome is Outcome.PASSED and "'feet' refused: this engine has" in result.detail

@@ -125,14 +125,6 @@ def test_a_suite_may_limit_torque_by_speed(suite_file):
     assert limited.physics.torque_speed_limit and limited.digest != plain.digest
 
 
-def test_a_suite_may_let_the_feet_alone_meet_other_parts(suite_file):
-    suites = [
-        load_suite(suite_file(mine(f"[physics]\nself_collision = {text}"))) for text in ("true", "false", "'feet'")
-    ]
-    assert [suite.physics.self_collision for suite in suites] == [True, False, "feet"]
-    assert len({suite.digest for suite in suites}) == 3
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -174,7 +166,7 @@ def test_a_suite_may_let_the_feet_alone_meet_other_parts(suite_file):
         ("[metrics.weights]\nlin_vel_err = inf", "metrics.weights.lin_vel_err is inf; it must be a finite number"),
         ("[metrics]\nsoft_limit_joints = []", "metrics.soft_limit_joints is .*; it must have at least 1 item"),
         ("[physics]\ntorque_limits = 1", "physics.torque_limits is 1; it must be true or false"),
-        ("[physics]\nself_collision = 'legs'", "physics.self_collision is 'legs'; it must be True, False or 'feet'"),
+        ("[physics]\nself_collision = 'legs'", "physics.self_collision is 'legs'; it must be true or false"),
         ("[physics]\niterations = -1", "physics.iterations is -1; it must be greater than or equal to 1"),
         ("[noise]\nstream = 'dice'", "noise.stream is 'dice'; it must be 'reference' or 'counter'"),
         ("[noise]\njoint_velocity = nan", "noise.joint_velocity is nan; it must be a finite number"),

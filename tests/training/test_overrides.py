@@ -118,18 +118,12 @@ def test_mistakes_are_named(override, message):
         ("training.algorithm.learning_rate_range=1e-5,1e300", r"'training.algorithm.learning_rate_range' is '1e300'"),
         ("environment.joints.armature=-1", r"'environment.joints.armature' is '-1'; .*, or none"),
         ("environment.joints.friction_loss=1e300", r"'environment.joints.friction_loss' is '1e300'"),
-        ("environment.physics.self_collision=legs", r"self_collision' is 'legs'; it must be True, False or 'feet'"),
+        ("environment.physics.self_collision=legs", r"self_collision' is 'legs'; it must be true or false"),
     ],
 )
 def test_no_setting_is_impossible(override, message):
     with pytest.raises(TaskError, match=message):
         find_task("go2-cts", [override])
-
-
-@pytest.mark.parametrize(("text", "value"), [("true", True), ("false", False), ("feet", "feet")])
-def test_the_feet_may_be_all_that_meets_other_parts(text, value):
-    task = find_task("go2-cts", [f"environment.physics.self_collision={text}"])
-    assert task.environment.physics.self_collision == value
 
 
 def test_every_key_can_be_set_to_what_it_is():
