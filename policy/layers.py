@@ -22,6 +22,23 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
 }
 
 
+def aligned(values: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Inputs (N, I) and weights (O, I) of a linear layer with zeros behind them, so that rows fill whole multiples of 16 bytes. A
+    product of 225 columns takes three times as long as one of 228 on an H200.
+    """
+    spare = -weight.shape[1] % 8  # as many fill 16 bytes in half precision
+    if spare == 0:
+        return values, weight
+    return functional.pad(values, [0, spare]), functional.pad(weight, [0, spare])
+
+
+def linear(values: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    """Outputs (N, O) of a linear layer for inputs (N, I), on a GPU with rows that are aligned."""
+    if values.is_cuda:
+        values, weight = aligned(values, weight)
+    return functional.linear(values, weight, bias)
+
+
 class Perceptron(nn.Sequential):
     """Layers one after another, called without hooks and detours: on the CPU these cost as much as a small layer."""
 
@@ -29,7 +46,7 @@ class Perceptron(nn.Sequential):
         """Outputs (N, last width) for inputs (N, first width)."""
         for layer in self:
             if isinstance(layer, nn.Linear):
-                input = functional.linear(input, layer.weight, layer.bias)
+                input = linear(input, layer.weight, layer.bias)
             else:
                 input = layer.forward(input)
         return input

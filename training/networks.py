@@ -15,6 +15,7 @@ from rsl_rl.modules.distribution import Distribution, GaussianDistribution
 from torch import nn
 from torch.nn import functional
 
+from ..policy.layers import linear
 from ..policy.networks import ARCHITECTURES, ExpertMixture, multilayer_perceptron
 from .configuration import ConfigurationError, NetworkConfiguration, TrainingConfiguration
 
@@ -245,6 +246,6 @@ def last_in_float32(layers: nn.Sequential, values: torch.Tensor) -> torch.Tensor
     """
     *hidden, last = layers
     for layer in hidden:
-        values = layer(values)
+        values = linear(values, layer.weight, layer.bias) if isinstance(layer, nn.Linear) else layer(values)
     with torch.autocast(values.device.type, enabled=False):
         return last(values.float())

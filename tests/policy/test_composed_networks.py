@@ -4,6 +4,7 @@ import pytest
 import torch
 from gaitgauge.policy.composed import AcMoeNetwork, CompositeActor, GatedActor, McpNetwork
 from gaitgauge.policy.estimators import VELOCITY, DreamwaqNetwork, HimNetwork
+from gaitgauge.policy.layers import aligned
 from torch import nn
 
 
@@ -90,3 +91,19 @@ def test_an_estimate_is_velocity_then_latent(make):
     else:
         assert torch.equal(estimate[:, 3:], encoded[:, 3:19])
     assert torch.equal(action, network.actor(torch.cat((estimate, history[:, -1]), dim=1)))
+
+
+@pytest.mark.parametrize(("width", "filled"), [(225, 232), (263, 264), (77, 80), (512, 512)])
+def test_rows_that_are_filled_up_change_no_product_and_no_gradient(width, filled):
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(7, width, generator=generator, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(5, width, generator=generator, dtype=torch.float64, requires_grad=True)
+    longer, wider = aligned(values, weight)
+    assert (longer.shape, wider.shape) == ((7, filled), (5, filled))
+    plain, other = values @ weight.t(), longer @ wider.t()
+    assert torch.allclose(plain, other, rtol=0.0, atol=1e-12)
+    up = torch.randn(7, 5, generator=generator, dtype=torch.float64)
+    for one, two in zip(
+        torch.autograd.grad(plain, (values, weight), up), torch.autograd.grad(other, (values, weight), up), strict=True
+    ):
+        assert torch.allclose(one, two, rtol=0.0, atol=1e-12)
