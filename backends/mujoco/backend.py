@@ -10,7 +10,7 @@ which each substep started.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from time import perf_counter
 from typing import ClassVar
@@ -338,8 +338,9 @@ class MujocoBackend(PhysicsBackend):
     # ---- changing the model ---------------------------------------------------------------------------------------
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
-        """See ``PhysicsBackend.randomize``."""
+        """See ``PhysicsBackend.randomize``. Worlds whose values stay as they are cost nothing: constants of a model are slow to make."""
         rows = self._rows(worlds)
+        changed: set[int] = set()
         for item in fields(Randomization):
             value = getattr(randomization, item.name)
             if value is None:
@@ -348,11 +349,17 @@ class MujocoBackend(PhysicsBackend):
                 raise BackendError(
                     f"Randomization.{item.name} has {len(value)} rows for {len(rows)} worlds; give one row for each"
                 )
-            for row, entry in zip(rows, value.to(torch.float64).numpy(), strict=True):
-                self._randomized.setdefault(int(row), {})[item.name] = entry
-        for row in rows:
-            self._apply_randomization(int(row))
-        self._read_gains(rows)
+            # copied: the caller may go on writing into its tensor
+            for row, entry in zip(map(int, rows), value.to(torch.float64, copy=True).numpy(), strict=True):
+                known = self._randomized.setdefault(row, {})
+                if item.name not in known or not np.array_equal(known[item.name], entry):
+                    known[item.name] = entry
+                    changed.add(row)
+        if not changed:
+            return
+        for row in changed:
+            self._apply_randomization(row)
+        self._read_gains(sorted(changed))
         self._batch.set_models(self._models)
 
     def _apply_randomization(self, row: int) -> None:
@@ -383,7 +390,7 @@ class MujocoBackend(PhysicsBackend):
         self._speed[row] = values.get("motor_speed", 1.0)
         self._offset[row] = values.get("motor_offset", 0.0)
 
-    def _read_gains(self, rows: range | NDArray[np.int64]) -> None:
+    def _read_gains(self, rows: Sequence[int] | NDArray[np.int64]) -> None:
         """Read kp and strength of each motor, and kd/kp, from which the torque-free target follows."""
         for row in rows:
             model = self._models[row]

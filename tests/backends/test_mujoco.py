@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import mujoco
 import pytest
 import torch
-from gaitgauge.backends.base import BackendError, PhysicsOptions, PhysicsState, ResetState, Scene
+from gaitgauge.backends.base import BackendError, PhysicsOptions, PhysicsState, Randomization, ResetState, Scene
 from gaitgauge.backends.mujoco import MujocoBackend
 from gaitgauge.backends.mujoco.model import build_models
 from gaitgauge.robots import load_robot
@@ -121,6 +121,25 @@ def test_targets_that_are_not_finite_leave_the_old_ones_in_force(scene: Scene):
     whole.step(kept)
     assert broken.state.diverged.tolist() == [False, False, False, True, False]
     assert torch.isnan(spoilt[3, 5]) and torch.equal(broken.state.joint_position, whole.state.joint_position)
+
+
+def test_only_worlds_whose_values_change_get_new_models(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    """Training hands over all motors in every step, of which a reset changes a few."""
+    backend, made = MujocoBackend(scene), []
+    apply = backend._apply_randomization
+    monkeypatch.setattr(backend, "_apply_randomization", lambda row: (made.append(row), apply(row)))
+    strength = torch.linspace(0.8, 1.2, WORLDS * 12, dtype=torch.float64).view(WORLDS, 12)
+    mass = torch.linspace(-1.0, 1.0, WORLDS)
+    for _ in range(2):
+        backend.randomize(Randomization(motor_strength=strength, base_mass_offset=mass))
+    assert sorted(made) == list(range(WORLDS))
+    strength[3] = 0.5  # in the caller's own tensor
+    backend.randomize(Randomization(motor_strength=strength))
+    assert made[WORLDS:] == [3]
+    assert backend._strength[3].tolist() == [0.5] * 12 and backend._strength[2].tolist() == strength[2].tolist()
+    assert float(backend._models[3].body_mass.sum()) == pytest.approx(
+        float(backend._palette[0].body_mass.sum() + mass[3]), abs=1e-6
+    )
 
 
 def meeting(model: mujoco.MjModel) -> set[frozenset[str]]:
