@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 from gaitgauge.gauge import diagnosis
 from gaitgauge.gauge.diagnosis import diagnose
+from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.alternatives import Alternative, alternatives, toml_lines
 from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.export import export_onnx
@@ -113,6 +114,42 @@ def test_the_sign_of_gravity_is_named(monkeypatch):
     assert found.verdict().startswith("the sign of gravity looks wrong")
 
 
+def test_gains_that_make_torques_jump_are_named(monkeypatch):
+    """The robot stays up with four times its gains, too, and does not ask for rougher targets."""
+
+    def right(contract: PolicyContract, robot) -> list[Alternative]:
+        return [a for a in alternatives(contract, robot) if a.contract.hash == GOOD.hash]
+
+    monkeypatch.setattr(diagnosis, "alternatives", right)
+    found = diagnose(described_as(BROKEN["gains"]), GO2, seconds=1.0)
+    assert found.described.survival == 1.0
+    assert [m.kind for m in found.mistakes] == ["gains"]
+    assert found.best.smoothness > found.described.smoothness + 0.1
+
+
+def test_contacts_and_motors_are_the_gauges():
+    """On feet that turn freely a robot turns about twice as fast."""
+    gauge = load_suite("gaitgauge-1").physics
+    physics = diagnosis._worlds(GO2, GOOD, 1, 1).scene.physics
+    assert (physics.timestep, physics.substeps) == (0.005, 4)
+    for name in ("cone", "impratio", "foot_condim", "self_collision", "torque_limits", "torque_speed_limit"):
+        assert getattr(physics, name) == getattr(gauge, name), name
+
+
+def test_worlds_do_not_ask_for_more_memory_than_a_small_machine_has(monkeypatch):
+    """Linux starts no further process where one has asked for more than there is, used or not."""
+    make, counts = diagnosis._worlds, []
+
+    def counted(robot, contract, count, threads):
+        counts.append(count)
+        return make(robot, contract, count, threads)
+
+    monkeypatch.setattr(diagnosis, "_worlds", counted)
+    found = diagnose(described_as(GOOD), GO2, seconds=0.04)
+    assert sum(counts) == 4 * (1 + len(found.others))
+    assert max(counts) * 14e6 < 0.5e9  # a world of MuJoCo asks for 14 MB
+
+
 def test_a_good_description_is_left_alone(monkeypatch):
     monkeypatch.setattr(diagnosis, "alternatives", few("sign of gravity"))
     found = diagnose(described_as(GOOD), GO2, seconds=1.0)
@@ -142,6 +179,8 @@ def test_a_period_that_the_physics_does_not_have_is_refused():
 def test_every_mistake_is_named(name):
     found = diagnose(described_as(BROKEN[name]), GO2)
     assert [name.startswith(m.kind) for m in found.mistakes] == [True]
+    # with other damping robots walk as well
+    assert found.best.contract.hash == GOOD.hash or name == "gains"
     assert found.best.score > 0.9
 
 
@@ -155,6 +194,7 @@ def test_two_mistakes_at_once_are_named():
     both = replace(BROKEN["action scale"], observation=BROKEN["observation scale of the command"].observation)
     found = diagnose(described_as(both), GO2)
     assert {m.kind for m in found.mistakes} == {"action scale", "observation scale"}
+    assert found.best.contract.hash == GOOD.hash
     assert found.best.score > 0.9
 
 

@@ -71,8 +71,9 @@ def puppets(name, scene, *, device="cpu", threads=1):
 
 
 def evaluate(request, folder, *, make=None, **options):
-    """An evaluation, on the engine without physics where a request names that."""
-    make = make or (puppets if getattr(request, "backend", "fake") == "fake" else make_backend)
+    """An evaluation of a request, or of what was prepared from one, on the engine without physics where it names that."""
+    asked = getattr(request, "request", request)
+    make = make or (puppets if asked.backend == "fake" else make_backend)
     with patch.object(evaluation, "make_backend", make):
         return evaluation.evaluate(request, folder, **options)
 
