@@ -340,20 +340,19 @@ class MujocoBackend(PhysicsBackend):
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``. Worlds whose values stay as they are cost nothing: constants of a model are slow to make."""
         rows = self._rows(worlds)
-        changed: set[int] = set()
-        for item in fields(Randomization):
-            value = getattr(randomization, item.name)
-            if value is None:
-                continue
+        values = {f.name: value for f in fields(Randomization) if (value := getattr(randomization, f.name)) is not None}
+        for name, value in values.items():
             if len(value) != len(rows):
                 raise BackendError(
-                    f"Randomization.{item.name} has {len(value)} rows for {len(rows)} worlds; give one row for each"
+                    f"Randomization.{name} has {len(value)} rows for {len(rows)} worlds; give one row for each"
                 )
+        changed: set[int] = set()
+        for name, value in values.items():
             # copied: the caller may go on writing into its tensor
             for row, entry in zip(map(int, rows), value.to(torch.float64, copy=True).numpy(), strict=True):
                 known = self._randomized.setdefault(row, {})
-                if item.name not in known or not np.array_equal(known[item.name], entry):
-                    known[item.name] = entry
+                if name not in known or not np.array_equal(known[name], entry):
+                    known[name] = entry
                     changed.add(row)
         if not changed:
             return

@@ -142,6 +142,18 @@ def test_only_worlds_whose_values_change_get_new_models(scene: Scene, monkeypatc
     )
 
 
+def test_a_randomization_that_is_refused_changes_nothing(scene: Scene):
+    """Else the same values without the mistake would seem to be in the models already."""
+    backend = MujocoBackend(scene)
+    strength, mass = torch.full((WORLDS, 12), 0.5), torch.full((WORLDS,), 2.0)
+    with pytest.raises(BackendError, match=f"motor_strength has 1 rows for {WORLDS} worlds"):
+        backend.randomize(Randomization(motor_strength=strength[:1], base_mass_offset=mass))
+    nominal = backend._palette[0].body_mass.sum()
+    assert [model.body_mass.sum() for model in backend._models] == pytest.approx([nominal] * WORLDS)
+    backend.randomize(Randomization(base_mass_offset=mass))
+    assert [model.body_mass.sum() for model in backend._models] == pytest.approx([nominal + 2.0] * WORLDS)
+
+
 def meeting(model: mujoco.MjModel) -> set[frozenset[str]]:
     """Pairs of geoms, of which at least one moves, whose masks let them meet."""
     return {
