@@ -6,7 +6,7 @@
 Trains for ``--skip`` iterations (compiling and CUDA graphs are behind them), then lets ``torch.profiler`` watch the next ones,
 and prints for each part: milliseconds of an iteration in which a kernel of it ran, milliseconds in which the device waited for
 one of it, how many kernels, how often the host waited for the device, and its dearest kernels. The profiler itself slows the
-host down, so that more is waited for than without it, and it misses kernels inside of a graph's loops, which count as waiting;
+host down, so that more is waited for than without it, and it misses most kernels inside of a graph's loops, which count as waiting;
 ``several_gpus.py`` measures the whole. On a CPU, where there are no kernels, the parts' own times are printed.
 """
 
@@ -25,7 +25,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import environment_throughput
 import torch
+import warp_profile
 from gaitgauge.training.launch import TrainRequest, prepare, train
 from gaitgauge.training.runner import TrainingRunner
 from gaitgauge.training.stopping import Progress
@@ -36,16 +38,7 @@ PARTS = (
     ("noting outcomes", "alg.store_outcome"),
     ("guard against NaN", "_guard"),
     ("episode log", "logger.add_step"),
-    ("random numbers", "env.parts.uniform.draw"),
-    ("targets", "env.parts.targets"),
-    ("latency", "env.parts.delay"),
-    ("physics", "env.backend.step"),
-    ("judging and resetting", "env._after_physics"),
-    ("log", "env._log"),
-    ("motor parameters", "env.parts.motors.apply"),
-    ("physics reset", "env.backend.reset"),
-    ("physics push", "env.backend.push"),
-    ("observing", "env._observe"),
+    *((title, ".".join(filter(None, ("env", path, name)))) for title, path, name in environment_throughput.PARTS),
     ("returns", "alg.compute_returns"),
     ("policy learning", "alg._policy_step"),
     ("student's targets", "alg.losses.prepare_student"),
@@ -129,8 +122,7 @@ def shares(trace: list[dict[str, Any]]) -> dict[str, Share]:
 
 def short_name(name: str) -> str:
     """A kernel's name without template arguments, and without what Warp adds to tell variants apart."""
-    name = re.sub(r"_cuda_kernel_(forward|backward).*$", "", name)
-    name = re.sub(r"_[0-9a-f]{8,}$|__locals__kernel|_[0-9a-f]{8}(?=_|$)", "", name)
+    name = warp_profile.short_name(name)
     if functor := re.search(r"elementwise_kernel.*?native::(?:\(anonymous namespace\)::)?(\w+)", name):
         return f"elementwise {functor.group(1)}"
     if product := re.search(r"cutlass_\w+", name):
@@ -201,14 +193,14 @@ def main() -> None:
     )
     if plain:
         print(f"an iteration without the profiler: {1e3 * sorted(plain)[len(plain) // 2]:.1f} ms")
-    print(f"{'part':<26}{'busy ms':>9}{'idle ms':>9}{'kernels':>9}{'waits':>7}")
+    print(f"{'part':<32}{'busy ms':>9}{'idle ms':>9}{'kernels':>9}{'waits':>7}")
     parts = sorted(found.items(), key=lambda item: -item[1].microseconds - item[1].idle)
     everything = Share(
         **{name: sum(getattr(s, name) for s in found.values()) for name in ("microseconds", "idle", "kernels", "waits")}
     )
     for title, share in [*parts, ("all", everything)]:
         print(
-            f"{title:<26}{share.microseconds / each:>9.2f}{share.idle / each:>9.2f}"
+            f"{title:<32}{share.microseconds / each:>9.2f}{share.idle / each:>9.2f}"
             f"{share.kernels / options.iterations:>9.0f}{share.waits / options.iterations:>7.0f}"
         )
     for title, share in parts:

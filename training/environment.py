@@ -188,7 +188,7 @@ class TrainingEnvironment(VecEnv):
 
     def _fuse(self, *, required: bool) -> None:
         """Compile both torch parts; where that is impossible, refuse if it is ``required``, or say so in ``unfused``."""
-        from torch._dynamo.exc import TorchDynamoException  # loading it takes seconds
+        from torch._dynamo.exc import TorchDynamoException  # loading it takes more than a second
 
         after_physics = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
         observe = torch.compile(self._observe, fullgraph=True, dynamic=False)

@@ -341,9 +341,9 @@ def train(
                 fuse=request.fuse,
             )
             closing.callback(env.close)
-            if env.unfused:
-                message(env.unfused)
             if run is not None:
+                if env.unfused:
+                    message(env.unfused)
                 _describe(plan, run, env)
             processes = Processes.join(device)
             scorer = filmer = None

@@ -1,5 +1,5 @@
-"""A rollout only asks the device for work. Whatever waits for an answer lets the device stand still until the host has asked for more:
-one such wait a control step cost a fifth of an iteration of 16,384 worlds.
+"""A rollout only asks the device for work. Whatever waits for an answer lets the device stand still until the host has asked for more
+(docs/performance.md has what one such wait a control step was worth).
 """
 
 import pytest

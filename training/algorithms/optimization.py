@@ -13,7 +13,7 @@ from torch import nn
 
 
 class FlatGradients:
-    """All gradients of an optimizer, and a few more numbers, in one tensor: one message between processes, one kernel to limit them."""
+    """All gradients of an optimizer, and a few more numbers, in one tensor: sent between processes and limited as one."""
 
     def __init__(self, parameters: Sequence[nn.Parameter], *, extra: int = 0) -> None:
         """Allocate; ``extra`` numbers travel with the gradients."""
