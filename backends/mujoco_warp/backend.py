@@ -20,6 +20,7 @@ from ..warp.state import StateArrays
 from ..warp.structures import filled, to_warp
 from . import kernels, readout
 from .arrays import Links, Palette, Roles, contact_arrays, motion_arrays
+from .fused_solver import fuse_solver
 from .height_fields import repair_height_fields
 from .masses import BATCHED_FIELDS, WorldMasses, describe_model
 from .memory import bytes_per_world
@@ -27,6 +28,7 @@ from .model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, b
 from .order import CanonicalOrder
 
 repair_height_fields()
+fuse_solver()
 
 _ALARMS = mujoco_warp.OverflowType
 _DROPPED = int(

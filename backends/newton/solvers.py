@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
+from ..mujoco_warp.fused_solver import fuse_solver
 from ..mujoco_warp.height_fields.repair import repair_height_fields
 from ..mujoco_warp.model import SMALLEST_TOLERANCE, constraint_rows, contacts_per_world
 from . import kernels, solver_kernels
@@ -25,6 +26,7 @@ from .import_check import import_differences
 from .model import WorldModel, carriers
 
 repair_height_fields()
+fuse_solver()
 
 _EXACT = Capability(support=Support.EXACT)
 
