@@ -14,6 +14,8 @@ from mujoco_warp_scenes import BOXES, FINE, FLAT, TRAINING, scene, upright
 
 FEW, MANY = 3, 30
 """Spheres under the body: contacts with four rows each, of which 64 rows are copied into shared memory."""
+MOST_ROWS = 256
+"""One number for all, so that few kernels are compiled."""
 DEVICES = ("cpu", pytest.param("cuda:0", marks=pytest.mark.gpu))
 
 
@@ -39,13 +41,13 @@ def velocities(model, worlds):
     return np.random.default_rng(7).normal(scale=0.6, size=(worlds, model.nv))
 
 
-def solved(model, function, *, worlds=16, device="cpu", monkeypatch=None, rows=None):
+def solved(model, function, *, worlds=16, device="cpu", monkeypatch=None):
     """Accelerations, constraint forces by degree of freedom and row, states, and iterations."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with wp.ScopedDevice(device):
         m = mujoco_warp.put_model(model)
-        d = mujoco_warp.put_data(model, data, nworld=worlds, njmax=rows or data.nefc, nconmax=64)
+        d = mujoco_warp.put_data(model, data, nworld=worlds, njmax=MOST_ROWS, nconmax=64)
         d.qvel.assign(velocities(model, worlds).astype(np.float32))
         monkeypatch.setattr(solver, "solve", function)
         mujoco_warp.forward(m, d)
@@ -123,15 +125,15 @@ def test_the_minimum_has_no_gradient(monkeypatch):
 
 
 def test_a_body_in_the_air_falls_freely(monkeypatch):
-    model = model_of(FEW, joints=0)
+    model = model_of(FEW)
     model.qpos0[2] = 1.0
-    found = solved(model, fused.solve, monkeypatch=monkeypatch, rows=16)
+    model.dof_frictionloss[:] = 0.0
+    model.jnt_limited[:] = 0
+    found = solved(model, fused.solve, monkeypatch=monkeypatch)
     assert found["row force"].shape[1] == 0
-    for velocity, acceleration in zip(velocities(model, 16), found["acceleration"], strict=True):
-        data = mujoco.MjData(model)
-        data.qvel[:] = velocity
-        mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(acceleration, data.qacc, rtol=0.0, atol=1e-4)
+    expected = solved(model, fused.plain_solve, monkeypatch=monkeypatch)
+    np.testing.assert_allclose(found["acceleration"], expected["acceleration"], rtol=0.0, atol=1e-4)
+    assert found["acceleration"][:, 2].mean() == pytest.approx(-9.81, abs=0.2)
     assert not found["joint force"].any()
     assert not found["iterations"].any()
 
@@ -164,7 +166,7 @@ def test_a_limit_of_iterations_is_kept_and_told(monkeypatch):
     model.opt.iterations = 1
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    m, d = mujoco_warp.put_model(model), mujoco_warp.put_data(model, data, nworld=16)
+    m, d = mujoco_warp.put_model(model), mujoco_warp.put_data(model, data, nworld=16, njmax=MOST_ROWS)
     m.opt.warn_overflow = 0
     d.qvel.assign(velocities(model, 16).astype(np.float32))
     monkeypatch.setattr(solver, "solve", fused.solve)
@@ -173,6 +175,7 @@ def test_a_limit_of_iterations_is_kept_and_told(monkeypatch):
     assert (d.overflow.numpy() & int(mujoco_warp.OverflowType.ITERATIONS)).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_robots_stand_and_fall_as_with_mujoco_warps_own(device, monkeypatch):
     """Two seconds of robots that drop onto three grounds with limp legs: the same to the accuracy of the solver at first, and

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import solver_speed
 import warp_profile as profile
 from gaitgauge.terrains.training_tiles import make_tile
 
@@ -62,7 +63,7 @@ def test_a_small_run_on_the_cpu_times_steps_and_kernels(tmp_path, capsys):
         assert 1 <= row["iterations_mean"] <= row["iterations_largest"] <= 10
     names = {k["name"]: k for k in rows[0]["kernels"]["kernels"]}
     assert names["motor_law"]["launches"] == 1.0
-    assert any("linesearch" in name for name in names)
+    assert any("solve_kernel" in name for name in names)
     assert "kernels of one substep" in capsys.readouterr().out
 
 
@@ -71,3 +72,18 @@ def test_cases_that_do_not_fit_into_the_time_are_named(tmp_path, capsys):
     arguments = ["--device", "cpu", "--worlds-scale", "0.001", "--steps", "1", "--walk", "1", "--scene", "gauge-wave"]
     profile.main([*arguments, "--time", "-1", "--out", str(tmp_path / "profile.json")])
     assert "left out for lack of time: gauge-wave, 3 worlds" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_solvers_are_compared_on_the_cpu(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "solver.json"
+    arguments = ["--device", "cpu", "--worlds", "6", "--steps", "1", "--walk", "4", "--contacts", "training", "cones"]
+    monkeypatch.setattr("sys.argv", ["solver_speed.py", *arguments, "--out", str(out)])
+    monkeypatch.setattr(solver_speed.solver, "solve", solver_speed.solver.solve)  # put back afterwards
+    solver_speed.main()
+    assert "one kernel" in capsys.readouterr().out
+    for row in json.loads(out.read_text()):
+        assert row["known"] == row["repeats"] == 1.0
+        assert row["rows"] > 12.0
+        assert row["acceleration, most"] < 1e-4
+        assert row["states that differ"] == row["iterations that differ"] == 0.0
