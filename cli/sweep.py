@@ -6,6 +6,7 @@ import json
 import os
 import time as clock
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from ..training.sweep.folding import fold_sweep
 from ..training.sweep.jobs import Jobs
 from ..training.sweep.keeping import keep_runs
 from ..training.sweep.runs import SweepRun, plan_runs
+from ..training.sweep.sharing import shared_gpus
 from .console import Terminal, make_table, shell_command
 from .errors import complain
 from .train import parse_duration
@@ -63,8 +65,18 @@ def run_sweep(
         for name, sentence in refused.items():
             complain(f"gaitgauge: entry '{name}' cannot start: {sentence}")
         threads = threads or max((os.cpu_count() or 2) // 2, 1)
-        jobs = Jobs(sweep, threads=threads, deadline=deadline, say=errors.say, per_gpu=per_gpu, gauging=gauging)
-        outcome = jobs.work([] if report else runs)
+        shares = per_gpu > 1 and not report and any(run.on_gpu for run in runs)
+        with shared_gpus(errors.say) if shares else nullcontext({}) as sharing:
+            jobs = Jobs(
+                sweep,
+                threads=threads,
+                deadline=deadline,
+                say=errors.say,
+                per_gpu=per_gpu,
+                sharing=sharing,
+                gauging=gauging,
+            )
+            outcome = jobs.work([] if report else runs)
         found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
         if keep is not None:
             errors.say(_keep(sweep, runs, keep.absolute()))

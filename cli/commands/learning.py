@@ -141,7 +141,8 @@ def sweep(
         int | None, typer.Option(min=1, max=MOST_THREADS, help="CPU threads of the gauge. Default: half of the cores.")
     ] = None,
     per_gpu: Annotated[
-        int, typer.Option(min=1, max=16, help="Trainings side by side on each GPU; faster together where MPS runs.")
+        int,
+        typer.Option(min=1, max=16, help="Trainings side by side on each GPU, through NVIDIA's MPS where it is there."),
     ] = 1,
     cluster: options.Cluster = None,
     time: Annotated[str | None, typer.Option(help="Stop after this wall-clock time: seconds, 9m, 2h or 1h30m.")] = None,

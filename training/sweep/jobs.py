@@ -66,6 +66,7 @@ class Jobs:
         say: Callable[[str], None],
         gpus: Sequence[str] | None = None,
         per_gpu: int = 1,
+        sharing: Mapping[str, str] | None = None,
         gauging: Sequence[str] | None = None,
     ) -> None:
         """Prepare.
@@ -77,6 +78,7 @@ class Jobs:
             say: called with a sentence now and then.
             gpus: as ``visible_gpus``, which is the default.
             per_gpu: trainings side by side on each GPU.
+            sharing: variables in the environment of trainings on GPUs (``sharing.shared_gpus``).
             gauging: options of ``evaluate`` on who plays a gauging; None for the threads.
         """
         self._sweep, self._deadline, self._say = sweep, deadline, say
@@ -85,7 +87,7 @@ class Jobs:
         self._places: dict[str, dict[str, str]] = {}
         for beside, gpu in itertools.product(range(per_gpu), gpus):  # every GPU has one before any has two
             place = f"GPU {gpu}, beside {beside}" if beside else f"GPU {gpu}"
-            self._places[place] = {"CUDA_VISIBLE_DEVICES": gpu, "OMP_NUM_THREADS": "1"}
+            self._places[place] = {"CUDA_VISIBLE_DEVICES": gpu, "OMP_NUM_THREADS": "1", **(sharing or {})}
         self._score_threads = max(threads // max(len(self._places), 1), 1)
         self._to_train: deque[SweepRun] = deque()
         self._to_gauge: deque[SweepRun] = deque()
