@@ -6,7 +6,7 @@ import json
 import os
 import time as clock
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,8 @@ def run_sweep(
             complain(f"gaitgauge: entry '{name}' cannot start: {sentence}")
         threads = threads or max((os.cpu_count() or 2) // 2, 1)
         shares = per_gpu > 1 and not report and any(run.on_gpu for run in runs)
-        with shared_gpus(errors.say) if shares else nullcontext({}) as sharing:
+        context: AbstractContextManager[Mapping[str, str]] = shared_gpus(errors.say) if shares else nullcontext({})
+        with context as sharing:
             jobs = Jobs(
                 sweep,
                 threads=threads,
