@@ -13,10 +13,10 @@ from mujoco_warp._src.types import OverflowType, vec5
 
 LANES = 32
 """Threads of a GPU that solve a world together, and the most degrees of freedom."""
-_STAGED_ROWS = 64
+_STAGED_ROWS = 44
 """Rows of the Jacobian that are copied into shared memory. Robots that lie on the ground have more: these are read where they are."""
-_SHARED_BYTES = 48 * 1024
-"""Static shared memory that a block may have."""
+_SHARED_BYTES = 47 * 1024
+"""Static shared memory of a block: a GPU gives 48 KiB, of which one is not ours."""
 _MOST_WORLDS = 4
 """Worlds that a block solves."""
 _PROGRAM = Template(Path(__file__).with_name("solve.cu").read_text())
@@ -103,13 +103,13 @@ class Sizes:
     @property
     def floats(self) -> int:
         """Numbers in shared memory for each world."""
-        vectors, arrays = (6, 7) if self.elliptic else (4, 2)
-        return (_STAGED_ROWS + 2 * self.dofs + vectors) * self.stride + 4 * -(-arrays * self.most_rows // 4)
+        vectors, arrays = (7, 7) if self.elliptic else (5, 5)
+        return (_STAGED_ROWS + 2 * self.dofs + vectors) * self.stride + arrays * self.row_room
 
     @property
-    def row_slots(self) -> int:
-        """Rows with a cost of their own that a thread keeps in registers: all, or those of joint friction and limits alone."""
-        return -(-(min(self.most_rows, 2 * self.dofs) if self.elliptic else self.most_rows) // LANES)
+    def row_room(self) -> int:
+        """Numbers of an array of rows in shared memory, whole 16 bytes."""
+        return 4 * -(-self.most_rows // 4)
 
     @property
     def worlds(self) -> int:
@@ -123,7 +123,7 @@ def program_text(sizes: Sizes) -> str:
         asdict(sizes) | {"elliptic": int(sizes.elliptic)},
         floats=sizes.floats,
         worlds=sizes.worlds,
-        row_slots=sizes.row_slots,
+        row_room=sizes.row_room,
         staged=_STAGED_ROWS,
         limit_reached=int(OverflowType.ITERATIONS),
     )

@@ -18,9 +18,6 @@ from mujoco_warp._src.types import ConeType, DisableBit, EnableBit, IntegratorTy
 from ...warp.structures import filled
 from .kernel import LANES, Problem, Sizes, Solution, solve_kernel
 
-_MOST_ROWS = 512
-"""Constraint rows of a world that can be solved here: their state stays in registers."""
-
 
 def sizes_of(model: Model, data: Data) -> Sizes:
     """What the kernel is compiled for."""
@@ -47,7 +44,7 @@ def knows(model: Model, data: Data) -> bool:
         and model.ntendon == 0
         and 0 < model.nv <= LANES
         and model.nv_pad % 4 == 0
-        and 0 < data.njmax <= _MOST_ROWS
+        and data.njmax > 0
         and sizes_of(model, data).worlds > 0
     )
 
