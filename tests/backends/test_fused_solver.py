@@ -16,7 +16,8 @@ FEW, MANY = 3, 30
 """Spheres under the body: contacts with four rows each, of which 44 rows are copied into shared memory."""
 MOST_ROWS = 256
 """One number for all, so that few kernels are compiled."""
-DEVICES = ("cpu", pytest.param("cuda:0", marks=pytest.mark.gpu))
+NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+DEVICES = ("cpu", pytest.param("cuda:0", marks=[pytest.mark.gpu, NO_GPU]))
 
 
 def model_of(spheres, *, options="", extra="", joints=4, condim=3):
