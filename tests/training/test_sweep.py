@@ -202,6 +202,9 @@ import json, os, sys, time, pathlib
 folder = pathlib.Path({str(self.folder)!r})
 with open(folder.parents[2] / "order", "a") as file: file.write(f"{self.label} on {{os.environ['CUDA_VISIBLE_DEVICES']}}\\n")
 time.sleep({0.3 if "slow" in self.entry.name else 0.0})
+if {self.entry.name!r} == "killed":
+    print("iteration 60 of 1530, 23 min left", flush=True)
+    os.kill(os.getpid(), 9)
 if {self.entry.name!r} == "broken":
     sys.exit("gaitgauge: the physics has diverged")
 run = folder / "logs" / "x" / "2026"
@@ -251,6 +254,12 @@ def test_each_gpu_has_one_training_and_a_failure_stops_nothing(tmp_path):
     (tmp_path / "order").unlink()
     assert list(work(runs)[0].failures) == ["broken, seed 0"]
     assert (tmp_path / "order").read_text().startswith("broken, seed 0")
+
+
+def test_a_training_that_was_killed_says_so_and_not_what_it_said_last(tmp_path):
+    run = scripted(tmp_path, "killed")
+    outcome, _ = work([run])
+    assert outcome.failures["killed, seed 0"] == f"ended by SIGKILL (see '{run.log}')"
 
 
 def test_a_gpu_may_have_several_trainings(tmp_path):

@@ -166,7 +166,7 @@ class Jobs:
             self._live.remove(job)
             run, code, gauged = job.run, job.process.returncode, job.place == "gauge"
             if code:
-                self._failures[run.label] = f"{_last_line(job.log) or f'exit code {code}'} (see '{job.log}')"
+                self._failures[run.label] = f"{_reason(code, job.log)} (see '{job.log}')"
                 self._say(f"{run.label} failed: {self._failures[run.label]}")
             elif gauged or run.trained:
                 self._say(f"{run.label} has been {'gauged' if gauged else 'trained'}")
@@ -182,7 +182,9 @@ class Jobs:
         self._live = []
 
 
-def _last_line(log: Path) -> str:
-    """The last sentence of a log."""
+def _reason(code: int, log: Path) -> str:
+    """Why a process failed: the signal that ended it, or the last sentence of its log."""
+    if code < 0:
+        return f"ended by {signal.Signals(-code).name}"
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    return one_line(lines[-1].removeprefix("gaitgauge: ")) if lines else ""
+    return one_line(lines[-1].removeprefix("gaitgauge: ")) if lines else f"exit code {code}"
