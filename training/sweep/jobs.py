@@ -185,6 +185,6 @@ class Jobs:
 def _reason(code: int, log: Path) -> str:
     """Why a process failed: the signal that ended it, or the last sentence of its log."""
     if code < 0:
-        return f"ended by {signal.Signals(-code).name}"
+        return "ended by " + next((known.name for known in signal.Signals if known == -code), f"signal {-code}")
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
     return one_line(lines[-1].removeprefix("gaitgauge: ")) if lines else f"exit code {code}"
