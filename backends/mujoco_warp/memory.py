@@ -10,7 +10,7 @@ from .height_fields.repair import SEARCH_THREADS, scratch_bytes
 from .model import Capacity
 
 _SCRATCH_FACTOR = 1.3
-"""Memory with mujoco_warp's scratch arrays, in units of the engine's data; a little less where the solver is one kernel."""
+"""Memory with mujoco_warp's scratch arrays, in units of the engine's data, its own solver's included: an upper bound."""
 _CONVEX_BYTES = 6600
 """Scratch memory of the convex solver for each contact that it has room for, with 35 iterations [bytes]."""
 _OWN_BYTES = 8000

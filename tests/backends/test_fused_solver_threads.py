@@ -4,14 +4,13 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import mujoco
 import mujoco_warp
 import numpy as np
 import pytest
 from gaitgauge.backends.mujoco_warp.fused_solver import solve as fused
 from gaitgauge.backends.mujoco_warp.fused_solver.kernel import program_text
 from mujoco_warp._src import solver
-from test_fused_solver import FEW, MANY, model_of, velocities
+from test_fused_solver import FEW, MANY, model_of, moving
 
 COMPILER = shutil.which("g++")
 WORLDS = 3
@@ -49,12 +48,7 @@ def _run(folder, program):
     ids=["pyramids", "many pyramids", "cones", "many cones"],
 )
 def test_threads_of_a_warp_wait_for_each_other(spheres, options, condim, tmp_path, monkeypatch):
-    model = model_of(spheres, options=options, condim=condim)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    m = mujoco_warp.put_model(model)
-    d = mujoco_warp.put_data(model, data, nworld=WORLDS, njmax=data.nefc)
-    d.qvel.assign(velocities(model, WORLDS).astype(np.float32))
+    m, d = moving(model_of(spheres, options=options, condim=condim), WORLDS)
     monkeypatch.setattr(solver, "solve", lambda *_: None)
     mujoco_warp.forward(m, d)
     _write(tmp_path, "problem", fused.problem_of(m, d))

@@ -33,6 +33,7 @@ class Problem:
     inertia_row: wp.array[int]
     """Row of each element of the inertia matrix's lower half."""
     inertia_column: wp.array[int]
+    """Its column."""
     inertia: wp.array2d[float]
     """(N, elements)."""
     smooth_force: wp.array2d[float]
@@ -47,20 +48,22 @@ class Problem:
     """All rows, (N,); may be more than there is room for."""
     limits: wp.array[int]
     """Rows of limits, which come next, (N,)."""
-    dof: wp.array2d[int]
-    """Degree of freedom of each row of joint friction, contact of each row of a contact, (N, R)."""
+    owner: wp.array2d[int]
+    """Degree of freedom of a row of joint friction, contact of a row of a contact, (N, R)."""
     jacobian: wp.array3d[float]
+    """(N, padded R, stride)."""
     stiffness: wp.array2d[float]
-    """Inverse regularization: the second derivative of a row's cost."""
+    """Inverse regularization: the second derivative of a row's cost, (N, padded R)."""
     reference: wp.array2d[float]
     """Reference acceleration, (N, R)."""
     loss: wp.array2d[float]
     """Most force of joint friction, (N, R)."""
     contact_row: wp.array2d[int]
-    """Rows of each contact of all worlds, its normal's first."""
+    """Rows of each contact of all worlds, its normal's first; negative where it has none."""
     contact_size: wp.array[int]
     """How many."""
     contact_friction: wp.array[vec5]
+    """Two of sliding, one of torsion [m], two of rolling [m]."""
     impratio_root: wp.array[float]
     """1 / sqrt(impratio), (N,) or (1,)."""
 
@@ -76,11 +79,13 @@ class Solution:
     constraint_force: wp.array2d[float]
     """By degree of freedom, (N, V)."""
     row_force: wp.array2d[float]
+    """(N, R)."""
     state: wp.array2d[int]
     """Of each row, (N, padded R): 0 satisfied, 1 quadratic, 2 linear on the negative side, 3 on the positive side, 4 cone."""
     iterations: wp.array[int]
+    """That it took, (N,)."""
     overflow: wp.array[int]
-    """Alarms; that of the iterations' limit is added."""
+    """Alarms, to which that of the iterations' limit is added, (N,)."""
 
 
 @dataclass(frozen=True, kw_only=True)

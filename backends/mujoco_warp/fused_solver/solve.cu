@@ -60,6 +60,7 @@
         for (int j = 0; j < $stride; ++j) line[i][j] += weight * row[j];
     };
 #endif
+    // in this order, and as much as kernel.py's Sizes.floats says; the first five vectors are cleared together below
     float* free_memory = memory;
     const auto take = [&](int numbers) {
         float* const taken = free_memory;
@@ -74,14 +75,14 @@
     float* const dry_weight = take($stride);         // joint friction by degree of freedom: second derivative of its cost, …
     float* const dry_force = take($stride);          // … and force
     float* const loss = take($stride);               // largest joint friction, by row
-    float* const weight = take($row_room);          // second derivative of a row's cost
+    float* const weight = take($row_room);           // second derivative of a row's cost
     float* const force = take($row_room);
-    float* const residual = take($row_room);        // J times acceleration, minus the reference
-    float* const change = take($row_room);          // J times the search direction
+    float* const residual = take($row_room);         // J times acceleration, minus the reference
+    float* const change = take($row_room);           // J times the search direction
     float* const stiffness = take($row_room);
 #if $elliptic
-    float* const friction = take($row_room);        // of a contact's row: what makes the cone round
-    float* const size = take($row_room);            // rows of the contact whose first row this is, or 0
+    float* const friction = take($row_room);         // of a contact's row: what makes the cone round
+    float* const size = take($row_room);             // rows of the contact whose first row this is, or 0
     float* const normal = take($stride);             // a contact's row of the normal, less …
     float* const tangent = take($stride);            // … its row along the slip
 #endif
@@ -131,7 +132,7 @@
     bool converged = true;
     if (rows > 0) {
         const auto along = [&](int r) {
-            if (r < dry) return vector[problem.dof.data[first + r]];
+            if (r < dry) return vector[problem.owner.data[first + r]];
             return r < staged ? dot(jacobian + (r - dry) * $stride, vector) : dot(all_rows + r * $stride, vector);
         };
         EACH(r, 0, rows) {
@@ -159,14 +160,19 @@
         }
 #if $elliptic
         EACH(r, plain, rows) {
-            const int contact = problem.dof.data[first + r];
+            const int contact = problem.owner.data[first + r];
             const int begin = problem.contact_row.data[contact * problem.contact_row.shape[1]];
-            const int count = wp::min(problem.contact_size.data[contact], rows - r);
+            const int count = problem.contact_size.data[contact], part = r - begin;
             const auto frictions = problem.contact_friction.data[contact];
-            size[r] = begin == r ? static_cast<float>(count) : 0.0f;
-            friction[r] = begin != r ? frictions[r - begin - 1]
-                : count == 1         ? 1.0f
-                                     : frictions[0] * problem.impratio_root.data[world % problem.impratio_root.shape[0]];
+            // where rows overflow, some are counted that no contact has written
+            const bool written = begin >= 0 && part >= 0 && part < count;
+            size[r] = written && part == 0 ? static_cast<float>(wp::min(count, rows - r)) : 0.0f;
+            friction[r] = !written ? 0.0f
+                : part > 0         ? frictions[part - 1]
+                : count == 1       ? 1.0f
+                                   : frictions[0] * problem.impratio_root.data[world % problem.impratio_root.shape[0]];
+            weight[r] = 0.0f;
+            force[r] = 0.0f;
             change[r] = 0.0f;
         }
         SYNC;
@@ -216,8 +222,8 @@
             // gradient of the cost
             SYNC;
             EACH(r, 0, dry) {
-                dry_weight[problem.dof.data[first + r]] = weight[r];
-                dry_force[problem.dof.data[first + r]] = force[r];
+                dry_weight[problem.owner.data[first + r]] = weight[r];
+                dry_force[problem.owner.data[first + r]] = force[r];
             }
             SYNC;
             DOFS(i) {

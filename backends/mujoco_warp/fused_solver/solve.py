@@ -65,7 +65,7 @@ def problem_of(model: Model, data: Data) -> Problem:
         dry=data.nf,
         limits=data.nl,
         rows=data.nefc,
-        dof=rows.id,
+        owner=rows.id,
         jacobian=rows.J,
         stiffness=rows.D,
         reference=rows.aref,
