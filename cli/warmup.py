@@ -51,14 +51,14 @@ def run_warmup(
     for name in backends:
         began = time.perf_counter()
         if not numbers:
-            warmup.exercise(name, scenes, "cuda")
+            with console.status(f"{name}: playing until nothing is left to compile …"):
+                warmup.exercise_until_compiled(name, scenes, "cuda")
             console.say(f"{name}: all kernels for this GPU are there ({time.perf_counter() - began:.0f} s)")
             continue
-        with (
-            console.status(f"{name}: playing on the CPU to see what is launched …"),
-            warmup.recorded_launches() as launched,
-        ):
-            warmup.exercise(name, scenes, "cpu")
+        with console.status(f"{name}: playing on the CPU to see what is launched …"):
+            warmup.exercise_until_compiled(name, scenes, "cpu")
+            with warmup.recorded_launches() as launched:
+                warmup.exercise(name, scenes, "cpu")
         console.say(
             f"{name}: {len(launched)} modules are launched (seen on the CPU in {time.perf_counter() - began:.0f} s)"
         )

@@ -3,13 +3,18 @@
 With the GPU, an engine is played for some steps, which compiles all. Without, it is played on the CPU while every launch is
 written down, and the kernels that were launched are compiled for the other architecture: into the same folder, under the same
 names as they are looked for later. What an engine launches on a GPU alone is not seen that way and is compiled at the first use.
+
+A kernel's name holds a hash, and the hash of one with ``wp.static`` in a loop depends on what the process has built before: the
+expressions that a function's last build has resolved are part of it. A program that finds all else compiled builds nothing. Such
+a program's names are those that count, so engines are played until a process builds nothing, and names are taken before builds.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +28,8 @@ from ..registry import make_backend
 
 _DEFAULT_BLOCK = 256
 """Threads of a block where a launch names none."""
+_MOST_PLAYS = 5
+"""A kernel's name can change once for each function with ``wp.static`` that it shares with others; two plays do so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +63,29 @@ def exercise(backend: str, scenes: Iterable[Scene], device: str) -> None:
             physics.push(half, linear_velocity_w=torch.zeros(count, 3, **options))
             physics.reset(start, half)
             physics.step(pose)
+
+
+def exercise_until_compiled(backend: str, scenes: Sequence[Scene], device: str) -> int:
+    """Play an engine in processes of their own until one finds all its kernels compiled; how many there were.
+
+    Raises:
+        BackendError: there is no such engine or device, or its kernels have other names each time.
+    """
+    for plays in range(1, _MOST_PLAYS + 1):
+        before = _compiled_files()
+        # one that has built nothing yet, as the programs are that these kernels are for
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+            process.submit(exercise, backend, scenes, device).result()
+        if _compiled_files() == before:
+            return plays
+    raise BackendError(
+        f"{backend} compiled kernels anew in each of {_MOST_PLAYS} programs that ran one after another; their folder is "
+        f"'{cache_folder()}': see that nothing else clears it"
+    )
+
+
+def _compiled_files() -> set[Path]:
+    return {path for path in Path(cache_folder()).glob("*/*") if path.suffix in (".o", ".cubin", ".ptx")}
 
 
 def supported_architectures() -> list[int]:
@@ -103,6 +133,9 @@ def compile_for(architecture: int, launched: dict[Any, set[int]], *, threads: in
         threads: compilations at a time.
     """
     began = time.perf_counter()
+    for module, blocks in launched.items():
+        for block in blocks:
+            module.get_module_hash(block)  # kept; after the first build below another one would come out
     # a module's default block size is part of it, so one module is compiled by one thread
     with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(lambda item: _compile(architecture, *item), launched.items()))
@@ -116,11 +149,11 @@ def _compile(architecture: int, module: Any, blocks: Iterable[int]) -> list[bool
     before = set(Path(cache_folder()).glob(f"*/*.sm{architecture}*"))
     fresh = []
     for block in sorted(blocks):
-        wp.set_module_options({"block_dim": block}, module=module)
+        module.options["block_dim"] = block  # not by wp.set_module_options, which drops the hashes
         try:
             (path,) = wp.compile_aot_module(module, arch=architecture, use_ptx=False)
         finally:
-            wp.set_module_options({"block_dim": usual}, module=module)
+            module.options["block_dim"] = usual
         fresh.append(Path(path) not in before)
     return fresh
 

@@ -61,6 +61,66 @@ def test_machine_code_lies_where_it_is_looked_for(compiled):
         assert binary.read_bytes()[:4] == b"\x7fELF"
 
 
+SHARING = """
+import json, sys
+import warp as wp
+from gaitgauge.backends.warp.warmup import compile_for, recorded_launches
+
+FACTORS = (1.5, 2.5)
+
+@wp.func
+def scaled(value: float):
+    total = float(0.0)
+    for i in range(2):
+        total += value * wp.static(FACTORS[i])
+    return total
+
+@wp.kernel(module="unique")
+def first(values: wp.array(dtype=float)):
+    values[wp.tid()] = scaled(values[wp.tid()])
+
+@wp.kernel(module="unique")
+def second(values: wp.array(dtype=float)):
+    values[wp.tid()] = scaled(values[wp.tid()]) + 1.0
+
+if sys.argv[1] == "compile":
+    values = wp.full(4, 1.0, dtype=float, device="cpu")
+    with recorded_launches() as launched:
+        for kernel in (first, second):
+            wp.launch(kernel, dim=4, inputs=[values], device="cpu")
+    if sys.argv[2] == "gpu":
+        compile_for(90, launched)
+else:
+    print(json.dumps([kernel.module.get_module_identifier(block_dim=256) for kernel in (first, second)]))
+"""
+
+
+@pytest.mark.slow
+def test_names_are_those_of_a_program_that_builds_nothing(tmp_path):
+    """The hash of a kernel holds what ``wp.static`` came to in the last build of a function that it shares with another one."""
+    program = tmp_path / "program.py"
+    program.write_text(SHARING)
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+    for words in (("compile", "cpu"), ("compile", "cpu"), ("compile", "gpu"), ("name",)):
+        command = [sys.executable, str(program), *words]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+    for name in json.loads(done.stdout.splitlines()[-1]):
+        assert list(tmp_path.rglob(f"{name}/*.sm90*.cubin")), name
+
+
+def test_an_engine_is_played_until_a_process_compiles_nothing(monkeypatch):
+    from gaitgauge.backends.warp import warmup
+
+    there = iter([{1}, {1, 2}, {1, 2}, {1, 2, 3}, {1, 2, 3}, {1, 2, 3}])
+    monkeypatch.setattr(warmup, "_compiled_files", lambda: next(there))
+    monkeypatch.setattr(warmup, "exercise", print)
+    assert warmup.exercise_until_compiled("mujoco-warp", [], "cpu") == 3
+    numbers = iter(range(100))
+    monkeypatch.setattr(warmup, "_compiled_files", lambda: {next(numbers)})
+    with pytest.raises(BackendError, match=r"compiled kernels anew in each of 5 programs"):
+        warmup.exercise_until_compiled("mujoco-warp", [], "cpu")
+
+
 def test_an_architecture_that_the_compiler_does_not_know_is_refused():
     from gaitgauge.backends.warp.warmup import check_architecture
 

@@ -208,7 +208,13 @@ if {self.entry.name!r} == "killed":
 if {self.entry.name!r} == "broken":
     sys.exit("gaitgauge: the physics has diverged")
 run = folder / "logs" / "x" / "2026"
-run.mkdir(parents=True)
+run.mkdir(parents=True, exist_ok=True)
+if {self.entry.name!r} == "asked" and not (run / "model_1.pt").exists():
+    (run / "model_1.pt").touch()
+    print("go on with: gaitgauge train --resume", flush=True)
+    sys.exit(128 + 15)
+if {self.entry.name!r} == "asked-early":
+    sys.exit(128 + 15)
 (run / "model_3.pt").touch()
 (run / "run.json").write_text(json.dumps(dict(outcome="finished", iteration={self.iterations})))
 """
@@ -260,6 +266,17 @@ def test_a_training_that_was_killed_says_so_and_not_what_it_said_last(tmp_path):
     run = scripted(tmp_path, "killed")
     outcome, _ = work([run])
     assert outcome.failures["killed, seed 0"] == f"ended by SIGKILL (see '{run.log}')"
+
+
+def test_a_training_that_was_stopped_from_outside_is_gone_on_with(tmp_path):
+    """Not in the same call: who stopped it may want the machine."""
+    run, early = scripted(tmp_path, "asked"), scripted(tmp_path, "asked-early")
+    outcome, said = work([run, early])
+    assert outcome.unfinished == ["asked, seed 0"] and list(outcome.failures) == ["asked-early, seed 0"]
+    assert (
+        "asked, seed 0 was stopped by SIGTERM from outside and has a checkpoint; a later call goes on with it" in said
+    )
+    assert work([run])[0].unfinished == [] and run.trained
 
 
 def test_a_gpu_may_have_several_trainings(tmp_path):

@@ -23,6 +23,8 @@ from .runs import SweepRun
 
 _POLL = 0.1
 """Time between two looks at the processes [s]."""
+_STOPPED = (128 + signal.SIGTERM, 128 + signal.SIGINT)
+"""Exit codes of trainings that were asked to stop (``stopping.StopSignals``)."""
 _PATIENCE = 120.0
 """Longest wait for processes that were asked to stop [s]: an iteration and its checkpoint."""
 
@@ -165,7 +167,12 @@ class Jobs:
         for job in [j for j in self._live if j.process.poll() is not None]:
             self._live.remove(job)
             run, code, gauged = job.run, job.process.returncode, job.place == "gauge"
-            if code:
+            if code in _STOPPED and not gauged and run.directory:
+                how = signal.Signals(code - 128).name
+                self._say(
+                    f"{run.label} was stopped by {how} from outside and has a checkpoint; a later call goes on with it"
+                )
+            elif code:
                 self._failures[run.label] = f"{_reason(code, job.log)} (see '{job.log}')"
                 self._say(f"{run.label} failed: {self._failures[run.label]}")
             elif gauged or run.trained:
