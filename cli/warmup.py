@@ -47,7 +47,7 @@ def run_warmup(
     if not numbers and not torch.cuda.is_available():
         raise UserError("there is no GPU here; say which one the kernels are for, such as --arch sm_90 (H100, H200)")
     console = Terminal()
-    scenes = _scenes(load_robot(robot))
+    scenes = scenes_of(load_robot(robot))
     for name in backends:
         began = time.perf_counter()
         if not numbers:
@@ -75,7 +75,7 @@ def run_warmup(
         console.say("what an engine launches on a GPU alone is not seen from a CPU and is compiled at the first use")
 
 
-def _scenes(robot: Robot) -> list[Scene]:
+def scenes_of(robot: Robot) -> list[Scene]:
     """A few worlds as training and as the gauge have them, on level ground, on boxes and on a height field."""
     level = LEVELS[len(LEVELS) // 2]
     names = [n for n in gauge_terrain_names() if n in ("flat", "stairs_fd", "wave")]

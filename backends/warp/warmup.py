@@ -56,13 +56,29 @@ def exercise(backend: str, scenes: Iterable[Scene], device: str) -> None:
             start = physics.standing()
             pose = start.held_target
             half = torch.arange(count, device=physics.device) % 2 == 0
-            physics.randomize(Randomization(friction=torch.full((count,), 0.8, **options)))
+            physics.randomize(_as_in_training(scene, count, options))
             physics.reset(start)
             physics.step(pose)
             physics.step(pose, sample_at=torch.ones(count, dtype=torch.int64, device=physics.device), worlds=half)
             physics.push(half, linear_velocity_w=torch.zeros(count, 3, **options))
             physics.reset(start, half)
             physics.step(pose)
+
+
+def _as_in_training(scene: Scene, count: int, options: dict[str, Any]) -> Randomization:
+    """All that training changes from world to world, at its nominal value: changed masses need kernels of their own."""
+    robot = scene.robot
+    joints = torch.ones(count, robot.num_joints, **options)
+    return Randomization(
+        friction=torch.full((count,), 0.8, **options),
+        base_mass_offset=torch.zeros(count, **options),
+        link_mass_scale=torch.ones(count, len(robot.collision_bodies), **options),
+        base_com_offset=torch.zeros(count, 3, **options),
+        stiffness_scale=joints,
+        damping_scale=joints,
+        motor_strength=joints,
+        motor_offset=torch.zeros_like(joints),
+    )
 
 
 def exercise_until_compiled(backend: str, scenes: Sequence[Scene], device: str) -> int:

@@ -108,6 +108,42 @@ def test_names_are_those_of_a_program_that_builds_nothing(tmp_path):
         assert list(tmp_path.rglob(f"{name}/*.sm90*.cubin")), name
 
 
+TRAINING = """
+from dataclasses import replace
+import torch
+from gaitgauge.training.environment import TrainingEnvironment
+from gaitgauge.training.tasks import find_task
+
+if __name__ == "__main__":
+    configuration = replace(find_task("go2-moe-cts").environment, num_envs=16)
+    environment = TrainingEnvironment(configuration, device="cpu")
+    for _ in range(3):
+        environment.step(torch.zeros(16, 12))
+"""
+WARMUP = """
+from gaitgauge.backends.warp.warmup import exercise_until_compiled
+from gaitgauge.cli.warmup import scenes_of
+from gaitgauge.robots import load_robot
+
+if __name__ == "__main__":
+    exercise_until_compiled("mujoco-warp", scenes_of(load_robot("go2")), "cpu")
+"""
+
+
+@pytest.mark.slow
+def test_training_finds_all_but_one_of_its_kernels(tmp_path):
+    """The number of worlds is part of the broad phase's."""
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+    found = []
+    for name, program in (("warmup.py", WARMUP), ("training.py", TRAINING)):
+        (tmp_path / name).write_text(program)
+        command = [sys.executable, str(tmp_path / name)]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+        assert done.returncode == 0, done.stderr
+        found.append({path.name for path in (tmp_path / "cache").glob("*/wp_*")})
+    assert [name for name in found[1] - found[0] if "_nxn_broadphase_" not in name] == []
+
+
 def test_an_engine_is_played_until_a_process_compiles_nothing(monkeypatch):
     from gaitgauge.backends.warp import warmup
 
