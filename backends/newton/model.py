@@ -239,7 +239,15 @@ def _add_ground(
     world: newton.ModelBuilder, slots: SlotTables, scene: Scene, *, gap: float
 ) -> tuple[list[int], list[int]]:
     """Add floor, box slots and height field; returns the shapes of the slots and the spare fields."""
-    material = newton.ModelBuilder.ShapeConfig(mu=1.0, mu_torsional=0.005, mu_rolling=0.0001, gap=gap, margin=0.0)
+    material = newton.ModelBuilder.ShapeConfig(
+        mu=1.0,
+        mu_torsional=0.005,
+        mu_rolling=0.0001,
+        gap=gap,
+        margin=0.0,
+        # of its own and negative: meets all but itself, which leaves the solver's 32 masks to pairs of the robot's shapes
+        collision_group=min(0, *world.shape_collision_group) - 1,
+    )
     world.add_ground_plane(cfg=material)
     boxes = slots.pose.shape[1] - bool(slots.fields)
     parked = wp.transform(wp.vec3(*PARKED), wp.quat_identity())

@@ -3,6 +3,7 @@
 Newton takes seconds to import, so only those who run these tests do.
 """
 
+from contextlib import closing
 from types import SimpleNamespace
 
 import mujoco
@@ -92,11 +93,49 @@ def test_devices_that_do_not_exist():
         make_backend("newton", scene(), device="tpu")
 
 
-def test_terrains_that_newton_cannot_build_together_are_refused_in_a_sentence():
-    """Its masks for who collides with whom have too few bits for many boxes, a height field and self-collision."""
-    terrains = [make_terrain(name, level) for name, level in (("flat", 0), ("stairs_fd", 5), ("wave", 4))]
-    with pytest.raises(BackendError, match=r"use fewer of them in one scene, PhysicsOptions\(self_collision=False\)"):
-        make_backend("newton", scene(*terrains, index=(0, 1)))
+@pytest.mark.parametrize("legs_meet", [True, False])
+def test_ground_meets_all_but_ground(legs_meet):
+    """Newton sorts who may touch whom into 32 masks. Ground that may touch ground filled them all."""
+    from gaitgauge.backends.newton.model import build_world_model
+
+    world = build_world_model(scene(BOXES, self_collision=legs_meet), device="cpu", gap=0.0, skin=True)
+    groups = world.model.shape_collision_group.numpy()
+    ground = world.layout.shape_ground.astype(bool)
+    assert len(set(groups[ground])) == 1 and groups[ground][0] < 0 and groups[ground][0] not in groups[~ground]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["go2", "go1", "anymal_c"])
+@pytest.mark.parametrize("legs_meet", [True, False])
+def test_boxes_a_height_field_and_legs_that_meet_fit_into_one_scene(name, legs_meet):
+    robot = load_robot(name)
+    terrains = tuple(make_terrain(ground, level) for ground, level in (("flat", 0), ("stairs_fd", 5), ("wave", 4)))
+    parameters = robot.parameters[robot.default_parameters]
+    physics = PhysicsOptions(self_collision=legs_meet)
+    whole = Scene(robot=robot, parameters=parameters, terrains=terrains, terrain_index=(0, 1, 2), physics=physics)
+    with closing(make_backend("newton", whole)) as engine:
+        model = engine._solver.solver.mj_model
+        of_ground = model.geom_bodyid == 0
+        meet = (model.geom_contype[:, None] & model.geom_conaffinity[None]) != 0
+        meet |= meet.T
+        assert of_ground.sum() > 20 and meet[np.ix_(of_ground, ~of_ground)].all(), "every part meets every ground"
+        robots = meet[np.ix_(~of_ground, ~of_ground)]
+        assert robots.any() == legs_meet
+        start = engine.standing()
+        engine.reset(start)
+        for _ in range(25):
+            engine.step(start.held_target)
+        assert (engine.state.foot_contact_force_w.norm(dim=-1).sum(1) > 50.0).all()
+
+
+def test_collisions_that_do_not_fit_into_newtons_masks_are_refused_in_a_sentence(monkeypatch):
+    def full(*_, **__):
+        raise ValueError("the masks are full")
+
+    newton = pytest.importorskip("newton")
+    monkeypatch.setattr(newton.solvers, "SolverMuJoCo", full)
+    with pytest.raises(BackendError, match=r"masks are full; .*PhysicsOptions\(self_collision=False\)"):
+        make_backend("newton", scene())
 
 
 def test_slots_of_a_palette():

@@ -7,6 +7,7 @@ import torch
 from gaitgauge.training.environment import TrainingEnvironment
 from gaitgauge.training.environment_configuration import EnvironmentConfiguration
 from gaitgauge.training.step_inputs import AFTER_RESET, AFTER_STEP
+from gaitgauge.training.tasks import find_task
 from gaitgauge.training.terrain_configuration import ALL_TILES, TerrainConfiguration
 
 torch.set_num_threads(1)
@@ -49,6 +50,20 @@ def test_continuing_comes_close_to_never_having_stopped(environment):
     found = environment.step(torch.zeros(6, 12))
     assert torch.equal(found[2], expected[2])
     assert torch.allclose(found[0]["policy"], expected[0]["policy"], atol=2e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["mujoco-warp", "newton"])
+def test_the_whole_task_runs(backend):
+    """All its ground in one scene, with legs that meet."""
+    environment = TrainingEnvironment(
+        replace(find_task("go2-moe-cts").environment, num_envs=16), backend=backend, device="cpu"
+    )
+    for _ in range(3):
+        observations, reward, _, _ = environment.step(torch.zeros(16, 12))
+        assert all(value.isfinite().all() for value in observations.values()) and reward.isfinite().all()
+    assert float(environment.parts.memory.diverged_total) == 0
+    environment.close()
 
 
 @pytest.mark.gpu
