@@ -89,6 +89,7 @@ def compare(
             help="Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
         ),
     ] = None,
+    trust: options.Trust = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print comparison.json instead of tables.")] = False,
 ) -> None:
     """Say which differences between policies are real. Policies are evaluated first; what has been played is not played again.

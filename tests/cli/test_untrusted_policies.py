@@ -71,6 +71,8 @@ def test_no_command_opens_the_file(run, refused, tmp_path, contract, kind, insid
         "play": [path, "--viewer", "viser", "--port", "18080"],
         "consistency": [path, "--backends", "mujoco,mujoco@iterations=50", "--suite", "demo"],
         "latent": [path],
+        "compare": [path, "pretrained", "--suite", "demo"],
+        "trial": [path],
     }
     for command, arguments in commands.items():
         for trust in ([], ["--trust"]):
