@@ -15,6 +15,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,7 +92,13 @@ def exercise_until_compiled(backend: str, scenes: Sequence[Scene], device: str) 
         before = _compiled_files()
         # one that has built nothing yet, as the programs are that these kernels are for
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-            process.submit(exercise, backend, scenes, device).result()
+            try:
+                process.submit(exercise, backend, scenes, device).result()
+            except BrokenProcessPool as error:
+                raise BackendError(
+                    f"the program that compiled kernels of {backend} was killed, for want of memory perhaps; what it had "
+                    "finished is kept: call again"
+                ) from error
         if _compiled_files() == before:
             return plays
     raise BackendError(

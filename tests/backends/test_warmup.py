@@ -157,6 +157,19 @@ def test_an_engine_is_played_until_a_process_compiles_nothing(monkeypatch):
         warmup.exercise_until_compiled("mujoco-warp", [], "cpu")
 
 
+def _quits(*_):
+    os._exit(9)
+
+
+def test_a_program_that_was_killed_while_it_compiled_is_a_sentence(monkeypatch):
+    from gaitgauge.backends.warp import warmup
+
+    monkeypatch.setattr(warmup, "_compiled_files", set)
+    monkeypatch.setattr(warmup, "exercise", _quits)
+    with pytest.raises(BackendError, match=r"compiled kernels of 9 was killed"):
+        warmup.exercise_until_compiled(9, [], "cpu")
+
+
 def test_an_architecture_that_the_compiler_does_not_know_is_refused():
     from gaitgauge.backends.warp.warmup import check_architecture
 
