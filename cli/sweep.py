@@ -39,7 +39,8 @@ def run_sweep(
 ) -> None:
     """Run what is left of a sweep, print its table, and keep what is trained.
 
-    The exit code is 1 where an entry could not be done, 128 + signal where it was stopped.
+    The exit code is 1 where an entry could not be done, or was stopped from outside and no time limit was set; 128 + signal
+    where the sweep was stopped.
     """
     began = clock.monotonic()
     sweep = load_sweep(file)
@@ -95,7 +96,7 @@ def run_sweep(
         errors.say(f"{len(outcome.unfinished)} of {len(runs)} runs are not done; go on with:\n  {shell_command()}")
     if outcome.stopped is not None:
         raise typer.Exit(128 + outcome.stopped)
-    if refused or outcome.failures:
+    if refused or outcome.failures or (outcome.unfinished and deadline is None):
         raise typer.Exit(1)
 
 

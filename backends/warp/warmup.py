@@ -14,10 +14,10 @@ from __future__ import annotations
 import multiprocessing
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -91,20 +91,38 @@ def exercise_until_compiled(backend: str, scenes: Sequence[Scene], device: str) 
     for plays in range(1, _MOST_PLAYS + 1):
         before = _compiled_files()
         # one that has built nothing yet, as the programs are that these kernels are for
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-            try:
-                process.submit(exercise, backend, scenes, device).result()
-            except BrokenProcessPool as error:
-                raise BackendError(
-                    f"the program that compiled kernels of {backend} was killed, for want of memory perhaps; what it had "
-                    "finished is kept: call again"
-                ) from error
+        spawn = multiprocessing.get_context("spawn")
+        answer, reply = spawn.Pipe(duplex=False)
+        process = spawn.Process(target=_exercise_and_reply, args=(reply, backend, scenes, device), daemon=True)
+        process.start()
+        reply.close()
+        try:
+            refusal = answer.recv()
+        except EOFError:
+            raise BackendError(
+                f"the program that compiled kernels of {backend} was killed, for want of memory perhaps; what it had "
+                "finished is kept: call again"
+            ) from None
+        process.join()
+        if refusal is not None:
+            raise BackendError(refusal)
         if _compiled_files() == before:
             return plays
     raise BackendError(
         f"{backend} compiled kernels anew in each of {_MOST_PLAYS} programs that ran one after another; their folder is "
         f"'{cache_folder()}': see that nothing else clears it"
     )
+
+
+def _exercise_and_reply(reply: Connection, backend: str, scenes: Sequence[Scene], device: str) -> None:
+    """Play, and send why that was refused, or None. It ends by itself where nobody waits for the answer any more."""
+    refusal = None
+    try:
+        exercise(backend, scenes, device)
+    except BackendError as error:
+        refusal = str(error)
+    with suppress(BrokenPipeError):
+        reply.send(refusal)
 
 
 def _compiled_files() -> set[Path]:

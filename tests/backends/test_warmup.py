@@ -2,11 +2,16 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 from gaitgauge.backends.base import BackendError
+from gaitgauge.cli.warmup import scenes_of
+from gaitgauge.robots import load_robot
 
 pytest.importorskip("warp")
 
@@ -165,9 +170,47 @@ def test_a_program_that_was_killed_while_it_compiled_is_a_sentence(monkeypatch):
     from gaitgauge.backends.warp import warmup
 
     monkeypatch.setattr(warmup, "_compiled_files", set)
-    monkeypatch.setattr(warmup, "exercise", _quits)
-    with pytest.raises(BackendError, match=r"compiled kernels of 9 was killed"):
-        warmup.exercise_until_compiled(9, [], "cpu")
+    monkeypatch.setattr(warmup, "_exercise_and_reply", _quits)
+    with pytest.raises(BackendError, match=r"compiled kernels of mujoco-warp was killed"):
+        warmup.exercise_until_compiled("mujoco-warp", [], "cpu")
+
+
+def test_what_an_engine_refuses_in_a_program_of_its_own_is_said():
+    from gaitgauge.backends.warp import warmup
+
+    with pytest.raises(BackendError, match=r"no device 'tpu'"):
+        warmup.exercise_until_compiled("mujoco-warp", scenes_of(load_robot("go2")), "tpu")
+
+
+ENDED = """
+import os, time
+from gaitgauge.backends.warp import warmup
+
+def plays_a_while(*_):
+    print(os.getpid(), flush=True)
+    time.sleep(1.0)
+
+warmup.exercise = plays_a_while
+if __name__ == "__main__":
+    warmup._compiled_files = set
+    warmup.exercise_until_compiled("mujoco-warp", [], "cpu")
+"""
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks a process up in /proc")
+def test_a_program_whose_warmup_was_ended_does_not_stay(tmp_path):
+    """It ends with its play, and waits for nobody."""
+    program = tmp_path / "program.py"
+    program.write_text(ENDED)
+    with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, text=True) as warming:
+        child = int(warming.stdout.readline())
+        warming.terminate()
+    for _ in range(300):
+        if not Path(f"/proc/{child}").exists():
+            return
+        time.sleep(0.1)
+    os.kill(child, signal.SIGKILL)
+    pytest.fail("the program of a warmup that was ended is still there")
 
 
 def test_an_architecture_that_the_compiler_does_not_know_is_refused():

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 import torch
+from gaitgauge.training.sweep.jobs import Jobs, SweepOutcome
 from small_run import SMALL
 from tiny_suite import SUITE
 
@@ -52,6 +53,16 @@ def test_entries_that_cannot_start_for_different_reasons_are_all_named(run, tiny
     told = [line for line in result.stderr.splitlines() if line.startswith("gaitgauge: ")]
     assert result.exit_code == 1 and len(told) == 2
     assert "'one' cannot start: unknown task" in told[0] and "'two' cannot start" in told[1] and "num_envs" in told[1]
+
+
+@pytest.mark.parametrize(("limit", "code"), [([], 1), (["--time", "1h"], 0)])
+def test_a_training_that_was_stopped_from_outside_is_no_success(run, tiny, monkeypatch, limit, code):
+    """With a time limit, being unfinished is expected."""
+    (tiny / "sweep.toml").write_text(sweep(one='task = "go2-cts"'))
+    stopped = SweepOutcome(failures={}, unfinished=["one, seed 0"], stopped=None)
+    monkeypatch.setattr(Jobs, "work", lambda *_: stopped)
+    result = run("sweep", "sweep.toml", "--out", "out", *limit)
+    assert result.exit_code == code and "1 of 1 runs are not done; go on with:" in result.stderr
 
 
 def test_a_suite_that_is_not_there(refused, tmp_path):
