@@ -118,7 +118,8 @@ def look(
     part of it.
 
     Raises:
-        LatentError: on some terrain, or with some command, every robot fell before anything could be noted.
+        LatentError: on some terrain, or with some command, every robot fell before anything could be noted; or all but one did
+            everywhere.
     """
     chosen = {
         "terrains": notes.command == list(COMMANDS).index("forward"),
@@ -141,6 +142,12 @@ def look(
             raise LatentError(
                 f"'{loaded.policy.path}' fell at once on '{names[pair][int(seen.argmin())]}', so there is nothing to look at; choose "
                 "other terrains or a lower --level"
+            )
+        left = np.unique(notes.robot[rows])
+        if len(left) < 2:
+            raise LatentError(
+                f"with '{loaded.policy.path}' all robots but number {left[0] + 1} fell at once, and telling {pair} apart takes two, to "
+                "learn from and to be tried on; choose other terrains, a lower --level or more --robots"
             )
         found: dict[str, Any] = {}
         for space, values in spaces.items():

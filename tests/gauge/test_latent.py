@@ -10,7 +10,8 @@ import pytest
 import torch
 from gaitgauge.gauge.latent.collecting import Notes, collect
 from gaitgauge.gauge.latent.separation import principal_components, separation, silhouette
-from gaitgauge.gauge.latent.study import LatentError, LatentRequest, _blocks, study_latents
+from gaitgauge.gauge.latent.study import LatentError, LatentRequest, _blocks, look, study_latents
+from gaitgauge.gauge.policies import Loaded
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
@@ -113,6 +114,25 @@ def test_means_are_of_notes_of_one_robot_that_follow_each_other():
     robots = [(0, 0), (0, 1), (1, 0)]
     expected = [[(*r, 2 * b), (*r, 2 * b + 1)] for r in robots for b in range(1 if r == (1, 0) else 2)]
     assert found == expected
+
+
+def test_a_single_robot_that_is_left_is_no_one_to_try_a_probe_on():
+    rows = [(t, c) for t in range(2) for c in range(4)]
+    terrain, command = np.array(rows).T
+    notes = Notes(
+        latent=np.eye(8),
+        weights=None,
+        history=np.eye(8),
+        terrain=terrain,
+        command=command,
+        robot=np.full(8, 1),
+        time=np.full(8, 0.1),
+        falls=8,
+        walkers=16,
+    )
+    loaded = Loaded(policy=load_policy("pretrained"), robot=load_robot("go2"))
+    with pytest.raises(LatentError, match="all robots but number 2 fell at once.*a lower --level or more --robots"):
+        look("mine", loaded, notes, ["flat", "wave"])
 
 
 @pytest.fixture(scope="module")
