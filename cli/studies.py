@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import typer
 
+from ..files.writing import LOCK, lock_folder, make_folder
 from .console import Terminal, shell_command
 from .errors import UserError
 from .progress import ProgressDisplay
@@ -39,6 +40,30 @@ def resumable(console: Terminal, title: str, folder: Path | None = None, *more: 
         raise typer.Exit(130) from None
 
 
+@contextmanager
+def _kept(folder: Path) -> Iterator[None]:
+    """A folder for this process alone, created where it is not there; an error leaves none that it created.
+
+    Raises:
+        UserError: it is a file, cannot be written to, or another process has it.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"'{folder}' is a file; give another folder with --out")
+    there = folder.exists()
+    make_folder(folder, UserError)
+    lock = lock_folder(folder, UserError)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+            if not there:
+                folder.rmdir()
+        raise
+    finally:
+        lock.release()
+
+
 def make_study(
     study: Callable[..., Mapping[str, Any]],
     request: Any,
@@ -50,10 +75,9 @@ def make_study(
     json_output: bool,
 ) -> None:
     """Make a study policy by policy, print it and where its two ``files`` are; exit code 1 where something was left out."""
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"'{folder}' is a file; give another folder with --out")
     errors = Terminal(stderr=True)
-    with ProgressDisplay(errors, title) as display:
+    # the folder first: what is wrong with it is said before anything is played
+    with _kept(folder), ProgressDisplay(errors, title) as display:
         results = study(
             request,
             folder,

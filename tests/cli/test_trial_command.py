@@ -4,6 +4,8 @@ import csv
 import json
 
 import pytest
+from filelock import FileLock
+from gaitgauge.files.writing import LOCK
 
 STANDS = """
 name = "stands"
@@ -91,3 +93,25 @@ def test_what_cannot_be_tried_is_said_and_the_others_go_on(run, policy, scenario
 )
 def test_one_sentence_where_nothing_can_be_tried(refused, policy, scenarios, words, sentence):
     assert sentence in refused("trial", policy, *words)
+
+
+@pytest.mark.parametrize("command", [("trial", "--scenario", "stands.toml"), ("latent", "--terrain", "flat")])
+@pytest.mark.parametrize("out", ["/proc/here", "taken"])
+def test_an_output_that_cannot_be_used_is_said_before_anything_is_played(
+    refused, policy, scenarios, tmp_path, monkeypatch, command, out
+):
+    monkeypatch.setattr("gaitgauge.files.writing._PATIENCE", 0.1)
+    monkeypatch.setattr("gaitgauge.gauge.trials.trialling.load_policies", lambda *_, **__: pytest.fail("played"))
+    monkeypatch.setattr("gaitgauge.gauge.latent.study.load_policies", lambda *_, **__: pytest.fail("played"))
+    (tmp_path / "taken").mkdir()
+    with FileLock(tmp_path / "taken" / LOCK):
+        sentence = refused(*command, policy, "--out", out)
+    assert sentence.startswith(("cannot write '/proc/here'", "another process is writing to 'taken'"))
+
+
+def test_what_is_refused_leaves_no_folder_but_one_that_was_there(refused, policy, tmp_path):
+    (tmp_path / "mine").mkdir()
+    for out in ("mine", "new"):
+        assert "there is no scenario" in refused("trial", policy, "--scenario", "moon", "--out", out)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine", policy.name]
+    assert not list((tmp_path / "mine").iterdir())
