@@ -8,6 +8,7 @@ import io
 import json
 import math
 import os
+import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -164,7 +165,7 @@ def _strays(folder: Path) -> Iterator[Path]:
         if LOCK in names and Path(place) != folder:
             below.clear()
             continue
-        yield from (Path(place, name) for name in names if name.startswith(".") and ".partial" in name)
+        yield from (Path(place, name) for name in names if re.match(r"\.[0-9a-f]+\.partial", name))
 
 
 def _flush(path: Path) -> None:

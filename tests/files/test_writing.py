@@ -130,8 +130,9 @@ def test_a_folder_has_one_writer(tmp_path, monkeypatch):
     stray = tmp_path / "below" / ".0123.partial"
     stray.parent.mkdir()
     stray.write_text("half")
-    kept = tmp_path / "kept.partial"
-    kept.write_text("somebody's")
+    kept = [tmp_path / "kept.partial", tmp_path / ".somebody's.partial"]
+    for path in kept:
+        path.write_text("somebody's")
     lock_folder(tmp_path, WriteError).release()
     assert not stray.exists()
-    assert kept.exists()
+    assert all(path.exists() for path in kept)
