@@ -295,20 +295,30 @@ def _problems(scenario: Scenario) -> Iterator[str]:
             f"success.speed is {success.speed:g} m/s and no more than {fastest:g} m/s is ever commanded, so success can never be "
             "decided; command more, or ask for less"
         )
-    way = sum(math.hypot(*phase.velocity[:2]) * phase.seconds for phase in scenario.commands)
+    onward = [phase for phase in scenario.commands if _leads_on(phase, scenario)]
+    if success.beyond is not None and not onward:
+        yield (
+            f"success.beyond is x = {success.beyond:g} m, but no command leads along x from a heading of {start.yaw:g} rad, so success "
+            "can never be decided; command a velocity that leads there, or ask for something else under [success]"
+        )
+    way = sum(math.hypot(*phase.velocity[:2]) * phase.seconds for phase in onward)
     if success.beyond is not None and not start.x + start.spread[0] < success.beyond <= start.x + way:
         yield (
             f"success.beyond is x = {success.beyond:g} m, but robots start at {start.x:g} m and the commands lead no further than "
             f"to {start.x + way:g} m, so success can never be decided; choose a place between"
         )
-    limits = [phase.until_x for phase in scenario.commands if phase.until_x is not None]
-    if success.beyond is not None and limits and max(limits) < success.beyond and _ends_early(scenario):
+    limits = [phase.until_x for phase in onward if phase.until_x is not None]
+    if success.beyond is not None and 0 < len(limits) == len(onward) and max(limits) < success.beyond:
         yield (
             f"success.beyond is x = {success.beyond:g} m, but the commands that lead on end at until_x = {max(limits):g} m, so "
             "success can never be decided; let until_x be as far"
         )
 
 
-def _ends_early(scenario: Scenario) -> bool:
-    """Whether every command that leads on ends at a place."""
-    return all(phase.until_x is not None for phase in scenario.commands if phase.velocity[0] > 0.0)
+def _leads_on(phase: Leg, scenario: Scenario) -> bool:
+    """Whether a command may lead towards larger x: any that moves does where robots are told to turn, for want of a heading."""
+    forward, lateral, _ = phase.velocity
+    start = scenario.start
+    away = abs(math.remainder(start.yaw + math.atan2(lateral, forward), math.tau))
+    turned = any(each.velocity[2] and not each.steer for each in scenario.commands)
+    return bool(forward or lateral) and (turned or away <= 0.5 * math.pi + start.spread[2])

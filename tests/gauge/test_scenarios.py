@@ -73,6 +73,16 @@ def test_unknown_names_are_refused_with_those_that_are_near():
         ("[success]\nsurvive = true", "", "nothing says what success is"),
         ("survive = true", "beyond = 3.0", "commands lead no further than to 2 m, so success can never be decided"),
         ("survive = true", "beyond = 0.0", "success can never be decided; choose a place between"),
+        (
+            "velocity = [1.0",
+            "until_x = 3.0\nvelocity = [-1.0",
+            "no command leads along x from a heading of 0 rad, so success can never be decided",
+        ),
+        (
+            "[success]\nsurvive = true",
+            "[start]\nyaw = 3.0\n[success]\nbeyond = 1.5",
+            "no command leads along x from a heading of 3 rad",
+        ),
         ("survive = true", "speed = 1.5", "no more than 1 m/s is ever commanded, so success can never be decided"),
         ("velocity = [1.0", "until_x = 1.0\nvelocity = [1.0", "commands that lead on end at until_x = 1 m"),
         ("friction = 0.6", "friction = 0.0", "friction is 0.0; it must be greater than 0"),
@@ -139,6 +149,17 @@ def test_what_cannot_be_played_or_decided_is_refused_in_one_sentence(tmp_path, o
     with pytest.raises(ValueError, match=sentence) as caught:
         load(tmp_path, text)
     assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("yaw", "velocity"),
+    [(3.1416 - 0.0001, "-1.0, 0.0, 0.0"), (1.5, "0.0, -1.0, 0.0"), (3.0, "1.0, 0.0, 0.5"), (0.0, "-1.0, 0.0, 0.5")],
+)
+def test_a_way_along_x_may_begin_with_any_heading(tmp_path, yaw, velocity):
+    back = f"[[commands]]\nseconds = 2.0\nuntil_x = 0.5\nvelocity = [{velocity}]\n\n"
+    text = OWN.replace("velocity = [1.0, 0.0, 0.0]", f"velocity = [{velocity}]")
+    text = text.replace("[success]\nsurvive = true", f"{back}[start]\nyaw = {yaw}\n[success]\nbeyond = 1.5")
+    assert load(tmp_path, text).success.beyond == 1.5
 
 
 def test_the_ground_is_drawn_from_the_side_by_its_corners():
