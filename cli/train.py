@@ -11,6 +11,7 @@ from typing import Any
 
 import typer
 
+from ..files.parsing import one_line
 from ..training.configuration import RunConfiguration
 from ..training.launch import TrainPlan, TrainRequest, prepare, train
 from ..training.stopping import Progress
@@ -20,6 +21,8 @@ from .progress import ProgressDisplay, duration
 
 _RATE_WINDOW = 20
 """Iterations over which the speed and the time left are averaged."""
+_LONGEST = 10_000 * 3600.0
+"""Of a time limit [s]."""
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
 
@@ -67,16 +70,16 @@ def parse_duration(text: str) -> float:
     """Seconds of ``90``, ``90s``, ``9m``, ``2h`` or ``1h30m``.
 
     Raises:
-        UserError: it is no duration, or not above zero.
+        UserError: it is no duration, not above zero, or longer than anybody waits.
     """
     if re.fullmatch(r"\d+(\.\d+)?", text):
         seconds = float(text)
     elif re.fullmatch(r"(\d+(\.\d+)?[hms])+", text):
         seconds = sum(float(number) * _UNITS[unit] for number, unit in re.findall(r"([\d.]+)([hms])", text))
     else:
-        raise UserError(f"--time is '{text}'; write seconds, or for example 9m, 2h or 1h30m")
-    if seconds <= 0.0:
-        raise UserError(f"--time is '{text}'; it must be longer than 0 s")
+        raise UserError(f"--time is '{one_line(text, 80)}'; write seconds, or for example 9m, 2h or 1h30m")
+    if not 0.0 < seconds <= _LONGEST:
+        raise UserError(f"--time is '{one_line(text, 80)}'; it must be longer than 0 s and at most {_LONGEST / 3600:g} h")
     return seconds
 
 

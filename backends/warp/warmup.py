@@ -24,6 +24,7 @@ from typing import Any
 import torch
 import warp as wp
 
+from ...files.parsing import one_line
 from ..base import BackendError, Randomization, Scene
 from ..registry import make_backend
 
@@ -205,12 +206,10 @@ def check_architecture(text: str) -> int:
     Raises:
         BackendError: the compiler does not know it.
     """
-    known = supported_architectures()
-    number = text.removeprefix("sm_")
-    if not number.isdigit() or int(number) not in known:
+    known = {f"sm_{number}": number for number in supported_architectures()}
+    number = known.get(f"sm_{text.removeprefix('sm_')}")
+    if number is None:
         raise BackendError(
-            f"the architecture '{text}' is not known to Warp's compiler; choose from: "
-            + ", ".join(f"sm_{a}" for a in known)
-            + " (--arch)"
+            f"the architecture '{one_line(text, 80)}' is not known to Warp's compiler; choose from: {', '.join(known)} (--arch)"
         )
-    return int(number)
+    return number

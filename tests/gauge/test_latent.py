@@ -131,7 +131,7 @@ def test_a_single_robot_that_is_left_is_no_one_to_try_a_probe_on():
         walkers=16,
     )
     loaded = Loaded(policy=load_policy("pretrained"), robot=load_robot("go2"))
-    with pytest.raises(LatentError, match="all robots but number 2 fell at once.*a lower --level or more --robots"):
+    with pytest.raises(LatentError, match=r"all robots but number 2 fell at once.*a lower --level or more --robots"):
         look("mine", loaded, notes, ["flat", "wave"])
 
 
