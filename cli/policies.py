@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,11 +17,9 @@ def policy_file(choice: str) -> Path:
         PolicyError: there is no such policy.
         UserError: the run directory holds no checkpoint.
     """
-    folder = Path(choice)
-    if not folder.is_dir():
+    if not os.path.isdir(choice):
         return find_policy(choice)
-    best = folder / "best.pt"
-    found = best if best.is_file() else latest_checkpoint(folder)
+    found = _checkpoint(Path(choice))
     if found is None:
         raise UserError(
             f"'{choice}' is a folder without a best.pt or model_<iteration>.pt; give a run directory or a policy file"
@@ -29,5 +28,11 @@ def policy_file(choice: str) -> Path:
 
 
 def policy_files(policies: Sequence[str]) -> tuple[str, ...]:
-    """The policies, run directories replaced by their best checkpoint, else their last."""
-    return tuple(str(policy_file(p)) if Path(p).is_dir() else p for p in policies)
+    """The policies, run directories replaced by their checkpoint; a folder without one stays, to be refused by itself."""
+    return tuple(str(_checkpoint(Path(p)) or p) if os.path.isdir(p) else p for p in policies)
+
+
+def _checkpoint(folder: Path) -> Path | None:
+    """A run directory's best checkpoint, else its last, None if there is none."""
+    best = folder / "best.pt"
+    return best if best.is_file() else latest_checkpoint(folder)

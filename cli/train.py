@@ -79,7 +79,9 @@ def parse_duration(text: str) -> float:
     else:
         raise UserError(f"--time is '{one_line(text, 80)}'; write seconds, or for example 9m, 2h or 1h30m")
     if not 0.0 < seconds <= _LONGEST:
-        raise UserError(f"--time is '{one_line(text, 80)}'; it must be longer than 0 s and at most {_LONGEST / 3600:g} h")
+        raise UserError(
+            f"--time is '{one_line(text, 80)}'; it must be longer than 0 s and at most {_LONGEST / 3600:g} h"
+        )
     return seconds
 
 

@@ -71,12 +71,14 @@ def test_what_comes_of_it_is_printed_and_written(run, policy, scenarios, tmp_pat
     assert "Standing &lt;b&gt;still&lt;/b&gt;" in page and "<b>still" not in page and "Theirs: 5/20" in page
 
 
-def test_what_cannot_be_tried_is_said_and_the_others_go_on(run, policy, scenarios):
+def test_what_cannot_be_tried_is_said_and_the_others_go_on(run, policy, scenarios, tmp_path):
+    (tmp_path / "empty").mkdir()
     words = ("--scenario", "stands.toml", "--scenario", "never.toml", "--repeats", 1, "--out", "here", "--json")
-    result = run("trial", policy, "nobody.pt", *words)
+    result = run("trial", policy, "nobody.pt", "empty", "x" * 300, *words)
     assert result.exit_code == 1
     found = json.loads(result.stdout)
-    assert [r["what"] for r in found["refused"]] == ["nobody.pt", "never.toml"]
+    assert [r["what"] for r in found["refused"]] == ["nobody.pt", "empty", "x" * 300, "never.toml"]
+    assert "empty was left out: 'empty' is a folder; name a policy file in it" in result.stderr
     assert "success can never be decided" in result.stderr and "no policy file 'nobody.pt'" in result.stderr
     assert found["scenarios"][0]["results"][0]["successes"] == 1
 
