@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..files.writing import write_atomically
+from ..files.writing import same_file, write_atomically
 from ..gauge.diagnosis import Diagnosis, Outcome, diagnose
 from ..policy.adapters import assumptions
 from ..policy.alternatives import toml_lines
@@ -39,10 +39,12 @@ def examine_policy(
     Arguments are ``doctor``'s options.
 
     Raises:
-        UserError: ``out`` is no ``.toml``, or cannot be written.
+        UserError: ``out`` is no ``.toml``, is ``contract``, or cannot be written.
     """
     if out is not None and out.suffix != ".toml":
         raise UserError(f"--out is '{out}'; give a file that ends in .toml")
+    if out is not None and contract is not None and same_file(out, contract):
+        raise UserError(f"--out is '{out}', the --contract that is examined; give another file")
     asked = None if robot is None else load_robot(robot)
     policy = load_policy(policy_file(choice), asked, trust=trust, contract_file=contract)
     body = robot_for(policy.contract, robot)

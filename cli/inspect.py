@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from ..files.parsing import did_you_mean
+from ..files.writing import same_file
 from .console import Terminal, make_table
 from .errors import UserError
 
@@ -38,13 +39,17 @@ def import_file(
 
     Raises:
         CheckpointError: ``trainable``, and the source is no training checkpoint.
-        UserError: the destination exists and is not to be replaced, or is a folder.
+        UserError: the destination exists and is not to be replaced, is the source, or is a folder.
         PolicyError, ContractError: the source is no policy, or the destination cannot be written.
     """
     if destination.is_dir():
         raise UserError(
             f"'{destination}' is a folder; give the file to write, for example '{destination}/policy.gauge.pt'"
         )
+    from ..policy.finding import find_policy
+
+    if any(same_file(destination, given) for given in (find_policy(source), contract) if given is not None):
+        raise UserError(f"'{destination}' is itself what is to be imported; give another file to write")
     if destination.exists() and not force:
         raise UserError(f"'{destination}' already exists; give another name, or replace it with --force")
     trainable = trainable or raw
@@ -53,7 +58,6 @@ def import_file(
     from ..policy.native import ForeignFile
 
     if trainable:
-        from ..policy.finding import find_policy
         from ..policy.loading import load_policy
         from ..training.checkpoint import trim_checkpoint
 

@@ -63,6 +63,13 @@ def write_atomically(path: Path, data: str | bytes | memoryview, error: type[Exc
         partial.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
+def same_file(path: str | Path, other: str | Path) -> bool:
+    """Whether two paths lead to one file, by links, too; no where either leads nowhere."""
+    with suppress(OSError):
+        return os.path.samefile(path, other)
+    return False
+
+
 def make_folder(folder: Path, error: type[Exception], *, option: str = "--out") -> None:
     """Create a folder and those above it, where it is not there.
 

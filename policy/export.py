@@ -18,7 +18,7 @@ import onnx
 import torch
 import yaml
 
-from ..files.writing import make_folder, replacing
+from ..files.writing import make_folder, replacing, same_file
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, deploy_contract
 from .base import PROBE_EPISODES, Policy, PolicyError
@@ -71,7 +71,7 @@ def export_torchscript(policy: Policy, path: str | Path) -> float:
         traced = torch.jit.trace(core.eval(), history, check_trace=False)
         script = torch.jit.script(SCRIPTS[type(network)](traced, start).eval())
         torch.jit.save(script, buffer, _extra_files={CONTRACT_FILE: contract.to_json()})
-    return _write_checked(Path(path), buffer.getvalue(), lambda written: _largest_difference(policy, written))
+    return _write_checked(policy, Path(path), buffer.getvalue(), lambda written: _largest_difference(policy, written))
 
 
 def export_onnx(policy: Policy, path: str | Path) -> float:
@@ -105,7 +105,9 @@ def export_onnx(policy: Policy, path: str | Path) -> float:
     model.ir_version = ONNX_IR_VERSION
     del model.metadata_props[:]
     onnx.helper.set_model_props(model, {"contract": contract.to_json(), **mjlab_metadata(contract)})
-    return _write_checked(Path(path), model.SerializeToString(), lambda written: _largest_difference(policy, written))
+    return _write_checked(
+        policy, Path(path), model.SerializeToString(), lambda written: _largest_difference(policy, written)
+    )
 
 
 def export_deploy(policy: Policy, path: str | Path, robot: Robot, *, finite_clips: bool = False) -> None:
@@ -129,7 +131,7 @@ def export_deploy(policy: Policy, path: str | Path, robot: Robot, *, finite_clip
             raise ExportError(f"a deploy.yaml cannot express this policy's contract: {lines.splitlines()[0]}")
         return 0.0
 
-    _write_checked(Path(path), text.encode(), check)
+    _write_checked(policy, Path(path), text.encode(), check)
 
 
 def export_unitree(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path, float]:
@@ -336,8 +338,10 @@ def _largest_difference(policy: Policy, written: Path) -> float:
     return largest
 
 
-def _write_checked(path: Path, data: bytes, check: Callable[[Path], float]) -> float:
-    """Write beside the destination, check, and only then give it its name."""
+def _write_checked(policy: Policy, path: Path, data: bytes, check: Callable[[Path], float]) -> float:
+    """Write beside the destination, check, and only then give it its name, which is not that of the policy."""
+    if same_file(path, policy.path):
+        raise ExportError(f"'{path}' is the policy that is to be exported; choose another folder (--out)")
     with replacing(path, ExportError) as partial:
         partial.write_bytes(data)
         return check(partial)

@@ -252,6 +252,19 @@ def test_import_replaces_nothing_unasked(refused, run, tmp_path, policy):
     assert [f.name for f in tmp_path.glob(".*")] == []
 
 
+@pytest.mark.parametrize("options", [("--force",), ("--force", "--trainable"), ()])
+def test_an_import_does_not_replace_what_it_reads(refused, tmp_path, policy, options):
+    before = policy.read_bytes()
+    (tmp_path / "link.pt").symlink_to(policy)
+    (tmp_path / "contract.toml").write_text("mine")
+    for source, destination in ((policy, policy), ("link.pt", policy), (policy, "link.pt")):
+        assert "is itself what is to be imported; give another file" in refused("import", source, destination, *options)
+    if "--trainable" not in options:
+        words = (policy, "contract.toml", "--contract", "contract.toml", *options)
+        assert "is itself what is to be imported" in refused("import", *words)
+    assert policy.read_bytes() == before and (tmp_path / "contract.toml").read_text() == "mine"
+
+
 def test_unwritable_destination_of_an_import(refused, tmp_path, policy):
     (tmp_path / "file").write_text("not a folder")
     assert "cannot write" in refused("import", policy, tmp_path / "file" / "out.gauge.pt")

@@ -48,6 +48,14 @@ def test_the_policy_is_not_written_over(refused, backwards):
     assert backwards.read_bytes() == before
 
 
+def test_the_contract_is_not_written_over(refused, backwards, tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text("# mine")
+    words = ("doctor", backwards, "--contract", mine, "--out", "mine.toml")
+    assert "the --contract that is examined; give another file" in refused(*words)
+    assert mine.read_text() == "# mine"
+
+
 @pytest.mark.usefixtures("few")
 def test_json_holds_it_all(run):
     result = run("doctor", "pretrained", "--seconds", 1, "--threads", 1, "--json")

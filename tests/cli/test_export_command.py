@@ -46,3 +46,10 @@ def test_bad_request(refused, policy, tmp_path, arguments, named):
 def test_exported_file_is_not_exported_again(run, refused, policy, tmp_path):
     assert run("export", policy, "--format", "torchscript", "--out", tmp_path).exit_code == 0
     assert "exported file already" in refused("export", Path(tmp_path) / "policy.pt", "--out", tmp_path / "again")
+
+
+def test_the_policy_is_not_written_over(refused, policy, tmp_path):
+    policy = policy.rename(tmp_path / "policy.pt")
+    before = policy.read_bytes()
+    assert "'policy.pt' is the policy that is to be exported" in refused("export", policy, "--out", ".")
+    assert policy.read_bytes() == before
