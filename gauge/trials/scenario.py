@@ -130,7 +130,7 @@ class Failure:
 
     tilt: Annotated[float, Field(gt=0.0, le=3.1416)] = 1.309
     """Tilt of the base [rad]."""
-    lying: Annotated[float, Field(gt=0.0, le=60.0)] | Literal[False] = 1.0
+    lying: Annotated[float, Field(gt=0.0, le=60.0)] | bool = 1.0
     """Time without a break with the trunk on the ground [s]; false: that is allowed."""
 
 
@@ -259,6 +259,8 @@ def _problems(scenario: Scenario) -> Iterator[str]:
         scenario.terrain()
     except TerrainError as error:
         yield str(error)
+    if scenario.failure.lying is True:
+        yield "failure.lying is true; give the time [s] after which it is a fall, or false where it never is"
     for number, force in enumerate(scenario.forces):
         for name, (least, largest) in (("newtons", force.newtons), ("begin", force.begin), ("seconds", force.seconds)):
             if least > largest:

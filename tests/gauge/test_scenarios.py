@@ -93,6 +93,8 @@ def test_unknown_names_are_refused_with_those_that_are_near():
             'friction = 0.6\nsuite = "nonesuch"',
             r"scenario file .*own\.toml: there is no suite 'nonesuch'",
         ),
+        ("[success]", "[failure]\nlying = 0\n[success]", "failure.lying is 0; it must be greater than 0"),
+        ("[success]", "[failure]\nlying = true\n[success]", "failure.lying is true; give the time"),
         ("[success]", "[ground]\nlevel = 3\n[success]", "ground.level is 3 of no terrain"),
         (
             "velocity = [1.0",
