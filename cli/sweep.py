@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time as clock
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import typer
+from rich.text import Text
 
 from ..files.writing import lock_folder, make_folder
 from ..gauge.cluster import check_address
@@ -21,8 +23,26 @@ from ..training.sweep.keeping import keep_runs
 from ..training.sweep.runs import SweepRun, plan_runs
 from ..training.sweep.sharing import shared_gpus
 from .console import Terminal, make_table, shell_command
-from .errors import complain
 from .train import parse_duration
+
+
+class _Listener(Terminal):
+    """Standard error. Where nobody reads it any more, what is said is lost, and the sweep goes on."""
+
+    def __init__(self) -> None:
+        super().__init__(stderr=True)
+
+    def say(self, sentence: str | Text) -> None:
+        """Print a sentence, or lose it."""
+        try:
+            super().say(sentence)
+        except OSError:  # what is left in the buffer would fail again when the interpreter ends
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+
+    def on_broken_pipe(self) -> None:
+        """Leave standard output alone, which rich would close with it."""
+        raise BrokenPipeError
 
 
 def run_sweep(
@@ -46,7 +66,7 @@ def run_sweep(
     sweep = load_sweep(file)
     folder = (out or Path("results") / f"sweep-{sweep.name}").absolute()
     deadline = None if time is None else began + parse_duration(time)
-    errors = Terminal(stderr=True)
+    errors = _Listener()
     gauging = None
     if cluster is not None:
         check_address(cluster)
@@ -64,7 +84,7 @@ def run_sweep(
         if not runs and len(set(refused.values())) == 1:
             raise SweepError(next(iter(refused.values())))
         for name, sentence in refused.items():
-            complain(f"gaitgauge: entry '{name}' cannot start: {sentence}")
+            errors.say(f"gaitgauge: entry '{name}' cannot start: {sentence}")
         threads = threads or max((os.cpu_count() or 2) // 2, 1)
         shares = per_gpu > 1 and not report and any(run.on_gpu for run in runs)
         context: AbstractContextManager[Mapping[str, str]] = shared_gpus(errors.say) if shares else nullcontext({})

@@ -5,10 +5,14 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
+
+STOP_SIGNALS = tuple(known for known in signal.Signals if known.name in ("SIGTERM", "SIGINT", "SIGHUP"))
+"""What asks for an orderly stop; Windows has no SIGHUP."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,18 +45,29 @@ class Progress:
 
 
 class StopSignals:
-    """While active, SIGTERM and SIGINT ask for an orderly stop; a second SIGINT interrupts at once."""
+    """While active, SIGTERM, SIGINT and SIGHUP ask for an orderly stop; a second SIGINT interrupts at once. Under ``nohup``, where
+    SIGHUP is ignored, it stays so.
+    """
 
-    def __init__(self, message: Callable[[str], None]) -> None:
+    def __init__(self, message: Callable[[str], None], *, interrupts: bool = True) -> None:
+        """Prepare.
+
+        Args:
+            message: called with a sentence; where it cannot be printed, it is lost.
+            interrupts: whether a second SIGINT raises KeyboardInterrupt; otherwise it sets ``insisted``.
+        """
         self.received: int | None = None
+        self.insisted = False
         self._message = message
+        self._interrupts = interrupts
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
         # Python runs signal handlers in the main thread only and refuses to install them elsewhere.
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGINT):
-                self._previous[number] = signal.signal(number, self._handle)
+            for number in STOP_SIGNALS:
+                if number.name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN:
+                    self._previous[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(
@@ -63,6 +78,11 @@ class StopSignals:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.received is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt
+            self.insisted = True
+            if self._interrupts:
+                raise KeyboardInterrupt
+            return
         self.received = number
-        self._message(f"{signal.Signals(number).name} received: finishing this iteration and writing a checkpoint.")
+        # The terminal may be gone, or in the middle of another line; rich ends the program where a pipe is closed.
+        with suppress(OSError, RuntimeError, SystemExit):
+            self._message(f"{signal.Signals(number).name} received: finishing this iteration and writing a checkpoint.")

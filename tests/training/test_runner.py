@@ -141,18 +141,39 @@ def test_logged_reward_is_the_mean_of_finished_episodes():
     assert runner.logger.episode_length.tolist() == [8.0, 8.0, 8.0, 6.0, 4.0, 8.0, 8.0, 8.0]
 
 
-def test_sigterm_writes_a_checkpoint(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_writes_a_checkpoint(tmp_path, number):
     messages = []
     runner = make(
-        tmp_path, message=messages.append, progress=lambda p: p.iteration == 3 and os.kill(os.getpid(), signal.SIGTERM)
+        tmp_path, message=messages.append, progress=lambda p: p.iteration == 3 and os.kill(os.getpid(), number)
     )
-    before = signal.getsignal(signal.SIGTERM)
+    before = signal.getsignal(number)
     outcome = runner.learn(1000)
-    assert outcome.reason == "signal" and outcome.exit_code == 143
+    assert outcome.reason == "signal" and outcome.exit_code == 128 + number
     assert outcome.iteration == 4 and outcome.checkpoint == tmp_path / "model_4.pt"
     assert read_checkpoint(outcome.checkpoint)["iter"] == 4
-    assert any("SIGTERM" in m for m in messages)
-    assert signal.getsignal(signal.SIGTERM) is before
+    assert any(number.name in m for m in messages)
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("problem", [OSError("the terminal is gone"), SystemExit(1)])
+def test_a_signal_writes_a_checkpoint_where_nobody_can_be_told(tmp_path, problem):
+    def message(_):
+        raise problem
+
+    runner = make(
+        tmp_path, message=message, progress=lambda p: p.iteration == 3 and os.kill(os.getpid(), signal.SIGTERM)
+    )
+    assert runner.learn(1000).checkpoint == tmp_path / "model_4.pt"
+
+
+def test_under_nohup_a_closed_terminal_stops_nothing(tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        runner = make(tmp_path, progress=lambda p: p.iteration == 1 and os.kill(os.getpid(), signal.SIGHUP))
+        assert runner.learn(2).reason == "finished"
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_time_limit(tmp_path):

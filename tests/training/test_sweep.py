@@ -201,7 +201,13 @@ class Scripted(SweepRun):
 import json, os, sys, time, pathlib
 folder = pathlib.Path({str(self.folder)!r})
 with open(folder.parents[2] / "order", "a") as file: file.write(f"{self.label} on {{os.environ['CUDA_VISIBLE_DEVICES']}}\\n")
-time.sleep({0.3 if "slow" in self.entry.name else 0.0})
+(folder / "new").write_text(str(os.getpid()))
+(folder / "new").rename(folder / "pid")
+if {self.entry.name!r} == "deaf":
+    import signal
+    for number in (signal.SIGTERM, signal.SIGINT): signal.signal(number, signal.SIG_IGN)
+    (folder / "is-deaf").touch()
+time.sleep({0.3 if "slow" in self.entry.name else 60.0 if self.entry.name in ("long", "deaf") else 0.0})
 if {self.entry.name!r} == "killed":
     print("iteration 60 of 1530, 23 min left", flush=True)
     os.kill(os.getpid(), 9)
@@ -217,6 +223,7 @@ if {self.entry.name!r} == "asked-early":
     sys.exit(128 + 15)
 (run / "model_3.pt").touch()
 (run / "run.json").write_text(json.dumps(dict(outcome="finished", iteration={self.iterations})))
+if {self.entry.name!r} == "damaged": (run / "run.json").write_text("{{")
 """
         return [sys.executable, "-S", "-c", program]
 
@@ -305,6 +312,99 @@ def test_a_signal_ends_what_is_at_work(tmp_path):
     timer.join()
     assert outcome.stopped == signal.SIGTERM and len(outcome.unfinished) == 2
     assert "SIGTERM received" in said[-1] and not any("late" in sentence for sentence in said)
+
+
+def wait_for(path: Path) -> Path:
+    until = time.monotonic() + 20.0
+    while not path.exists():
+        assert time.monotonic() < until, path
+        time.sleep(0.02)
+    return path
+
+
+def alive(run: Scripted) -> bool:
+    """Whether the training of a run lives, which was started from this process or from one that is gone."""
+    try:
+        os.kill(int((run.folder / "pid").read_text()), 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def signals_once(path: Path, *numbers: int) -> threading.Thread:
+    """Sends this process signals, 30 ms apart, once a file is there."""
+
+    def send() -> None:
+        wait_for(path)
+        for number in numbers:
+            os.kill(os.getpid(), number)
+            time.sleep(0.03)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    return thread
+
+
+def test_a_second_interrupt_shortens_the_wait_and_leaves_no_training(tmp_path, monkeypatch):
+    monkeypatch.setattr("gaitgauge.training.sweep.jobs._LAST_PATIENCE", 0.3)
+    run, began = scripted(tmp_path, "deaf"), time.monotonic()
+    sender = signals_once(run.folder / "is-deaf", signal.SIGINT, signal.SIGINT)
+    outcome, _ = work([run])
+    sender.join()
+    assert outcome.stopped == signal.SIGINT and outcome.unfinished == ["deaf, seed 0"]
+    assert not alive(run) and time.monotonic() - began < 30.0
+
+
+def test_a_terminal_that_is_closed_stops_a_sweep_like_a_signal(tmp_path):
+    run = scripted(tmp_path, "long")
+    sender = signals_once(run.folder / "pid", signal.SIGHUP)
+    outcome, said = work([run])
+    sender.join()
+    assert outcome.stopped == signal.SIGHUP and not alive(run) and "SIGHUP received" in said[-1]
+
+
+def test_a_mistake_of_the_sweep_itself_leaves_no_training(tmp_path, monkeypatch):
+    run = scripted(tmp_path, "long")
+
+    def broken(self):
+        wait_for(run.folder / "pid")
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Jobs, "_collect", broken)
+    with pytest.raises(ZeroDivisionError):
+        work([run])
+    assert not alive(run)
+
+
+@pytest.mark.parametrize("place", ["train.log", "gauge.log"])
+def test_a_log_that_cannot_be_written_is_the_failure_of_its_run(tmp_path, place):
+    runs = [scripted(tmp_path, name) for name in ("first", "second")]
+    (runs[0].folder / place).mkdir(parents=True)
+    outcome, _ = work(runs)
+    log = runs[0].folder / place
+    assert outcome.failures == {"first, seed 0": f"'{log}': is a directory; mend that and call again"}
+    assert runs[1].gauged(SWEEP)
+
+
+def test_a_description_that_is_damaged_is_the_failure_of_its_run(tmp_path):
+    """Also where it comes about while the run is trained."""
+    runs = [scripted(tmp_path, name) for name in ("damaged", "second")]
+    outcome, _ = work(runs)
+    assert list(outcome.failures) == ["damaged, seed 0"] and outcome.unfinished == []
+    assert "run.json' is not valid JSON" in outcome.failures["damaged, seed 0"] and runs[1].gauged(SWEEP)
+
+
+def test_a_training_that_a_killed_sweep_left_is_not_started_again(tmp_path):
+    runs = [scripted(tmp_path, name) for name in ("long", "second")]
+    if not (sweep := os.fork()):
+        work(runs[:1])
+    number = int(wait_for(runs[0].folder / "pid").read_text())
+    os.kill(sweep, signal.SIGKILL)
+    os.waitpid(sweep, 0)
+    outcome, _ = work(runs)
+    assert list(outcome.failures) == ["long, seed 0"] and runs[1].gauged(SWEEP) and alive(runs[0])
+    assert f"it is still being trained by process {number} of an earlier call" in outcome.failures["long, seed 0"]
+    os.kill(number, signal.SIGTERM)
 
 
 def test_gpus_are_those_that_may_be_seen(monkeypatch):

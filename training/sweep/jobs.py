@@ -8,25 +8,33 @@ import signal
 import subprocess
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import torch
 
 from ...files.parsing import one_line
-from ..checkpoint import CheckpointError
 from ..side_process import ENVIRONMENT, await_end
-from ..stopping import StopSignals
-from .file import Sweep
-from .runs import SweepRun
+from ..stopping import STOP_SIGNALS, StopSignals
+from .file import Sweep, SweepError
+from .runs import RUN_ERRORS, SweepRun, what_failed
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 _POLL = 0.1
 """Time between two looks at the processes [s]."""
-_STOPPED = (128 + signal.SIGTERM, 128 + signal.SIGINT)
+_STOPPED = tuple(128 + number for number in STOP_SIGNALS)
 """Exit codes of trainings that were asked to stop (``stopping.StopSignals``)."""
 _PATIENCE = 120.0
 """Longest wait for processes that were asked to stop [s]: an iteration and its checkpoint."""
+_LAST_PATIENCE = 10.0
+"""Longest wait for processes that were interrupted [s], before they are killed: they end what runs beside them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,59 +105,82 @@ class Jobs:
         self._failures: dict[str, str] = {}
 
     def work(self, runs: Sequence[SweepRun]) -> SweepOutcome:
-        """Train and gauge, until all is done, the time is up or a signal asks to stop; then trainings have written checkpoints."""
+        """Train and gauge, until all is done, the time is up or a signal asks to stop; then trainings have written checkpoints.
+
+        However it ends, no process is left; a second SIGINT shortens the wait for their checkpoints.
+        """
         for run in runs:
             self._sort(run)
-        with StopSignals(self._say) as signals:
-            while signals.received is None and not self._late and (self._live or self._start()):
-                self._start()
-                self._collect()
-                time.sleep(_POLL)
-            self._stop()
-        unfinished = [r.label for r in runs if r.label not in self._failures and not self._done(r)]
+        with StopSignals(self._say, interrupts=False) as signals:
+            try:
+                while signals.received is None and not self._late and (self._live or self._start()):
+                    self._start()
+                    self._collect()
+                    time.sleep(_POLL)
+            finally:
+                self._stop(lambda: signals.insisted)
+        unfinished = [run.label for run in runs if self._is_left(run)]
         return SweepOutcome(failures=dict(self._failures), unfinished=unfinished, stopped=signals.received)
 
     @property
     def _late(self) -> bool:
         return self._deadline is not None and time.monotonic() >= self._deadline
 
-    def _done(self, run: SweepRun) -> bool:
-        return run.trained and run.gauged(self._sweep)
+    @contextmanager
+    def _failing(self, run: SweepRun) -> Iterator[None]:
+        """Around what concerns one run: what goes wrong is its failure, and the others go on."""
+        try:
+            yield
+        except RUN_ERRORS as error:
+            self._failures[run.label] = what_failed(error)
+            self._say(f"{run.label} failed: {self._failures[run.label]}")
+
+    def _is_left(self, run: SweepRun) -> bool:
+        """Whether a later call goes on with a run that has not failed."""
+        if run.label not in self._failures:
+            with self._failing(run):
+                return not (run.trained and run.gauged(self._sweep))
+        return False
 
     def _sort(self, run: SweepRun) -> None:
         """Put a run where it goes on."""
-        try:
+        with self._failing(run):
             if not run.trained:
                 self._to_train.append(run)
             elif not run.gauged(self._sweep):
                 self._to_gauge.append(run)
-        except CheckpointError as error:
-            self._failures[run.label] = str(error)
 
     def _start(self) -> bool:
         """Start what there is a place for; whether anything is at work."""
-        taken = {job.place for job in self._live}
         for run in list(self._to_train):
+            taken = {job.place for job in self._live}
             free = [p for p in (self._places if run.on_gpu else ("the CPU",)) if p not in taken]
             if free:
-                taken.add(free[0])
                 self._to_train.remove(run)
-                seconds = None if self._deadline is None else self._deadline - time.monotonic()
-                command = run.training_command(self._sweep, seconds=seconds, score_threads=self._score_threads)
-                how = "goes on" if run.directory else "is trained"
-                self._launch(run, command, free[0], run.log, f"{run.label} {how} on {free[0]}; its log is {run.log}")
-        if self._to_gauge and "gauge" not in taken:
+                with self._failing(run):
+                    seconds = None if self._deadline is None else self._deadline - time.monotonic()
+                    command = run.training_command(self._sweep, seconds=seconds, score_threads=self._score_threads)
+                    how = "goes on" if run.directory else "is trained"
+                    self._launch(run, command, free[0], run.log, f"{how} on {free[0]}; its log is {run.log}")
+        while self._to_gauge and all(job.place != "gauge" for job in self._live):
             run = self._to_gauge.popleft()
-            command = run.gauging_command(self._sweep, where=self._gauging)
-            self._launch(
-                run, command, "gauge", run.folder / "gauge.log", f"{run.label} is gauged on {self._sweep.suite}"
-            )
+            with self._failing(run):
+                command = run.gauging_command(self._sweep, where=self._gauging)
+                self._launch(run, command, "gauge", run.folder / "gauge.log", f"is gauged on {self._sweep.suite}")
         return bool(self._live)
 
-    def _launch(self, run: SweepRun, command: Sequence[str], place: str, log: Path, sentence: str) -> None:
+    def _launch(self, run: SweepRun, command: Sequence[str], place: str, log: Path, how: str) -> None:
+        """Start a process, which keeps a lock until its end: the next sweep finds it if this one is killed.
+
+        Raises:
+            SweepError: a process that an earlier call left has the lock.
+            OSError: it cannot be started, or its log cannot be written.
+        """
         environment = {**os.environ, **self._places.get(place, ENVIRONMENT)}
         log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("ab") as output:
+        with log.open("ab") as output, log.with_suffix(".lock").open("a+b", buffering=0) as lock:
+            if fcntl is not None:
+                _take(lock, "gauged" if place == "gauge" else "trained")
             # A session of its own: Ctrl-C in the terminal is for the sweep, which hands it on.
             process = subprocess.Popen(
                 list(command),
@@ -158,35 +189,71 @@ class Jobs:
                 stderr=output,
                 env=environment,
                 start_new_session=True,
+                pass_fds=() if fcntl is None else (lock.fileno(),),
             )
-        self._live.append(_Job(run=run, place=place, process=process, log=log))
-        self._say(sentence)
+            self._live.append(_Job(run=run, place=place, process=process, log=log))
+            with suppress(OSError):  # a full disk
+                lock.truncate(0)
+                lock.write(str(process.pid).encode())
+        self._say(f"{run.label} {how}")
 
     def _collect(self) -> None:
         """Take what has ended and sort it on."""
         for job in [j for j in self._live if j.process.poll() is not None]:
             self._live.remove(job)
-            run, code, gauged = job.run, job.process.returncode, job.place == "gauge"
-            if code in _STOPPED and not gauged and run.directory:
-                how = signal.Signals(code - 128).name
-                self._say(
-                    f"{run.label} was stopped by {how} from outside and has a checkpoint; a later call goes on with it"
-                )
-            elif code:
-                self._failures[run.label] = f"{_reason(code, job.log)} (see '{job.log}')"
-                self._say(f"{run.label} failed: {self._failures[run.label]}")
-            elif gauged or run.trained:
-                self._say(f"{run.label} has been {'gauged' if gauged else 'trained'}")
-                self._sort(run)
+            with self._failing(job.run):
+                self._take_in(job.run, job.process.returncode, job.log, gauged=job.place == "gauge")
 
-    def _stop(self) -> None:
-        """Ask what is at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk."""
+    def _take_in(self, run: SweepRun, code: int, log: Path, *, gauged: bool) -> None:
+        """What became of a process.
+
+        Raises:
+            SweepError: it failed.
+        """
+        if code in _STOPPED and not gauged and run.directory:
+            how = signal.Signals(code - 128).name
+            self._say(
+                f"{run.label} was stopped by {how} from outside and has a checkpoint; a later call goes on with it"
+            )
+        elif code:
+            raise SweepError(f"{_reason(code, log)} (see '{log}')")
+        elif gauged or run.trained:
+            self._say(f"{run.label} has been {'gauged' if gauged else 'trained'}")
+            self._sort(run)
+
+    def _stop(self, insisted: Callable[[], bool]) -> None:
+        """Ask what is at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk. Where they take
+        too long, or ``insisted`` says so, they are interrupted, and killed at last.
+        """
+        for number, patience, waits in (
+            (signal.SIGTERM, _PATIENCE, lambda: not insisted()),
+            (signal.SIGINT, _LAST_PATIENCE, lambda: True),
+        ):
+            for job in self._live:
+                job.process.send_signal(number)
+            until = time.monotonic() + patience
+            while waits() and time.monotonic() < until and any(job.process.poll() is None for job in self._live):
+                time.sleep(_POLL)
         for job in self._live:
-            job.process.send_signal(signal.SIGTERM)
-        until = time.monotonic() + _PATIENCE
-        for job in self._live:
-            await_end(job.process, max(until - time.monotonic(), 0.1))
+            await_end(job.process, 0.0)
         self._live = []
+
+
+def _take(lock: BinaryIO, doing: str) -> None:
+    """Lock a file for this process and for those that inherit it.
+
+    Raises:
+        SweepError: another process has it.
+    """
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        lock.seek(0)
+        number = one_line(lock.read(20).decode(errors="replace")) or "?"
+        raise SweepError(
+            f"it is still being {doing} by process {number} of an earlier call; wait until that has ended, or stop it with "
+            f"'kill {number}', and call again"
+        ) from error
 
 
 def _reason(code: int, log: Path) -> str:

@@ -10,7 +10,10 @@ from typing import Any
 from ...backends.base import BackendError
 from ...files.parsing import one_line, read_results
 from ...files.writing import json_text, make_folder, write_atomically
+from ...gauge.comparison import ComparisonError
 from ...gauge.suite import SuiteError, load_suite
+from ...policy.base import PolicyError
+from ...policy.contract import ContractError
 from ...policy.finding import latest_checkpoint
 from ..checkpoint import CheckpointError
 from ..configuration import ConfigurationError
@@ -25,6 +28,16 @@ KEPT = "kept"
 KEPT_CURVES = "curves.csv"
 KEPT_POLICY = "policy.gauge.pt"
 RESULTS = "results.json"
+RUN_ERRORS = (SweepError, CheckpointError, ComparisonError, PolicyError, ContractError, OSError)
+"""What may be wrong with the files of one run; the others go on."""
+
+
+def what_failed(error: Exception) -> str:
+    """One sentence on one of ``RUN_ERRORS``."""
+    if not isinstance(error, OSError):
+        return str(error)
+    reason = (error.strerror or one_line(error)).lower()
+    return f"'{one_line(error.filename)}': {reason}; mend that and call again" if error.filename else reason
 
 
 @dataclass(frozen=True, kw_only=True)
