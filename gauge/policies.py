@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,12 +78,15 @@ def load_policies(
     return found, refused
 
 
-def check_fit(suite: Suite, robot: Robot, contract: PolicyContract) -> None:
+def check_fit(suite: Suite, robot: Robot, contract: PolicyContract, *, longest: float = math.inf) -> None:
     """Check that a suite's physics suits a robot and a policy.
+
+    Args:
+        longest: control period that can be looked at [s].
 
     Raises:
         RobotError: the robot lacks the suite's joint parameters.
-        SuiteError: the policy was made for another control period.
+        SuiteError: the policy was made for another control period, or for one above ``longest``.
     """
     if suite.parameters not in robot.parameters:
         raise RobotError(
@@ -93,6 +97,11 @@ def check_fit(suite: Suite, robot: Robot, contract: PolicyContract) -> None:
         raise SuiteError(
             f"the policy was made for a control period of {contract.control_period:g} s, suite '{suite.name}' runs "
             f"{suite.physics.control_period:g} s; use a policy of that period"
+        )
+    if contract.control_period > longest:
+        raise SuiteError(
+            f"the policy's control period is {contract.control_period:g} s, and what is noted here every {longest:g} s needs one of at "
+            "most that; use a policy of a shorter period"
         )
 
 

@@ -86,7 +86,7 @@ def collect(policy: Policy, robot: Robot, asked: LatentRequest, suite: Suite, te
         PolicyError: the policy has neither encoder nor experts, or its output is not finite.
         ContractError: it is not for this robot.
     """
-    check_fit(suite, robot, policy.contract)
+    check_fit(suite, robot, policy.contract, longest=INTERVAL)
     places = [(t, c, r) for t in range(len(terrains)) for c in range(len(COMMANDS)) for r in range(asked.robots)]
     scene = Scene(
         robot=robot,

@@ -128,7 +128,7 @@ def run_scenario(
         BackendError: the engine cannot do what the scenario asks for.
         ContractError, PolicyError: the policy is not for this robot, or its output is not finite.
         RobotError: the robot lacks the joint parameters of the scenario's suite.
-        SuiteError: the policy's control period is not that of the scenario's suite.
+        SuiteError: the policy's control period is not that of the scenario's suite, or too long.
     """
     scene = make_scene(scenario, robot, policy, len(seeds))
     if torch.device(device).type == "cpu":
@@ -140,7 +140,7 @@ def run_scenario(
 def make_scene(scenario: Scenario, robot: Robot, policy: Policy, count: int) -> Scene:
     """The worlds of ``count`` trials. Raises as ``run_scenario``."""
     suite = load_suite(scenario.suite)
-    check_fit(suite, robot, policy.contract)
+    check_fit(suite, robot, policy.contract, longest=min(SMOOTHING, PATH_INTERVAL))
     return Scene(
         robot=robot,
         parameters=joint_parameters(suite, robot, policy.contract),

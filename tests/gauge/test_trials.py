@@ -184,3 +184,15 @@ def test_a_policy_of_another_control_period_is_refused():
     policy.contract = replace(policy.contract, control_period=0.01)
     with pytest.raises(SuiteError, match=r"made for a control period of 0\.01 s, suite 'coarse' runs 0\.02 s"):
         play(scenario(STAND), policy)
+
+
+def test_a_control_period_above_that_of_means_is_refused(tmp_path):
+    path = tmp_path / "slow.toml"
+    path.write_text(
+        'extends = "gaitgauge-1"\nname = "slow"\n[physics]\ntimestep = 0.01\nsubsteps = 30\n'
+        "[metrics]\ninterval = 30\n[noise]\nlatency = 0\n"
+    )
+    policy = ScriptedPolicy()
+    policy.contract = replace(policy.contract, control_period=0.3)
+    with pytest.raises(SuiteError, match=r"control period is 0\.3 s, and what is noted here every 0\.1 s needs one"):
+        play(scenario(STAND, suite=str(path)), policy)
