@@ -14,7 +14,7 @@ class WatchedNetwork:
     """A network of ``networks.py`` that acts as ever and keeps what its ``encode`` gave last."""
 
     latent: torch.Tensor | None = None
-    """What the actor was given of the history, (N, L); None where there is no encoder."""
+    """What the actor was given of the history, (N, L); None where there is no encoder, or one of no width."""
     weights: torch.Tensor | None = None
     """The gate's weights, (N, K); None where there are no experts."""
     history: torch.Tensor
@@ -28,7 +28,8 @@ class WatchedNetwork:
     def __call__(self, history: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for ``history`` (N, H, F)."""
         self.history = history
-        self.latent, self.weights = self._network.encode(history)
+        found = self._network.encode(history)
+        self.latent, self.weights = (part if part is not None and part.shape[1] else None for part in found)
         action: torch.Tensor = self._network(history)
         return action
 

@@ -41,9 +41,10 @@ def principal_components(points: Array, count: int = 2) -> tuple[Array, Array]:
 
     Returns:
         (N, count), each axis with the sign that makes its largest coefficient positive, and each axis's share of the
-        variance, (count,).
+        variance, (count,). Of less than ``count`` dimensions the further axes are zero.
     """
     centred = points - points.mean(axis=0)
+    centred = np.pad(centred, ((0, 0), (0, max(count - points.shape[1], 0))))
     _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
     axes = axes[:count]
     axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]

@@ -32,6 +32,11 @@ def test_principal_components_of_points_on_a_cross():
     assert np.allclose(spread, [[3, 0], [-3, 0], [0, -1], [0, 1]])
 
 
+def test_points_on_a_line_have_a_second_axis_of_nothing():
+    spread, shares = principal_components(np.array([[1.0], [2.0], [6.0]]))
+    assert np.allclose(spread, [[-2, 0], [-1, 0], [3, 0]]) and shares.tolist() == [1.0, 0.0]
+
+
 def test_silhouette_of_two_pairs():
     points, classes = np.array([[0.0], [1.0], [10.0], [11.0]]), np.array([0, 0, 1, 1])
     # (10.5 − 1) / 10.5 at the ends, (9.5 − 1) / 9.5 inside
@@ -184,6 +189,30 @@ def test_several_policies_side_by_side_and_one_that_has_nothing_to_look_at(polic
         assert "pretrained" in titles and ("a<b>" in titles) == (name != "experts")
     page = (tmp_path / "latent.html").read_text()
     assert "a<b>" not in page and "plain was left out" in page and page.count("<svg") == 3
+
+
+def test_a_latent_of_one_entry_and_parts_of_none(tmp_path):
+    """Networks that files may hold, whatever they are good for."""
+    narrow = {"encoder_hidden": [8], "actor_hidden": [8]}
+    networks = {
+        "one": ("cts", narrow | {"latent_width": 1}),
+        "none": ("cts", narrow | {"latent_width": 0}),
+        "nobody": ("moe_cts", {"num_experts": 0}),
+    }
+    for name, (architecture, arguments) in networks.items():
+        weights = {k: 0.01 * v for k, v in ARCHITECTURES[architecture](**arguments).state_dict().items()}
+        stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=weights)
+        save_policy(tmp_path / f"{name}.gauge.pt", standard_contract(load_robot("go2")), stored)
+    request = LatentRequest(
+        policies=tuple(str(tmp_path / f"{name}.gauge.pt") for name in networks),
+        terrains=("flat",),
+        seconds=0.2,
+        settling=0.2,
+        robots=2,
+    )
+    one, none, nobody = study_latents(request, tmp_path / "out")["policies"]
+    assert one["commands"].keys() == {"latent", "input", "explained"} and one["commands"]["explained"][1] == 0.0
+    assert none["commands"].keys() == {"input"} and nobody["experts"] is None
 
 
 def test_one_sentence_where_there_is_nothing_to_look_at(policies, tmp_path):
