@@ -77,7 +77,7 @@ def _set(node: Any, path: list[str], text: str, key: str, root: Any) -> Any:
     names = [child for child, _ in _children(node)]
     if name in names:
         place = names.index(name)
-    elif name.isdecimal() and int(name) < len(elements):
+    elif name in map(str, range(len(elements))):
         place = int(name)
     else:
         raise _unknown(key, root)

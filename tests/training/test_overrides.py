@@ -71,6 +71,7 @@ def test_later_settings_win_and_the_original_stays():
         ("engine.power.x=2", r"unknown setting 'engine.power.x'"),
         ("wheels.middle.radius=1", r"unknown setting .*wheels.front.radius"),
         ("wheels.2.radius=1", r"unknown setting"),
+        (f"wheels.{'9' * 5000}.radius=1", r"unknown setting"),
         ("qqqqqq=1", r"settings begin with: colours, engine, label"),
         ("engine=2", r"'engine' is a group of 3 settings; set one of them: engine.power"),
         ("wheels=2", r"'wheels' cannot be set|'wheels' is a group"),
