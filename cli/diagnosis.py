@@ -39,12 +39,12 @@ def examine_policy(
     Arguments are ``doctor``'s options.
 
     Raises:
-        UserError: ``out`` is no ``.toml``, is ``contract``, or cannot be written.
+        UserError: ``out`` is no ``.toml``, is ``contract`` or ``robot``, or cannot be written.
     """
     if out is not None and out.suffix != ".toml":
         raise UserError(f"--out is '{out}'; give a file that ends in .toml")
-    if out is not None and contract is not None and same_file(out, contract):
-        raise UserError(f"--out is '{out}', the --contract that is examined; give another file")
+    if out is not None and any(same_file(out, given) for given in (contract, robot) if given):
+        raise UserError(f"--out is '{out}', which is read as --contract or --robot; give another file")
     asked = None if robot is None else load_robot(robot)
     policy = load_policy(policy_file(choice), asked, trust=trust, contract_file=contract)
     body = robot_for(policy.contract, robot)

@@ -48,8 +48,8 @@ def import_file(
         )
     from ..policy.finding import find_policy
 
-    if any(same_file(destination, given) for given in (find_policy(source), contract) if given is not None):
-        raise UserError(f"'{destination}' is itself what is to be imported; give another file to write")
+    if any(same_file(destination, given) for given in (find_policy(source), contract, robot) if given):
+        raise UserError(f"'{destination}' is itself read for the import; give another file to write")
     if destination.exists() and not force:
         raise UserError(f"'{destination}' already exists; give another name, or replace it with --force")
     trainable = trainable or raw

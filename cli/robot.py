@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from ..files.writing import make_folder, write_atomically
+from ..files.writing import make_folder, same_file, write_atomically
 from ..robots import Robot, RobotError, load_robot
 from ..robots.drafting import draft_robot
 from ..robots.examining import Finding, examine
@@ -36,6 +36,8 @@ def new_robot(*, model: Path, out: Path | None, name: str | None, force: bool) -
     folder = out or model.parent
     description = folder / ROBOT_FILE
     own = folder / f"{model.stem}-named.xml"
+    if same_file(model, description):
+        raise UserError(f"'{model}' would be replaced by the description; give the model another name, or --out")
     _refuse_existing(description, force)
     draft = draft_robot(model, name, folder=folder)
     if draft.model:

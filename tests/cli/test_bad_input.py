@@ -258,10 +258,10 @@ def test_an_import_does_not_replace_what_it_reads(refused, tmp_path, policy, opt
     (tmp_path / "link.pt").symlink_to(policy)
     (tmp_path / "contract.toml").write_text("mine")
     for source, destination in ((policy, policy), ("link.pt", policy), (policy, "link.pt")):
-        assert "is itself what is to be imported; give another file" in refused("import", source, destination, *options)
-    if "--trainable" not in options:
-        words = (policy, "contract.toml", "--contract", "contract.toml", *options)
-        assert "is itself what is to be imported" in refused("import", *words)
+        assert "is itself read for the import; give another file" in refused("import", source, destination, *options)
+    for option in ("--robot", "--contract")[: 1 if "--trainable" in options else 2]:
+        words = (policy, "contract.toml", option, "contract.toml", *options)
+        assert "is itself read for the import" in refused("import", *words)
     assert policy.read_bytes() == before and (tmp_path / "contract.toml").read_text() == "mine"
 
 

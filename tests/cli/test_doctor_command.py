@@ -48,11 +48,12 @@ def test_the_policy_is_not_written_over(refused, backwards):
     assert backwards.read_bytes() == before
 
 
-def test_the_contract_is_not_written_over(refused, backwards, tmp_path):
+@pytest.mark.parametrize("option", ["--contract", "--robot"])
+def test_what_is_read_is_not_written_over(refused, backwards, tmp_path, option):
     mine = tmp_path / "mine.toml"
     mine.write_text("# mine")
-    words = ("doctor", backwards, "--contract", mine, "--out", "mine.toml")
-    assert "the --contract that is examined; give another file" in refused(*words)
+    words = ("doctor", backwards, option, mine, "--out", "mine.toml")
+    assert "which is read as --contract or --robot; give another file" in refused(*words)
     assert mine.read_text() == "# mine"
 
 

@@ -58,6 +58,14 @@ def test_nothing_that_was_there_is_lost(refused, run, model):
     assert run("robot", "new", model, "--force").exit_code == 0
 
 
+@pytest.mark.parametrize("options", [(), ("--force",)])
+def test_a_model_by_the_name_of_the_description_is_not_replaced(refused, model, options):
+    model = model.rename(model.with_name("robot.toml"))
+    before = model.read_bytes()
+    assert "would be replaced by the description" in refused("robot", "new", model, *options)
+    assert model.read_bytes() == before
+
+
 @pytest.mark.parametrize("name", ["home&#10;imu_site = &quot;x&quot;&#10;#", "home\u2028", "home\x7f"])
 def test_a_keyframe_s_name_is_no_line_of_the_description(run, model, name):
     """Where the pose comes from stands in a comment, which a line's end ends."""
