@@ -6,8 +6,8 @@ import json
 import os
 import sys
 import time as clock
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from ..gauge.cluster import check_address
 from ..training.sweep.file import Sweep, SweepError, load_sweep
 from ..training.sweep.folding import fold_sweep
 from ..training.sweep.jobs import Jobs
-from ..training.sweep.keeping import keep_runs
+from ..training.sweep.keeping import check_keep, keep_runs
 from ..training.sweep.runs import SweepRun, plan_runs
 from ..training.sweep.sharing import shared_gpus
 from .console import Terminal, make_table, shell_command
@@ -83,6 +83,9 @@ def run_sweep(
         runs, refused = plan_runs(sweep, folder, to_train=not report)
         if not runs and len(set(refused.values())) == 1:
             raise SweepError(next(iter(refused.values())))
+        if keep is not None:
+            with _locked(keep):
+                check_keep(runs, keep.absolute())
         for name, sentence in refused.items():
             errors.say(f"gaitgauge: entry '{name}' cannot start: {sentence}")
         threads = threads or max((os.cpu_count() or 2) // 2, 1)
@@ -100,43 +103,67 @@ def run_sweep(
             )
             outcome = jobs.work([] if report else runs)
         found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
-        if keep is not None:
-            errors.say(_keep(sweep, runs, keep.absolute()))
+        failed = _failures(found)
+        for label, sentence in failed.items():
+            if label not in outcome.failures:
+                errors.say(f"{label} failed: {sentence}")
+        try:
+            if json_output:
+                print(json.dumps(found, indent=1))
+            else:
+                print_sweep(Terminal(), found, folder)
+        finally:
+            unkept = {} if keep is None else _keep(sweep, runs, keep.absolute(), failed, errors.say)
     finally:
         lock.release()
-    if json_output:
-        print(json.dumps(found, indent=1))
-    else:
-        output = Terminal()
-        print_sweep(output, found)
-        for name in ("sweep.html", "comparison.html", "curves.csv"):
-            if (folder / name).is_file():
-                output.say(f"{name.partition('.')[0]:11}{folder / name}")
     if outcome.unfinished:
         errors.say(f"{len(outcome.unfinished)} of {len(runs)} runs are not done; go on with:\n  {shell_command()}")
     if outcome.stopped is not None:
         raise typer.Exit(128 + outcome.stopped)
-    if refused or outcome.failures or (outcome.unfinished and deadline is None):
+    if refused or failed or unkept or (outcome.unfinished and deadline is None):
         raise typer.Exit(1)
 
 
-def _keep(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> str:
-    """Keep what is trained in a folder, with a page and a table of all that it holds; one sentence on what was kept."""
-    lock = lock_folder(folder, SweepError)
+@contextmanager
+def _locked(keep: Path) -> Iterator[None]:
+    """Keep the folder of ``--keep`` for this process."""
     try:
-        labels = keep_runs(sweep, runs, folder)
-        there, refused = plan_runs(sweep, folder, to_train=False)
-        found = fold_sweep(sweep, there, refused, {}, folder)
+        lock = lock_folder(keep, SweepError)
+    except SweepError as error:
+        raise SweepError(f"--keep cannot be used: {error}") from error
+    try:
+        yield
     finally:
         lock.release()
+
+
+def _failures(found: Mapping[str, Any]) -> dict[str, str]:
+    """Why runs failed, by label."""
+    return {f"{r['entry']}, seed {r['seed']}": r["reason"] for r in found["runs"] if r["reason"]}
+
+
+def _keep(
+    sweep: Sweep, runs: Sequence[SweepRun], folder: Path, failed: Mapping[str, str], say: Callable[[str], None]
+) -> dict[str, str]:
+    """Keep what is trained in a folder, with a page and a table of all that it holds; says what was kept, and returns what could
+    not be, beside what has ``failed`` already.
+    """
+    with _locked(folder):
+        labels, unkept = keep_runs(sweep, runs, folder)
+        there, refused = plan_runs(sweep, folder, to_train=False)
+        found = fold_sweep(sweep, there, refused, {}, folder)
+    unkept = {label: sentence for label, sentence in (_failures(found) | unkept).items() if label not in failed}
+    for label, sentence in unkept.items():
+        say(f"{label} is not kept: {sentence}")
     states = [row["state"] for row in found["runs"]]
     there_now = f"{states.count('gauged') + states.count('trained')} of {len(runs)} are in {folder}"
     to_gauge = f", {states.count('trained')} of them not gauged yet" if "trained" in states else ""
-    return f"kept {len(labels)} runs; {there_now}{to_gauge}"
+    say(f"kept {len(labels)} runs; {there_now}{to_gauge}")
+    return unkept
 
 
-def print_sweep(console: Terminal, found: Mapping[str, Any]) -> None:
-    """A table of the entries, and the comparison's sentences."""
+def print_sweep(console: Terminal, found: Mapping[str, Any], folder: Path) -> None:
+    """A table of the entries, the comparison's sentences, and where the files are."""
     groups = list(dict.fromkeys(g for e in found["entries"] if e["best"] for g in e["best"]["groups"] or {}))
     columns = ("entry", "score", "95 % interval", *groups, "level", "seed", "mean of seeds")
     table = make_table(f"{found['title']} ({found['suite']})", *columns, numbers=True)
@@ -160,3 +187,5 @@ def print_sweep(console: Terminal, found: Mapping[str, Any]) -> None:
     console.print(table)
     for sentence in found["sentences"]:
         console.say(sentence)
+    for name in ("sweep.html", *(["comparison.html"] if found["compared"] else []), "curves.csv"):
+        console.say(f"{name.partition('.')[0]:11}{folder / name}")

@@ -2,7 +2,9 @@
 
 import json
 import os
+import shutil
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,6 +12,8 @@ from gaitgauge.cli.sweep import _Listener
 from gaitgauge.training.sweep.jobs import Jobs, SweepOutcome
 from small_run import SMALL
 from tiny_suite import SUITE
+
+ROOT = Path(__file__).parents[2]
 
 
 def sweep(**entries: str) -> str:
@@ -46,6 +50,12 @@ def test_a_folder_to_keep_runs_in_that_cannot_be_is_told_at_once(refused, tiny):
     (tiny / "file").touch()
     assert "--keep is 'out', the sweep's own folder" in refused("sweep", "sweep.toml", "--out", "out", "--keep", "out")
     assert "choose another --keep" in refused("sweep", "sweep.toml", "--out", "out", "--keep", "file")
+    (tiny / "kept" / ".lock").mkdir(parents=True)
+    assert "--keep cannot be used: " in refused("sweep", "sweep.toml", "--out", "out", "--keep", "kept")
+    note = tiny / "other" / "runs" / "one" / "seed-0" / "entry.json"
+    note.parent.mkdir(parents=True)
+    note.write_text('{"task": "go2-flat"}')
+    assert "another folder with --keep" in refused("sweep", "sweep.toml", "--out", "out", "--keep", "other")
 
 
 def test_entries_that_cannot_start_for_different_reasons_are_all_named(run, tiny):
@@ -76,6 +86,25 @@ def test_a_sweep_goes_on_where_nobody_reads_what_it_says(monkeypatch):
         listener.say("lost")
         listener.say("lost, too")
         closed.flush()  # nothing is left that would fail at the end
+
+
+def test_a_run_that_is_damaged_leaves_a_table_and_the_others_are_kept(run, tmp_path):
+    shutil.copytree(ROOT / "docs/data/sweeps/baselines", tmp_path / "out", ignore=shutil.ignore_patterns("HIM", "MoE*"))
+    (tmp_path / "out/comparison.html").write_text("of an earlier call")
+    damaged = tmp_path / "out/runs/CTS/seed-0/kept/results.json"
+    damaged.write_text("{")
+    file = ROOT / "benchmarks/sweeps/baselines.toml"
+    result = run("sweep", file, "--out", "out", "--report", "--keep", "kept")
+    assert result.exit_code == 1 and "0.6945" in result.stdout and "comparison" not in result.stdout
+    (failure,) = [line for line in result.stderr.splitlines() if "CTS, seed 0" in line]
+    assert failure.startswith("CTS, seed 0 failed: ") and str(damaged) in failure
+    assert "kept 1 runs; 1 of 8 are in" in result.stderr
+    assert (tmp_path / "kept/runs/DreamWaQ/seed-0/kept/results.json").is_file()
+    # what is kept already and cannot be read is told, too
+    place = tmp_path / "kept/runs/DreamWaQ/seed-0/kept/results.json"
+    place.write_text("{")
+    result = run("sweep", file, "--out", "out", "--report", "--keep", "kept")
+    assert result.exit_code == 1 and "DreamWaQ, seed 0 is not kept: " in result.stderr and str(place) in result.stderr
 
 
 def test_a_suite_that_is_not_there(refused, tmp_path):

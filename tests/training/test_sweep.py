@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from gaitgauge.gauge.policies import file_digest
+from gaitgauge.gauge.suite import load_suite
 from gaitgauge.training.checkpoint import CheckpointError
 from gaitgauge.training.sweep.curves import by_figure, curves_csv
 from gaitgauge.training.sweep.file import Sweep, SweepEntry, SweepError, load_sweep
@@ -22,6 +24,7 @@ from gaitgauge.training.tasks import find_task
 from scipy.stats import t as student_t
 
 ROOT = Path(__file__).parents[2]
+CARD = ROOT / "docs" / "data" / "scorecards" / "pretrained-gaitgauge-1.json"
 ENTRY = SweepEntry(name="one", task="go2-cts")
 SWEEP = Sweep(name="toy", title="A toy", entry=(ENTRY,), backend="fake", training_suite="none")
 
@@ -56,6 +59,14 @@ def write(folder: Path, text: str) -> Path:
         (
             f"name = 'a'\ntitle = 'b'\nseeds = {list(range(1001))}\n[[entry]]\nname = 'c'\ntask = 'd'",
             "1,001 trainings",
+        ),
+        (
+            "name = 'a'\ntitle = 'b'\nsettings = ['training.run.seed=1']\n[[entry]]\nname = 'c'\ntask = 'd'",
+            r"'training.run.seed=1', with which all seeds train the same run; write seeds",
+        ),
+        (
+            "name = 'a'\ntitle = 'b'\n[[entry]]\nname = 'c'\ntask = 'd'\nsettings = [' environment.seed = 1']",
+            "with which all seeds",
         ),
         ("name =", "not valid TOML"),
     ],
@@ -124,7 +135,7 @@ def test_without_a_gpu_only_engines_of_the_cpu_start(tmp_path):
     assert plan_runs(replace(sweep, entry=(replace(ENTRY, device="cpu"),)), tmp_path / "other")[1] == {}
 
 
-@pytest.mark.parametrize("note", [{"more": 1}, {"\x1b[31m": 1}, {"seed": 9}])
+@pytest.mark.parametrize("note", [{"more": 1}, {"\x1b[31m": 1}, {"seed": 9}, {"more": None}, {"init_from": None}])
 def test_a_note_that_was_edited_is_refused(tmp_path, note):
     ((run,), _) = plan_runs(SWEEP, tmp_path)
     path = run.folder / "entry.json"
@@ -166,6 +177,7 @@ def test_a_training_begins_or_goes_on(tmp_path):
     assert goes_on[3:] == [
         *("train", "go2-cts", "environment.num_envs=8", "--resume", str(directory)),
         *("--score-suite", "quick", "--score-threads", "2", "--time", "90s", "--device", "cpu"),
+        *("--log-root", str(run.folder / "logs")),
     ]
     (directory / "best.pt").touch()
     assert run.policy(SWEEP).name == "model_5.pt" and run.policy(BEST).name == "best.pt"
@@ -228,10 +240,15 @@ if {self.entry.name!r} == "damaged": (run / "run.json").write_text("{{")
         return [sys.executable, "-S", "-c", program]
 
     def gauging_command(self, sweep, *, where):
-        target = self.results(sweep)
-        program = (
-            f"import pathlib; p = pathlib.Path({str(target)!r}); p.mkdir(parents=True); (p / 'results.json').touch()"
-        )
+        card = json.loads(CARD.read_text())
+        card["policy"]["file_sha256"] = file_digest(str(self.policy(sweep)))
+        (self.folder / "card.json").write_text(json.dumps(card))
+        program = f"""
+import pathlib, shutil
+target = pathlib.Path({str(self.results(sweep))!r})
+target.mkdir(parents=True, exist_ok=True)
+shutil.copy({str(self.folder / "card.json")!r}, target / "results.json")
+"""
         return [sys.executable, "-S", "-c", program]
 
 
@@ -244,6 +261,7 @@ def scripted(folder: Path, name: str, *, seed: int = 0, on_gpu: bool = True) -> 
         on_gpu=on_gpu,
         iterations=3,
         folder=folder / "runs" / name / f"seed-{seed}",
+        suite_digest=load_suite(SWEEP.suite).digest,
     )
 
 
@@ -415,6 +433,19 @@ def test_gpus_are_those_that_may_be_seen(monkeypatch):
     assert visible_gpus() == ["0", "1"]
 
 
+def test_copies_of_a_run_are_no_seeds(tmp_path):
+    runs = [scripted(tmp_path, "same", seed=seed) for seed in (0, 1)]
+    work(runs)
+    sweep = replace(SWEEP, entry=(runs[0].entry,))
+    found = fold_sweep(sweep, runs, {}, {}, tmp_path)
+    assert "All seeds of 'same' have the same score, which says nothing of their spread." in found["sentences"]
+
+
+def test_a_suite_that_changes_during_a_gauging_is_not_played_for_ever(tmp_path):
+    run = replace(scripted(tmp_path, "one"), suite_digest="another")
+    assert "was changed while it was gauged; call again" in work([run])[0].failures["one, seed 0"]
+
+
 def test_tables_tell_what_is_missing(tmp_path):
     """Nothing has been trained: rows and a page all the same."""
     sweep = replace(SWEEP, entry=(ENTRY, replace(ENTRY, name="<b>")), title="A & B")
@@ -451,5 +482,5 @@ def test_entries_are_compared_over_their_seeds():
     assert found[0]["corrected"] == pytest.approx(min(3.0 * expected, 1.0)) and found[1]["p_value"] == pytest.approx(
         1.0
     )
-    assert across_seeds({"a": [0.5, 0.5], "b": [0.6, 0.6]})[0]["p_value"] == 0.0
+    assert across_seeds({"a": [0.5, 0.5], "b": [0.6, 0.6], "c": [0.6, 0.7]}) == [], "copies of a run are no seeds"
     assert across_seeds({"a": [0.5], "b": [0.6, 0.6]}) == []

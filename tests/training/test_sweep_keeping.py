@@ -8,18 +8,19 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.gauge.policies import file_digest
-from gaitgauge.policy.finding import PRETRAINED
+from gaitgauge.policy.finding import PRETRAINED, SHIPPED
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 from gaitgauge.training.sweep.curves import kept_curves_csv, learning_curves
-from gaitgauge.training.sweep.file import Sweep, SweepEntry, SweepError
+from gaitgauge.training.sweep.file import Sweep, SweepEntry, SweepError, load_sweep
 from gaitgauge.training.sweep.folding import fold_sweep
 from gaitgauge.training.sweep.jobs import Jobs
-from gaitgauge.training.sweep.keeping import keep_runs
+from gaitgauge.training.sweep.keeping import check_keep, keep_runs
 from gaitgauge.training.sweep.runs import plan_runs
 from torch.utils.tensorboard import SummaryWriter
 
-CARD = Path(__file__).parents[2] / "docs" / "data" / "scorecards" / "pretrained-robogauge-1.1.json"
+ROOT = Path(__file__).parents[2]
+CARD = ROOT / "docs" / "data" / "scorecards" / "pretrained-robogauge-1.1.json"
 SWEEP = Sweep(
     name="toy",
     title="A toy",
@@ -49,7 +50,7 @@ def finished(tmp_path_factory):
     results = runs[0].folder / "gauge" / "model_3"
     results.mkdir(parents=True)
     card = json.loads(CARD.read_text())
-    card["policy"] |= {"path": "/home/me/model_3.pt"}
+    card["policy"] |= {"path": "/home/me/model_3.pt", "provenance": {"iteration": 3}}
     card["provenance"] |= {"host": "lab-7", "command": "gaitgauge evaluate /home/me/model_3.pt"}
     (results / "results.json").write_text(json.dumps(card))
     return folder
@@ -58,7 +59,7 @@ def finished(tmp_path_factory):
 @pytest.fixture
 def kept(finished, tmp_path):
     runs, _ = plan_runs(SWEEP, finished, to_train=False)
-    assert keep_runs(SWEEP, runs, tmp_path / "kept") == ["one, seed 0"]
+    assert keep_runs(SWEEP, runs, tmp_path / "kept") == (["one, seed 0"], {})
     return tmp_path / "kept"
 
 
@@ -106,7 +107,7 @@ def test_without_its_policy_a_kept_run_is_still_done(finished, kept):
     (kept / "runs" / "one" / "seed-0" / "kept" / "policy.gauge.pt").unlink()
     (run, _), _ = plan_runs(SWEEP, kept, to_train=False)
     assert run.trained and run.gauged(SWEEP) and run.policy(SWEEP) is None
-    assert keep_runs(SWEEP, [run], finished.with_name("elsewhere")) == ["one, seed 0"]
+    assert keep_runs(SWEEP, [run], finished.with_name("elsewhere")) == (["one, seed 0"], {})
 
 
 def test_what_is_not_gauged_yet_is_kept_and_gauged_where_there_is_no_gpu(finished, tmp_path):
@@ -116,7 +117,7 @@ def test_what_is_not_gauged_yet_is_kept_and_gauged_where_there_is_no_gpu(finishe
     results = bare / "runs" / "one" / "seed-0" / "gauge" / "model_3" / "results.json"
     results.rename(tmp_path / "results.json")
     runs, _ = plan_runs(alone, bare, to_train=False)
-    assert keep_runs(alone, runs, kept) == ["one, seed 0"] and keep_runs(alone, runs, kept) == []
+    assert keep_runs(alone, runs, kept) == (["one, seed 0"], {}) and keep_runs(alone, runs, kept) == ([], {})
     (run,), refused = plan_runs(alone, kept)
     assert refused == {} and run.trained and not run.gauged(alone)
     command = run.gauging_command(alone, where=[])
@@ -124,7 +125,7 @@ def test_what_is_not_gauged_yet_is_kept_and_gauged_where_there_is_no_gpu(finishe
     assert command[3:5] == ["evaluate", str(policy)] and command[command.index("--out") + 1] == str(out)
     # once it is gauged, here or where it was trained, its results are kept too
     (tmp_path / "results.json").rename(results)
-    assert keep_runs(alone, runs, kept) == ["one, seed 0"]
+    assert keep_runs(alone, runs, kept) == (["one, seed 0"], {})
     assert run.gauged(alone) and run.results(alone) == run.folder / "kept"
 
 
@@ -145,8 +146,155 @@ def test_half_of_a_small_form_is_none(kept):
 def test_what_was_kept_before_stays(finished, kept):
     runs, _ = plan_runs(SWEEP, finished, to_train=False)
     before = {path: path.stat().st_mtime_ns for path in kept.rglob("*")}
-    assert keep_runs(SWEEP, runs, kept) == []
+    assert keep_runs(SWEEP, runs, kept) == ([], {})
     assert {path: path.stat().st_mtime_ns for path in kept.rglob("*")} == before
+
+
+TWO_SEEDS = replace(SWEEP, entry=(replace(SWEEP.entry[0], seeds=(0, 1)),))
+
+
+@pytest.fixture
+def seeds(finished, tmp_path):
+    """A folder in which two seeds are done, and its runs."""
+    shutil.copytree(finished, tmp_path / "seeds")
+    one = tmp_path / "seeds" / "runs" / "one"
+    shutil.copytree(one / "seed-0", one / "seed-1", ignore=shutil.ignore_patterns("entry.json"))
+    runs, refused = plan_runs(TWO_SEEDS, tmp_path / "seeds", to_train=False)
+    assert refused == {}
+    return tmp_path / "seeds", runs
+
+
+@pytest.mark.parametrize("name", ["logs/go2_moe_cts/2026-01-01_00-00-00/run.json", "gauge/model_3/results.json"])
+def test_a_damaged_file_is_the_failure_of_its_run_alone(seeds, tmp_path, name):
+    folder, runs = seeds
+    (runs[0].folder / name).write_text("{")
+    found = fold_sweep(TWO_SEEDS, runs, {}, {}, folder)
+    assert [row["state"] for row in found["runs"]] == ["failed", "gauged"] and found["runs"][1]["score"]
+    reason = found["runs"][0]["reason"]
+    assert str(runs[0].folder / name) in reason and "delete it and call again" in reason and "\n" not in reason
+    kept, failures = keep_runs(TWO_SEEDS, runs, tmp_path / "kept")
+    assert kept == ["one, seed 1"] and failures == {"one, seed 0": reason}
+    outcome = Jobs(TWO_SEEDS, threads=1, deadline=None, say=lambda _: None, gpus=["0"]).work(runs)
+    assert outcome.failures == failures and outcome.unfinished == []
+
+
+def test_a_damaged_checkpoint_says_what_to_do_and_its_results_do_not_count(seeds, tmp_path):
+    folder, runs = seeds
+    checkpoint = runs[0].directory / "model_3.pt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    found = fold_sweep(TWO_SEEDS, runs, {}, {}, folder)
+    assert [row["state"] for row in found["runs"]] == ["trained", "gauged"]
+    assert "Results of 'one, seed 0' are of another suite or checkpoint and do not count." in found["sentences"]
+    kept, failures = keep_runs(TWO_SEEDS, runs, tmp_path / "kept")
+    assert kept == ["one, seed 1"] and list(failures) == ["one, seed 0"]
+    assert f"'{checkpoint}' is a damaged or truncated archive" in failures["one, seed 0"]
+    assert "remove it and call again" in failures["one, seed 0"] and runs[1].damage(TWO_SEEDS) == ""
+
+
+def test_damaged_kept_curves_leave_the_score(kept):
+    runs, _ = plan_runs(SWEEP, kept, to_train=False)
+    (runs[0].folder / "kept" / "curves.csv").write_text("no curves")
+    row = fold_sweep(SWEEP, runs, {}, {}, kept)["runs"][0]
+    assert row["state"] == "failed" and "delete it and call again" in row["reason"] and row["score"] is not None
+    (runs[0].folder / "kept" / "curves.csv").unlink()
+    assert fold_sweep(SWEEP, runs, {}, {}, kept)["runs"][0]["state"] == "gauged"
+
+
+OTHER_SUITE = replace(SWEEP, suite="gaitgauge-1")
+OTHER_CARD = CARD.with_name("pretrained-gaitgauge-1.json")
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_results_of_another_suite_do_not_count_and_stay(seeds, begun):
+    """``begun``: its gauging was not finished, or the results were taken away."""
+    folder, (run, _) = seeds
+    before = run.folder / "gauge" / "model_3" / "results.json"
+    if begun:
+        before.with_name("request.json").write_text(json.dumps({"suite_digest": run.suite_digest}))
+        before.unlink()
+    (other, _), _ = plan_runs(OTHER_SUITE, folder, to_train=False)
+    place = other.results(OTHER_SUITE)
+    assert not other.gauged(OTHER_SUITE) and place.parent == before.parents[1] and place != before.parent
+    assert "--resume" not in other.gauging_command(OTHER_SUITE, where=[])
+    place.mkdir()
+    shutil.copy(OTHER_CARD, place / "results.json")
+    assert other.gauged(OTHER_SUITE) and run.gauged(SWEEP) is not begun and run.results(SWEEP) == before.parent
+
+
+def test_kept_results_of_another_suite_do_not_count_and_stay(seeds, kept, tmp_path):
+    (run, _), _ = plan_runs(OTHER_SUITE, kept, to_train=False)
+    assert run.trained and not run.gauged(OTHER_SUITE)
+    assert run.results(OTHER_SUITE) == run.folder / "gauge" / "policy.gauge"
+    text = (run.folder / "kept" / "results.json").read_text()
+    (gauged, _), _ = plan_runs(OTHER_SUITE, seeds[0], to_train=False)
+    place = gauged.results(OTHER_SUITE)
+    place.mkdir()
+    shutil.copy(OTHER_CARD, place / "results.json")
+    labels, failures = keep_runs(OTHER_SUITE, [gauged], kept)
+    assert labels == [] and "give another --keep" in failures["one, seed 0"]
+    assert (run.folder / "kept" / "results.json").read_text() == text
+    (run.folder / "kept" / "policy.gauge.pt").unlink()
+    with pytest.raises(SweepError, match=r"not of the suite gaitgauge-1 as it is now, and without policy\.gauge\.pt"):
+        run.gauged(OTHER_SUITE)
+
+
+def test_results_of_another_checkpoint_do_not_count(seeds):
+    _, (run, _) = seeds
+    shutil.copy(SHIPPED / "go1.gauge.pt", run.directory / "model_3.pt")
+    assert not run.gauged(SWEEP) and run.results(SWEEP) != run.folder / "gauge" / "model_3"
+
+
+@pytest.mark.parametrize("noted", [True, False])
+def test_another_checkpoint_that_was_kept_does_not_count(finished, kept, tmp_path, noted):
+    """``noted``: by this version; else the results say which it is."""
+    (run, _), _ = plan_runs(SWEEP, kept, to_train=False)
+    path = run.folder / "kept" / "run.json"
+    description = json.loads(path.read_text()) | {"best_iteration": 2}
+    assert description["kept_iteration"] == 3
+    if not noted:
+        del description["kept_iteration"]
+    path.write_text(json.dumps(description))
+    assert run.gauged(SWEEP)
+    best = replace(SWEEP, training_suite="quick", checkpoint="best")
+    with pytest.raises(SweepError, match="policy of iteration 3, and checkpoint 'best' is that of 2"):
+        run.gauged(best)
+
+
+def test_the_shipped_folders_are_read(tmp_path):
+    """The newest and the oldest."""
+    for name in ("baselines", "from-nothing"):
+        shutil.copytree(ROOT / "docs" / "data" / "sweeps" / name, tmp_path / name)
+        sweep = load_sweep(ROOT / "benchmarks" / "sweeps" / f"{name}.toml")
+        runs, refused = plan_runs(sweep, tmp_path / name, to_train=False)
+        there = [run for run in runs if run.directory]
+        assert refused == {} and len(there) >= 2 and all(run.trained and run.gauged(sweep) for run in there)
+
+
+def test_what_cannot_be_kept_is_known_before_a_training(kept):
+    runs, _ = plan_runs(SWEEP, kept, to_train=False)
+    changed = [replace(run, settings=("training.run.iterations=4",)) for run in runs]
+    with pytest.raises(SweepError, match=r"one/seed-0' holds a training with another settings; give another .* --keep"):
+        check_keep(changed, kept)
+    check_keep(runs, kept / "new")
+    assert not (kept / "new").exists()
+
+
+@pytest.mark.parametrize("description", [None, {"outcome": "running", "iteration": 1}])
+def test_a_training_is_done_when_its_last_checkpoint_is_there(seeds, tmp_path, description):
+    """Killed while it waited for a score, or its description was deleted since it was damaged: it could not be gone on with."""
+    _, (run, _) = seeds
+    path = run.directory / "run.json"
+    path.unlink() if description is None else path.write_text(json.dumps(description))
+    assert run.trained and keep_runs(SWEEP, [run], tmp_path / "kept")[0] == ["one, seed 0"]
+    there = replace(run, folder=tmp_path / "kept" / "runs" / "one" / "seed-0")
+    assert there.trained and there.gauged(SWEEP)
+
+
+def test_an_earlier_comparison_is_not_named_as_new(finished):
+    (finished / "comparison.html").touch()
+    runs, _ = plan_runs(SWEEP, finished, to_train=False)
+    assert fold_sweep(SWEEP, runs, {}, {}, finished)["compared"] is False
+    assert "comparison.html" not in (finished / "sweep.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def _read_curves(path: Path) -> dict[str, Curve]:
     except (ValueError, csv.Error) as error:
         raise SweepError(
             f"the learning curves '{one_line(path)}' are damaged: each row has a figure ({', '.join(FIGURES)}) and two numbers; "
-            "keep the run again"
+            "put the file back, or delete it and call again: the run is told without curves"
         ) from error
     return found
 

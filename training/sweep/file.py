@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read_text
+from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read_text, shown
 from ..launch import DEFAULT_BACKEND
 
 NO_SUITE = "none"
+_SEEDS = ("training.run.seed", "environment.seed")
+"""Settings that would be the same in all runs of an entry."""
 MOST_RUNS = 1000
 """Trainings of a sweep."""
 
@@ -72,6 +74,11 @@ class Sweep:
         for seeds in (self.seeds, *(e.seeds for e in self.entry if e.seeds is not None)):
             if not seeds or len(set(seeds)) < len(seeds):
                 raise ValueError(f"has seeds {list(seeds)}; give at least one, and each once")
+        for setting in (*self.settings, *(setting for e in self.entry for setting in e.settings)):
+            if setting.partition("=")[0].strip() in _SEEDS:
+                raise ValueError(
+                    f"has the setting {shown(setting)}, with which all seeds train the same run; write seeds = […]"
+                )
         if self.checkpoint == "best" and self.training_suite == NO_SUITE:
             raise ValueError("has checkpoint 'best', which training_suite chooses; give a suite, or checkpoint 'last'")
         runs = sum(len(self.seeds if e.seeds is None else e.seeds) for e in self.entry)

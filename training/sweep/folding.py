@@ -16,10 +16,15 @@ from ...gauge.comparison import ComparisonError, compare, format_p, holm, load_r
 from ...gauge.comparison_report import write_comparison
 from ...gauge.intervals import CONFIDENCE
 from ...gauge.pages import page_template
-from ..run_directory import read_run_json
 from .curves import Curve, by_figure, curves_csv, learning_curves
 from .file import Sweep, SweepError
-from .runs import SweepRun
+from .runs import RUN_ERRORS, SweepRun, read_card, what_failed
+
+_FOUND = (
+    *("environment_steps", "training_seconds", "best_training_score", "policy", "results"),
+    *("score", "score_interval", "level", "groups"),
+)
+"""What a row says of a run, None where there is nothing yet."""
 
 
 def fold_sweep(
@@ -32,20 +37,31 @@ def fold_sweep(
         failures: why runs failed, by label.
 
     Returns:
-        The content of ``sweep.json``: ``runs``, ``entries``, their differences ``across_seeds``, and ``sentences``.
+        The content of ``sweep.json``: ``runs``, ``entries``, their differences ``across_seeds``, ``sentences``, and whether the
+        entries were ``compared``. A run whose files are damaged has the state ``failed``.
 
     Raises:
-        SweepError, ComparisonError, CheckpointError: a file is damaged or cannot be written.
+        SweepError: a file cannot be written.
     """
-    rows = [_row(sweep, run, failures.get(run.label, ""), folder) for run in runs]
+    rows: list[dict[str, Any]] = []
+    curves: dict[tuple[str, int], dict[str, Curve]] = {}
+    for run in runs:
+        row = {"entry": run.entry.name, "seed": run.seed, "task": run.entry.task, "settings": list(run.settings)}
+        row |= {"state": "unfinished", "reason": failures.get(run.label, ""), **dict.fromkeys(_FOUND)}
+        try:
+            _fill(row, sweep, run, folder)
+            curves[run.entry.name, run.seed] = learning_curves(run.directory) if run.directory else {}
+        except RUN_ERRORS as error:
+            row["reason"] = row["reason"] or what_failed(error)
+        rows.append(row | ({"state": "failed"} if row["reason"] else {}))
     best = {row["entry"]: row for row in sorted(rows, key=lambda r: r["score"] or 0.0) if row["score"] is not None}
-    sentences = []
+    sentences, compared = [], False
     if len(best) > 1:
         order = [e.name for e in sweep.entry if e.name in best]
         try:
             found = compare([load_result(folder / best[name]["results"]) for name in order], order)
             write_comparison(folder, found)
-            sentences = found.sentences
+            sentences, compared = found.sentences, True
         except ComparisonError as error:
             sentences = [f"No comparison: {error}."]
     scores = {
@@ -53,6 +69,10 @@ def fold_sweep(
     }
     pairs = across_seeds(scores)
     sentences += [_seeds_sentence(pairs)] if pairs else []
+    if alike := [name for name, own in scores.items() if len(own) > 1 and len(set(own)) == 1]:
+        sentences.append(f"All seeds of {_listed(alike)} have the same score, which says nothing of their spread.")
+    if other := [r.label for r, row in zip(runs, rows, strict=True) if row["state"] == "trained" and r.has_results]:
+        sentences.append(f"Results of {_listed(other)} are of another suite or checkpoint and do not count.")
     data: dict[str, Any] = {
         "schema": 1,
         "name": sweep.name,
@@ -63,38 +83,27 @@ def fold_sweep(
             _entry(e.name, [r for r in rows if r["entry"] == e.name], refused.get(e.name)) for e in sweep.entry
         ],
         "across_seeds": pairs,
+        "compared": compared,
         "sentences": sentences,
     }
-    curves = {(r.entry.name, r.seed): learning_curves(run) for r in runs if (run := r.directory) is not None}
     write_atomically(folder / "sweep.json", json_text(data), SweepError)
     write_atomically(folder / "curves.csv", curves_csv(curves), SweepError)
-    write_atomically(folder / "sweep.html", _page(data, curves, compared=len(best) > 1), SweepError)
+    write_atomically(folder / "sweep.html", _page(data, curves), SweepError)
     return data
 
 
-def _row(sweep: Sweep, run: SweepRun, failure: str, folder: Path) -> dict[str, Any]:
-    """One run in numbers; None where there is none yet."""
-    directory, results = run.directory, run.results(sweep)
-    noted = read_run_json(directory) if directory else {}
-    row: dict[str, Any] = {
-        "entry": run.entry.name,
-        "seed": run.seed,
-        "task": run.entry.task,
-        "settings": list(run.settings),
-        "state": "failed" if failure else "gauged" if run.gauged(sweep) else "trained" if run.trained else "unfinished",
-        "reason": failure,
-        "environment_steps": noted.get("environment_steps"),
-        "training_seconds": noted.get("training_seconds"),
-        "best_training_score": noted.get("best_score"),
-        "policy": str(policy.relative_to(folder)) if (policy := run.policy(sweep)) else None,
-        "results": None,
-    }
-    row |= dict.fromkeys(("score", "score_interval", "level", "groups"))
+def _fill(row: dict[str, Any], sweep: Sweep, run: SweepRun, folder: Path) -> None:
+    """Put into a row how far a run is, and in numbers what became of it, as long as its files can be read."""
+    noted = run.description()
+    row |= {"environment_steps": noted.get("environment_steps"), "training_seconds": noted.get("training_seconds")}
+    row["best_training_score"] = noted.get("best_score")
+    row["state"] = "trained" if run.trained else "unfinished"
+    policy, results = run.policy(sweep), run.results(sweep)
+    row["policy"] = str(policy.relative_to(folder)) if policy else None
     if results is not None and run.gauged(sweep):
-        found = load_result(results)
-        row |= {name: found[name] for name in ("score", "score_interval", "level", "groups")}
-        row["results"] = str(results.relative_to(folder))
-    return row
+        card = read_card(results)
+        row |= {name: card[name] for name in ("score", "score_interval", "level", "groups")}
+        row |= {"state": "gauged", "results": str(results.relative_to(folder))}
 
 
 def _entry(name: str, rows: Sequence[Mapping[str, Any]], refused: str | None) -> dict[str, Any]:
@@ -119,17 +128,16 @@ def across_seeds(scores: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
     """Differences of the entries' mean scores over their seeds of training, by Welch's t-test, corrected for many looks by Holm.
 
     Args:
-        scores: of each entry's runs; an entry with fewer than two says nothing of its spread and is left out.
+        scores: of each entry's runs; an entry with fewer than two, or with the same in all, says nothing of its spread and is left out.
 
     Returns:
         ``first``, ``second``, ``difference`` of the second's mean minus the first's, ``p_value`` and ``corrected`` of each pair.
     """
-    known = {name: own for name, own in scores.items() if len(own) > 1}
+    known = {name: own for name, own in scores.items() if len(set(own)) > 1}
     pairs: list[dict[str, Any]] = []
     for (first, one), (second, two) in combinations(known.items(), 2):
-        spread = statistics.variance(one) + statistics.variance(two)
         difference = statistics.fmean(two) - statistics.fmean(one)
-        p_value = float(ttest_ind(one, two, equal_var=False).pvalue) if spread > 0.0 else float(difference == 0.0)
+        p_value = float(ttest_ind(one, two, equal_var=False).pvalue)
         pairs.append({"first": first, "second": second, "difference": round(difference, 6), "p_value": p_value})
     corrected = holm([pair["p_value"] for pair in pairs])
     return [pair | {"corrected": p} for pair, p in zip(pairs, corrected, strict=True)]
@@ -145,7 +153,11 @@ def _seeds_sentence(pairs: Sequence[Mapping[str, Any]]) -> str:
     return f"{found}: {shown}." if real else f"{found}: with so few runs the methods cannot be told apart."
 
 
-def _page(data: Mapping[str, Any], curves: Mapping[tuple[str, int], Mapping[str, Curve]], *, compared: bool) -> str:
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
+
+
+def _page(data: Mapping[str, Any], curves: Mapping[tuple[str, int], Mapping[str, Curve]]) -> str:
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
     names = [entry["entry"] for entry in data["entries"]]
     groups = list(dict.fromkeys(g for e in data["entries"] if e["best"] for g in e["best"]["groups"] or {}))
@@ -153,6 +165,5 @@ def _page(data: Mapping[str, Any], curves: Mapping[tuple[str, int], Mapping[str,
         sweep=data,
         groups=groups,
         names=names,
-        compared=compared,
         figures={figure: charts.curves(series) for figure, series in by_figure(curves, names).items()},
     )

@@ -216,7 +216,11 @@ class Jobs:
                 f"{run.label} was stopped by {how} from outside and has a checkpoint; a later call goes on with it"
             )
         elif code:
-            raise SweepError(f"{_reason(code, log)} (see '{log}')")
+            raise SweepError(f"{run.damage(self._sweep) or _reason(code, log)} (see '{log}')")
+        elif gauged and not run.gauged(self._sweep):
+            raise SweepError(
+                f"its checkpoint or the suite {self._sweep.suite} was changed while it was gauged; call again"
+            )
         elif gauged or run.trained:
             self._say(f"{run.label} has been {'gauged' if gauged else 'trained'}")
             self._sort(run)

@@ -11,55 +11,78 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from ...files.parsing import one_line
 from ...files.provenance import without_place
 from ...files.writing import json_text, make_folder, write_atomically
-from ...gauge.comparison import load_result
 from ...gauge.policies import file_digest
+from ...policy.base import PolicyError
+from ...policy.contract import ContractError
 from ...policy.importing import import_policy
-from ..run_directory import read_run_json
 from .curves import kept_curves_csv, learning_curves
 from .file import Sweep, SweepError
-from .runs import KEPT, KEPT_CURVES, KEPT_POLICY, RESULTS, SweepRun
+from .runs import KEPT, KEPT_CURVES, KEPT_POLICY, RESULTS, RUN_ERRORS, SweepRun, read_card, what_failed
 
 
-def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> list[str]:
+def check_keep(runs: Sequence[SweepRun], folder: Path) -> None:
+    """Find out before a training whether its run can be kept in a folder.
+
+    Raises:
+        SweepError: the folder holds trainings with other settings.
+    """
+    for run in runs:
+        _in(folder, run).claim(option="--keep", note=False)
+
+
+def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> tuple[list[str], dict[str, str]]:
     """Keep what is trained in another folder, beside what it holds already.
 
     Args:
         folder: another one, of a sweep of the same trainings.
 
     Returns:
-        Labels of the runs that were kept now; what was kept before is left as it is.
-
-    Raises:
-        SweepError: the folder holds trainings with other settings, or cannot be written to.
-        CheckpointError, ComparisonError, PolicyError: a file of a run is damaged.
+        Labels of the runs that were kept now, what was kept before is left as it is; and why runs could not be kept, by label.
     """
-    kept = []
+    kept, failures = [], {}
     for run in runs:
-        if not run.trained:
-            continue
-        target = replace(run, folder=folder / "runs" / run.entry.name / f"seed-{run.seed}")
-        target.claim()
-        if not target.trained or (run.gauged(sweep) and not target.gauged(sweep)):
-            _keep(sweep, run, target.folder / KEPT)
-            kept.append(run.label)
-    return kept
+        try:
+            if run.trained and _keep(sweep, run, _in(folder, run)):
+                kept.append(run.label)
+        except RUN_ERRORS as error:
+            failures[run.label] = what_failed(error)
+    return kept, failures
 
 
-def _keep(sweep: Sweep, run: SweepRun, place: Path) -> None:
-    """Write the small form of a run; its description, by which it is known, comes last."""
+def _in(folder: Path, run: SweepRun) -> SweepRun:
+    """A run's counterpart in the folder that it is kept in."""
+    return replace(run, folder=folder / "runs" / run.entry.name / f"seed-{run.seed}")
+
+
+def _keep(sweep: Sweep, run: SweepRun, target: SweepRun) -> bool:
+    """Write the small form of a run, whose description, by which it is known, comes last; False where it is there already."""
+    target.claim(option="--keep")
+    gauged, there, place = run.gauged(sweep), target.trained, target.folder / KEPT
+    if there and (target.gauged(sweep) or not gauged):
+        return False
+    if there and (place / RESULTS).is_file():
+        raise SweepError(
+            f"'{one_line(place / RESULTS)}' is of another suite or checkpoint, and a kept run has results of one; give another --keep"
+        )
     directory, results, policy = run.directory, run.results(sweep), run.policy(sweep)
     assert directory is not None
-    make_folder(place, SweepError)
+    make_folder(place, SweepError, option="--keep")
     write_atomically(place / KEPT_CURVES, kept_curves_csv(learning_curves(directory)), SweepError)
     if policy is not None:  # a run that was kept and gauged may have been left without
-        import_policy(policy, place / KEPT_POLICY)
-    if results is not None and run.gauged(sweep):
-        card = load_result(results)
+        try:
+            import_policy(policy, place / KEPT_POLICY)
+        except (PolicyError, ContractError) as error:
+            raise SweepError(run.damage(sweep) or str(error)) from error
+    if results is not None and gauged:
+        card = read_card(results)
         if policy is not None:
             of_policy = {"path": KEPT_POLICY, "file_sha256": file_digest(str(place / KEPT_POLICY))}
             card["policy"] = {**card["policy"], **of_policy}
         card["provenance"] = without_place(card["provenance"])
         write_atomically(place / RESULTS, json_text(card), SweepError)
-    write_atomically(place / "run.json", json_text(without_place(read_run_json(directory))), SweepError)
+    done = run.description() | {"outcome": "finished", "kept_iteration": run.wanted_iteration(sweep)}
+    write_atomically(place / "run.json", json_text(without_place(done)), SweepError)
+    return True

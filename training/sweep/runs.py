@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from ...backends.base import BackendError
-from ...files.parsing import one_line, read_results
+from ...files.parsing import one_line, read_results, shown
 from ...files.writing import json_text, make_folder, write_atomically
-from ...gauge.comparison import ComparisonError
+from ...gauge.comparison import ComparisonError, load_result
+from ...gauge.policies import file_digest
 from ...gauge.suite import SuiteError, load_suite
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...policy.finding import latest_checkpoint
+from ...policy.loading import load_policy
 from ..checkpoint import CheckpointError
 from ..configuration import ConfigurationError
 from ..launch import TrainRequest, prepare
@@ -55,6 +57,8 @@ class SweepRun:
     """Updates of the whole run."""
     folder: Path
     """Where its run directory and its gauging go."""
+    suite_digest: str
+    """Of the suite that gauges it."""
     init_from: str | None = None
     """What it begins with; None for nothing."""
 
@@ -90,31 +94,119 @@ class SweepRun:
         Raises:
             CheckpointError: its description is damaged.
         """
+        noted = self.description()
+        finished = self.directory != self._kept or noted.get("outcome") == "finished"
+        return finished and noted.get("iteration", 0) >= self.iterations
+
+    def description(self) -> dict[str, Any]:
+        """Its ``run.json`` with the ``iteration`` of its last checkpoint; empty before the first.
+
+        Raises:
+            CheckpointError: it is damaged.
+        """
         run = self.directory
-        noted = read_run_json(run) if run else {}
-        return noted.get("outcome") == "finished" and noted.get("iteration", 0) >= self.iterations
+        if run is None:
+            return {}
+        try:
+            noted = read_run_json(run)
+        except CheckpointError as error:
+            how = "is trained again" if run == self._kept else "goes on from its last checkpoint"
+            raise CheckpointError(f"{error}; delete it and call again: the run {how}") from error
+        last = latest_checkpoint(run)
+        return noted | ({} if last is None else {"iteration": int(last.stem.removeprefix("model_"))})
 
     def policy(self, sweep: Sweep) -> Path | None:
-        """What of it is gauged; None before it is trained, and where it was not kept."""
+        """What of it is gauged; None before it is trained, and where it was not kept.
+
+        Raises:
+            SweepError: another checkpoint was kept than the sweep asks for.
+            CheckpointError, ComparisonError: what was kept is damaged.
+        """
         run = self.directory
         if run is None:
             return None
         if run == self._kept:
+            self._check_kept(sweep)
             return run / KEPT_POLICY if (run / KEPT_POLICY).is_file() else None
         best = run / "best.pt"
         return best if sweep.checkpoint == "best" and best.is_file() else latest_checkpoint(run)
 
+    def wanted_iteration(self, sweep: Sweep) -> int | None:
+        """Of the checkpoint that the sweep asks for, as the description notes it; None where it does not.
+
+        Raises:
+            CheckpointError: the description is damaged.
+        """
+        noted = self.description()
+        best = noted.get("best_iteration") if sweep.checkpoint == "best" else None
+        return noted.get("iteration") if best is None else best
+
+    def _check_kept(self, sweep: Sweep) -> None:
+        wanted, there = self.wanted_iteration(sweep), self.description().get("kept_iteration")
+        if there is None and (self._kept / RESULTS).is_file():
+            provenance = read_card(self._kept)["policy"].get("provenance")
+            there = provenance.get("iteration") if isinstance(provenance, dict) else None
+        if there is not None and there != wanted:
+            raise SweepError(
+                f"'{one_line(self._kept)}' keeps the policy of iteration {shown(there)}, and checkpoint '{sweep.checkpoint}' is that of "
+                f"{wanted}; change checkpoint in the sweep's file, or give another folder"
+            )
+
     def results(self, sweep: Sweep) -> Path | None:
-        """Where the gauging of its policy goes; None before it is trained."""
-        if self.directory == self._kept and (self._kept / RESULTS).is_file():
-            return self._kept
+        """Where the gauging of its policy goes; None before it is trained. Results of another suite or policy keep their place.
+
+        Raises:
+            SweepError: what was kept is of another checkpoint, or of another suite and without a policy.
+            CheckpointError, ComparisonError: a file is damaged.
+            OSError: its policy cannot be read.
+        """
         policy = self.policy(sweep)
-        return self.folder / "gauge" / policy.stem if policy else None
+        digest = None if policy is None else file_digest(str(policy))
+        if self.directory == self._kept and (self._kept / RESULTS).is_file():
+            if self._is_place(self._kept, digest):
+                return self._kept
+            if policy is None:
+                raise SweepError(
+                    f"'{one_line(self._kept / RESULTS)}' is not of the suite {sweep.suite} as it is now, and without {KEPT_POLICY} beside "
+                    "it the run cannot be gauged again; put that there, or give another folder"
+                )
+        if policy is None or digest is None:
+            return None
+        usual = self.folder / "gauge" / policy.stem
+        if self._is_place(usual, digest):
+            return usual
+        return usual.with_name(f"{policy.stem}-{self.suite_digest[:8]}-{digest[:8]}")
+
+    def _is_place(self, folder: Path, digest: str | None) -> bool:
+        """Whether a folder is free for results of this suite and of a policy's file, or has them; None for any policy."""
+        if (folder / RESULTS).is_file():
+            card = read_card(folder)
+            return card["suite"]["digest"] == self.suite_digest and digest in (None, card["policy"]["file_sha256"])
+        request = folder / "request.json"
+        return (
+            not request.is_file()
+            or read_results(request, "request", SweepError).get("suite_digest") == self.suite_digest
+        )
 
     def gauged(self, sweep: Sweep) -> bool:
-        """Whether its policy has been gauged."""
+        """Whether its policy has been gauged on this suite; raises as ``results``."""
         results = self.results(sweep)
         return results is not None and (results / RESULTS).is_file()
+
+    @property
+    def has_results(self) -> bool:
+        """Whether there are results of any suite and policy."""
+        return (self._kept / RESULTS).is_file() or any(self.folder.glob(f"gauge/*/{RESULTS}"))
+
+    def damage(self, sweep: Sweep) -> str:
+        """What is wrong with the checkpoint that it goes on from, or with what is gauged of it; empty where nothing is."""
+        run = self.directory
+        try:
+            for path in {latest_checkpoint(run) if run else None, self.policy(sweep)} - {None}:
+                load_policy(str(path))
+        except (PolicyError, ContractError) as error:
+            return f"{error}; put it back, or remove it and call again: the run goes on from what is left, as from a checkpoint before it"
+        return ""
 
     def training_command(self, sweep: Sweep, *, seconds: float | None, score_threads: int) -> list[str]:
         """Begins the training or goes on with it; ``seconds`` is its wall-clock limit [s]."""
@@ -123,10 +215,11 @@ class SweepRun:
             options = ["--score-suite", sweep.training_suite, "--score-threads", str(score_threads)]
         options += [] if seconds is None else ["--time", f"{max(seconds, 1.0):.0f}s"]
         options += [] if self.on_gpu else ["--device", "cpu"]
+        options += ["--log-root", str(self.folder / "logs")]
         if (run := self.directory) is not None:
             # The settings are those of the checkpoint; given again, functions that they name need no --trust.
             return [*PROGRAM, "train", self.entry.task, *self.settings, "--resume", str(run), *options]
-        options += ["--backend", self.backend, "--seed", str(self.seed), "--log-root", str(self.folder / "logs")]
+        options += ["--backend", self.backend, "--seed", str(self.seed)]
         options += [] if self.init_from is None else ["--init-from", self.init_from]
         return [*PROGRAM, "train", self.entry.task, *self.settings, *options]
 
@@ -137,11 +230,14 @@ class SweepRun:
         options = ["--suite", sweep.suite, *where, "--out", str(results), "--json", "--no-clip"]
         return [*PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
 
-    def claim(self) -> None:
-        """Note in its folder what it is trained with, or check that it is the same as before.
+    def claim(self, *, option: str = "--out", note: bool = True) -> None:
+        """Check that its folder holds no training with other settings, and ``note`` there what it is trained with.
+
+        Args:
+            option: which names the folder, for the sentence.
 
         Raises:
-            SweepError: the folder holds a training with other settings.
+            SweepError: the folder holds a training with other settings, or cannot be written to.
         """
         mine: Mapping[str, Any] = {
             "task": self.entry.task,
@@ -149,16 +245,29 @@ class SweepRun:
             "seed": self.seed,
             "backend": self.backend,
         } | ({} if self.init_from is None else {"init_from": self.init_from})
-        note = self.folder / "entry.json"
-        if not note.exists():
-            make_folder(self.folder, SweepError)
-            write_atomically(note, json_text(dict(mine)), SweepError)
-        elif (found := read_results(note, "sweep's note", SweepError)) != mine:
-            changed = next(name for name in {**mine, **found} if found.get(name) != mine.get(name))
+        path = self.folder / "entry.json"
+        if not path.exists():
+            if note:
+                make_folder(self.folder, SweepError, option=option)
+                write_atomically(path, json_text(dict(mine)), SweepError)
+        elif (found := read_results(path, "sweep's note", SweepError)) != mine:
+            changed = next(n for n in {**mine, **found} if n not in mine or n not in found or found[n] != mine[n])
             raise SweepError(
-                f"'{self.folder}' holds a training with another {one_line(changed, 80)}; give another folder with --out, or take this one "
-                "away"
+                f"'{self.folder}' holds a training with another {one_line(changed, 80)}; give another folder with {option}, or take this "
+                "one away"
             )
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """The results in a folder.
+
+    Raises:
+        ComparisonError: there are none, or they are damaged.
+    """
+    try:
+        return load_result(folder)
+    except ComparisonError as error:
+        raise ComparisonError(f"{error}; delete it and call again, which makes it anew") from error
 
 
 def _is_trained(run: SweepRun) -> bool:
@@ -179,8 +288,7 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
     Raises:
         SuiteError: no such suite.
     """
-    for suite in {sweep.suite, sweep.training_suite} - {NO_SUITE}:
-        load_suite(suite)
+    digests = {suite: load_suite(suite).digest for suite in {sweep.suite, sweep.training_suite} - {NO_SUITE}}
     runs: list[tuple[int, SweepRun]] = []
     refused: dict[str, str] = {}
     for entry in sweep.entry:
@@ -206,6 +314,7 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
                     iterations=iterations,
                     init_from=init_from,
                     folder=folder / "runs" / entry.name / f"seed-{seed}",
+                    suite_digest=digests[sweep.suite],
                 )
                 for seed in (sweep.seeds if entry.seeds is None else entry.seeds)
             ]
