@@ -210,7 +210,8 @@ def test_results_of_another_suite_do_not_count_and_stay(seeds, begun):
     folder, (run, _) = seeds
     before = run.folder / "gauge" / "model_3" / "results.json"
     if begun:
-        before.with_name("request.json").write_text(json.dumps({"suite_digest": run.suite_digest}))
+        request = {"suite_digest": run.suite_digest, "policy": load_policy(run.directory / "model_3.pt").digest}
+        before.with_name("request.json").write_text(json.dumps(request))
         before.unlink()
     (other, _), _ = plan_runs(OTHER_SUITE, folder, to_train=False)
     place = other.results(OTHER_SUITE)
@@ -238,8 +239,16 @@ def test_kept_results_of_another_suite_do_not_count_and_stay(seeds, kept, tmp_pa
         run.gauged(OTHER_SUITE)
 
 
-def test_results_of_another_checkpoint_do_not_count(seeds):
+@pytest.mark.parametrize("begun", [False, True])
+def test_results_of_another_checkpoint_do_not_count(seeds, begun):
+    """``begun``: its gauging was not finished."""
     _, (run, _) = seeds
+    if begun:
+        results = run.folder / "gauge" / "model_3" / "results.json"
+        request = {"suite_digest": run.suite_digest, "policy": load_policy(run.directory / "model_3.pt").digest}
+        results.with_name("request.json").write_text(json.dumps(request))
+        results.unlink()
+        assert run.results(SWEEP) == results.parent
     shutil.copy(SHIPPED / "go1.gauge.pt", run.directory / "model_3.pt")
     assert not run.gauged(SWEEP) and run.results(SWEEP) != run.folder / "gauge" / "model_3"
 

@@ -17,6 +17,7 @@ from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...policy.finding import latest_checkpoint
 from ...policy.loading import load_policy
+from ...policy.native import FilePolicy
 from ..checkpoint import CheckpointError
 from ..configuration import ConfigurationError
 from ..launch import TrainRequest, prepare
@@ -161,32 +162,31 @@ class SweepRun:
             OSError: its policy cannot be read.
         """
         policy = self.policy(sweep)
-        digest = None if policy is None else file_digest(str(policy))
         if self.directory == self._kept and (self._kept / RESULTS).is_file():
-            if self._is_place(self._kept, digest):
+            if self._is_place(self._kept, policy):
                 return self._kept
             if policy is None:
                 raise SweepError(
                     f"'{one_line(self._kept / RESULTS)}' is not of the suite {sweep.suite} as it is now, and without {KEPT_POLICY} beside "
                     "it the run cannot be gauged again; put that there, or give another folder"
                 )
-        if policy is None or digest is None:
+        if policy is None:
             return None
         usual = self.folder / "gauge" / policy.stem
-        if self._is_place(usual, digest):
+        if self._is_place(usual, policy):
             return usual
-        return usual.with_name(f"{policy.stem}-{self.suite_digest[:8]}-{digest[:8]}")
+        return usual.with_name(f"{policy.stem}-{self.suite_digest[:8]}-{file_digest(str(policy))[:8]}")
 
-    def _is_place(self, folder: Path, digest: str | None) -> bool:
-        """Whether a folder is free for results of this suite and of a policy's file, or has them; None for any policy."""
+    def _is_place(self, folder: Path, policy: Path | None) -> bool:
+        """Whether a folder is free for results of this suite and a policy's file, or has them or begun with them; None for any."""
         if (folder / RESULTS).is_file():
             card = read_card(folder)
-            return card["suite"]["digest"] == self.suite_digest and digest in (None, card["policy"]["file_sha256"])
-        request = folder / "request.json"
-        return (
-            not request.is_file()
-            or read_results(request, "request", SweepError).get("suite_digest") == self.suite_digest
-        )
+            its = card["policy"]["file_sha256"]
+            return card["suite"]["digest"] == self.suite_digest and (policy is None or its == file_digest(str(policy)))
+        if policy is None or not (folder / "request.json").is_file():
+            return True
+        begun = read_results(folder / "request.json", "request", SweepError)
+        return begun.get("suite_digest") == self.suite_digest and begun.get("policy") == _read_policy(policy).digest
 
     def gauged(self, sweep: Sweep) -> bool:
         """Whether its policy has been gauged on this suite; raises as ``results``."""
@@ -202,10 +202,10 @@ class SweepRun:
         """What is wrong with the checkpoint that it goes on from, or with what is gauged of it; empty where nothing is."""
         run = self.directory
         try:
-            for path in {latest_checkpoint(run) if run else None, self.policy(sweep)} - {None}:
-                load_policy(str(path))
-        except (PolicyError, ContractError) as error:
-            return f"{error}; put it back, or remove it and call again: the run goes on from what is left, as from a checkpoint before it"
+            for path in filter(None, {latest_checkpoint(run) if run else None, self.policy(sweep)}):
+                _read_policy(path)
+        except SweepError as error:
+            return str(error)
         return ""
 
     def training_command(self, sweep: Sweep, *, seconds: float | None, score_threads: int) -> list[str]:
@@ -256,6 +256,14 @@ class SweepRun:
                 f"'{self.folder}' holds a training with another {one_line(changed, 80)}; give another folder with {option}, or take this "
                 "one away"
             )
+
+
+def _read_policy(path: Path) -> FilePolicy:
+    try:
+        return load_policy(path)
+    except (PolicyError, ContractError) as error:
+        how = "the run goes on from what is left, as from a checkpoint before it"
+        raise SweepError(f"{error}; put it back, or remove it and call again: {how}") from error
 
 
 def read_card(folder: Path) -> dict[str, Any]:
