@@ -145,7 +145,8 @@ def test_a_whole_sweep(run, tiny):
     assert again.exit_code == 1 and "is trained" not in again.stderr and json.loads(again.stdout) == found
     (tiny / "out" / "sweep.html").unlink()
     told = run("sweep", "sweep.toml", "--out", "out", "--report")
-    assert told.exit_code == 1 and "sweep.html" in told.stdout and "HIM" in told.stdout
+    assert told.exit_code == 1 and "HIM" in told.stdout
+    assert "sweep.html" in told.stdout and "comparison.html" in told.stdout
     assert json.loads((tiny / "out" / "sweep.json").read_text()) == found
     keeps = run("sweep", "sweep.toml", "--out", "out", "--report", "--keep", "kept")
     assert "kept 2 runs; 2 of 2 are in" in keeps.stderr
