@@ -88,6 +88,8 @@ def run_sweep(
                 check_keep(runs, keep.absolute())
         for name, sentence in refused.items():
             errors.say(f"gaitgauge: entry '{name}' cannot start: {sentence}")
+        if not runs:  # tables of an earlier call, perhaps of another file, are not written over
+            raise typer.Exit(1)
         threads = threads or max((os.cpu_count() or 2) // 2, 1)
         shares = per_gpu > 1 and not report and any(run.on_gpu for run in runs)
         context: AbstractContextManager[Mapping[str, str]] = shared_gpus(errors.say) if shares else nullcontext({})

@@ -65,6 +65,20 @@ def test_entries_that_cannot_start_for_different_reasons_are_all_named(run, tiny
     told = [line for line in result.stderr.splitlines() if line.startswith("gaitgauge: ")]
     assert result.exit_code == 1 and len(told) == 2
     assert "'one' cannot start: unknown task" in told[0] and "'two' cannot start" in told[1] and "num_envs" in told[1]
+    assert result.stdout == "" and not (tiny / "out" / "sweep.html").exists()
+
+
+def test_a_folder_of_other_settings_keeps_its_tables(run, tmp_path):
+    """Every entry is refused, each in a sentence of its own."""
+    shutil.copytree(ROOT / "docs/data/sweeps/baselines", tmp_path / "out", ignore=shutil.ignore_patterns("*.pt"))
+    text = (ROOT / "benchmarks/sweeps/baselines.toml").read_text().replace("iterations=1530", "iterations=1531")
+    (tmp_path / "sweep.toml").write_text(text)
+    (tmp_path / "out/sweep.html").write_text("of an earlier call")
+    result = run("sweep", "sweep.toml", "--out", "out", "--report")
+    told = [line for line in result.stderr.splitlines() if line.startswith("gaitgauge: ")]
+    assert result.exit_code == 1 and len(told) == 4
+    assert all("holds a training with other settings" in line for line in told)
+    assert (tmp_path / "out/sweep.html").read_text() == "of an earlier call"
 
 
 @pytest.mark.parametrize(("limit", "code"), [([], 1), (["--time", "1h"], 0)])

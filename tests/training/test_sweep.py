@@ -159,7 +159,7 @@ def test_a_folder_of_other_settings_is_refused(tmp_path):
     plan_runs(SWEEP, tmp_path)
     assert plan_runs(SWEEP, tmp_path)[1] == {}
     changed = replace(SWEEP, settings=("training.algorithm.epochs=3",))
-    assert "holds a training with another settings" in plan_runs(changed, tmp_path)[1]["one"]
+    assert "holds a training with other settings" in plan_runs(changed, tmp_path)[1]["one"]
 
 
 def test_a_training_begins_or_goes_on(tmp_path):

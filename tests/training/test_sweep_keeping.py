@@ -282,7 +282,7 @@ def test_the_shipped_folders_are_read(tmp_path):
 def test_what_cannot_be_kept_is_known_before_a_training(kept):
     runs, _ = plan_runs(SWEEP, kept, to_train=False)
     changed = [replace(run, settings=("training.run.iterations=4",)) for run in runs]
-    with pytest.raises(SweepError, match=r"one/seed-0' holds a training with another settings; give another .* --keep"):
+    with pytest.raises(SweepError, match=r"one/seed-0' holds a training with other settings; give another .* --keep"):
         check_keep(changed, kept)
     check_keep(runs, kept / "new")
     assert not (kept / "new").exists()

@@ -252,9 +252,9 @@ class SweepRun:
                 write_atomically(path, json_text(dict(mine)), SweepError)
         elif (found := read_results(path, "sweep's note", SweepError)) != mine:
             changed = next(n for n in {**mine, **found} if n not in mine or n not in found or found[n] != mine[n])
+            what = "other settings" if changed == "settings" else f"another {one_line(changed, 80)}"
             raise SweepError(
-                f"'{self.folder}' holds a training with another {one_line(changed, 80)}; give another folder with {option}, or take this "
-                "one away"
+                f"'{self.folder}' holds a training with {what}; give another folder with {option}, or take this one away"
             )
 
 
