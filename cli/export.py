@@ -62,7 +62,7 @@ def run_export(*, policy: str, out: Path | None, form: str, layout: str, trust: 
     for written, largest in found.items():
         actions = f"actions differ by at most {largest:.1e}" if largest else "actions are the same"
         check = "reads back the same" if written.suffix == ".yaml" else actions
-        console.say(f"{written}  {written.stat().st_size / 1e6:.2f} MB  {_ABOUT[written.suffix]}; {check}")
+        console.say(f"{written}  {max(written.stat().st_size / 1e3, 1):,.0f} kB  {_ABOUT[written.suffix]}; {check}")
     if unitree:
         console.say(f"point the controller's policy_dir at {folder.resolve()}")
         if sentence := first_steps(loaded):

@@ -1,5 +1,6 @@
 """``gaitgauge export``: files, their check, and one sentence for what cannot be exported."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ def test_all_formats(run, policy, tmp_path):
     assert sorted(f.name for f in (tmp_path / "out").iterdir()) == ["deploy.yaml", "policy.onnx", "policy.pt"]
     assert result.output.count("; actions ") == 2
     assert "reads back the same" in result.output
+    assert re.search(r"deploy.yaml  [1-9]\d* kB", result.output)
     ours = load_policy(policy).contract
     assert load_policy(tmp_path / "out" / "policy.pt").contract.joint_names == ours.joint_names
 
