@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any
+from contextlib import contextmanager, suppress
+from typing import IO, Any
 
 from rich.console import Console
 from rich.segment import Segment
@@ -20,11 +21,19 @@ _PLAIN_WIDTH = 160
 
 
 class Terminal(Console):
-    """A console for names that strangers chose. Styles are given beside the text, as ``style`` or ``Text``."""
+    """A console for names that strangers chose. Styles are given beside the text, as ``style`` or ``Text``.
 
-    def __init__(self, *, stderr: bool = False, quiet: bool = False) -> None:
-        """Print to standard output, or to standard error."""
+    Where nobody reads any more, a pipe without a reader or a terminal that was closed, what is said is lost and the command goes on.
+    """
+
+    def __init__(self, *, stderr: bool = False, quiet: bool = False, may_lose: bool = False) -> None:
+        """Print to standard output, or to standard error.
+
+        Args:
+            may_lose: whether the command goes on with a full disk behind its output, too; it always does on standard error.
+        """
         super().__init__(stderr=stderr, quiet=quiet, markup=False, emoji=False, highlight=False)
+        self._may_lose = may_lose or stderr
         if not self.is_terminal:
             self.width = _PLAIN_WIDTH
 
@@ -32,6 +41,16 @@ class Terminal(Console):
         """Print, after the notices that were held back."""
         _notices.tell()
         super().print(*objects, **options)
+
+    def _write_buffer(self) -> None:
+        """Write what was printed, or lose it; rich would end the program where a pipe has no reader."""
+        try:
+            super()._write_buffer()
+        except OSError as problem:
+            if not (self._may_lose or problem.errno in (errno.EPIPE, errno.EIO)):
+                raise
+            self.quiet = True
+            silence(self.file)
 
     def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
         """What reaches the terminal: text of any kind, control characters escaped."""
@@ -54,6 +73,20 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
+def silence(stream: IO[str]) -> None:
+    """Let a stream that cannot be written to lead nowhere: what is left in its buffer would fail again when the program ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def complain(sentence: str) -> None:
+    """Print one line on standard error, or lose it."""
+    try:
+        print(printable(sentence.replace("\n", " ")), file=sys.stderr)
+    except OSError:
+        silence(sys.stderr)
+
+
 class _Notices(logging.Handler):
     """Keeps the package's warnings back until a command says something."""
 
@@ -73,7 +106,7 @@ class _Notices(logging.Handler):
         """Print what was kept."""
         held, self._held = self._held, []
         for message in held:
-            print(printable(message.replace("\n", " ")), file=sys.stderr)
+            complain(message)
 
     def forget(self) -> None:
         """Drop what was kept."""

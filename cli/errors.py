@@ -6,12 +6,12 @@ import functools
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
 import typer
 
-from .console import held_notices, printable
+from .console import complain, held_notices, silence
 
 
 class UserError(ValueError):
@@ -65,19 +65,12 @@ def check_folder() -> None:
         sys.exit(2)
 
 
-def complain(sentence: str) -> None:
-    """Print one line on standard error."""
-    print(printable(sentence.replace("\n", " ")), file=sys.stderr)
-
-
 def system_failure(error: OSError) -> str:
     """One sentence on what the operating system refused. A refusal without a file's name was of standard output."""
     reason = (error.strerror or str(error)).lower()
     if error.filename is not None:
         return f"'{os.fsdecode(error.filename)}': {reason}"
-    # What is left in the buffer of standard output would fail again when the interpreter ends.
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    silence(sys.stdout)
     return f"output cannot be written: {reason}"
 
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import typer
-from rich.text import Text
 
 from ..files.writing import lock_folder, make_folder
 from ..gauge.cluster import check_address
@@ -24,25 +22,6 @@ from ..training.sweep.runs import SweepRun, plan_runs
 from ..training.sweep.sharing import shared_gpus
 from .console import Terminal, make_table, shell_command
 from .train import parse_duration
-
-
-class _Listener(Terminal):
-    """Standard error. Where nobody reads it any more, what is said is lost, and the sweep goes on."""
-
-    def __init__(self) -> None:
-        super().__init__(stderr=True)
-
-    def say(self, sentence: str | Text) -> None:
-        """Print a sentence, or lose it."""
-        try:
-            super().say(sentence)
-        except OSError:  # what is left in the buffer would fail again when the interpreter ends
-            with suppress(OSError, ValueError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
-
-    def on_broken_pipe(self) -> None:
-        """Leave standard output alone, which rich would close with it."""
-        raise BrokenPipeError
 
 
 def run_sweep(
@@ -66,7 +45,7 @@ def run_sweep(
     sweep = load_sweep(file)
     folder = (out or Path("results") / f"sweep-{sweep.name}").absolute()
     deadline = None if time is None else began + parse_duration(time)
-    errors = _Listener()
+    errors = Terminal(stderr=True)
     gauging = None
     if cluster is not None:
         check_address(cluster)

@@ -32,7 +32,7 @@ def run_training(*, task: str, time: str | None, **choices: Any) -> None:
     seconds = None if time is None else parse_duration(time)
     plan = prepare(TrainRequest(task=task, seconds=seconds, **choices))
     # Of several processes, one for each GPU, the first speaks.
-    console = Terminal(quiet=os.environ.get("RANK", "0") != "0")
+    console = Terminal(quiet=os.environ.get("RANK", "0") != "0", may_lose=True)
     steps = plan.task.training.run.steps_per_iteration * plan.task.environment.num_envs
 
     def started(run: Path) -> None:

@@ -83,6 +83,6 @@ class StopSignals:
                 raise KeyboardInterrupt
             return
         self.received = number
-        # The terminal may be gone, or in the middle of another line; rich ends the program where a pipe is closed.
-        with suppress(OSError, RuntimeError, SystemExit):
+        # The terminal may be gone, or in the middle of another line.
+        with suppress(OSError, RuntimeError):
             self._message(f"{signal.Signals(number).name} received: finishing this iteration and writing a checkpoint.")

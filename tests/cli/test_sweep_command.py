@@ -1,14 +1,12 @@
 """``gaitgauge sweep``: one sentence for what is wrong, and a whole sweep of small trainings."""
 
 import json
-import os
 import shutil
 import sys
 from pathlib import Path
 
 import pytest
 import torch
-from gaitgauge.cli.sweep import _Listener
 from gaitgauge.training.sweep.jobs import Jobs, SweepOutcome
 from small_run import SMALL
 from tiny_suite import SUITE
@@ -89,17 +87,6 @@ def test_a_training_that_was_stopped_from_outside_is_no_success(run, tiny, monke
     monkeypatch.setattr(Jobs, "work", lambda *_: stopped)
     result = run("sweep", "sweep.toml", "--out", "out", *limit)
     assert result.exit_code == code and "1 of 1 runs are not done; go on with:" in result.stderr
-
-
-def test_a_sweep_goes_on_where_nobody_reads_what_it_says(monkeypatch):
-    read, write = os.pipe()
-    os.close(read)
-    with os.fdopen(write, "w") as closed:
-        monkeypatch.setattr(sys, "stderr", closed)
-        listener = _Listener()
-        listener.say("lost")
-        listener.say("lost, too")
-        closed.flush()  # nothing is left that would fail at the end
 
 
 def test_a_run_that_is_damaged_leaves_a_table_and_the_others_are_kept(run, tmp_path):

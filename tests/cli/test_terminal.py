@@ -1,11 +1,13 @@
 """What the terminal shows: names as they are, one line for each mistake, whatever the file system does."""
 
+import errno
 import io
 import logging
 import os
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -84,6 +86,62 @@ def test_progress_is_a_block_on_a_terminal():
 @pytest.mark.parametrize(("seconds", "text"), [(30.4, "30 s"), (127, "2 min 07 s"), (3901, "1 h 05 min")])
 def test_durations_for_people(seconds, text):
     assert duration(seconds) == text
+
+
+class Unwritable(io.StringIO):
+    """A stream that takes nothing."""
+
+    def __init__(self, number):
+        super().__init__()
+        self.number = number
+
+    def write(self, text):
+        raise OSError(self.number, os.strerror(self.number))
+
+
+@pytest.mark.parametrize("number", [errno.EPIPE, errno.EIO])
+@pytest.mark.parametrize("block", [False, True])
+def test_what_nobody_reads_any_more_is_lost_and_the_command_goes_on(number, block):
+    """The reader of a pipe has left, the window of a terminal was closed."""
+    terminal = Terminal()
+    terminal.file, terminal._force_terminal = Unwritable(number), block
+    with ProgressDisplay(terminal, "gauging") as display:
+        display.update(1.0, "9 of 9", last=True)
+        terminal.say("done")
+    terminal.say("really")
+
+
+def test_a_full_disk_is_an_error_where_results_are_said_alone():
+    for options, said in (({}, False), ({"may_lose": True}, True), ({"stderr": True}, True)):
+        terminal = Terminal(**options)
+        terminal.file = Unwritable(errno.ENOSPC)
+        with nullcontext() if said else pytest.raises(OSError, match="No space left"):
+            terminal.say("0.7")
+
+
+def test_nothing_is_left_in_a_broken_pipe_that_would_fail_at_the_end(monkeypatch):
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as closed:
+        monkeypatch.setattr(sys, "stderr", closed)
+        terminal = Terminal(stderr=True)
+        terminal.say("lost")
+        terminal.say("lost, too")
+        closed.flush()
+
+
+def test_an_error_that_cannot_be_told_keeps_its_exit_code(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Unwritable(errno.EIO))
+
+    @report_errors
+    def command() -> None:
+        logging.getLogger("gaitgauge.policy.rebuilt").warning("slow")
+        Terminal(stderr=True).say("half of it")
+        raise UserError("wrong")
+
+    with pytest.raises(typer.Exit) as ended:
+        command()
+    assert ended.value.exit_code == 2
 
 
 @pytest.mark.parametrize("arguments", [("list", "suites"), ("--version",), ("list", "robots")])

@@ -1,10 +1,14 @@
 """``gaitgauge train``: one run on the fake engine, how it goes on, and one clear sentence for whatever is wrong."""
 
 import errno
+import fcntl
 import importlib.util
 import json
 import os
+import pty
 import signal
+import subprocess
+import termios
 import threading
 from pathlib import Path
 
@@ -19,6 +23,7 @@ from gaitgauge.training.launch import TrainRequest, prepare
 from gaitgauge.training.overrides import override_keys
 from gaitgauge.training.processes import idle_gpus
 from gaitgauge.training.scoring import Scorer, scores_of
+from gaitgauge.training.side_process import PROGRAM
 from gaitgauge.training.tasks import TASKS
 from small_run import FAKE, SMALL
 
@@ -116,6 +121,27 @@ def test_signal_writes_a_checkpoint_and_says_how_to_go_on(run, tmp_path):
     last = max(int(f.stem.removeprefix("model_")) for f in tmp_path.rglob("model_*.pt"))
     assert last >= 2
     assert f"{last} iterations done" in result.output
+
+
+@pytest.mark.slow
+def test_a_terminal_that_is_closed_is_a_stop_like_a_signal(tmp_path):
+    """SIGHUP, and then nothing can be written any more."""
+    window, terminal = pty.openpty()
+    command = ["train", "go2-flat", *FAKE, *SMALL, "--iterations", 100_000, "training.run.save_interval=2"]
+    training = subprocess.Popen(
+        [*PROGRAM, *map(str, command), "--log-root", str(tmp_path)],
+        **dict.fromkeys(("stdin", "stdout", "stderr"), terminal),
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(terminal)
+    while not list(tmp_path.rglob("model_2.pt")):
+        assert training.poll() is None
+        os.read(window, 10_000)
+    os.close(window)
+    assert training.wait(60) == 128 + signal.SIGHUP
+    (noted,) = tmp_path.rglob("run.json")
+    assert json.loads(noted.read_text())["outcome"] == "signal"
 
 
 def test_time_limit_ends_with_success(run, tmp_path):
