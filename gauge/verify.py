@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..files.parsing import edited, one_line, shown
+from ..policy.finding import shipped_policies
 from ..robots import robot_names
 from ..robots.loading import robot_digest
 from .coverage import UNKNOWN, coverage, coverage_of
@@ -47,7 +48,7 @@ def prepare_replay(
     """What must be played to check a card.
 
     Args:
-        policy: the policy's file, where it is not at the card's path.
+        policy: the policy's file, where it is not at the card's path and none that ships.
         suite: name or ``.toml`` file, where the suite is one of the user's own.
         quick: one environment of each terrain, at nominal friction and payload where the card has it, else the card's first.
         fresh: number from which other seeds than the card's are made; None for the card's.
@@ -59,7 +60,7 @@ def prepare_replay(
     path, wanted = policy or card["policy"]["path"], card["suite"]
     if fresh is not None and card["score_interval"] is None:
         raise CardError("the card has no interval, so that nothing can be said of other seeds; leave out --fresh")
-    if policy is None and not Path(path).is_file():
+    if policy is None and path not in shipped_policies() and not Path(path).is_file():
         raise CardError(
             f"the card's policy is not at '{one_line(path)}' on this machine; say where it is with --policy"
         )

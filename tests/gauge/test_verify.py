@@ -1,6 +1,7 @@
 """When a score card holds: pure judgements on hand-made replays."""
 
 from copy import deepcopy
+from pathlib import Path
 
 import pytest
 from gaitgauge.gauge.comparison import ComparisonError, load_result
@@ -102,6 +103,19 @@ def test_a_card_without_an_interval_says_nothing_about_other_seeds(card):
         CardError, match="the card has no interval, so that nothing can be said of other seeds; leave out --fresh"
     ):
         prepare_replay(card, fresh=1)
+
+
+def test_a_card_of_a_policy_that_ships_names_it():
+    """Its path is a name, as the user gave it, and no file's."""
+    shipped = load_result(Path(__file__).parents[2] / "docs/data/scorecards/pretrained-gaitgauge-1.json")
+    shipped["policy"]["file_sha256"] = file_digest("pretrained")  # the card may be that of one that shipped before
+    assert len(prepare_replay(shipped, quick=True).environments) == 7
+    shipped["policy"]["file_sha256"] = "ab" * 32
+    with pytest.raises(CardError, match="'pretrained' is another policy than the card's"):
+        prepare_replay(shipped, quick=True)
+    shipped["policy"]["path"] = "latest"  # whatever was trained last is nobody's card
+    with pytest.raises(CardError, match="the card's policy is not at 'latest' on this machine"):
+        prepare_replay(shipped, quick=True)
 
 
 def test_a_card_that_holds_less_than_it_says_is_refused():
