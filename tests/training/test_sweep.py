@@ -1,5 +1,6 @@
 """Sweeps: their files, which runs they have, processes in their places, and what is told at the end."""
 
+import fcntl
 import json
 import os
 import re
@@ -421,8 +422,40 @@ def test_a_training_that_a_killed_sweep_left_is_not_started_again(tmp_path):
     os.waitpid(sweep, 0)
     outcome, _ = work(runs)
     assert list(outcome.failures) == ["long, seed 0"] and runs[1].gauged(SWEEP) and alive(runs[0])
-    assert f"it is still being trained by process {number} of an earlier call" in outcome.failures["long, seed 0"]
+    assert outcome.failures["long, seed 0"] == (
+        f"it is still being trained on GPU 3 by process {number} of an earlier call; wait until that has ended, or stop it "
+        f"with 'kill {number}', and call again"
+    )
     os.kill(number, signal.SIGTERM)
+
+
+@pytest.mark.parametrize("noted", ["", "1; rm -rf ~", "5", "\x1b[31m on \x1b"])
+def test_what_a_lock_file_says_is_no_command(tmp_path, noted):
+    """A full disk leaves it empty, versions before this one wrote a number alone; who wrote anything else is not known."""
+    run = scripted(tmp_path, "one")
+    run.folder.mkdir(parents=True)
+    lock = run.folder / "train.lock"
+    lock.write_text(noted)
+    with lock.open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        sentence = work([run])[0].failures["one, seed 0"]
+    assert ("kill 5'" in sentence) == (noted == "5") and "rm" not in sentence and sentence.isprintable()
+    assert sentence.startswith("it is still being trained by ") and sentence.endswith("and call again")
+
+
+@pytest.mark.parametrize("name", ["train.lock", "train.log", "gauge.lock", "gauge.log"])
+def test_a_link_in_a_run_s_folder_is_not_written_through(tmp_path, name):
+    """The folder may come from elsewhere."""
+    run = scripted(tmp_path, "one")
+    run.folder.mkdir(parents=True)
+    (tmp_path / "precious").write_text("mine")
+    (run.folder / name).symlink_to(tmp_path / "precious")
+    sentence = work([run])[0].failures["one, seed 0"]
+    assert (
+        sentence
+        == f"'{run.folder / name}' is a link, and a sweep writes to its own files alone; remove it and call again"
+    )
+    assert (tmp_path / "precious").read_text() == "mine"
 
 
 def test_gpus_are_those_that_may_be_seen(monkeypatch):

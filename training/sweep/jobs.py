@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import signal
 import subprocess
 import time
@@ -173,12 +174,17 @@ class Jobs:
         """Start a process, which keeps a lock until its end: the next sweep finds it if this one is killed.
 
         Raises:
-            SweepError: a process that an earlier call left has the lock.
+            SweepError: a process that an earlier call left has the lock; or log or lock is a link, which may lead anywhere.
             OSError: it cannot be started, or its log cannot be written.
         """
         environment = {**os.environ, **self._places.get(place, ENVIRONMENT)}
         log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("ab") as output, log.with_suffix(".lock").open("a+b", buffering=0) as lock:
+        for path in (log, own := log.with_suffix(".lock")):
+            if path.is_symlink():
+                raise SweepError(
+                    f"'{path}' is a link, and a sweep writes to its own files alone; remove it and call again"
+                )
+        with log.open("ab") as output, own.open("a+b", buffering=0) as lock:
             if fcntl is not None:
                 _take(lock, "gauged" if place == "gauge" else "trained")
             # A session of its own: Ctrl-C in the terminal is for the sweep, which hands it on.
@@ -194,7 +200,7 @@ class Jobs:
             self._live.append(_Job(run=run, place=place, process=process, log=log))
             with suppress(OSError):  # a full disk
                 lock.truncate(0)
-                lock.write(str(process.pid).encode())
+                lock.write(f"{process.pid}{'' if place == 'gauge' else f' on {place}'}".encode())
         self._say(f"{run.label} {how}")
 
     def _collect(self) -> None:
@@ -253,10 +259,12 @@ def _take(lock: BinaryIO, doing: str) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         lock.seek(0)
-        number = one_line(lock.read(20).decode(errors="replace")) or "?"
+        noted = re.fullmatch(r"(\d+)( on [\w ,-]+)?", lock.read(200).decode(errors="replace"), re.ASCII)
+        number, where = noted.groups("") if noted else ("", "")
+        who = f"process {number} of an earlier call" if number else "another process"
+        stop = f", or stop it with 'kill {number}'," if number else ""
         raise SweepError(
-            f"it is still being {doing} by process {number} of an earlier call; wait until that has ended, or stop it with "
-            f"'kill {number}', and call again"
+            f"it is still being {doing}{where} by {who}; wait until that has ended{stop} and call again"
         ) from error
 
 
