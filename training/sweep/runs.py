@@ -250,7 +250,13 @@ class SweepRun:
             if note:
                 make_folder(self.folder, SweepError, option=option)
                 write_atomically(path, json_text(dict(mine)), SweepError)
-        elif (found := read_results(path, "sweep's note", SweepError)) != mine:
+            return
+        try:
+            found = read_results(path, "sweep's note", SweepError)
+        except SweepError as error:
+            how = "put it back, or delete it if the training beside it is the one that the sweep's file asks for"
+            raise SweepError(f"{error}; {how}, and call again") from error
+        if found != mine:
             changed = next(n for n in {**mine, **found} if n not in mine or n not in found or found[n] != mine[n])
             what = "other settings" if changed == "settings" else f"another {one_line(changed, 80)}"
             raise SweepError(
@@ -287,7 +293,7 @@ def _is_trained(run: SweepRun) -> bool:
 
 
 def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[list[SweepRun], dict[str, str]]:
-    """The runs of a sweep, those of the first seed first, and of each entry that cannot start one sentence on why.
+    """The runs of a sweep, those of the first seed first, and of each entry of which a run cannot start one sentence on why.
 
     Args:
         to_train: whether this machine must be able to train what is left to train. What was trained elsewhere can be gauged and
@@ -334,10 +340,13 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
                     own = [run for run in own if _is_trained(run)]
                 else:
                     own = [replace(run, on_gpu=on_gpu) for run in own]
-            for run in own:
-                run.claim()
-        except (TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError, SweepError) as error:
+        except (TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError) as error:
             refused[entry.name] = str(error)
             continue
-        runs += enumerate(own)
+        for place, run in enumerate(own):
+            try:
+                run.claim()
+                runs.append((place, run))
+            except SweepError as error:
+                refused.setdefault(entry.name, str(error))
     return [run for _, run in sorted(runs, key=lambda item: item[0])], refused
