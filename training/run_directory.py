@@ -67,14 +67,13 @@ def find_checkpoint(
         CheckpointError: there is none.
     """
     if choice == "latest":
-        # A run for another robot than the task's has an experiment of its own.
-        runs = [
-            r
-            for r in root.glob("*/*")
-            if r.is_dir() and (r.parent.name == experiment or (task and read_run_json(r).get("task") == task))
-        ]
+        runs = [r for r in root.glob("*/*") if r.is_dir()]
         for run in sorted(runs, key=lambda r: r.name, reverse=True):
-            if found := latest_checkpoint(run):
+            # A run for another robot than the task's has an experiment of its own; a task made of another one has that one's.
+            mine = run.parent.name == experiment
+            if task:
+                mine = read_run_json(run).get("task", task if mine else None) == task
+            if mine and (found := latest_checkpoint(run)):
                 return found
         raise CheckpointError(f"There is no checkpoint: no run in '{root / experiment}' has a model_<iteration>.pt.")
     path = Path(choice)

@@ -103,6 +103,14 @@ def test_run_directories(tmp_path):
     assert find_checkpoint("latest", experiment="go2", root=tmp_path) == first / "model_1000.pt"
     assert find_checkpoint("latest", experiment="go2", task="run", root=tmp_path) == first / "model_1000.pt"
     assert find_checkpoint("latest", experiment="go2", task="walk", root=tmp_path) == other / "model_3.pt"
+    # A task of one's own that was made of another one has its folder.
+    own = tmp_path / "go2" / "2027-01-02_00-00-00"
+    own.mkdir()
+    (own / "model_4.pt").touch()
+    (own / "run.json").write_text('{"task": "own:TASK"}')
+    assert find_checkpoint("latest", experiment="go2", task="run", root=tmp_path) == first / "model_1000.pt"
+    assert find_checkpoint("latest", experiment="go2", task="own:TASK", root=tmp_path) == own / "model_4.pt"
+    assert find_checkpoint("latest", experiment="go2", root=tmp_path) == own / "model_4.pt"
     assert find_checkpoint(str(first), experiment="other", root=tmp_path) == first / "model_1000.pt"
     with pytest.raises(CheckpointError, match=r"There is no checkpoint 'none\.pt'"):
         find_checkpoint("none.pt", experiment="go2", root=tmp_path)
