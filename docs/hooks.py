@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -37,5 +39,15 @@ def on_files(files: Files, config: Any) -> Files:
     with_package = {**os.environ, "PYTHONPATH": str(PATHS), "TERMINAL_WIDTH": "100"}
     command = [sys.executable, "-m", "typer", "gaitgauge.cli.main", "utils", "docs", "--name", "gaitgauge"]
     text = subprocess.run(command, check=True, capture_output=True, text=True, env=with_package, cwd=ROOT).stdout
-    files.append(File.generated(config, "cli.md", content=text.replace("# `gaitgauge`", "# Commands", 1)))
+    content = with_examples(text.replace("# `gaitgauge`", "# Commands", 1))
+    files.append(File.generated(config, "cli.md", content=content))
     return files
+
+
+def with_examples(text: str) -> str:
+    """Make code of the indented lines below each ``Examples:``, which Markdown takes for one paragraph."""
+
+    def code(found: re.Match[str]) -> str:
+        return f"Examples:\n\n```\n{textwrap.dedent(found[1])}```\n"
+
+    return re.sub(r"^Examples:\n((?:  .*\n)+)", code, text, flags=re.MULTILINE)
