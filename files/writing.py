@@ -172,7 +172,7 @@ def _strays(folder: Path) -> Iterator[Path]:
         if LOCK in names and Path(place) != folder:
             below.clear()
             continue
-        yield from (Path(place, name) for name in names if re.match(r"\.[0-9a-f]+\.partial", name))
+        yield from (Path(place, name) for name in names if re.match(r"\.[0-9a-f]{16}\.partial", name))
 
 
 def _flush(path: Path) -> None:

@@ -78,7 +78,7 @@ def test_no_text_of_a_table_is_a_formula():
 
 def test_half_written_files_of_another_s_folder_are_left_alone(tmp_path):
     """A training that outlived its sweep was writing its checkpoint there."""
-    mine, theirs = tmp_path / ".0123.partial", tmp_path / "runs" / "a" / ".4567.partial"
+    mine, theirs = (folder / ".0123456789abcdef.partial" for folder in (tmp_path, tmp_path / "runs" / "a"))
     theirs.parent.mkdir(parents=True)
     (theirs.parent / ".lock").touch()
     for path in (mine, theirs):
@@ -127,10 +127,10 @@ def test_a_folder_has_one_writer(tmp_path, monkeypatch):
         lock_folder(tmp_path, WriteError)
     other.kill()
     other.wait()
-    stray = tmp_path / "below" / ".0123.partial"
+    stray = tmp_path / "below" / ".0123456789abcdef.partial"
     stray.parent.mkdir()
     stray.write_text("half")
-    kept = [tmp_path / "kept.partial", tmp_path / ".somebody's.partial"]
+    kept = [tmp_path / "kept.partial", tmp_path / ".somebody's.partial", tmp_path / ".bed.partial.toml"]
     for path in kept:
         path.write_text("somebody's")
     lock_folder(tmp_path, WriteError).release()
