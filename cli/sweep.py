@@ -65,8 +65,9 @@ def run_sweep(
         if keep is not None:
             with _locked(keep):
                 check_keep(runs, keep.absolute())
+        begun = {run.entry.name for run in runs}
         for name, sentence in refused.items():
-            errors.say(f"gaitgauge: entry '{name}' cannot start: {sentence}")
+            errors.say(f"gaitgauge: entry '{name}' cannot start{' in full' if name in begun else ''}: {sentence}")
         if not runs:  # tables of an earlier call, perhaps of another file, are not written over
             raise typer.Exit(1)
         threads = threads or max((os.cpu_count() or 2) // 2, 1)

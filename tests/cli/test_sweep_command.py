@@ -79,6 +79,18 @@ def test_a_folder_of_other_settings_keeps_its_tables(run, tmp_path):
     assert (tmp_path / "out/sweep.html").read_text() == "of an earlier call"
 
 
+def test_an_entry_of_which_one_seed_cannot_start_is_told_so(run, tiny):
+    (tiny / "sweep.toml").write_text("seeds = [0, 1]\n" + sweep(one='task = "go2-cts"'))
+    note = tiny / "out" / "runs" / "one" / "seed-0" / "entry.json"
+    note.parent.mkdir(parents=True)
+    note.write_text("{")
+    result = run("sweep", "sweep.toml", "--out", "out", "--report", "--json")
+    assert (
+        result.exit_code == 1 and "entry 'one' cannot start in full: " in result.stderr and str(note) in result.stderr
+    )
+    assert [row["seed"] for row in json.loads(result.stdout)["runs"]] == [1]
+
+
 @pytest.mark.parametrize(("limit", "code"), [([], 1), (["--time", "1h"], 0)])
 def test_a_training_that_was_stopped_from_outside_is_no_success(run, tiny, monkeypatch, limit, code):
     """With a time limit, being unfinished is expected."""

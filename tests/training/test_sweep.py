@@ -163,6 +163,15 @@ def test_a_folder_of_other_settings_is_refused(tmp_path):
     assert "holds a training with other settings" in plan_runs(changed, tmp_path)[1]["one"]
 
 
+def test_a_seed_that_is_new_is_not_noted_with_settings_that_are_refused(tmp_path):
+    """Or the file as it was would be refused for it."""
+    plan_runs(SWEEP, tmp_path)
+    more = replace(SWEEP, seeds=(1, 0))
+    runs, refused = plan_runs(replace(more, settings=("training.algorithm.epochs=3",)), tmp_path)
+    assert runs == [] and "holds a training with other settings" in refused["one"]
+    assert plan_runs(more, tmp_path)[1] == {}
+
+
 def test_a_training_begins_or_goes_on(tmp_path):
     (run,), _ = plan_runs(replace(SWEEP, settings=("environment.num_envs=8",)), tmp_path)
     begins = run.training_command(SWEEP, seconds=None, score_threads=2)

@@ -181,14 +181,10 @@ def test_a_damaged_file_is_the_failure_of_its_run_alone(seeds, tmp_path, name):
 def test_a_damaged_note_refuses_its_seed_alone(seeds, tmp_path):
     folder, runs = seeds
     note = runs[0].folder / "entry.json"
-    for text, reason in (
-        ("{", "delete it if the training beside it is"),
-        ('{"task": "go2-flat"}', "holds a training with another"),
-    ):
-        note.write_text(text)
-        there, refused = plan_runs(TWO_SEEDS, folder, to_train=False)
-        assert [run.label for run in there] == ["one, seed 1"] and there[0].gauged(TWO_SEEDS)
-        assert str(note.parent) in refused["one"] and reason in refused["one"]
+    note.write_text("{")
+    there, refused = plan_runs(TWO_SEEDS, folder, to_train=False)
+    assert [run.label for run in there] == ["one, seed 1"] and there[0].gauged(TWO_SEEDS)
+    assert str(note) in refused["one"] and "delete it if the training beside it is" in refused["one"]
 
 
 def test_a_damaged_checkpoint_says_what_to_do_and_its_results_do_not_count(seeds, tmp_path):

@@ -35,6 +35,10 @@ RUN_ERRORS = (SweepError, CheckpointError, ComparisonError, PolicyError, Contrac
 """What may be wrong with the files of one run; the others go on."""
 
 
+class DamagedNoteError(SweepError):
+    """What a run's folder says of its settings cannot be read; other runs of the entry are none the worse."""
+
+
 def what_failed(error: Exception) -> str:
     """One sentence on one of ``RUN_ERRORS``."""
     if not isinstance(error, OSError):
@@ -237,6 +241,7 @@ class SweepRun:
             option: which names the folder, for the sentence.
 
         Raises:
+            DamagedNoteError: what was noted there cannot be read.
             SweepError: the folder holds a training with other settings, or cannot be written to.
         """
         mine: Mapping[str, Any] = {
@@ -255,7 +260,7 @@ class SweepRun:
             found = read_results(path, "sweep's note", SweepError)
         except SweepError as error:
             how = "put it back, or delete it if the training beside it is the one that the sweep's file asks for"
-            raise SweepError(f"{error}; {how}, and call again") from error
+            raise DamagedNoteError(f"{error}; {how}, and call again") from error
         if found != mine:
             changed = next(n for n in {**mine, **found} if n not in mine or n not in found or found[n] != mine[n])
             what = "other settings" if changed == "settings" else f"another {one_line(changed, 80)}"
@@ -340,13 +345,16 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
                     own = [run for run in own if _is_trained(run)]
                 else:
                     own = [replace(run, on_gpu=on_gpu) for run in own]
-        except (TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError) as error:
+            for run in tuple(own):  # all of them before one is noted
+                try:
+                    run.claim(note=False)
+                except DamagedNoteError as error:
+                    refused.setdefault(entry.name, str(error))
+                    own.remove(run)
+            for run in own:
+                run.claim()
+        except (TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError, SweepError) as error:
             refused[entry.name] = str(error)
             continue
-        for place, run in enumerate(own):
-            try:
-                run.claim()
-                runs.append((place, run))
-            except SweepError as error:
-                refused.setdefault(entry.name, str(error))
+        runs += enumerate(own)
     return [run for _, run in sorted(runs, key=lambda item: item[0])], refused
