@@ -339,6 +339,11 @@ def test_curves_come_back_as_they_were(tmp_path):
     assert learning_curves(tmp_path) == curves
 
 
+def test_a_report_notes_nothing(tmp_path):
+    """Of runs that are not there: a file with a mistake in it would be what they are asked for later."""
+    assert len(plan_runs(SWEEP, tmp_path, to_train=False)[0]) == 2 and not any(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
 def test_a_report_needs_no_gpu(tmp_path):
     sweep = replace(SWEEP, entry=SWEEP.entry[1:])

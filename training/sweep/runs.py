@@ -301,8 +301,8 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
     """The runs of a sweep, those of the first seed first, and of each entry of which a run cannot start one sentence on why.
 
     Args:
-        to_train: whether this machine must be able to train what is left to train. What was trained elsewhere can be gauged and
-            reported on any.
+        to_train: whether this machine must be able to train what is left to train, which is noted in their folders. What was
+            trained elsewhere can be gauged and reported on any.
 
     Raises:
         SuiteError: no such suite.
@@ -351,8 +351,9 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
                 except DamagedNoteError as error:
                     refused.setdefault(entry.name, str(error))
                     own.remove(run)
-            for run in own:
-                run.claim()
+            if to_train:
+                for run in own:
+                    run.claim()
         except (TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError, SweepError) as error:
             refused[entry.name] = str(error)
             continue
