@@ -178,6 +178,18 @@ def test_a_damaged_file_is_the_failure_of_its_run_alone(seeds, tmp_path, name):
     assert outcome.failures == failures and outcome.unfinished == []
 
 
+@pytest.mark.parametrize("name", ["score_interval", "level", "groups"])
+def test_results_without_what_the_table_tells_are_the_failure_of_their_run_alone(seeds, name):
+    folder, runs = seeds
+    path = runs[0].folder / "gauge" / "model_3" / "results.json"
+    card = json.loads(path.read_text())
+    del card[name]
+    path.write_text(json.dumps(card))
+    rows = fold_sweep(TWO_SEEDS, runs, {}, {}, folder)["runs"]
+    assert [row["state"] for row in rows] == ["failed", "gauged"]
+    assert rows[0]["reason"] == f"results '{path}' lack {name}; delete it and call again, which makes it anew"
+
+
 def test_a_damaged_note_refuses_its_seed_alone(seeds, tmp_path):
     folder, runs = seeds
     note = runs[0].folder / "entry.json"

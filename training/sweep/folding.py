@@ -18,11 +18,11 @@ from ...gauge.intervals import CONFIDENCE
 from ...gauge.pages import page_template
 from .curves import Curve, by_figure, curves_csv, learning_curves
 from .file import Sweep, SweepError
-from .runs import RUN_ERRORS, SweepRun, read_card, what_failed
+from .runs import RUN_ERRORS, SCORES, SweepRun, read_card, what_failed
 
 _FOUND = (
     *("environment_steps", "training_seconds", "best_training_score", "policy", "results"),
-    *("score", "score_interval", "level", "groups"),
+    *SCORES,
 )
 """What a row says of a run, None where there is nothing yet."""
 
@@ -102,7 +102,7 @@ def _fill(row: dict[str, Any], sweep: Sweep, run: SweepRun, folder: Path) -> Non
     row["policy"] = str(policy.relative_to(folder)) if policy else None
     if results is not None and run.gauged(sweep):
         card = read_card(results)
-        row |= {name: card[name] for name in ("score", "score_interval", "level", "groups")}
+        row |= {name: card[name] for name in SCORES}
         row |= {"state": "gauged", "results": str(results.relative_to(folder))}
 
 

@@ -31,6 +31,8 @@ KEPT = "kept"
 KEPT_CURVES = "curves.csv"
 KEPT_POLICY = "policy.gauge.pt"
 RESULTS = "results.json"
+SCORES = ("score", "score_interval", "level", "groups")
+"""What a table tells of results."""
 RUN_ERRORS = (SweepError, CheckpointError, ComparisonError, PolicyError, ContractError, OSError)
 """What may be wrong with the files of one run; the others go on."""
 
@@ -284,9 +286,13 @@ def read_card(folder: Path) -> dict[str, Any]:
         ComparisonError: there are none, or they are damaged.
     """
     try:
-        return load_result(folder)
+        card = load_result(folder)
+        for name in SCORES:
+            if name not in card:
+                raise ComparisonError(f"results '{one_line(folder / RESULTS)}' lack {name}")
     except ComparisonError as error:
         raise ComparisonError(f"{error}; delete it and call again, which makes it anew") from error
+    return card
 
 
 def _is_trained(run: SweepRun) -> bool:
