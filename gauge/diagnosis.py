@@ -120,15 +120,16 @@ class Diagnosis:
                 f"the robot does not walk as described (score {score:.2f} of 1), and none of {len(self.others)} likely changes "
                 "helps: the policy was made for something else, or more than one thing is wrong"
             )
-        names = " and ".join(f"the {each.kind}" for each in self.mistakes)
+        kinds = list(dict.fromkeys(each.kind for each in self.mistakes))
+        names = " and ".join(f"the {kind}" for kind in kinds)
         changes = ", then ".join(f"{each.kind} {each.text}" for each in self.mistakes)
-        verb = "look" if len(self.mistakes) > 1 else "looks"
+        verb = "look" if len(kinds) > 1 else "looks"
         text = f"{names} {verb} wrong: with {changes}, the score rises from {score:.2f} to {best:.2f} of 1"
         if best < SOUND:
             text += ", which is not yet walking, so something else is wrong, too"
         elif len(self.mistakes) == 1 and self.rivals:
-            kinds = ", ".join(dict.fromkeys(each.kind for each in self.rivals))
-            text += f"; changes of another kind do about as well ({kinds})"
+            others = ", ".join(dict.fromkeys(each.kind for each in self.rivals))
+            text += f"; changes of another kind do about as well ({others})"
         return text
 
 

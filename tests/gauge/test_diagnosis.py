@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 from gaitgauge.gauge import diagnosis
-from gaitgauge.gauge.diagnosis import diagnose
+from gaitgauge.gauge.diagnosis import Diagnosis, Outcome, diagnose
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.alternatives import Alternative, alternatives, toml_lines
 from gaitgauge.policy.contract import PolicyContract, standard_contract
@@ -112,6 +112,19 @@ def test_the_sign_of_gravity_is_named(monkeypatch):
     assert found.best.contract.hash == GOOD.hash
     assert found.others[-1].kind == "decoy"
     assert found.verdict().startswith("the sign of gravity looks wrong")
+
+
+def test_what_looks_wrong_is_named_once():
+    """Two steps of one kind: 0.5 rad, 0.1 rad, 0.25 rad."""
+
+    def step(kind: str, value: float) -> Outcome:
+        return Outcome(kind=kind, text="x", contract=GOOD, survival=value, tracking=value, smoothness=value)
+
+    steps = (step("action scale", 0.3), step("joint order", 0.6), step("action scale", 0.9))
+    found = Diagnosis(described=step("", 0.05), others=steps[:1], mistakes=steps)
+    assert found.verdict().startswith("the action scale and the joint order look wrong: with action scale x, then")
+    found = Diagnosis(described=step("", 0.05), others=steps[:1], mistakes=(steps[0], steps[2]))
+    assert found.verdict().startswith("the action scale looks wrong: with action scale x, then action scale x")
 
 
 def test_gains_that_make_torques_jump_are_named(monkeypatch):
