@@ -18,6 +18,7 @@ from ..robots import load_robot
 from .console import Terminal, make_table
 from .errors import UserError
 from .policies import policy_file
+from .progress import ProgressDisplay
 
 _SHOWN = 8
 """Changes that the table shows."""
@@ -48,9 +49,15 @@ def examine_policy(
     asked = None if robot is None else load_robot(robot)
     policy = load_policy(policy_file(choice), asked, trust=trust, contract_file=contract)
     body = robot_for(policy.contract, robot)
-    progress = Terminal(stderr=True)
-    with progress.status("playing the policy as described and otherwise …"):
-        found = diagnose(policy, body, seconds=seconds, threads=threads or os.cpu_count() or 1)
+    with ProgressDisplay(Terminal(stderr=True), "playing as described and otherwise") as display:
+
+        def report(mistakes: int, played: int, count: int) -> None:
+            text = (
+                f"{played} of {count} contracts that differ in {'one thing' if mistakes == 1 else f'{mistakes} things'}"
+            )
+            display.update(played / count, text)
+
+        found = diagnose(policy, body, seconds=seconds, threads=threads or os.cpu_count() or 1, report=report)
     lines = toml_lines(found.best.contract, policy.contract)
     if out is not None:
         lines_of_file = [f"# {found.verdict()}", *toml_lines(found.best.contract)]

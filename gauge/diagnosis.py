@@ -6,7 +6,7 @@ counts is whether the robot stays up, whether it does what it is told, and how s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -139,6 +139,7 @@ def diagnose(
     *,
     seconds: float = 2.0,
     threads: int = 1,
+    report: Callable[[int, int, int], None] = lambda *_: None,
 ) -> Diagnosis:
     """Play a policy as described and with every likely other contract; where one is clearly better and the robot does not
     walk yet, go on from there.
@@ -146,6 +147,8 @@ def diagnose(
     Args:
         seconds: how long each is played.
         threads: CPU threads of the physics; results do not depend on them.
+        report: called with the number of mistakes that the contracts being played differ in, how many of these contracts have
+            been played, and how many there are.
 
     Raises:
         ContractError: the policy is not for this robot.
@@ -165,12 +168,16 @@ def diagnose(
         own = [Alternative(kind="", text="as described", contract=c) for c in contracts]
         chosen = [[one, *alternatives(one.contract, robot)] for one in own]
         flat = [each for group in chosen for each in group]
-        outcomes = iter([o for i in range(0, len(flat), _TOGETHER) for o in played(flat[i : i + _TOGETHER])])
+        made: list[Outcome] = []
+        while len(made) < len(flat):
+            report(len(best) + 1, len(made), len(flat))
+            made += played(flat[len(made) : len(made) + _TOGETHER])
+        outcomes = iter(made)
         return [[next(outcomes) for _ in group] for group in chosen]
 
+    best: tuple[Outcome, ...] = ()
     ((described, *others),) = tried([policy.contract])
     paths = _sorted((each,) for each in others)
-    best: tuple[Outcome, ...] = ()
     score = described.score
     while paths and paths[0][-1].score > score + CLEAR:
         best, score = paths[0], paths[0][-1].score

@@ -158,8 +158,11 @@ def test_worlds_do_not_ask_for_more_memory_than_a_small_machine_has(monkeypatch)
         return make(robot, contract, count, threads)
 
     monkeypatch.setattr(diagnosis, "_worlds", counted)
-    found = diagnose(described_as(GOOD), GO2, seconds=0.04)
+    told = []
+    found = diagnose(described_as(GOOD), GO2, seconds=0.04, report=lambda *how_far: told.append(how_far))
     assert sum(counts) == 4 * (1 + len(found.others))
+    played = [sum(counts[:batch]) // 4 for batch in range(len(counts))]
+    assert told == [(1, before, sum(counts) // 4) for before in played]
     assert max(counts) * 14e6 < 0.5e9  # a world of MuJoCo asks for 14 MB
 
 
