@@ -140,7 +140,7 @@ def _keep(
     states = [row["state"] for row in found["runs"]]
     there_now = f"{states.count('gauged') + states.count('trained')} of {len(runs)} are in {folder}"
     to_gauge = f", {states.count('trained')} of them not gauged yet" if "trained" in states else ""
-    say(f"kept {len(labels)} runs; {there_now}{to_gauge}")
+    say(f"kept {len(labels)} run{'s' * (len(labels) != 1)}; {there_now}{to_gauge}")
     return unkept
 
 

@@ -113,7 +113,7 @@ def test_a_run_that_is_damaged_leaves_a_table_and_the_others_are_kept(run, tmp_p
     assert result.exit_code == 1 and "0.6945" in result.stdout and "comparison" not in result.stdout
     (failure,) = [line for line in result.stderr.splitlines() if "CTS, seed 0" in line]
     assert failure.startswith("CTS, seed 0 failed: ") and str(damaged) in failure
-    assert "kept 1 runs; 1 of 8 are in" in result.stderr
+    assert "kept 1 run; 1 of 8 are in" in result.stderr
     assert (tmp_path / "kept/runs/DreamWaQ/seed-0/kept/results.json").is_file()
     # what is kept already and cannot be read is told, too
     place = tmp_path / "kept/runs/DreamWaQ/seed-0/kept/results.json"
