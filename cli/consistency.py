@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.text import Text
 
+from ..files.parsing import bare_name
 from ..gauge.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
 from ..gauge.consistency.request import StudyRequest, StudyStatus
 from ..gauge.consistency.study import prepare_study, study
@@ -40,7 +41,7 @@ def run_consistency(
     prepared = prepare_study(request)  # all that can be wrong with the request is said before anything is written
     for engine in prepared.skipped:
         console.say(f"{engine['backend']} is left out: {engine['reason']}")
-    folder = out or Path("results") / f"{joined_names(policies)}-{Path(request.suite).stem}-consistency"
+    folder = out or Path("results") / f"{joined_names(policies)}-{bare_name(request.suite)}-consistency"
     with resumable(console, "comparing", folder, "--resume") as display:
         command = ["gaitgauge", *sys.argv[1:]]
         results = study(request, folder, resume=resume, command=command, watch=_shower(display))

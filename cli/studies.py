@@ -11,6 +11,7 @@ from typing import Any
 
 import typer
 
+from ..files.parsing import bare_name
 from ..files.writing import LOCK, lock_folder, make_folder
 from .console import Terminal, shell_command
 from .errors import UserError
@@ -19,7 +20,7 @@ from .progress import ProgressDisplay
 
 def joined_names(policies: Sequence[str]) -> str:
     """Names of the first policies, for a folder's name."""
-    return "-".join(Path(p).name.partition(".")[0] for p in policies[:3])
+    return "-".join(bare_name(p) for p in policies[:3])
 
 
 @contextmanager

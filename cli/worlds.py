@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..backends.registry import choose_device
+from ..files.parsing import bare_name
 from ..gauge.suite import load_suite
 from ..policy.base import Policy
 from ..policy.its_robot import robot_for
@@ -64,7 +65,7 @@ class WorldMaker:
 
 def labels(choices: Sequence[str]) -> list[str]:
     """Names of policies for people: as short as they go while they differ."""
-    short = [Path(c).name.removesuffix(".pt").removesuffix(".gauge").removesuffix(".onnx") or c for c in choices]
+    short = [bare_name(c) or c for c in choices]
     if len(set(short)) == len(short):
         return short
     longer = ["/".join(Path(c).parts[-2:]) for c in choices]

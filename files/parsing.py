@@ -75,6 +75,13 @@ def one_line(text: object, longest: int = 300) -> str:
     return words if len(words) <= longest else words[: longest - 1] + "…"
 
 
+def bare_name(path: object) -> str:
+    """The name of a policy, a suite or a card without folder and kind: ``pretrained-robogauge-1.1`` of its ``.json``."""
+    return re.sub(
+        r"(\.gauge)?\.(pt|pth|onnx|npz|toml|json)$", "", re.split(r"[/\\]", str(path).rstrip("/\\"))[-1], flags=re.I
+    )
+
+
 def did_you_mean(word: object, known: Collection[str]) -> str:
     """``; did you mean 'a' or 'b'?`` for words of ``known`` close to ``word``, else an empty string."""
     close = get_close_matches(str(word)[:_SHOWN], list(known), n=3)

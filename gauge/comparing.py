@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..files.parsing import bare_name
 from .comparison import ComparisonError, compare, load_result
 from .comparison_report import write_comparison
 from .evaluate import Request, Status, evaluate, prepare
@@ -21,12 +22,13 @@ def is_result(contestant: str) -> bool:
 
 def run_folders(requests: Mapping[str, Request], root: Path) -> dict[str, Path]:
     """Where the evaluation of each policy goes: as ``evaluate`` has it, with the policy's folder where two files have one name."""
-    stems = [Path(r.policy).stem for r in requests.values()]
+    stems = [bare_name(r.policy) for r in requests.values()]
     folders = {}
     for name, request in requests.items():
-        path = Path(request.policy)
-        stem = f"{path.resolve().parent.name}-{path.stem}" if stems.count(path.stem) > 1 else path.stem
-        folders[name] = root / f"{stem}-{Path(request.suite).stem}-{request.pipeline}"
+        stem = bare_name(request.policy)
+        if stems.count(stem) > 1:
+            stem = f"{Path(request.policy).resolve().parent.name}-{stem}"
+        folders[name] = root / f"{stem}-{bare_name(request.suite)}-{request.pipeline}"
     return folders
 
 

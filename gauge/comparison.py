@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..files.parsing import edited, one_line, read_results, shown
+from ..files.parsing import bare_name, edited, one_line, read_results, shown
 from .coverage import COMPLETE, coverage_of
 from .episodes import QUALITY
 from .intervals import CONFIDENCE, Array, Chance, Evidence
@@ -371,9 +371,9 @@ def _key(row: Mapping[str, Any]) -> tuple[str, float, float]:
 def _labels(results: Sequence[Mapping[str, Any]]) -> list[str]:
     """Short names that tell the policies apart: of the file, with its folder where that is not enough, numbered at last."""
     paths = [PurePath(r["policy"]["path"].replace("\\", "/")) for r in results]
-    labels = [one_line(p.name.partition(".")[0], _LABEL) for p in paths]
+    labels = [one_line(bare_name(p), _LABEL) for p in paths]
     if len(set(labels)) < len(labels):
-        labels = [one_line(f"{p.parent.name}/{p.name.partition('.')[0]}".lstrip("/"), _LABEL) for p in paths]
+        labels = [one_line(f"{p.parent.name}/{bare_name(p)}".lstrip("/"), _LABEL) for p in paths]
     if len(set(labels)) < len(labels):
         labels = [f"{label} ({at})" for at, label in enumerate(labels, 1)]
     return labels

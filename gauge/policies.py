@@ -6,10 +6,9 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from ..files.parsing import one_line
+from ..files.parsing import bare_name, one_line
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError, PolicyContract
 from ..policy.finding import find_policy
@@ -66,7 +65,7 @@ def load_policies(
     found: dict[str, Loaded] = {}
     refused: list[Refused] = []
     names = list(dict.fromkeys(names))
-    short = [one_line(Path(name).name.partition(".")[0], 80) for name in names]
+    short = [one_line(bare_name(name), 80) for name in names]
     for name, stem in zip(names, short, strict=True):
         try:
             policy = load_policy(name, asked, trust=trust)

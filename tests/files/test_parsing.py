@@ -4,7 +4,17 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import pytest
-from gaitgauge.files.parsing import build, from_text, one_line, parse_json, parse_toml, parse_yaml, read_text, shown
+from gaitgauge.files.parsing import (
+    bare_name,
+    build,
+    from_text,
+    one_line,
+    parse_json,
+    parse_toml,
+    parse_yaml,
+    read_text,
+    shown,
+)
 from pydantic import Field
 
 
@@ -138,3 +148,19 @@ def test_shown_values_are_short_and_printable():
         assert len(shown(value)) <= 80
         assert shown(value).isprintable()
     assert one_line("a\nb\x07" + "c" * 400).startswith("a b\\x07cc")
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("cards/pretrained-robogauge-1.1.json", "pretrained-robogauge-1.1"),
+        ("robogauge-1.1", "robogauge-1.1"),
+        ("mine.gauge.pt", "mine"),
+        ("runs/a/model_50.pt", "model_50"),
+        ("C:\\policies\\trot.v2.onnx", "trot.v2"),
+        ("results/demo/", "demo"),
+        ("latest", "latest"),
+    ],
+)
+def test_a_bare_name_keeps_its_version(path, name):
+    assert bare_name(path) == name
