@@ -28,7 +28,7 @@ def test_policies_and_results_side_by_side(run, tmp_path, policy, tiny):
     assert {p.name for p in out.iterdir() if p.is_file()} == {f"comparison.{k}" for k in ("json", "csv", "tex", "html")}
     # what has been played is not played again, and results stand in for policies
     before = {p: p.stat().st_mtime_ns for p in out.rglob("*.npz")}
-    again = run("compare", out / "standing.gauge-tiny-stress", other, *command[3:], "--json")
+    again = run("compare", out / "standing-tiny-stress", other, *command[3:], "--json")
     assert again.exit_code == 0, again.output
     assert json.loads(again.stdout) == json.loads((out / "comparison.json").read_text())
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.npz")} == before
