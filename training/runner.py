@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from ..policy.contract import TERM_WIDTH, PolicyContract
 from .algorithms.methods import METHODS
 from .algorithms.symmetry import Mirror
 from .averaging import WeightAverage
-from .checkpoint import copy_checkpoint
+from .checkpoint import CheckpointError, copy_checkpoint
 from .configuration import TrainingConfiguration
 from .filming import Filmer
 from .keepsake import Keepsake
@@ -164,6 +164,12 @@ class TrainingRunner:
                         break
             except ProcessLostError as error:
                 raise self._rescue(error, begin) from error
+            except BaseException:
+                # of several processes, those that are left say how it ended
+                if self.log_dir is not None and not self.processes.several:
+                    with suppress(CheckpointError):  # a full disk may be what it failed of
+                        update_run_json(self.log_dir, {"outcome": "failed"})
+                raise
             if reason != "signal":
                 self._submit(written)
                 self._wait(run.gauge_wait, lambda: signals.received is not None)

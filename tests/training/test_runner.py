@@ -192,6 +192,7 @@ def test_nan_in_the_environment_is_counted_and_stops_the_run(tmp_path):
     with pytest.raises(TrainingDivergedError, match=r"8 of 64 environment samples .* last checkpoint"):
         strict.learn(1)
     assert read_checkpoint(tmp_path / "model_2.pt")["iter"] == 2
+    assert json.loads((tmp_path / "run.json").read_text())["outcome"] == "failed"
 
 
 def test_broken_weights_are_never_written(tmp_path):
