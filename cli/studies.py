@@ -42,7 +42,7 @@ def resumable(console: Terminal, title: str, folder: Path | None = None, *more: 
 
 
 @contextmanager
-def _kept(folder: Path) -> Iterator[None]:
+def _own_folder(folder: Path) -> Iterator[None]:
     """A folder for this process alone, created where it is not there; an error leaves none that it created.
 
     Raises:
@@ -78,7 +78,7 @@ def make_study(
     """Make a study policy by policy, print it and where its two ``files`` are; exit code 1 where something was left out."""
     errors = Terminal(stderr=True)
     # the folder first: what is wrong with it is said before anything is played
-    with _kept(folder), ProgressDisplay(errors, title) as display:
+    with _own_folder(folder), ProgressDisplay(errors, title) as display:
         results = study(
             request,
             folder,

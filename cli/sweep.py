@@ -85,7 +85,7 @@ def run_sweep(
             )
             outcome = jobs.work([] if report else runs)
         found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
-        failed = _failures(found)
+        failed = _failures(runs, found)
         for label, sentence in failed.items():
             if label not in outcome.failures:
                 errors.say(f"{label} failed: {sentence}")
@@ -119,9 +119,9 @@ def _locked(keep: Path) -> Iterator[None]:
         lock.release()
 
 
-def _failures(found: Mapping[str, Any]) -> dict[str, str]:
+def _failures(runs: Sequence[SweepRun], found: Mapping[str, Any]) -> dict[str, str]:
     """Why runs failed, by label."""
-    return {f"{r['entry']}, seed {r['seed']}": r["reason"] for r in found["runs"] if r["reason"]}
+    return {run.label: row["reason"] for run, row in zip(runs, found["runs"], strict=True) if row["reason"]}
 
 
 def _keep(
@@ -134,7 +134,7 @@ def _keep(
         labels, unkept = keep_runs(sweep, runs, folder)
         there, refused = plan_runs(sweep, folder, to_train=False)
         found = fold_sweep(sweep, there, refused, {}, folder)
-    unkept = {label: sentence for label, sentence in (_failures(found) | unkept).items() if label not in failed}
+    unkept = {label: sentence for label, sentence in (_failures(there, found) | unkept).items() if label not in failed}
     for label, sentence in unkept.items():
         say(f"{label} is not kept: {sentence}")
     states = [row["state"] for row in found["runs"]]

@@ -10,7 +10,7 @@ import pytest
 from gaitgauge.training.sweep import sharing
 from gaitgauge.training.sweep.jobs import Jobs
 from gaitgauge.training.sweep.sharing import shared_gpus
-from test_sweep import SWEEP, scripted
+from scripted_sweep import SWEEP, scripted
 
 PROGRAM = "nvidia-cuda-mps-control"
 DAEMON = """#!/bin/sh
