@@ -1,4 +1,4 @@
-"""The motor law, for engines that compute it in NumPy or torch; ``warp.motor_law`` is the same for kernels.
+"""The motor law, for engines that compute it in NumPy or torch; ``warp.motors.motor_torque`` is the same for kernels.
 
 Torque = kp (target + offset − q) − kd q̇, clipped to limits, then multiplied by the motor strength. With
 ``PhysicsOptions.torque_speed_limit`` the limits follow the joint's speed: in the direction of motion a motor gives its

@@ -3,7 +3,7 @@
 """Kernels that collide shapes with height fields: a thread for each prism, where mujoco_warp has one for each shape.
 
 ``list_prisms`` lists what lies under each shape, ``test_prisms`` leaves out what a plane separates and solves spheres,
-``search_prisms`` finds the other contacts by GJK and EPA; ``write_contacts`` (in ``mujoco_warp_field_contacts``) chooses up to
+``search_prisms`` finds the other contacts by GJK and EPA; ``write_contacts`` (in ``contacts.py``) chooses up to
 four for each shape. Places in the lists are given out in the order in which threads come by; nothing else depends on that
 order: a pair's prisms lie together, in the order of their numbers.
 """
