@@ -1,8 +1,8 @@
-"""Write the hand-made trotting controller as a policy file: ``policy/pretrained/go2.gauge.pt`` until a trained one ships.
+"""Write the hand-made trotting controller as a policy file: a baseline that a trained policy has to beat.
 
 The file depends on nothing but this script and the robot: the same bytes come out every time.
 
-    python benchmarks/make_trot_policy.py [DESTINATION]
+    python benchmarks/make_trot_policy.py trot.gauge.pt
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.robots import load_robot
 from gaitgauge.robots.body_plan import total_mass
@@ -70,7 +69,7 @@ def make() -> tuple[Any, StoredNetwork]:
 def main() -> None:
     """Write the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("destination", type=Path, nargs="?", default=PRETRAINED)
+    parser.add_argument("destination", type=Path, help="file to write")
     destination = parser.parse_args().destination
     contract, network = make()
     save_policy(destination, contract, network)

@@ -71,6 +71,19 @@ def test_the_file_is_reproducible(tmp_path):
     assert first == (tmp_path / "b" / "go2.gauge.pt").read_bytes()
 
 
+def test_the_script_asks_where_to_write(tmp_path, monkeypatch):
+    """Without a destination it wrote over the trained policy that ships."""
+    written = []
+    monkeypatch.setattr(make_trot_policy, "save_policy", lambda path, contract, network: written.append(path))
+    monkeypatch.setattr("sys.argv", ["make_trot_policy.py"])
+    with pytest.raises(SystemExit):
+        make_trot_policy.main()
+    assert written == []
+    monkeypatch.setattr("sys.argv", ["make_trot_policy.py", str(tmp_path / "trot.gauge.pt")])
+    make_trot_policy.main()
+    assert written == [tmp_path / "trot.gauge.pt"]
+
+
 def test_walks_as_told_despite_noise_and_latency(go2):
     """Forward, backward, sideways, round and standing, on level ground under the gauge's disturbances."""
     commands = torch.tensor([[0.6, 0, 0], [-0.6, 0, 0], [0, 0.4, 0], [0, 0, 0.8], [0, 0, 0]], dtype=torch.float64)
