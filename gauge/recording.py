@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from ..backends.warp.graphs import RecordedFunction
+from ..backends.graphs import RecordedFunction
 
 _MOST_RECORDINGS = 30
 """Recordings of one part after which it is not recorded again: memory that moves all the time is none to record."""

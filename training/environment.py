@@ -18,8 +18,8 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from ..backends.base import Randomization, ResetState, Scene
+from ..backends.graphs import WARM_UP, RecordedFunction
 from ..backends.registry import make_backend
-from ..backends.warp.graphs import WARM_UP, RecordedFunction
 from ..files.parsing import shown
 from ..policy.contract import History, PolicyContract, standard_contract
 from ..policy.its_robot import REMEMBERED

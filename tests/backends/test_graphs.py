@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from gaitgauge.backends.warp.graphs import WARM_UP, RecordedFunction
+from gaitgauge.backends.graphs import WARM_UP, RecordedFunction
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import torch
 from tensordict import TensorDict
 
-from ...backends.warp.graphs import RecordedFunction
+from ...backends.graphs import RecordedFunction
 from ...policy.fence.archive import LARGEST_FILE
 from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
 from ..networks import StudentActor, ValueNetwork, Widths
