@@ -21,7 +21,7 @@ from ..policy.adapters import assumptions
 from ..policy.base import Policy
 from ..robots import Robot
 from ..robots.body_plan import model_joint_order
-from ..robots.rotation import from_yaw, yaw_of
+from ..robots.rotation import from_yaw, in_heading
 from ..terrains.base import Terrain
 from .errors import UserError
 
@@ -194,14 +194,8 @@ class PlaySession:
     def _measure(self) -> None:
         """Follow the speed of the base: an exponential average, which a trunk that swings at every step does not shake."""
         state = self.state
-        x, y, _ = state.base_linear_velocity_w[0].tolist()
-        heading = float(yaw_of(state.base_quaternion_w)[0])
-        turn = float(state.base_angular_velocity_b[0, 2])
-        now = (
-            x * math.cos(heading) + y * math.sin(heading),
-            y * math.cos(heading) - x * math.sin(heading),
-            turn,
-        )
+        velocity = in_heading(state.base_quaternion_w[0], state.base_linear_velocity_w[0])
+        now = (*velocity.tolist(), float(state.base_angular_velocity_b[0, 2]))
         share = min(1.0, self.period / _SPEED_OVER)
         forward, lateral, yaw = (old + share * (new - old) for old, new in zip(self._speed_now, now, strict=True))
         self._speed_now = (forward, lateral, yaw)

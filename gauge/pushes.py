@@ -6,7 +6,7 @@ import random
 
 import torch
 
-from ..robots.rotation import heading_of
+from ..robots.rotation import from_heading
 from .segments import Segment
 from .suite import Push, Suite
 
@@ -37,5 +37,4 @@ def sideways(quaternion: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
         quaternion: base orientation wxyz, (N, 4).
         force: [N], (N,).
     """
-    cosine, sine = heading_of(quaternion)
-    return torch.stack((-sine * force, cosine * force, torch.zeros_like(force)), dim=1)
+    return from_heading(quaternion, torch.zeros_like(force), force)

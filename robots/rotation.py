@@ -38,6 +38,29 @@ def heading_of(quaternion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return cosine / length, sine / length
 
 
+def from_heading(quaternion: torch.Tensor, forward: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
+    """A horizontal vector given along the body's heading, in world axes; it rounds as ``heading_of`` does, alike in every row.
+
+    Args:
+        quaternion: (…, 4).
+        forward: along the heading, (…).
+        left: to its left, (…).
+
+    Returns:
+        (…, 3), the last component zero.
+    """
+    cosine, sine = heading_of(quaternion)
+    x, y = cosine * forward - sine * left, sine * forward + cosine * left
+    return torch.stack((x, y, torch.zeros_like(x)), dim=-1)
+
+
+def in_heading(quaternion: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    """The inverse: a world vector (…, 3) forward along the body's heading and to its left, (…, 2)."""
+    cosine, sine = heading_of(quaternion)
+    x, y = vector[..., 0], vector[..., 1]
+    return torch.stack((cosine * x + sine * y, cosine * y - sine * x), dim=-1)
+
+
 def projected_gravity(quaternion: torch.Tensor) -> torch.Tensor:
     """Unit vector of gravity in the body frame, Rᵀ (0, 0, −1): (0, 0, −1) for an upright body, (…, 4) to (…, 3)."""
     w, x, y, z = quaternion.unbind(-1)

@@ -20,7 +20,7 @@ from ...backends.base import PhysicsBackend, PhysicsState, Randomization, Scene
 from ...backends.registry import make_backend
 from ...policy.base import Policy
 from ...robots import Robot
-from ...robots.rotation import from_yaw, rotate_inverse, tilt, yaw_of
+from ...robots.rotation import from_heading, from_yaw, rotate_inverse, tilt
 from ..episodes import Episode
 from ..motors import joint_parameters
 from ..policies import check_fit
@@ -236,9 +236,7 @@ class _Run:
         """External force on every base at a time [s] after the start, world frame [N], (N, 3)."""
         acts = (time >= self._begin) & (time < self._end)
         forward, left = (self._pull * acts[..., None]).sum(dim=1).unbind(-1)
-        yaw = yaw_of(state.base_quaternion_w)
-        cos, sin = torch.cos(yaw), torch.sin(yaw)
-        return torch.stack((cos * forward - sin * left, sin * forward + cos * left, torch.zeros_like(yaw)), dim=-1)
+        return from_heading(state.base_quaternion_w, forward, left)
 
     def _trial(self, i: int, diverged: bool, *columns: Any) -> Trial:
         """What came of a robot, from what was noted of it step by step."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 import torch
 from gaitgauge.gauge.consistency.statistics import wilson_interval
@@ -164,19 +165,30 @@ def test_wilson_interval():
 
 def test_what_happens_to_a_robot_depends_on_neither_the_others_nor_threads():
     policy = load_policy("pretrained")
-    pull = Force(direction="side", newtons=(100.0, 150.0), begin=(0.1, 0.2), seconds=(0.1, 0.2))
+    pull = Force(direction="side", newtons=(100.0, 150.0), begin=(0.1, 0.2), seconds=(0.2, 0.3))
     ground = Ground(begin=0.3, stretches=(Stretch(length=3.0, rise=0.5, steps=5),))
     trial = scenario(
         replace(STAND, seconds=0.1),
-        replace(AHEAD, seconds=0.4),
+        replace(AHEAD, seconds=0.6),
         forces=(pull,),
         ground=ground,
         start=Start(),
         suite="gaitgauge-1",
     )
-    three = run_scenario(policy, GO2, trial, [0, 1, 2], threads=2)
-    alone = run_scenario(policy, GO2, trial, [1])
-    assert three[1] == alone[0] and three[0] != three[1]
+
+    def paths(seeds: range, threads: int = 1) -> np.ndarray:
+        """Where the robots' bases were after every step, (robots, steps, 3)."""
+        rows: list[np.ndarray] = []
+        run_scenario(
+            policy, GO2, trial, seeds, threads=threads, watch=lambda s, _: rows.append(s.base_position_w.numpy().copy())
+        )
+        return np.stack(rows, axis=1)
+
+    # torch works on up to sixteen at a time, and on those that are left over in another way
+    together = paths(range(16), threads=2)
+    apart = np.concatenate([paths(range(6)), paths(range(6, 11)), paths(range(11, 15)), paths(range(15, 16))])
+    assert np.array_equal(together, apart)
+    assert len({row[-1].tobytes() for row in together}) == 16
 
 
 def test_a_policy_of_another_control_period_is_refused():

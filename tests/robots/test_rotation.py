@@ -59,3 +59,13 @@ def test_heading_is_that_of_yaw(sample):
     yaw = rotation.yaw_of(quaternions)
     np.testing.assert_allclose(cosine, torch.cos(yaw), atol=1e-12)
     np.testing.assert_allclose(sine, torch.sin(yaw), atol=1e-12)
+
+
+def test_vectors_in_the_heading_and_back(sample):
+    _, quaternions, vectors = sample
+    forward, left = vectors[:, 0], vectors[:, 1]
+    world = rotation.from_heading(quaternions, forward, left)
+    turned = Rotation.from_euler("z", rotation.yaw_of(quaternions)[:, None].numpy())
+    np.testing.assert_allclose(world, turned.apply(np.stack((forward, left, 0.0 * left), axis=1)), atol=1e-12)
+    back = rotation.in_heading(quaternions, world + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64))
+    np.testing.assert_allclose(back, vectors[:, :2], atol=1e-12)
