@@ -16,7 +16,15 @@ import torch
 from ..files.parsing import parse_toml, parse_yaml, read_text
 from ..robots.base import Robot
 from .base import PolicyError
-from .contract import ContractError, History, HistoryOrder, ObservationTerm, PolicyContract, standard_contract
+from .contract import (
+    ContractError,
+    History,
+    HistoryOrder,
+    ObservationTerm,
+    PolicyContract,
+    reordered,
+    standard_contract,
+)
 from .native import StoredNetwork
 
 # Observation terms as Isaac Lab and mjlab name them.
@@ -53,7 +61,8 @@ def sidecar_contract(path: Path) -> PolicyContract | None:
 
 
 def described_contract(path: Path, robot: Robot) -> PolicyContract:
-    """Read a ``contract.toml``: fields of ``PolicyContract``, of which those left out are the robot's standard ones.
+    """Read a ``contract.toml``: fields of ``PolicyContract``, of which those left out are the robot's standard ones. Where
+    it lists the joints in an order of its own, standard values per joint go with their joints.
 
     Raises:
         PolicyError: no such file, or a field is unknown or malformed.
@@ -61,9 +70,12 @@ def described_contract(path: Path, robot: Robot) -> PolicyContract:
     source = f"contract file '{path}'"
     data = parse_toml(read_text(path, "contract file", PolicyError), source, PolicyError)
     provenance = {"adapter": "contract.toml", "file": path.name}
-    standard = standard_contract(robot, provenance=provenance).to_dict()
+    standard = standard_contract(robot, provenance=provenance)
+    names = data.get("joint_names")
+    if isinstance(names, list) and len(names) == robot.num_joints and all(n in names for n in robot.joint_names):
+        standard = reordered(standard, names)
     try:
-        return PolicyContract.from_dict({**standard, **data})
+        return PolicyContract.from_dict({**standard.to_dict(), **data})
     except ContractError as error:
         raise PolicyError(f"{source} is wrong: {error}") from error
 

@@ -15,7 +15,7 @@ from typing import Any, get_args
 
 from ..robots import Robot, RobotError
 from ..robots.body_plan import BodyPlan, body_plan
-from .contract import TERM_WIDTH, ContractError, HistoryOrder, ObservationTerm, PolicyContract
+from .contract import PER_JOINT, TERM_WIDTH, ContractError, HistoryOrder, ObservationTerm, PolicyContract, reordered
 
 _SCALES: dict[str, tuple[tuple[float, ...], ...]] = {
     "base_linear_velocity_b": ((1.0,), (2.0,)),
@@ -59,6 +59,8 @@ def toml_lines(contract: PolicyContract, other: PolicyContract | None = None) ->
     Tables come last, as TOML wants them.
     """
     data, old = contract.to_dict(), {} if other is None else other.to_dict()
+    if data["joint_names"] != old.get("joint_names"):  # values that the file leaves out would go with their joints
+        old = {k: v for k, v in old.items() if k not in PER_JOINT or len(set(v or ())) == 1}
     changed = {k: v for k, v in data.items() if k not in ("provenance", "schema_version") and v != old.get(k)}
     terms = changed.pop("observation", ())
     lines = [f"{key} = {_toml(value)}" for key, value in changed.items() if value is not None]
@@ -81,13 +83,7 @@ def _joint_orders(contract: PolicyContract, robot: Robot) -> Iterator[Alternativ
     for text, names in _orders(robot):
         if sorted(names) != sorted(contract.joint_names):
             continue
-        index = [contract.joint_names.index(n) for n in names]
-
-        def moved(values: Sequence[Any], index: Sequence[int] = index) -> tuple[Any, ...]:
-            return tuple(values[i] for i in index) if len(values) == len(index) else tuple(values)
-
-        went = _per_joint(replace(contract, joint_names=names), moved)
-        yield Alternative(kind="joint order", text=text, contract=went)
+        yield Alternative(kind="joint order", text=text, contract=reordered(contract, names))
         if "assumed" not in contract.provenance:  # else the values are the robot's, by the names of its joints
             stayed = replace(contract, joint_names=names)
             yield Alternative(kind="joint order", text=f"{text}; values per joint as they stand", contract=stayed)
@@ -119,25 +115,6 @@ def _orders(robot: Robot) -> Iterator[tuple[str, tuple[str, ...]]]:
                 tuple(name for kind in zip(*legs, strict=True) for name in kind),
             )
     yield "in the order of their names", tuple(sorted(robot.joint_names))
-
-
-def _per_joint(contract: PolicyContract, change: Callable[[Sequence[Any]], tuple[Any, ...]]) -> PolicyContract:
-    """A contract whose values per joint are changed together."""
-    terms = []
-    for term in contract.observation:
-        if TERM_WIDTH[term.name] is None:
-            clip = change(term.clip) if isinstance(term.clip, tuple) else term.clip
-            term = replace(term, scale=change(term.scale), clip=clip)
-        terms.append(term)
-    return replace(
-        contract,
-        default_joint_position=change(contract.default_joint_position),
-        action_scale=change(contract.action_scale),
-        target_range=None if contract.target_range is None else change(contract.target_range),
-        stiffness=change(contract.stiffness),
-        damping=change(contract.damping),
-        observation=tuple(terms),
-    )
 
 
 def _plan(robot: Robot) -> BodyPlan | None:

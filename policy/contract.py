@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -33,6 +33,8 @@ TERM_WIDTH: Mapping[str, int | None] = {
 }
 
 
+PER_JOINT = ("default_joint_position", "action_scale", "stiffness", "damping", "target_range")
+"""Fields of a contract with a value for each joint."""
 PRIVILEGED_TERMS = ("base_linear_velocity_b",)
 """Observation terms that no sensor of a robot measures."""
 
@@ -129,7 +131,7 @@ class PolicyContract:
         names, joints = self.joint_names, len(self.joint_names)
         if len(set(names)) != joints:
             raise ContractError(f"contract: joint_names has a name twice: {shown(list(names))}")
-        for name in ("default_joint_position", "action_scale", "stiffness", "damping", "target_range"):
+        for name in PER_JOINT:
             entries = getattr(self, name)
             if entries is not None and len(entries) != joints:
                 raise ContractError(f"contract: {name} has {len(entries)} entries; {joints} are needed")
@@ -226,6 +228,25 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
             f"the policy has {', '.join(contract.joint_names)}; the robot has {', '.join(robot.joint_names)}"
         )
     return tuple(robot.joint_names.index(n) for n in contract.joint_names)
+
+
+def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyContract:
+    """The contract with its joints in another order; every value per joint goes with its joint.
+
+    Args:
+        joint_names: the contract's joints, each once.
+    """
+    index = [contract.joint_names.index(name) for name in joint_names]
+
+    def moved(values: Any) -> Any:
+        return tuple(values[i] for i in index) if isinstance(values, tuple) and len(values) == len(index) else values
+
+    terms = tuple(
+        term if TERM_WIDTH[term.name] else replace(term, scale=moved(term.scale), clip=moved(term.clip))
+        for term in contract.observation
+    )
+    values = {name: moved(getattr(contract, name)) for name in PER_JOINT}
+    return replace(contract, joint_names=tuple(joint_names), observation=terms, **values)
 
 
 def difference(a: PolicyContract, b: PolicyContract) -> str:

@@ -9,6 +9,7 @@ import pytest
 from gaitgauge.gauge import diagnosis
 from gaitgauge.gauge.diagnosis import Diagnosis, Outcome, diagnose
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.adapters import described_contract
 from gaitgauge.policy.alternatives import Alternative, alternatives, toml_lines
 from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.export import export_onnx
@@ -91,7 +92,15 @@ def test_lines_of_a_contract_file_give_the_contract_back():
     assert PolicyContract.from_dict(data).hash == wanted.hash
     given = replace(GOOD, history=replace(GOOD.history, start="zeros"))
     changed = tomllib.loads("\n".join(toml_lines(wanted, given)))
-    assert set(changed) == {"joint_names", "history"}
+    assert set(changed) == {"joint_names", "default_joint_position", "history"}
+
+
+def test_lines_to_change_mend_a_contract_file(tmp_path):
+    """Values that stay where they stand while the joints move: left out, they would go with their joints."""
+    wanted = replace(standard_contract(GO2), joint_names=GO2.sdk_joint_names)
+    mended = tmp_path / "contract.toml"
+    mended.write_text("\n".join(toml_lines(wanted, standard_contract(GO2))))
+    assert described_contract(mended, GO2).hash == wanted.hash
 
 
 def few(*kinds: str):

@@ -1,8 +1,10 @@
+import json
 import os
 import pickle
 import shutil
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import import_public_cts
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.policy import finding
+from gaitgauge.policy.adapters import described_contract
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import ContractError, PolicyContract
 from gaitgauge.policy.finding import find_policy
@@ -17,6 +20,7 @@ from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import save_policy
 from gaitgauge.policy.networks import CtsNetwork, multilayer_perceptron
+from gaitgauge.robots import load_robot
 from torch import nn
 
 
@@ -188,6 +192,46 @@ def test_a_contract_file_says_how_a_bare_checkpoint_is_run(tmp_path, cts_file):
         load_policy(path, contract_file=described)
     with pytest.raises(PolicyError, match="has its contract inside; leave out --contract"):
         load_policy(cts_file, contract_file=described)
+
+
+def test_what_a_contract_file_leaves_out_goes_with_its_joints(tmp_path, go2):
+    """With joints in the SDK's order each got the value that stands at its place in the robot's."""
+    described = tmp_path / "contract.toml"
+    described.write_text(f"joint_names = {json.dumps(go2.sdk_joint_names)}")
+    contract = described_contract(described, go2)
+    assert contract.joint_names == go2.sdk_joint_names  # right before left
+    hips = dict(zip(contract.joint_names, contract.default_joint_position, strict=True))
+    assert hips["FR_hip_joint"] == hips["RR_hip_joint"] == -0.1
+    assert hips["FL_hip_joint"] == hips["RL_hip_joint"] == 0.1
+    described.write_text(described.read_text() + "\ndefault_joint_position = " + json.dumps([0.1] * 12))
+    assert described_contract(described, go2).default_joint_position == (0.1,) * 12
+
+
+@pytest.mark.parametrize("joints", ['["a", "b"]', '["a", 1]', "3", '["FL_hip_joint"]', "{ a = 1 }"])
+def test_joints_that_are_not_the_robots_are_refused(tmp_path, go2, joints):
+    described = tmp_path / "contract.toml"
+    described.write_text(f"joint_names = {joints}")
+    with pytest.raises(PolicyError, match="contract file"):
+        described_contract(described, go2)
+
+
+def test_joints_by_kind_take_gains_and_scales_along(tmp_path):
+    """The Go2's gains are alike at all joints; a robot with others at its calves, listed by kind."""
+    go2 = load_robot("go2")
+    motors = go2.parameters[go2.default_parameters]
+    per_joint = {"stiffness": (20.0, 20.0, 40.0) * 4, "damping": (0.5, 0.5, 1.0) * 4}
+    robot = replace(
+        go2,
+        action_scale=(0.125, 0.25, 0.25) * 4,
+        parameters={**go2.parameters, go2.default_parameters: replace(motors, **per_joint)},
+    )
+    described = tmp_path / "contract.toml"
+    by_kind = [name for kind in range(3) for name in go2.joint_names[kind::3]]
+    described.write_text(f"joint_names = {json.dumps(by_kind)}")
+    contract = described_contract(described, robot)
+    assert contract.stiffness == (20.0,) * 8 + (40.0,) * 4
+    assert contract.damping == (0.5,) * 8 + (1.0,) * 4
+    assert contract.action_scale == (0.125,) * 4 + (0.25,) * 8
 
 
 def test_bare_checkpoint_with_normalization_and_activation(tmp_path, observations):
