@@ -34,7 +34,7 @@ class RunFolder:
         """
         self._episodes = folder / "episodes"
         wanted = json.loads(json.dumps(request))
-        present = _present_request(folder, wanted, resume=resume)
+        _present_request(folder, wanted, resume=resume)  # before anything in it is touched
         if self._episodes.is_symlink():  # records are removed and set aside there: of whom?
             raise StoreError(
                 f"'{one_line(self._episodes)}' is a link, and a run writes to its own folder alone; "
@@ -43,7 +43,8 @@ class RunFolder:
         make_folder(self._episodes, StoreError)
         self._lock = lock_folder(folder, StoreError)
         try:
-            if present != wanted:
+            # and once more: who had the folder while this process waited may have left a run in it
+            if _present_request(folder, wanted, resume=resume) != wanted:
                 write_atomically(folder / "request.json", json.dumps(wanted, indent=1) + "\n", StoreError)
             self.records, self.damaged = read_records(self._episodes)
             """Episodes that have ended, to which ``put`` does not add; files that were damaged and are set aside."""

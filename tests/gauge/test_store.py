@@ -6,6 +6,8 @@ import re
 
 import numpy as np
 import pytest
+from gaitgauge.files.writing import lock_folder
+from gaitgauge.gauge import store
 from gaitgauge.gauge.episodes import Record, RecordError
 from gaitgauge.gauge.store import RunFolder, StoreError
 from scripted_gauge import DIAGONAL, MAXIMUM, episode
@@ -80,6 +82,30 @@ def test_what_a_killed_process_left_half_written_is_no_record_and_goes(tmp_path)
     half.write_bytes(b"half")
     assert list(records(tmp_path)) == [record.episode]
     assert not half.exists()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "sentence"), [("another", "belongs to another run"), ("same", "already holds this run")]
+)
+def test_a_run_that_came_first_keeps_its_folder_though_it_ends_while_another_waits(
+    tmp_path, monkeypatch, wanted, sentence
+):
+    """The other saw a folder without an episode, and would have taken this run's records for its own."""
+    request = {**REQUEST, "suite": "s 2"} if wanted == "another" else REQUEST
+    first = RunFolder(tmp_path, {**REQUEST, "seeds": [7]}, resume=False)
+    first.__exit__()
+
+    def lock(folder, error):
+        """What happens while the second one waits for the lock: a first run of REQUEST begins, keeps a record and ends."""
+        monkeypatch.setattr(store, "lock_folder", lock_folder)
+        put(tmp_path, full_record())
+        return lock_folder(folder, error)
+
+    monkeypatch.setattr(store, "lock_folder", lock)
+    with pytest.raises(StoreError, match=sentence):
+        RunFolder(tmp_path, request, resume=False)
+    assert json.loads((tmp_path / "request.json").read_text()) == REQUEST
+    assert list(records(tmp_path)) == [full_record().episode]  # the lock is free again
 
 
 def test_records_that_results_do_not_count_are_discarded(tmp_path):
