@@ -1,8 +1,8 @@
 """Control steps a second and memory of the Warp engines, with everything that training does to it.
 
-Each control step is 4 substeps of 5 ms (pyramidal cone, 10 solver iterations, feet with sliding friction only, no
-self-collision) of a standing and stepping Go2: new joint targets and latencies, physics, reading the whole state,
-resets of 2 % of the worlds on a new terrain of the palette, and new friction, gains, strengths and offsets for these.
+Each control step is one of a standing and stepping Go2 in the physics of training (``TRAINING_PHYSICS``): new joint targets
+and latencies, physics, reading the whole state, resets of 2 % of the worlds on a new terrain of the palette, and new friction,
+gains, strengths and offsets for these.
 Every configuration runs in a process of its own, so that memory is measured from a clean start.
 
     python benchmarks/warp_throughput.py --out throughput.json
@@ -28,7 +28,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gaitgauge.backends.base import ResetState, Scene
+    from gaitgauge.backends.base import Scene
 
 SIZES = (1024, 2048, 4096, 8192, 16384, 32768, 65536)
 GROUNDS = ("plane", "boxes", "field")
@@ -63,28 +63,17 @@ def make_palette(ground: str) -> tuple:
 
 def training_scene(ground: str, worlds: int) -> Scene:
     """Go2s in the training's physics."""
-    from gaitgauge.backends.base import PhysicsOptions, Scene
+    from gaitgauge.backends.base import TRAINING_PHYSICS, Scene
     from gaitgauge.robots import load_robot
 
     robot = load_robot("go2")
     terrains = make_palette(ground)
-    physics = PhysicsOptions(
-        timestep=0.005,
-        substeps=4,
-        cone="pyramidal",
-        impratio=1.0,
-        iterations=10,
-        ls_iterations=20,
-        tolerance=1e-6,
-        foot_condim=3,
-        self_collision=False,
-    )
     return Scene(
         robot=robot,
         parameters=robot.parameters["training"],
         terrains=terrains,
         terrain_index=tuple(i % len(terrains) for i in range(worlds)),
-        physics=physics,
+        physics=TRAINING_PHYSICS,
     )
 
 
@@ -92,7 +81,7 @@ def measure(name: str, ground: str, worlds: int, device: str, steps: int) -> dic
     """Build, warm up and time one configuration."""
     import torch
     from gaitgauge.backends import make_backend
-    from gaitgauge.backends.base import Randomization
+    from gaitgauge.backends.base import Randomization, ResetState
 
     gpu = device.startswith("cuda")
 
