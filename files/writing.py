@@ -53,6 +53,11 @@ def replacing(path: Path, error: type[Exception], *, durable: bool = True, endin
             partial.unlink()
 
 
+def is_half_written(name: str) -> bool:
+    """Whether a file's name is one that ``replacing`` gives: sixteen digits of chance, which no user's file has."""
+    return re.match(r"\.[0-9a-f]{16}\.partial", name) is not None
+
+
 def write_atomically(path: Path, data: str | bytes | memoryview, error: type[Exception]) -> None:
     """Write a file, all or nothing.
 
@@ -172,7 +177,7 @@ def _strays(folder: Path) -> Iterator[Path]:
         if LOCK in names and Path(place) != folder:
             below.clear()
             continue
-        yield from (Path(place, name) for name in names if re.match(r"\.[0-9a-f]{16}\.partial", name))
+        yield from (Path(place, name) for name in names if is_half_written(name))
 
 
 def _flush(path: Path) -> None:

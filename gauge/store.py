@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..files.parsing import one_line, parse_json, read_text, shown
-from ..files.writing import LOCK, lock_folder, make_folder, write_atomically, write_failure
+from ..files.writing import LOCK, is_half_written, lock_folder, make_folder, write_atomically, write_failure
 from .episodes import Episode, Record, read_records
 
 
@@ -108,7 +108,7 @@ def _left_by_a_kill(path: Path) -> bool:
     """Whether something in a folder is all that a run leaves that was killed while it began."""
     if path.is_dir():
         return path.name == "episodes" and not any(path.iterdir())
-    return path.name == LOCK or path.name.endswith(".partial")
+    return path.name == LOCK or is_half_written(path.name)
 
 
 def _differences(present: Mapping[str, Any], wanted: Mapping[str, Any], path: str = "") -> list[str]:

@@ -196,6 +196,10 @@ def test_a_folder_with_something_else_in_it_is_refused(tmp_path):
     with pytest.raises(StoreError, match="is not empty and holds no run"):
         RunFolder(tmp_path, REQUEST, resume=True)
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+    (tmp_path / "notes.txt").rename(tmp_path / "notes.partial")  # nor is that one of a run's own
+    with pytest.raises(StoreError, match="is not empty and holds no run"):
+        RunFolder(tmp_path, REQUEST, resume=True)
+    (tmp_path / "notes.partial").rename(tmp_path / "notes.txt")
     with pytest.raises(StoreError, match="is a file"):
         RunFolder(tmp_path / "notes.txt", REQUEST, resume=False)
 
