@@ -133,7 +133,8 @@ def test_the_estimate_of_memory_is_that_of_a_gpu():
             if row.get("backend", "mujoco-warp") != "mujoco-warp" or row["worlds"] < 8192:
                 continue  # of few worlds, what all share is a large part
             wanted = make_scene(row["ground"], row["worlds"])
-            wanted = replace(wanted, physics=replace(wanted.physics, iterations=10, self_collision=False))  # as measured
+            # the physics that it was measured with
+            wanted = replace(wanted, physics=replace(wanted.physics, iterations=10, self_collision=False))
             shared = build_shared_model(wanted)
             estimate = bytes_per_world(shared.model, buffer_capacity(wanted, shared), row["worlds"])
             assert 1.0 <= estimate / row["bytes_per_world"] < 1.15, (
