@@ -65,6 +65,23 @@ class TrunkFeelsNothing(StateFault):
         return altered(state, trunk_contact_force_w=torch.zeros_like(state.trunk_contact_force_w))
 
 
+class FootForceStays(StateFault):
+    """A reset leaves a force of the step before it."""
+
+    field = "foot_contact_force_w"
+
+    def step(self, *args, **kwargs):
+        super().step(*args, **kwargs)
+        self.kept = getattr(self._state, self.field).clone()
+
+    def spoil(self, state):
+        return altered(state, **{self.field: getattr(self, "kept", getattr(state, self.field))})
+
+
+class TrunkForceStays(FootForceStays):
+    field = "trunk_contact_force_w"
+
+
 class FootForceCountedTwice(StateFault):
     def spoil(self, state):
         bodies = state.body_contact_force_w.clone()
@@ -232,6 +249,8 @@ class OverPromises(MujocoBackend):
 
 
 FAULTS = [
+    (TrunkForceStays, "state/fields"),
+    (FootForceStays, "state/fields"),
     (QuaternionXyzw, "reset/state"),
     (AngularVelocityInWorld, "reset/state"),
     (AngularVelocityInWorld, "kinematics/frames"),
