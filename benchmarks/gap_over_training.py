@@ -23,7 +23,7 @@ import io
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,8 @@ WHO = ("stretch", "iteration", "environment_steps_millions", "policy_sha256", "p
 FIELDS = (*WHO, *(f"{e.replace('-', '_')}_{f}" for e in ENGINES for f in SCORE_FIELDS), *TRAINING_FIELDS)
 COMPARED = {"score on mujoco-warp": "mujoco_warp_score", **{f.replace("_", " "): f for f in TRAINING_FIELDS}}
 """What the score in MuJoCo is compared with: title and column."""
+OWN_PHYSICS = ("watch_tilt", "watch_penetration", "contacts_per_world", "deterministic")
+"""Fields of ``PhysicsOptions`` that stay the suite's: what it looks for and how it is calculated."""
 
 Row = dict[str, str]
 Series = list[tuple[float, float]]
@@ -156,22 +158,11 @@ def mean_before(series: Series, steps: float, window: float) -> float | None:
 def training_suite(suite: Suite, physics: PhysicsOptions, parameters: str, folder: Path) -> Path:
     """A suite file with everything of ``suite`` but the physics, which is that of training.
 
-    Substep counts (noise, sampling) keep their time as nearly as the longer substep allows; torque limits act as in training.
+    Substep counts (noise, sampling) keep their time as nearly as the longer substep allows; motors are limited as in training.
     """
     step, old = physics.timestep, suite.physics.timestep
-    settings: dict[str, Any] = {
-        "timestep": step,
-        "substeps": round(suite.physics.control_period / step),
-        "cone": physics.cone,
-        "impratio": physics.impratio,
-        "iterations": physics.iterations,
-        "ls_iterations": physics.ls_iterations,
-        "tolerance": physics.tolerance,
-        "self_collision": physics.self_collision,
-        "torque_limits": physics.torque_limits,
-    }
-    if physics.foot_condim is not None:
-        settings["foot_condim"] = physics.foot_condim
+    settings = {f.name: getattr(physics, f.name) for f in fields(physics) if f.name not in OWN_PHYSICS}
+    settings["substeps"] = round(suite.physics.control_period / step)
     lines = [
         f'extends = "{suite.name}"',
         f'name = "{suite.name}-training-physics"',
@@ -179,7 +170,7 @@ def training_suite(suite: Suite, physics: PhysicsOptions, parameters: str, folde
         f'title = "{suite.title}; with the physics of training"',
         f'parameters = "{parameters}"',
         "[physics]",
-        *(f"{k} = {_toml(v)}" for k, v in settings.items()),
+        *(f"{k} = {_toml(v)}" for k, v in settings.items() if v is not None),
         "[noise]",
         f"latency = {round(suite.noise.latency * old / step)}",
         "[metrics]",

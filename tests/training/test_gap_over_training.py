@@ -1,5 +1,6 @@
 """``benchmarks/gap_over_training.py``: where checkpoints stand, which tables belong together, what a ranking says."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import gap_over_training as gap
@@ -57,6 +58,9 @@ def test_training_suite_keeps_times_and_takes_the_physics(tmp_path):
     suite = load_suite(str(gap.training_suite(plain, environment.physics, environment.joints.parameters, tmp_path)))
     assert suite.physics.control_period == pytest.approx(0.02)
     assert (suite.physics.timestep, suite.physics.cone) == (0.005, "pyramidal")
+    watches = {"watch_tilt": 2.5, "watch_penetration": 0.035}  # the gauge's own
+    assert environment.physics.torque_speed_limit  # it was left out
+    assert suite.physics == replace(environment.physics, **watches)
     assert suite.metrics.interval * suite.physics.timestep == pytest.approx(0.1)
     assert suite.noise.latency * suite.physics.timestep == pytest.approx(0.018, abs=0.0025)
     assert (suite.scoring, suite.goals, suite.matrix) == (plain.scoring, plain.goals, plain.matrix)
