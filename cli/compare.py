@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from ..backends.registry import choose_device
 from ..gauge.comparing import compare_all
 from ..gauge.comparison import format_p
 from ..gauge.evaluate import Request
-from .console import Terminal, make_table
+from .console import Terminal, make_table, print_json
 from .evaluate import shower
 from .studies import joined_names, resumable
 
@@ -50,7 +49,7 @@ def run_comparison(
             watch=shower(display),
         )
     if json_output:
-        print(json.dumps(found, indent=1))
+        print_json(found)
         return
     output = Terminal()
     print_comparison(output, found)

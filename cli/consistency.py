@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +14,7 @@ from ..files.parsing import bare_name
 from ..gauge.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
 from ..gauge.consistency.request import StudyRequest, StudyStatus
 from ..gauge.consistency.study import prepare_study, study
-from .console import Terminal, make_table
+from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay
 from .studies import joined_names, resumable
 
@@ -47,7 +46,7 @@ def run_consistency(
         results = study(request, folder, resume=resume, command=command, watch=_shower(display))
     page = write_page(folder)
     if json_output:
-        print(json.dumps(results, indent=1))
+        print_json(results)
         return
     console = Terminal()
     print_study(console, results)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import os
 import shlex
@@ -18,6 +19,10 @@ from rich.text import Text
 
 _PLAIN_WIDTH = 160
 """Columns of a table where there is no terminal to ask; squeezed into a pipe's 80 it could not be read."""
+
+
+_NOBODY_READS = (errno.EPIPE, errno.EIO)
+"""What writing fails with on a pipe without a reader and on a terminal that was closed."""
 
 
 class Terminal(Console):
@@ -47,7 +52,7 @@ class Terminal(Console):
         try:
             super()._write_buffer()
         except OSError as problem:
-            if not (self._may_lose or problem.errno in (errno.EPIPE, errno.EIO)):
+            if not (self._may_lose or problem.errno in _NOBODY_READS):
                 raise
             self.quiet = True
             silence(self.file)
@@ -64,6 +69,17 @@ class Terminal(Console):
     def say(self, sentence: str | Text) -> None:
         """Print a sentence that the terminal wraps, if anything does."""
         self.print(sentence, soft_wrap=True)
+
+
+def print_json(data: Any) -> None:
+    """Print what programs read, after the notices that were held back; lost where nobody reads any more."""
+    _notices.tell()
+    try:
+        print(json.dumps(data, indent=1), flush=True)
+    except OSError as problem:
+        if problem.errno not in _NOBODY_READS:
+            raise
+        silence(sys.stdout)
 
 
 def printable(text: str) -> str:

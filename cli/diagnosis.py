@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from ..policy.alternatives import toml_lines
 from ..policy.its_robot import robot_for
 from ..policy.loading import load_policy
 from ..robots import load_robot
-from .console import Terminal, make_table
+from .console import Terminal, make_table, print_json
 from .errors import UserError
 from .policies import policy_file
 from .progress import ProgressDisplay
@@ -63,7 +62,7 @@ def examine_policy(
         lines_of_file = [f"# {found.verdict()}", *toml_lines(found.best.contract)]
         write_atomically(out, "\n".join(lines_of_file) + "\n", UserError)
     if json_output:
-        print(json.dumps(_as_data(found, lines, assumptions(policy.contract)), indent=1))
+        print_json(_as_data(found, lines, assumptions(policy.contract)))
         return found.sound
     console = Terminal()
     console.print(_table(choice, found))

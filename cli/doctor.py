@@ -25,7 +25,7 @@ from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
 from . import picture
-from .console import Terminal, make_table
+from .console import Terminal, make_table, print_json
 
 OK, WARNING, PROBLEM = "ok", "warning", "problem"
 _STYLES = {OK: "green", WARNING: "yellow", PROBLEM: "bold red"}
@@ -70,7 +70,7 @@ def examine(*, json_output: bool = False) -> bool:
         for check in CHECKS:
             findings += list(check())
     if json_output:
-        print(json.dumps([asdict(each) for each in findings], indent=1))
+        print_json([asdict(each) for each in findings])
         return all(each.status != PROBLEM for each in findings)
     for each in findings:
         table.add_row(each.what, Text(each.status, _STYLES[each.status]), each.found, each.advice)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import sys
@@ -12,6 +13,9 @@ from typing import Any
 import typer
 
 from .console import complain, held_notices, silence
+
+_OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE, errno.EIO)
+"""What writing to standard output fails with; a process that cannot be started has no file's name either."""
 
 
 class UserError(ValueError):
@@ -66,10 +70,12 @@ def check_folder() -> None:
 
 
 def system_failure(error: OSError) -> str:
-    """One sentence on what the operating system refused. A refusal without a file's name was of standard output."""
+    """One sentence on what the operating system refused. Without a file's name, what writing fails with was of standard output."""
     reason = (error.strerror or str(error)).lower()
     if error.filename is not None:
         return f"'{os.fsdecode(error.filename)}': {reason}"
+    if error.errno not in _OF_WRITING:
+        return f"the system refused: {reason}"
     silence(sys.stdout)
     return f"output cannot be written: {reason}"
 

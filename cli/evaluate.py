@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +22,7 @@ from ..gauge.results import ALL
 from ..gauge.suite import Suite
 from ..policy.adapters import assumptions
 from ..policy.contract import PolicyContract
-from .console import Terminal, make_table
+from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay, duration
 from .studies import resumable
 
@@ -76,7 +75,7 @@ def run_evaluation(
         else:
             report = write_report(folder)
     if json_output:
-        print(json.dumps(results, indent=1))
+        print_json(results)
         return
     console = Terminal()
     print_results(console, results)

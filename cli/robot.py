@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -16,7 +15,7 @@ from ..robots import Robot, RobotError, load_robot
 from ..robots.drafting import draft_robot
 from ..robots.examining import Finding, examine
 from ..robots.loading import ROBOT_FILE, load_robot_file
-from .console import Terminal, shell_command
+from .console import Terminal, print_json, shell_command
 from .errors import UserError
 from .picture import Picture, Tile, choose_renderer
 
@@ -110,7 +109,7 @@ def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_outp
         _draw(robot, quality, drawn)
     if json_output:
         rows = [asdict(f) for f in findings]
-        print(json.dumps({"robot": asked, "sound": sound, "checks": rows, "picture": drawn and str(drawn)}, indent=1))
+        print_json({"robot": asked, "sound": sound, "checks": rows, "picture": drawn and str(drawn)})
         return sound
     _print(findings)
     console = Terminal()

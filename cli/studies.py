@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -13,7 +12,7 @@ import typer
 
 from ..files.parsing import bare_name
 from ..files.writing import LOCK, lock_folder, make_folder
-from .console import Terminal, shell_command
+from .console import Terminal, print_json, shell_command
 from .errors import UserError
 from .progress import ProgressDisplay
 
@@ -86,7 +85,7 @@ def make_study(
             watch=lambda turn, turns, name: display.update((turn - 1) / turns, f"{turn} of {turns}: {name}"),
         )
     if json_output:
-        print(json.dumps(results, indent=1))
+        print_json(results)
     else:
         console = Terminal()
         show(console, results)

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time as clock
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from ..files.writing import lock_folder, make_folder
 from ..gauge.cluster import check_address
-from ..training.sweep.file import Sweep, SweepError, load_sweep
-from ..training.sweep.folding import fold_sweep
-from ..training.sweep.jobs import Jobs
-from ..training.sweep.keeping import check_keep, keep_runs
-from ..training.sweep.runs import SweepRun, plan_runs
-from ..training.sweep.sharing import shared_gpus
-from .console import Terminal, make_table, shell_command
+from ..training.sweep.call import Kept, work_through
+from ..training.sweep.file import load_sweep
+from .console import Terminal, make_table, print_json, shell_command
 from .train import parse_duration
 
 
@@ -38,7 +31,7 @@ def run_sweep(
 ) -> None:
     """Run what is left of a sweep, print its table, and keep what is trained.
 
-    The exit code is 1 where an entry could not be done, or was stopped from outside and no time limit was set; 128 + signal
+    The exit code is 1 where an entry could not be done or kept, or was stopped from outside and no time limit was set; 128 + signal
     where the sweep was stopped.
     """
     began = clock.monotonic()
@@ -50,98 +43,45 @@ def run_sweep(
     if cluster is not None:
         check_address(cluster)
         gauging = ["--cluster", cluster, *([] if threads is None else ["--threads", str(threads)])]
-    if folder.exists() and not folder.is_dir():
-        raise SweepError(f"'{folder}' is a file; give another folder with --out")
-    make_folder(folder, SweepError)
-    if keep is not None:  # what is wrong with it is said before hours of training
-        make_folder(keep, SweepError, option="--keep")
-        if keep.samefile(folder):
-            raise SweepError(f"--keep is '{keep}', the sweep's own folder; give another one")
-    lock = lock_folder(folder, SweepError)
-    try:
-        runs, refused = plan_runs(sweep, folder, to_train=not report)
-        if not runs and len(set(refused.values())) == 1:
-            raise SweepError(next(iter(refused.values())))
-        if keep is not None:
-            with _locked(keep):
-                check_keep(runs, keep.absolute())
-        begun = {run.entry.name for run in runs}
-        for name, sentence in refused.items():
-            errors.say(f"gaitgauge: entry '{name}' cannot start{' in full' if name in begun else ''}: {sentence}")
-        if not runs:  # tables of an earlier call, perhaps of another file, are not written over
-            raise typer.Exit(1)
-        threads = threads or max((os.cpu_count() or 2) // 2, 1)
-        shares = per_gpu > 1 and not report and any(run.on_gpu for run in runs)
-        context: AbstractContextManager[Mapping[str, str]] = shared_gpus(errors.say) if shares else nullcontext({})
-        with context as sharing:
-            jobs = Jobs(
-                sweep,
-                threads=threads,
-                deadline=deadline,
-                say=errors.say,
-                per_gpu=per_gpu,
-                sharing=sharing,
-                gauging=gauging,
-            )
-            outcome = jobs.work([] if report else runs)
-        found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
-        failed = _failures(runs, found)
-        for label, sentence in failed.items():
-            if label not in outcome.failures:
-                errors.say(f"{label} failed: {sentence}")
-        try:
-            if json_output:
-                print(json.dumps(found, indent=1))
-            else:
-                print_sweep(Terminal(), found, folder)
-        finally:
-            unkept = {} if keep is None else _keep(sweep, runs, keep.absolute(), failed, errors.say)
-    finally:
-        lock.release()
+    done = work_through(
+        sweep,
+        folder,
+        threads=threads or max((os.cpu_count() or 2) // 2, 1),
+        per_gpu=per_gpu,
+        gauging=gauging,
+        deadline=deadline,
+        report=report,
+        keep=keep,
+        say=errors.say,
+    )
+    if done is None:
+        raise typer.Exit(1)
+    outcome = done.outcome
+    for label, sentence in done.failures.items():
+        if label not in outcome.failures:  # those were told when they happened
+            errors.say(f"{label} failed: {sentence}")
+    if json_output:
+        print_json(done.found)
+    else:
+        print_sweep(Terminal(), done.found, folder)
+    if done.kept is not None:
+        assert keep is not None
+        print_kept(errors, done.kept, f"{len(done.runs)} are in {keep.absolute()}")
     if outcome.unfinished:
-        errors.say(f"{len(outcome.unfinished)} of {len(runs)} runs are not done; go on with:\n  {shell_command()}")
+        errors.say(f"{len(outcome.unfinished)} of {len(done.runs)} runs are not done; go on with:\n  {shell_command()}")
     if outcome.stopped is not None:
         raise typer.Exit(128 + outcome.stopped)
-    if refused or failed or unkept or (outcome.unfinished and deadline is None):
+    unkept = {} if done.kept is None else done.kept.unkept
+    if done.refused or done.failures or unkept or (outcome.unfinished and deadline is None):
         raise typer.Exit(1)
 
 
-@contextmanager
-def _locked(keep: Path) -> Iterator[None]:
-    """Keep the folder of ``--keep`` for this process."""
-    try:
-        lock = lock_folder(keep, SweepError)
-    except SweepError as error:
-        raise SweepError(f"--keep cannot be used: {error}") from error
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def _failures(runs: Sequence[SweepRun], found: Mapping[str, Any]) -> dict[str, str]:
-    """Why runs failed, by label."""
-    return {run.label: row["reason"] for run, row in zip(runs, found["runs"], strict=True) if row["reason"]}
-
-
-def _keep(
-    sweep: Sweep, runs: Sequence[SweepRun], folder: Path, failed: Mapping[str, str], say: Callable[[str], None]
-) -> dict[str, str]:
-    """Keep what is trained in a folder, with a page and a table of all that it holds; says what was kept, and returns what could
-    not be, beside what has ``failed`` already.
-    """
-    with _locked(folder):
-        labels, unkept = keep_runs(sweep, runs, folder)
-        there, refused = plan_runs(sweep, folder, to_train=False)
-        found = fold_sweep(sweep, there, refused, {}, folder)
-    unkept = {label: sentence for label, sentence in (_failures(there, found) | unkept).items() if label not in failed}
-    for label, sentence in unkept.items():
-        say(f"{label} is not kept: {sentence}")
-    states = [row["state"] for row in found["runs"]]
-    there_now = f"{states.count('gauged') + states.count('trained')} of {len(runs)} are in {folder}"
-    to_gauge = f", {states.count('trained')} of them not gauged yet" if "trained" in states else ""
-    say(f"kept {len(labels)} run{'s' * (len(labels) != 1)}; {there_now}{to_gauge}")
-    return unkept
+def print_kept(console: Terminal, kept: Kept, of_all: str) -> None:
+    """What was kept and what could not be, and how much of ``of_all`` is there."""
+    for label, sentence in kept.unkept.items():
+        console.say(f"{label} is not kept: {sentence}")
+    to_gauge = f", {kept.to_gauge} of them not gauged yet" if kept.to_gauge else ""
+    console.say(f"kept {len(kept.labels)} run{'s' * (len(kept.labels) != 1)}; {kept.there} of {of_all}{to_gauge}")
 
 
 def print_sweep(console: Terminal, found: Mapping[str, Any], folder: Path) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..gauge.validation import AVERAGE, example, read_measurements, validate
-from .console import Terminal, make_table
+from .console import Terminal, make_table, print_json
 from .errors import UserError
 
 
@@ -24,7 +23,7 @@ def run_validation(*, tables: Sequence[Path], example_name: str | None, ranks_on
         real, *simulators = [read_measurements(path) for path in tables]
         parts = [validate(real, simulators, ranks_only=ranks_only)]
     if json_output:
-        print(json.dumps(parts if example_name else parts[0], indent=1))
+        print_json(parts if example_name else parts[0])
         return
     console = Terminal()
     for part in parts:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ import typer
 from ..backends.registry import choose_device
 from ..gauge.comparison import load_result
 from ..gauge.verify import prepare_replay, verify
-from .console import Terminal
+from .console import Terminal, print_json
 from .evaluate import shower
 from .studies import resumable
 
@@ -50,7 +49,7 @@ def run_verification(
         command = ["gaitgauge", *sys.argv[1:]]
         found = verify(content, prepared, folder, fresh=fresh, command=command, watch=shower(display))
     if json_output:
-        print(json.dumps(found, indent=1))
+        print_json(found)
     else:
         console = Terminal()
         for item in found["levels"]:

@@ -130,6 +130,28 @@ def test_nothing_is_left_in_a_broken_pipe_that_would_fail_at_the_end(monkeypatch
         closed.flush()
 
 
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.ENOSPC, "output cannot be written: no space left on device"),
+        (errno.EAGAIN, "the system refused: resource temporarily unavailable"),
+    ],
+)
+def test_a_refusal_without_a_file_is_of_the_output_only_where_writing_can_say_so(monkeypatch, capsys, number, said):
+    """A process that cannot be started has no file's name either."""
+    silenced = []
+    monkeypatch.setattr("gaitgauge.cli.errors.silence", silenced.append)
+
+    @report_errors
+    def command():
+        raise OSError(number, os.strerror(number))
+
+    with pytest.raises(typer.Exit):
+        command()
+    assert capsys.readouterr().err == f"gaitgauge: {said}\n"
+    assert bool(silenced) == (number == errno.ENOSPC)
+
+
 def test_an_error_that_cannot_be_told_keeps_its_exit_code(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Unwritable(errno.EIO))
 
@@ -173,15 +195,12 @@ def test_a_folder_that_was_removed_is_one_sentence(tmp_path):
     )
 
 
-def test_a_reader_that_left_is_no_error():
-    done = subprocess.run(
-        f"{sys.executable} -c '{PROGRAM}' list suites | true",
-        shell=True,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+@pytest.mark.parametrize("arguments", ["list suites", "validate --example paper --json"])
+def test_a_reader_that_left_is_no_error(arguments):
+    # `exec <&-` closes the pipe before anything is written to it
+    command = f"set -o pipefail; {sys.executable} -c '{PROGRAM}' {arguments} | exec 0<&-"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_folder_s_name_that_is_too_long_is_one_sentence(refused, policy):

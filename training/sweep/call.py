@@ -1,0 +1,143 @@
+"""One call of a sweep, from its plan to what is kept, with the folders that it writes to locked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...files.writing import lock_folder, make_folder
+from .file import Sweep, SweepError
+from .folding import fold_sweep
+from .jobs import Jobs, SweepOutcome
+from .keeping import check_keep, keep_runs
+from .runs import SweepRun, plan_runs
+from .sharing import shared_gpus
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kept:
+    """What the folder of ``--keep`` has now."""
+
+    labels: Sequence[str]
+    """Runs that were kept by this call."""
+    unkept: Mapping[str, str]
+    """Why runs could not be kept, by label, beside what failed before."""
+    there: int
+    """How many of the call's runs it holds."""
+    to_gauge: int
+    """How many of these are not gauged yet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepCall:
+    """What became of a call."""
+
+    runs: Sequence[SweepRun]
+    refused: Mapping[str, str]
+    """Why entries cannot start, by name."""
+    outcome: SweepOutcome
+    found: Mapping[str, Any]
+    """As ``fold_sweep``."""
+    kept: Kept | None
+    """None where nothing was to be kept."""
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Why runs failed, by label."""
+        return _failures(self.runs, self.found)
+
+
+def work_through(
+    sweep: Sweep,
+    folder: Path,
+    *,
+    threads: int,
+    per_gpu: int,
+    gauging: Sequence[str] | None,
+    deadline: float | None,
+    report: bool,
+    keep: Path | None,
+    say: Callable[[str], None],
+) -> SweepCall | None:
+    """Do what is left of a sweep, write its tables, and keep what is trained.
+
+    Args:
+        folder: its own, absolute.
+        threads, per_gpu, gauging, deadline: as of ``Jobs``.
+        report: write the tables of what is there, and start nothing.
+        keep: folder of what is kept; None for none.
+        say: called with a sentence now and then.
+
+    Returns:
+        None where no entry can start: then tables of an earlier call, perhaps of another file, are not written over.
+
+    Raises:
+        SweepError: a folder cannot be used, or all entries are refused for one and the same reason.
+        SuiteError: no such suite.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise SweepError(f"'{folder}' is a file; give another folder with --out")
+    make_folder(folder, SweepError)
+    if keep is not None:  # what is wrong with it is said before hours of training
+        make_folder(keep, SweepError, option="--keep")
+        if keep.samefile(folder):
+            raise SweepError(f"--keep is '{keep}', the sweep's own folder; give another one")
+        keep = keep.absolute()
+    lock = lock_folder(folder, SweepError)
+    try:
+        runs, refused = plan_runs(sweep, folder, to_train=not report)
+        if not runs and len(set(refused.values())) == 1:
+            raise SweepError(next(iter(refused.values())))
+        if keep is not None:
+            with _locked(keep):
+                check_keep(runs, keep)
+        begun = {run.entry.name for run in runs}
+        for name, sentence in refused.items():
+            say(f"gaitgauge: entry '{name}' cannot start{' in full' if name in begun else ''}: {sentence}")
+        if not runs:
+            return None
+        shares = per_gpu > 1 and not report and any(run.on_gpu for run in runs)
+        context: AbstractContextManager[Mapping[str, str]] = shared_gpus(say) if shares else nullcontext({})
+        with context as sharing:
+            jobs = Jobs(
+                sweep, threads=threads, deadline=deadline, say=say, per_gpu=per_gpu, sharing=sharing, gauging=gauging
+            )
+            outcome = jobs.work([] if report else runs)
+        found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
+        kept = None if keep is None else _keep(sweep, runs, keep, _failures(runs, found))
+    finally:
+        lock.release()
+    return SweepCall(runs=runs, refused=refused, outcome=outcome, found=found, kept=kept)
+
+
+@contextmanager
+def _locked(keep: Path) -> Iterator[None]:
+    """Keep the folder of ``--keep`` for this process."""
+    try:
+        lock = lock_folder(keep, SweepError)
+    except SweepError as error:
+        raise SweepError(f"--keep cannot be used: {error}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _failures(runs: Sequence[SweepRun], found: Mapping[str, Any]) -> dict[str, str]:
+    return {run.label: row["reason"] for run, row in zip(runs, found["runs"], strict=True) if row["reason"]}
+
+
+def _keep(sweep: Sweep, runs: Sequence[SweepRun], folder: Path, failed: Mapping[str, str]) -> Kept:
+    """Keep what is trained in a folder, with a page and a table of all that it holds."""
+    with _locked(folder):
+        labels, unkept = keep_runs(sweep, runs, folder)
+        there, refused = plan_runs(sweep, folder, to_train=False)
+        found = fold_sweep(sweep, there, refused, {}, folder)
+    unkept = {label: sentence for label, sentence in (_failures(there, found) | unkept).items() if label not in failed}
+    mine = {run.label for run in runs}
+    states = [row["state"] for run, row in zip(there, found["runs"], strict=True) if run.label in mine]
+    to_gauge = states.count("trained")
+    return Kept(labels=labels, unkept=unkept, there=states.count("gauged") + to_gauge, to_gauge=to_gauge)
