@@ -57,10 +57,20 @@ def run_training(*, task: str, time: str | None, **choices: Any) -> None:
 
 
 def _again(plan: TrainPlan) -> list[str]:
-    """What a resume must be told anew, since checkpoints do not decide it: trust, and where data go."""
+    """What a resume must be told anew, since checkpoints do not decide it: trust, where data go, and what is for one command alone."""
     run, usual = plan.task.training.run, RunConfiguration()
     found = ["--trust"] if plan.needs_trust else []
     found += ["--logger", run.logger] if run.logger != usual.logger else []
+    for name in ("device", "threads", "capture", "fuse", "score_suite", "score_threads"):
+        value, option = getattr(plan.request, name), name.replace("_", "-")
+        if value == getattr(TrainRequest, name):
+            continue
+        if name == "score_suite" and value is None:
+            found.append("--no-score")
+        elif isinstance(value, bool):
+            found.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            found += [f"--{option}", str(value)]
     return found + (
         [f"training.run.logger_project={run.logger_project}"] if run.logger_project != usual.logger_project else []
     )

@@ -126,13 +126,18 @@ def test_signal_writes_a_checkpoint_and_says_how_to_go_on(run, tmp_path):
 @pytest.mark.slow
 def test_a_terminal_that_is_closed_is_a_stop_like_a_signal(tmp_path):
     """SIGHUP, and then nothing can be written any more."""
+
+    def take_the_terminal() -> None:
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests may run under nohup
+
     window, terminal = pty.openpty()
     command = ["train", "go2-flat", *FAKE, *SMALL, "--iterations", 100_000, "training.run.save_interval=2"]
     training = subprocess.Popen(
         [*PROGRAM, *map(str, command), "--log-root", str(tmp_path)],
         **dict.fromkeys(("stdin", "stdout", "stderr"), terminal),
         start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        preexec_fn=take_the_terminal,
     )
     os.close(terminal)
     while not list(tmp_path.rglob("model_2.pt")):
@@ -142,6 +147,16 @@ def test_a_terminal_that_is_closed_is_a_stop_like_a_signal(tmp_path):
     assert training.wait(60) == 128 + signal.SIGHUP
     (noted,) = tmp_path.rglob("run.json")
     assert json.loads(noted.read_text())["outcome"] == "signal"
+
+
+def test_what_is_told_to_go_on_with_keeps_what_checkpoints_do_not(run, monkeypatch):
+    """A run on the CPU without scores, or with another suite's, is not scored by ``quick`` on a GPU by the command that is printed."""
+    chosen = ("--threads", 2, "--no-fuse", "--score-suite", "robogauge-1.1", "--score-threads", 1)
+    result = run("train", "go2-flat", *FAKE[:-1], *chosen, *SMALL, "--time", "0.5s")
+    told = " ".join(result.output.partition("--resume")[2].split())
+    assert told.endswith("--device cpu --threads 2 --no-fuse --score-suite robogauge-1.1 --score-threads 1")
+    result = run("train", "go2-flat", *FAKE, *SMALL, "--time", "0.5s")
+    assert " ".join(result.output.partition("--resume")[2].split()).endswith("--device cpu --no-score")
 
 
 def test_time_limit_ends_with_success(run, tmp_path):
