@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 _Iterations = Annotated[int, Field(ge=1, le=10_000)]
 
 
+SMALLEST_BASE_MASS = 0.01
+"""A base never gets lighter than this [kg]; see ``Randomization.base_mass_offset``."""
+
+
 class BackendError(RuntimeError):
     """An engine cannot do what it was asked for; the message says what, why and what to change."""
 
@@ -196,7 +200,8 @@ class Randomization:
     friction: torch.Tensor | None = None
     """Sliding friction coefficient that acts in every contact of the world, (W,)."""
     base_mass_offset: torch.Tensor | None = None
-    """Mass added to the base body's nominal mass [kg], (W,); inertia and centre of mass stay (a point load at the centre of mass)."""
+    """Mass added to the base body's nominal mass [kg], (W,); inertia and centre of mass stay (a point load at the centre of mass).
+    A base keeps ``SMALLEST_BASE_MASS``, whatever is taken from it."""
     link_mass_scale: torch.Tensor | None = None
     """Factor on each collision body's nominal mass and inertia except the base's, (W, B); the base's entry is ignored."""
     base_com_offset: torch.Tensor | None = None

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..base import (
     CAPABILITY_NAMES,
+    SMALLEST_BASE_MASS,
     BackendError,
     Capability,
     PhysicsBackend,
@@ -375,7 +376,8 @@ class MujocoBackend(PhysicsBackend):
             model.body_mass[self._bodies[others]] *= scale
             model.body_inertia[self._bodies[others]] *= scale[:, None]
         if "base_mass_offset" in values:
-            model.body_mass[self._base] = max(float(nominal.body_mass[self._base] + values["base_mass_offset"]), 0.01)
+            mass = float(nominal.body_mass[self._base] + values["base_mass_offset"])
+            model.body_mass[self._base] = max(mass, SMALLEST_BASE_MASS)
         if "base_com_offset" in values:
             model.body_ipos[self._base] = nominal.body_ipos[self._base] + values["base_com_offset"]
         if not values.keys().isdisjoint(("link_mass_scale", "base_mass_offset", "base_com_offset")):

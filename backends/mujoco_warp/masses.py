@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..base import SMALLEST_BASE_MASS
 from ..description import ModelFields
 from ..warp.motors import MotorTensors
 from .model import SharedModel
@@ -27,8 +28,6 @@ BATCHED_FIELDS = (
     "dof_invweight0",
 )
 """Model fields of which every world has its own."""
-_SMALLEST_MASS = 0.01
-"""Mass that a base keeps, whatever is taken from it [kg]."""
 
 
 class WorldMasses:
@@ -69,7 +68,7 @@ class WorldMasses:
             scaled = self._nominal_inertia[:, bodies] * scale[:, :, None]
             self._inertia[:, bodies] = torch.where(column[:, :, None], scaled, inertia)
         if "base_mass_offset" in rows:
-            mass = (self._nominal_mass[:, base] + rows["base_mass_offset"]).clamp(min=_SMALLEST_MASS)
+            mass = (self._nominal_mass[:, base] + rows["base_mass_offset"]).clamp(min=SMALLEST_BASE_MASS)
             write(self._mass[:, base], mass)
         if "base_com_offset" in rows:
             write(self._com[:, base], self._nominal_com[:, base] + rows["base_com_offset"])

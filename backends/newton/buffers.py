@@ -8,13 +8,11 @@ import newton
 import torch
 import warp as wp
 
+from ..base import SMALLEST_BASE_MASS
 from ..warp.structures import filled
 from . import kernels
 from .model import WorldModel
 from .solvers import SolverAdapter
-
-SMALLEST_MASS = 0.01
-"""A base never gets lighter than this [kg]."""
 
 
 def contact_structure(contacts: newton.Contacts, force: Any, shape_body: Any) -> Any:
@@ -52,7 +50,7 @@ class MassTensors:
         self._scale[:, self._order] = self.link_scale
         self._scale[:, self._base] = 1.0
         self._mass.copy_(self._nominal_mass * self._scale)
-        self._mass[:, self._base] = (self._nominal_mass[self._base] + self.base_offset).clamp(min=SMALLEST_MASS)
+        self._mass[:, self._base] = (self._nominal_mass[self._base] + self.base_offset).clamp(min=SMALLEST_BASE_MASS)
         self._inertia.copy_(self._nominal_inertia * self._scale[..., None, None])
         self._inverse_mass.copy_(1.0 / self._mass)
         self._inverse_inertia.copy_(torch.linalg.inv(self._inertia))
