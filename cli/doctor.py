@@ -5,7 +5,6 @@ What could hang or kill the process (GPU drivers, OpenGL) is tried in a child pr
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shutil
@@ -26,11 +25,11 @@ from rich.text import Text
 
 from . import picture
 from .console import Terminal, make_table, print_json
+from .errors import UserError
+from .probe import ask
 
 OK, WARNING, PROBLEM = "ok", "warning", "problem"
 _STYLES = {OK: "green", WARNING: "yellow", PROBLEM: "bold red"}
-_PATIENCE = 120.0
-"""Longest time that a child process may take [s]."""
 _FREE_DISK = 5.0
 """Free space below which a training run with its checkpoints may not fit [GB]."""
 _FREE_MEMORY = 4.0
@@ -50,8 +49,17 @@ class Finding:
 
 
 def run_doctor(*, policy: str | None, json_output: bool, **choices: Any) -> None:
-    """Examine this machine, or a policy as ``diagnosis.examine_policy`` does; exit code 1 where something is wrong."""
+    """Examine this machine, or a policy as ``diagnosis.examine_policy`` does; exit code 1 where something is wrong.
+
+    Raises:
+        UserError: an option is for a policy, and none is named.
+    """
     if policy is None:
+        for name in ("contract", "robot", "out"):
+            if choices[name] is not None:
+                raise UserError(
+                    f"--{name} is for the examination of a policy; name one: gaitgauge doctor POLICY --{name} …"
+                )
         well = examine(json_output=json_output)
     else:
         from .diagnosis import examine_policy
@@ -135,7 +143,7 @@ print(json.dumps([torch.version.cuda, gpus]))
 
 def check_gpu() -> Iterator[Finding]:
     """Whether torch can use a GPU, which training needs."""
-    what, (answer, trouble) = "GPU (torch)", _ask(_TORCH_PROBE)
+    what, (answer, trouble) = "GPU (torch)", ask(_TORCH_PROBE)
     if trouble:
         yield Finding(what, PROBLEM, f"torch fails: {trouble}", "reinstall torch: make install")
         return
@@ -178,7 +186,7 @@ print(json.dumps([str(d) for d in warp.get_devices()]))
 
 def check_warp() -> Iterator[Finding]:
     """The devices of Warp, on which the training engines run."""
-    what, (answer, trouble) = "Warp devices", _ask(_WARP_PROBE)
+    what, (answer, trouble) = "Warp devices", ask(_WARP_PROBE)
     if trouble:
         yield Finding(what, PROBLEM, f"Warp fails: {trouble}", "reinstall warp-lang: make install")
     elif any(d.startswith("cuda") for d in answer):
@@ -196,7 +204,7 @@ print(json.dumps([mujoco.__version__, mujoco.mj_versionString()]))
 
 def check_mujoco() -> Iterator[Finding]:
     """Whether MuJoCo loads, with the batched stepping that the gauge runs on."""
-    what, (answer, trouble) = "MuJoCo engine", _ask(_MUJOCO_PROBE)
+    what, (answer, trouble) = "MuJoCo engine", ask(_MUJOCO_PROBE)
     if trouble:
         yield Finding(what, PROBLEM, f"fails: {trouble}", "reinstall it: make install")
         return
@@ -215,7 +223,7 @@ _PACKAGES_OF = {"egl": "libegl1 (and a GPU driver or libgl1-mesa-dri)", "osmesa"
 
 def check_rendering() -> Iterator[Finding]:
     """Which of MuJoCo's ways to render without a window work; one is enough for videos."""
-    works = {backend: not _ask(picture.PROBE, MUJOCO_GL=backend)[1] for backend in picture.RENDERERS}
+    works = {backend: not ask(picture.PROBE, MUJOCO_GL=backend)[1] for backend in picture.RENDERERS}
     for backend, good in works.items():
         what = f"rendering ({backend})"
         if good:
@@ -297,31 +305,6 @@ def _writable(folder: Path) -> Finding:
         return Finding(what, PROBLEM, f"{there}: {error.strerror}", advice)
     found = "writable" if there == folder.absolute() else "will be created when it is needed"
     return Finding(what, OK, found)
-
-
-def _ask(program: str, **environment: str) -> tuple[Any, str]:
-    """Run a Python program in a child process.
-
-    Returns:
-        What it prints as JSON on its last line, and an empty text; or None, and what went wrong.
-    """
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            capture_output=True,
-            text=True,
-            timeout=_PATIENCE,
-            env={**os.environ, **environment},
-        )
-    except subprocess.TimeoutExpired:
-        return None, f"no answer within {_PATIENCE:g} s"
-    lines = [line for line in (done.stdout if done.returncode == 0 else done.stderr).splitlines() if line.strip()]
-    if done.returncode != 0:
-        return None, lines[-1] if lines else f"ended with exit code {done.returncode}"
-    try:
-        return json.loads(lines[-1] if lines else ""), ""
-    except json.JSONDecodeError:
-        return None, f"answered {lines[-1:]}"
 
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (

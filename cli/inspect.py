@@ -53,8 +53,9 @@ def import_file(
     if destination.exists() and not force:
         raise UserError(f"'{destination}' already exists; give another name, or replace it with --force")
     trainable = trainable or raw
-    if trainable and contract is not None:
-        raise UserError("a training checkpoint has its contract inside; leave out --contract")
+    for option, given in (("contract", contract), ("robot", robot)):
+        if trainable and given is not None:
+            raise UserError(f"a training checkpoint has its {option} inside; leave out --{option}")
     from ..policy.native import ForeignFile
 
     if trainable:

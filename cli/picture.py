@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .errors import UserError
+from .probe import ask
 
 if TYPE_CHECKING:
     import mujoco
@@ -95,12 +94,10 @@ def choose_renderer() -> Quality:
     """
     asked = os.environ.get("MUJOCO_GL")
     for name in (asked,) if asked else RENDERERS:
-        environment = {**os.environ, "MUJOCO_GL": name}
-        tried = subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True, check=False)
-        if tried.returncode == 0:
+        driver, trouble = ask(PROBE, MUJOCO_GL=name)
+        if not trouble:
             os.environ["MUJOCO_GL"] = name
-            driver = tried.stdout.decode(errors="replace").lower()
-            return PLAIN if name == "osmesa" or any(n in driver for n in _ON_THE_CPU) else RICH
+            return PLAIN if name == "osmesa" or any(n in driver.lower() for n in _ON_THE_CPU) else RICH
     named = f"MUJOCO_GL={asked} does not draw" if asked else "neither EGL nor OSMesa draws"
     raise UserError(
         f"videos need off-screen rendering, and {named} on this machine; install libegl1 and libgl1-mesa-dri, or "

@@ -21,7 +21,7 @@ from ..policy.adapters import assumptions
 from ..policy.base import Policy
 from ..robots import Robot
 from ..robots.body_plan import model_joint_order
-from ..robots.rotation import from_yaw, in_heading
+from ..robots.rotation import from_yaw, in_heading, tilt
 from ..terrains.base import Terrain
 from .errors import UserError
 
@@ -232,8 +232,7 @@ class PlaySession:
     @property
     def tilt(self) -> float:
         """Angle between the base's z axis and the world's [rad]."""
-        _, x, y, _ = self.state.base_quaternion_w[0].tolist()
-        return math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
+        return float(tilt(self.state.base_quaternion_w[0]))
 
     @property
     def target_distance(self) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 import typer
 
 from ..backends.registry import choose_device
+from ..files.parsing import bare_name
 from ..gauge.comparison import load_result
 from ..gauge.verify import prepare_replay, verify
 from .console import Terminal, print_json
@@ -41,7 +42,8 @@ def run_verification(
         fresh=fresh,
         trust=trust,
     )
-    stem = card.resolve().parent.name if card.name == "results.json" else card.stem
+    place = card.resolve()
+    stem = bare_name(place.parent if place.name == "results.json" else place)
     folder = (
         out or Path("results") / f"verify-{stem}{'-quick' if quick else ''}{'' if fresh is None else f'-fresh-{fresh}'}"
     )

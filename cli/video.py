@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 
@@ -49,28 +51,39 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
     import imageio_ffmpeg
 
     codec, pixels, options = _CODECS[path.suffix.lower()]
-    with replacing(path, UserError, ending=path.suffix) as partial:
-        writer = imageio_ffmpeg.write_frames(
-            str(partial),
-            size,
-            fps=fps,
-            codec=codec,
-            quality=None,
-            pix_fmt_in="rgb24",
-            pix_fmt_out=pixels,
-            macro_block_size=2,
-            ffmpeg_log_level="error",
-            output_params=options,
+    with replacing(path, UserError, ending=path.suffix) as partial, TemporaryFile() as complaints:
+        pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size), "-r", f"{fps:g}", "-i", "-"]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *pictures, "-an", "-c:v", codec]
+        # A session of its own: Ctrl-C in the terminal is for this command, which ends the film.
+        encoder = subprocess.Popen(
+            [*command, "-pix_fmt", pixels, *options, str(partial)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=complaints,
+            start_new_session=True,
         )
-        writer.send(None)
+        assert encoder.stdin is not None
+
+        def failure() -> UserError:
+            code = encoder.wait()
+            complaints.seek(0)
+            said = " ".join(complaints.read().decode(errors="replace").split())
+            return UserError(f"cannot write '{path}': {said[-200:] or f'ffmpeg ended with exit code {code}'}")
 
         def add(picture: np.ndarray) -> None:
             try:
-                writer.send(np.ascontiguousarray(picture))
+                encoder.stdin.write(np.ascontiguousarray(picture).data)
             except OSError as error:
-                raise UserError(f"cannot write '{path}': {' '.join(str(error).split())[:200]}") from error
+                raise failure() from error
 
         try:
             yield add
+            with suppress(OSError):  # it has ended by itself, and says why
+                encoder.stdin.close()
+            if encoder.wait():
+                raise failure()
         finally:
-            writer.close()
+            encoder.kill()
+            encoder.wait()
+            with suppress(OSError):
+                encoder.stdin.close()

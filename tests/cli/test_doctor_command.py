@@ -71,6 +71,11 @@ def test_a_file_that_is_no_policy_is_refused(refused, tmp_path):
     assert "there is no policy file" in refused("doctor", tmp_path / "nothing.pt")
 
 
+@pytest.mark.parametrize("option", ["contract", "robot", "out"])
+def test_what_is_for_a_policy_is_refused_without_one(refused, option):
+    assert f"--{option} is for the examination of a policy" in refused("doctor", f"--{option}", "nothing")
+
+
 def test_the_machine_is_told_as_json(run, monkeypatch):
     monkeypatch.setattr(doctor, "CHECKS", (doctor.check_python,))
     (found,) = json.loads(run("doctor", "--json").stdout)

@@ -31,9 +31,25 @@ def test_video_file_is_whole_or_not_there(tmp_path):
     assert [f.name for f in tmp_path.glob("*.mp4")] == ["walk.mp4"]
 
 
+@pytest.mark.parametrize("name", ["walk.mp4", "walk.gif"])
+def test_a_film_that_the_encoder_gave_up_is_not_there(tmp_path, monkeypatch, name):
+    """GIFs are encoded whole at the end, when nothing is left to add."""
+    encoder = tmp_path / "ffmpeg"
+    encoder.write_text(
+        f"#!{sys.executable}\nimport sys\nopen(sys.argv[-1], 'wb').write(sys.stdin.buffer.read(99))\n"
+        "sys.stdin.buffer.read()\nsys.exit('No space left\\non device')\n"
+    )
+    encoder.chmod(0o755)
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(encoder))
+    with pytest.raises(UserError, match=rf"cannot write '.*{name}': No space left on device$"):
+        with film(tmp_path / name, fps=25, size=(64, 48)) as add:
+            add(np.zeros((48, 64, 3), dtype=np.uint8))
+    assert list(tmp_path.iterdir()) == [encoder]
+
+
 def test_machine_without_a_renderer(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr(subprocess, "run", lambda *a, **k: subprocess.CompletedProcess(a, 1))
+    monkeypatch.setattr("gaitgauge.cli.picture.ask", lambda *a, **k: (None, "ended with exit code 1"))
     with pytest.raises(UserError, match="MUJOCO_GL=osmesa does not draw"):
         choose_renderer()
     monkeypatch.delenv("MUJOCO_GL")
@@ -42,10 +58,9 @@ def test_machine_without_a_renderer(monkeypatch):
 
 
 def test_driver_decides_what_a_picture_may_cost(monkeypatch):
-    for driver, quality in ((b"llvmpipe (LLVM 15.0.6, 256 bits)", PLAIN), (b"NVIDIA H200/PCIe/SSE2", RICH)):
+    for driver, quality in (("llvmpipe (LLVM 15.0.6, 256 bits)", PLAIN), ("NVIDIA H200/PCIe/SSE2", RICH)):
         monkeypatch.setenv("MUJOCO_GL", "egl")
-        answer = subprocess.CompletedProcess([], 0, stdout=driver)
-        monkeypatch.setattr(subprocess, "run", lambda *a, answer=answer, **k: answer)
+        monkeypatch.setattr("gaitgauge.cli.picture.ask", lambda *a, answer=driver, **k: (answer, ""))
         assert choose_renderer() is quality
 
 

@@ -64,3 +64,13 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
     content["policy"]["path"] = "elsewhere/policy.pt"
     path.write_text(json.dumps(content))
     assert "--policy" in refused("verify", path, *options)
+
+
+def test_a_card_s_folder_by_default_has_its_whole_name_whatever_names_the_card(run, tmp_path, monkeypatch, card):
+    path, _, options = card
+    folder = tmp_path / "tiny-1.1-stress"
+    (tmp_path / "run").rename(folder)
+    monkeypatch.chdir(folder)
+    for named in (folder, folder / "results.json", ".", "results.json"):
+        assert run("verify", named, *options, "--quick").exit_code == 0
+    assert [f.name for f in (folder / "results").iterdir()] == ["verify-tiny-1.1-stress-quick"]
