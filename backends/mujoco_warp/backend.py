@@ -19,6 +19,7 @@ from ..warp.device import is_memory_error, memory_advice
 from ..warp.state import StateArrays
 from ..warp.structures import filled, to_warp
 from . import kernels, readout
+from .alarms import DROPPED
 from .arrays import Links, Palette, Roles, contact_arrays, motion_arrays
 from .fused_solver import fuse_solver
 from .height_fields import repair_height_fields
@@ -30,17 +31,6 @@ from .order import CanonicalOrder
 repair_height_fields()
 fuse_solver()
 
-_ALARMS = mujoco_warp.OverflowType
-_DROPPED = int(
-    _ALARMS.NEFC
-    | _ALARMS.NJMAX_NNZ
-    | _ALARMS.BROADPHASE
-    | _ALARMS.NARROWPHASE
-    | _ALARMS.CCD
-    | _ALARMS.HFIELD
-    | _ALARMS.EPA_HORIZON
-)
-"""Alarms that mean dropped contacts or constraints; a solver that stopped at its iteration limit is none."""
 PARKED_HEIGHT = 100.0
 """Height at which a robot waits, away from every contact, that has diverged or must not step [m]."""
 
@@ -131,7 +121,7 @@ class MujocoWarpBackend(WarpBackend):
     def _read(self, select: Any, value: int, out: StateArrays, *, forces: bool) -> None:
         """Launch the read-out of the worlds whose ``select`` is ``value``."""
         n, motion, chosen = self.num_worlds, self._motion, [select, value]
-        wp.launch(readout.read_joints, dim=(n, self._joints), inputs=[*chosen, _DROPPED, motion, self._live, out])
+        wp.launch(readout.read_joints, dim=(n, self._joints), inputs=[*chosen, DROPPED, motion, self._live, out])
         wp.launch(readout.read_feet, dim=(n, self._feet), inputs=[*chosen, self._links, motion, out])
         if forces:
             sizes = [self._feet, self._bodies]

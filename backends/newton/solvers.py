@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
+from ..mujoco_warp.alarms import DROPPED
 from ..mujoco_warp.fused_solver import fuse_solver
 from ..mujoco_warp.height_fields.repair import repair_height_fields
 from ..mujoco_warp.model import SMALLEST_TOLERANCE, constraint_rows, contacts_per_world
@@ -181,9 +182,6 @@ class MujocoAdapter(SolverAdapter):
         self.warm_start = self._data.qacc_warmstart
         self.contacts = newton.Contacts(self.solver.get_max_contact_count(), 0, device=model.device)
         self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
-        # iterations that run out are no loss of contacts
-        overflow = mujoco_warp.OverflowType
-        self._overflow_mask = int(overflow.ALL & ~(overflow.ITERATIONS | overflow.LS_ITERATIONS | overflow.EPA_HORIZON))
 
     def _check_import(self, world: WorldModel, scene: Scene) -> None:
         """Refuse a robot of which Newton's importer made something else than MuJoCo's compiler."""
@@ -201,7 +199,7 @@ class MujocoAdapter(SolverAdapter):
         wp.launch(
             kernels.collect_overflow_bits,
             dim=active.shape[0],
-            inputs=[active, self._data.overflow, self._overflow_mask, overflowed],
+            inputs=[active, self._data.overflow, DROPPED, overflowed],
             device=active.device,
         )
 

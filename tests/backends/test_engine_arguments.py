@@ -10,7 +10,7 @@ from gaitgauge.backends.registry import make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains import make_terrain
 
-ENGINES = ("mujoco", "mujoco-warp", "newton")
+ENGINES = ("mujoco", "mujoco-warp", pytest.param("newton", marks=pytest.mark.slow))
 
 
 @pytest.fixture(scope="module", params=ENGINES)

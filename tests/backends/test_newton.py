@@ -255,6 +255,22 @@ def test_a_small_buffer_overflows_and_says_so(solver):
 
 
 @pytest.mark.slow
+def test_every_alarm_but_that_of_a_spent_solver_is_an_overflow():
+    """A pair of shapes whose search has no room for its horizon ends without a contact (``mujoco_warp/_src/collision_gjk.py``)."""
+    mujoco_warp = pytest.importorskip("mujoco_warp")
+    warp = pytest.importorskip("warp")
+    adapter = make_backend("newton", scene())._solver
+    told = set()
+    for alarm in mujoco_warp.OverflowType:
+        adapter._data.overflow.fill_(int(alarm))
+        overflowed = warp.zeros(1, dtype=warp.bool)
+        adapter.collect_overflow(warp.ones(1, dtype=int), overflowed)
+        if overflowed.numpy()[0]:
+            told.add(alarm.name)
+    assert told == {a.name for a in mujoco_warp.OverflowType} - {"NONE", "ITERATIONS", "LS_ITERATIONS"}
+
+
+@pytest.mark.slow
 def test_randomizing_some_worlds_takes_a_row_for_each():
     engine = make_backend("newton:steel", scene(index=(0, 0, 0)))
     mask = torch.tensor([True, False, True])
