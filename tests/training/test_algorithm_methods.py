@@ -227,6 +227,36 @@ def test_beginning_with_a_bare_policy(method, tmp_path):
     assert "Loss/surrogate" in begun.logger.scalars
 
 
+@pytest.mark.parametrize("method", NAMES)
+def test_a_minibatch_that_is_not_finite_spoils_nothing_learned_for_a_bare_policy(method):
+    algorithm, env = build(method, epochs=3, minibatches=2)
+    algorithm.follow_student(2)
+    rollout(algorithm, env)
+    before = [p.clone() for p in algorithm.critic.parameters()]
+    algorithm.storage.returns[0, 0] = torch.nan
+    report = algorithm.update()
+    assert report["skipped_minibatches"] == 3.0, "one of two, in each of three passes"
+    assert all(torch.isfinite(torch.tensor(value)) for value in report.values())
+    after = list(algorithm.critic.parameters())
+    assert all(torch.isfinite(p).all() for p in (*algorithm.actor.parameters(), *after))
+    assert not all(torch.equal(a, b) for a, b in zip(after, before, strict=True)), "the other minibatch counts"
+    rollout(algorithm, env)
+    assert algorithm.update()["skipped_minibatches"] == 0.0
+
+
+def test_what_a_bare_policy_lacks_learns_from_samples_of_the_latent():
+    """The noise of the samples was zero until training went on as usual: the decoder saw means alone."""
+    algorithm, env = build("dreamwaq")
+    algorithm.follow_student(2)
+    drawn = []
+    for _ in range(2):
+        rollout(algorithm, env)
+        algorithm.update()
+        drawn.append(algorithm.losses.noise.clone())
+        assert drawn[-1].std().item() == pytest.approx(1.0, abs=0.2)
+    assert not torch.equal(*drawn)
+
+
 def test_next_states_are_those_of_the_step_after_and_ends_have_none():
     algorithm, env = build("him")
     obs, following = env.get_observations(), []

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
-from .optimization import FlatGradients
+from .optimization import FlatGradients, take_step
 
 if TYPE_CHECKING:
     from .ppo import PPO
@@ -39,9 +39,13 @@ class Bootstrap:
         """
         self._algorithm = algorithm
         self._left = iterations
-        self._parameters, self._losses, self._names = list(parameters), losses, names
-        self._gradients = FlatGradients(self._parameters)
-        self._optimizer = torch.optim.Adam(self._parameters, lr=1e-3)
+        self._losses, self._names = losses, names
+        parameters = list(parameters)
+        self._gradients = FlatGradients(parameters, extra=len(names))
+        self._optimizer = torch.optim.Adam(parameters, lr=1e-3)
+        self._sums = torch.zeros(len(names) + 2, device=self._gradients.values.device)
+        # Not in CUDA graphs: it is over after a few iterations.
+        self._step = algorithm.joined(self._loss, self._optimizer, self._gradients, self._apply, graphs=False)
 
     @property
     def over(self) -> bool:
@@ -52,22 +56,22 @@ class Bootstrap:
         """All passes over one rollout.
 
         Returns:
-            Means of the losses over the minibatches, by name.
+            Means of the losses over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
+            and were dropped.
         """
-        algorithm = self._algorithm
-        settings = algorithm.configuration
-        groups = algorithm.storage.minibatch_rows(settings.minibatches)
-        sums = torch.zeros(len(self._names), device=groups[0].device)
-        for _ in range(settings.epochs):
-            for minibatch in zip(*groups, strict=True):
-                losses = self._losses(*minibatch)
-                self._optimizer.zero_grad(set_to_none=True)
-                losses.sum().backward()
-                self._gradients.gather()
-                algorithm.processes.average(self._gradients.values)
-                torch.nn.utils.clip_grad_norm_(self._parameters, settings.max_gradient_norm)
-                self._optimizer.step()
-                sums += losses.detach()
+        algorithm, settings = self._algorithm, self._algorithm.configuration
+        self._sums.zero_()
+        algorithm.losses.prepare_student()
+        algorithm.pass_over(algorithm.storage.minibatch_rows(settings.minibatches), self._step)
         self._left -= 1
-        means = (sums / (settings.epochs * settings.minibatches)).tolist()
-        return dict(zip(self._names, means, strict=True)) | {"skipped_minibatches": 0.0}
+        *sums, _, skipped = self._sums.tolist()
+        total = settings.epochs * settings.minibatches
+        means = {name: value / total for name, value in zip(self._names, sums, strict=True)}
+        return means | {"skipped_minibatches": skipped}
+
+    def _loss(self, *rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        losses = self._losses(*rows)
+        return losses.sum(), losses.detach()
+
+    def _apply(self) -> None:
+        take_step(self._optimizer, self._gradients, self._algorithm.configuration.max_gradient_norm, self._sums)

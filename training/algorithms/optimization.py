@@ -45,6 +45,17 @@ class FlatGradients:
         return norm, (~finite).float()
 
 
+def take_step(optimizer: torch.optim.Optimizer, gradients: FlatGradients, limit: float, sums: torch.Tensor) -> None:
+    """Step along gathered gradients whose joint norm is at most ``limit``; gradients that are not finite are dropped.
+
+    Args:
+        sums: grows by what travelled with the gradients, their norm, and 1.0 if they were dropped, (extra + 2,).
+    """
+    norm, skipped = gradients.clip(limit)
+    optimizer.step()
+    sums += torch.nan_to_num(torch.cat((gradients.extra, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
+
+
 def load_moments(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> float:
     """Take over what an Adam's ``state_dict()`` says of its moments; its settings stay those of this run.
 

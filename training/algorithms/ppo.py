@@ -6,7 +6,7 @@ A method is a class derived from ``PPO``: its networks, what the actor is given 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import torch
@@ -20,7 +20,7 @@ from ..processes import Processes
 from ..schedules import RampTable
 from .bootstrap import Bootstrap
 from .losses import Losses
-from .optimization import FlatGradients, load_moments
+from .optimization import FlatGradients, load_moments, take_step
 from .storage import EnvironmentSplit, RolloutStorage
 from .symmetry import Mirror, passes
 
@@ -90,7 +90,7 @@ class PPO:
         self._desired_kl = torch.zeros((), device=device)
         self.follow(torch.zeros((), device=device))
         self._policy_metrics = torch.zeros(len(self.losses.policy_names) + 2, device=device)
-        self._student_metrics = torch.zeros(len(self.losses.student_names) + 1, device=device)
+        self._student_metrics = torch.zeros(len(self.losses.student_names) + 2, device=device)
         self._policy_loss, self._student_loss = self.losses.policy, self.losses.student
         mode = configuration.compile_mode
         if mode == "default" or (mode == "auto" and on_gpu):
@@ -300,16 +300,17 @@ class PPO:
         self._student_metrics.zero_()
         groups = storage.minibatch_rows(settings.minibatches)
         self.losses.prepare_policy()
-        for turned in passes(settings.epochs, alternate=settings.symmetry == "alternate"):
-            for minibatch in zip(*groups, strict=True):
-                self._policy_step(*map(turned, minibatch))
+        self.pass_over(groups, self._policy_step)
         self.losses.prepare_student()
-        rows_in_history = storage.student_rows(groups[-1])
-        for turned in passes(settings.epochs, alternate=settings.symmetry == "alternate"):
-            for rows in rows_in_history:
-                self._student_step(turned(rows))
+        self.pass_over((storage.student_rows(groups[-1]),), self._student_step)
         wait()
         return self._report()
+
+    def pass_over(self, groups: Sequence[torch.Tensor], step: Callable[..., None]) -> None:
+        """Take a step on every minibatch of rows, (M, B) for each group, once in each pass."""
+        for turned in passes(self.configuration.epochs, alternate=self.configuration.symmetry == "alternate"):
+            for minibatch in zip(*groups, strict=True):
+                step(*map(turned, minibatch))
 
     def _report(self) -> dict[str, float]:
         """Read the counters back, the update's only wait for the device."""
@@ -317,8 +318,10 @@ class PPO:
         sums = torch.cat((self._policy_metrics, self._student_metrics)).tolist()
         names = (*self.losses.policy_names, "gradient_norm", "skipped")
         policy = dict(zip(names, sums[: len(names)], strict=True))
-        student = dict(zip((*self.losses.student_names, "skipped"), sums[len(names) :], strict=True))
+        names_of_student = (*self.losses.student_names, "gradient_norm", "skipped")
+        student = dict(zip(names_of_student, sums[len(names) :], strict=True))
         skipped = policy.pop("skipped") + student.pop("skipped")
+        del student["gradient_norm"]
         if self.configuration.symmetry != "augment":  # no pair of images to compare
             del policy["symmetry"]
         for name in self.without_meaning():
@@ -335,16 +338,23 @@ class PPO:
         losses = self.losses
         self._policy_gradients = FlatGradients(self._policy_parameters, extra=len(losses.policy_names))
         self._student_gradients = FlatGradients(self.actor.student_parameters(), extra=len(losses.student_names))
-        self._policy_step = self._joined(self._policy_loss, self.optimizer, self._policy_gradients, self._apply_policy)
-        self._student_step = self._joined(
+        self._policy_step = self.joined(self._policy_loss, self.optimizer, self._policy_gradients, self._apply_policy)
+        self._student_step = self.joined(
             self._student_loss, self.student_optimizer, self._student_gradients, self._apply_student
         )
 
-    def _joined(
-        self, loss: Loss, optimizer: torch.optim.Optimizer, gradients: FlatGradients, apply: Callable[[], None]
+    def joined(
+        self,
+        loss: Loss,
+        optimizer: torch.optim.Optimizer,
+        gradients: FlatGradients,
+        apply: Callable[[], None],
+        *,
+        graphs: bool = True,
     ) -> Callable[..., None]:
         """One step of two halves: gradients of a loss of rows, and what follows from them. Between several processes each half is a
-        CUDA graph of its own: a message inside a graph could not be given up when a process is lost.
+        CUDA graph of its own, where there are any and ``graphs`` says so: a message inside a graph could not be given up when a
+        process is lost.
         """
 
         def compute(*rows: torch.Tensor) -> None:
@@ -355,7 +365,7 @@ class PPO:
             gradients.extra.copy_(metrics)
 
         def recorded(step: Callable[..., None]) -> Callable[..., None]:
-            return RecordedFunction(step, self.device) if self._graphs else step
+            return RecordedFunction(step, self.device) if self._graphs and graphs else step
 
         def whole(*rows: torch.Tensor) -> None:
             compute(*rows)
@@ -373,17 +383,13 @@ class PPO:
         return shared
 
     def _apply_policy(self) -> None:
-        metrics = self._policy_gradients.extra
-        self._adapt_learning_rate(metrics[self.losses.policy_names.index("kl")])
-        norm, skipped = self._policy_gradients.clip(self.configuration.max_gradient_norm)
-        self.optimizer.step()
-        self._policy_metrics += torch.nan_to_num(torch.cat((metrics, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
+        self._adapt_learning_rate(self._policy_gradients.extra[self.losses.policy_names.index("kl")])
+        limit = self.configuration.max_gradient_norm
+        take_step(self.optimizer, self._policy_gradients, limit, self._policy_metrics)
 
     def _apply_student(self) -> None:
-        _, skipped = self._student_gradients.clip(self.configuration.max_gradient_norm)
-        self.student_optimizer.step()
-        metrics = torch.cat((self._student_gradients.extra, skipped[None]))
-        self._student_metrics += torch.nan_to_num(metrics, 0.0, 0.0, 0.0)
+        limit = self.configuration.max_gradient_norm
+        take_step(self.student_optimizer, self._student_gradients, limit, self._student_metrics)
 
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
         """rsl_rl's rule, on the device: slower above twice the desired divergence, faster below half of it."""
