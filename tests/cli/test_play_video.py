@@ -41,9 +41,9 @@ def test_a_film_that_the_encoder_gave_up_is_not_there(tmp_path, monkeypatch, nam
     )
     encoder.chmod(0o755)
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(encoder))
-    with pytest.raises(UserError, match=rf"cannot write '.*{name}': No space left on device$"):
-        with film(tmp_path / name, fps=25, size=(64, 48)) as add:
-            add(np.zeros((48, 64, 3), dtype=np.uint8))
+    refused = pytest.raises(UserError, match=rf"cannot write '.*{name}': No space left on device$")
+    with refused, film(tmp_path / name, fps=25, size=(64, 48)) as add:
+        add(np.zeros((48, 64, 3), dtype=np.uint8))
     assert list(tmp_path.iterdir()) == [encoder]
 
 

@@ -67,7 +67,7 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
 
 
 def test_a_card_s_folder_by_default_has_its_whole_name_whatever_names_the_card(run, tmp_path, monkeypatch, card):
-    path, _, options = card
+    options = card[2]
     folder = tmp_path / "tiny-1.1-stress"
     (tmp_path / "run").rename(folder)
     monkeypatch.chdir(folder)
