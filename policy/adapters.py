@@ -287,14 +287,20 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
     observations = words("observation_names")
     own = [_own_term(name, source) for name in observations]
     count = len(observations)
-    scales = [float(s) for s in words("observation_terms_scale")] or [1.0] * count
+    scales = words("observation_terms_scale") or ["1.0"] * count
     clips = words("observation_terms_clip") or ["-inf;inf"] * count
     length = _one_length({max(1, int(float(n))) for n in words("observation_terms_history_length")}, source)
     terms = []
-    for name, term, scale, clip in zip(observations, own, scales, clips, strict=True):
-        low, high = (float(v) for v in clip.split(";"))
+    for name, term, listed, pair in zip(observations, own, scales, clips, strict=True):
+        scale = tuple(float(s) for s in listed.split(";"))
+        low, high = (float(v) for v in pair.split(";"))
         limit = _limit(low, high, name, source)
-        terms.append(ObservationTerm(name=term, scale=(scale,), clip=None if limit == math.inf else limit * abs(scale)))
+        clip = tuple(limit * (abs(s) or 1.0) for s in scale)  # what is scaled by zero is zero, clipped or not
+        terms.append(
+            ObservationTerm(
+                name=term, scale=scale, clip=None if limit == math.inf else clip if len(clip) > 1 else clip[0]
+            )
+        )
     action_scale = [float(v) for v in words("action_scale")]
     return PolicyContract(
         robot=robot.name,

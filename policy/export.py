@@ -22,7 +22,7 @@ from ..files.writing import make_folder, replacing, same_file
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, deploy_contract
 from .base import PROBE_EPISODES, Policy, PolicyError
-from .contract import TERM_WIDTH, HistoryOrder, PolicyContract, difference
+from .contract import TERM_WIDTH, HistoryOrder, ObservationTerm, PolicyContract, difference
 from .export_modules import SCRIPTS, Explained, TermMajor, term_major_order
 from .loading import load_policy
 from .native import NativePolicy
@@ -79,7 +79,7 @@ def export_onnx(policy: Policy, path: str | Path) -> float:
     J).
 
     The metadata hold the contract in full precision under ``contract``, and what mjlab's runtime reads under its own
-    names.
+    names, where these can say it (see ``mjlab_metadata``).
 
     Raises:
         ExportError: the policy is foreign or recurrent, the file cannot be written, or it acts differently.
@@ -185,15 +185,19 @@ def stacked_contract(contract: PolicyContract, frames: int) -> PolicyContract:
 
 
 def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
-    """Metadata under mjlab's names. Lists are joined by commas; a term with a scale per entry joins them by
-    semicolons.
+    """Metadata under mjlab's names. Lists are joined by commas; a term with a scale per entry joins them by semicolons.
+
+    mjlab clips a whole term to one magnitude, and does it before scaling; nothing is returned for a contract whose clips
+    need more than that, so that its runtime refuses the file.
     """
 
     def numbers(values: tuple[float, ...]) -> str:
         return ",".join(repr(v) for v in values)
 
     terms = contract.observation
-    clips = [term.clip if isinstance(term.clip, float) else None for term in terms]
+    limits = [_limit_before_scaling(term) for term in terms]
+    if None in limits:
+        return {}
     return {
         "run_path": str(contract.provenance.get("run", "")),
         "joint_names": ",".join(contract.joint_names),
@@ -203,11 +207,22 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
         "command_names": "twist",
         "observation_names": ",".join(DEPLOY_TERMS[term.name] for term in terms),
         "observation_terms_scale": ",".join(";".join(repr(s) for s in term.scale) for term in terms),
-        "observation_terms_clip": ",".join("-inf;inf" if c is None else f"{-c!r};{c!r}" for c in clips),
+        "observation_terms_clip": ",".join(f"-{limit!r};{limit!r}" for limit in limits),
         "observation_terms_history_length": ",".join([str(contract.history.length)] * len(terms)),
         "observation_terms_flatten_history_dim": ",".join(["True"] * len(terms)),
         "action_scale": numbers(contract.action_scale),
     }
+
+
+def _limit_before_scaling(term: ObservationTerm) -> float | None:
+    """Magnitude to which a term is clipped before it is scaled, infinity for no clip; None if its entries have different ones."""
+    if term.clip is None:
+        return math.inf
+    width = max(len(_every(term.clip, 1)), len(term.scale))
+    pairs = zip(_every(term.clip, width), _every(term.scale, width), strict=True)
+    limits = [clip / abs(scale) for clip, scale in pairs if scale]  # what is scaled by zero is zero, clipped or not
+    largest = max(limits, default=math.inf)
+    return largest if math.isclose(min(limits, default=math.inf), largest) else None
 
 
 def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: bool = False) -> dict[str, Any]:
@@ -272,16 +287,17 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
 
 def _spelled_out(contract: PolicyContract) -> PolicyContract:
     """The same contract with a scale and a clip for every single entry, so that two can be compared."""
-
-    def every(values: float | tuple[float, ...], width: int) -> tuple[float, ...]:
-        listed = values if isinstance(values, tuple) else (values,)
-        return listed * width if len(listed) == 1 else listed
-
     terms = []
     for term in contract.observation:
         width = TERM_WIDTH[term.name] or contract.num_joints
-        terms.append(replace(term, scale=every(term.scale, width), clip=term.clip and every(term.clip, width)))
+        terms.append(replace(term, scale=_every(term.scale, width), clip=term.clip and _every(term.clip, width)))
     return replace(contract, observation=tuple(terms))
+
+
+def _every(values: float | tuple[float, ...], width: int) -> tuple[float, ...]:
+    """A value for every entry of a term."""
+    listed = values if isinstance(values, tuple) else (values,)
+    return listed * width if len(listed) == 1 else listed
 
 
 def _with_wide_clips(contract: PolicyContract) -> PolicyContract:

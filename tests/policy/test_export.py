@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 from gaitgauge.policy import export
-from gaitgauge.policy.adapters import deploy_contract
+from gaitgauge.policy.adapters import deploy_contract, mjlab_contract
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import History, PolicyContract, standard_contract
 from gaitgauge.policy.export import (
@@ -217,6 +217,63 @@ def test_onnx_metadata(moe_onnx):
     assert metadata["observation_terms_history_length"] == "5,5,5,5,5,5"
     assert metadata == {"contract": metadata["contract"], **mjlab_metadata(stored)}
     assert load_policy(path).contract == stored
+
+
+def clipped(clips: dict[str, float | tuple[float, ...]], scales: dict[str, tuple[float, ...]] | None = None):
+    """The standard contract with clips, and other scales, of some terms."""
+    contract = standard_contract(load_robot("go2"), history=History(start="repeat"))
+    changed = (
+        replace(t, clip=clips.get(t.name), scale=(scales or {}).get(t.name, t.scale)) for t in contract.observation
+    )
+    return replace(contract, observation=tuple(changed))
+
+
+def test_mjlab_clips_before_it_scales():
+    """Entries of 100 after a factor of 0.25 are those of 400 before it."""
+    contract = clipped({"base_angular_velocity_b": 100.0, "joint_velocity": (50.0,), "joint_position": (3.0,) * 12})
+    metadata = mjlab_metadata(contract)
+    unclipped = "-inf;inf"
+    assert metadata["observation_terms_clip"].split(",") == [
+        "-400.0;400.0",
+        unclipped,
+        unclipped,
+        "-3.0;3.0",
+        "-1000.0;1000.0",
+        unclipped,
+    ]
+
+
+@pytest.mark.parametrize(
+    "contract",
+    [
+        clipped({}),
+        clipped({"base_angular_velocity_b": 100.0, "joint_velocity": 50.0}),
+        clipped({"command": (3.0, 3.0, 0.375)}),
+        clipped({"joint_velocity": 50.0}, {"joint_velocity": (-0.05,)}),
+        clipped({"joint_velocity": 50.0}, {"joint_velocity": (0.0,)}),
+    ],
+    ids=["none", "two", "per entry", "negative factor", "factor of zero"],
+)
+def test_mjlab_metadata_come_back_as_they_were(contract):
+    read = mjlab_contract(mjlab_metadata(contract), load_robot("go2"), source="policy.onnx")
+    for term, wanted in zip(read.observation, contract.observation, strict=True):
+        assert (term.name, term.scale) == (wanted.name, wanted.scale)
+        if wanted.scale == (0.0,):
+            continue  # always zero, clipped or not
+        assert (term.clip is None) == (wanted.clip is None)
+        assert np.allclose(term.clip or 0.0, wanted.clip or 0.0, rtol=1e-12)
+    rest = [name for name in contract.to_dict() if name not in ("observation", "provenance")]
+    assert [getattr(read, name) for name in rest] == [getattr(contract, name) for name in rest]
+
+
+@pytest.mark.parametrize("clip", [100.0, (1.0, 2.0, 3.0)])
+def test_clips_that_mjlab_cannot_express_leave_its_names_out(clip, tmp_path):
+    """Its runtime refuses a file without them; the clips that it found there were others, or none."""
+    contract = clipped({"command": clip})  # which has a factor per entry
+    assert mjlab_metadata(contract) == {}
+    policy = make_policy("mlp", contract)
+    export_onnx(policy, tmp_path / "policy.onnx")
+    assert load_policy(tmp_path / "policy.onnx").contract == contract
 
 
 def test_a_file_that_does_not_describe_itself_says_what_was_taken_for_granted(moe_onnx, tmp_path, caplog):
