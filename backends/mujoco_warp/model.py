@@ -156,14 +156,12 @@ def buffer_capacity(scene: Scene, shared: SharedModel) -> Capacity:
 
 
 def strip(spec: mujoco.MjSpec) -> None:
-    """Remove what costs time in thousands of worlds: actuators (the motor law is ours) and what is only seen."""
+    """Remove what the engine brings itself or does not need: actuators (the motor law is ours), sensors, lights and cameras.
+
+    What is only seen is gone already, as far as it carries no mass (``robot_spec``).
+    """
     for element in [*spec.actuators, *spec.sensors, *spec.lights, *spec.cameras]:
         spec.delete(element)
-    inertial = all(body.explicitinertial for body in spec.bodies if body.name != "world")
-    if inertial:  # otherwise a visual geom may carry mass
-        for geom in list(spec.geoms):
-            if not geom.contype and not geom.conaffinity:
-                spec.delete(geom)
 
 
 def _add_slots(spec: mujoco.MjSpec, terrains: tuple[Terrain, ...], slots: int) -> list[str]:

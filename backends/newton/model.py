@@ -134,9 +134,27 @@ def _compiled_robot(scene: Scene) -> tuple[mujoco.MjModel, str]:
     for key in list(spec.keys):
         spec.delete(key)
     try:
+        _weigh_what_is_seen(spec)
         return spec.compile(), spec.to_xml()
     except ValueError as error:
         raise BackendError(f"MuJoCo cannot build the model of robot '{scene.robot.name}': {error}") from error
+
+
+def _weigh_what_is_seen(spec: mujoco.MjSpec) -> None:
+    """Write down what the bodies weigh where geoms that are only seen are part of it, and delete these, which Newton does not import."""
+    seen = [geom for geom in spec.geoms if not (geom.contype or geom.conaffinity)]
+    if not seen:
+        return
+    model = spec.compile()
+    for body in spec.bodies:
+        if model.body_mass[body.id] > 0.0:
+            body.explicitinertial = True
+            body.mass, body.inertia = model.body_mass[body.id], model.body_inertia[body.id]
+            body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
+            body.fullinertia = np.full(6, np.nan)
+    for geom in seen:
+        spec.delete(geom)
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
 
 
 def _leaf(label: str) -> str:

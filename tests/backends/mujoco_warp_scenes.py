@@ -1,6 +1,7 @@
 """Scenes for tests of the mujoco_warp engine."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -45,6 +46,15 @@ def scene(*terrains, index=None, **physics):
         terrain_index=index,
         physics=PhysicsOptions(**physics),
     )
+
+
+def with_shell(folder, compiler):
+    """A Go2 whose base bears a sphere of 3 kg that meets nothing, with these attributes of its ``compiler`` element."""
+    shell = '<freejoint name="base"/><geom type="sphere" size="0.1" mass="3" contype="0" conaffinity="0"/>'
+    text = ROBOT.mjcf.read_text().replace("<compiler ", f"<compiler {compiler}")
+    mjcf = folder / "go2.xml"
+    mjcf.write_text(text.replace('<freejoint name="base"/>', shell))
+    return replace(ROBOT, mjcf=mjcf)
 
 
 def upright(backend, height):

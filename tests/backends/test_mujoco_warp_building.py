@@ -12,13 +12,14 @@ import pytest
 import torch
 import warp_throughput
 from gaitgauge.backends import BackendError
+from gaitgauge.backends.mujoco.model import build_models
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
 from gaitgauge.backends.mujoco_warp.arrays import Palette
 from gaitgauge.backends.mujoco_warp.memory import bytes_per_world
 from gaitgauge.backends.mujoco_warp.model import PARKED, buffer_capacity, build_shared_model
 from gaitgauge.backends.warp.device import DeviceScope, is_memory_error, memory_advice
 from gaitgauge.backends.warp.structures import filled
-from mujoco_warp_scenes import BLOCK, BOXES, COARSE, FINE, FLAT, ROBOT, WALL, scene
+from mujoco_warp_scenes import BLOCK, BOXES, COARSE, FINE, FLAT, ROBOT, WALL, scene, with_shell
 
 ROOT = Path(__file__).parents[2]
 
@@ -54,6 +55,19 @@ def test_bounds_are_those_of_the_compiler():
     np.testing.assert_allclose(shared.palette["bound_half"][0, -1], model.geom_aabb[geom, 3:], atol=1e-6)
     np.testing.assert_allclose(shared.palette["radius"][0, -1], model.geom_rbound[geom], rtol=1e-6)
     np.testing.assert_allclose(shared.palette["size"][0, -1], model.geom_size[geom], rtol=1e-6)
+
+
+@pytest.mark.parametrize("compiler", ["", 'inertiafromgeom="true" '])
+def test_what_is_seen_alone_weighs_what_it_weighs_in_mujoco(tmp_path, compiler):
+    """A shell of 3 kg that meets nothing: part of the weight only where shapes are weighed instead of what inertials say."""
+    robot = with_shell(tmp_path, compiler)
+    mass = mujoco.MjModel.from_xml_path(str(robot.mjcf)).body_mass.sum()
+    text = ROBOT.mjcf.read_text().replace("<compiler ", f"<compiler {compiler}")
+    without = mujoco.MjModel.from_xml_string(text).body_mass.sum()
+    assert mass == pytest.approx(without + (3.0 if compiler else 0.0))
+    wanted = replace(scene(), robot=robot)
+    assert build_models(wanted)[0].body_mass.sum() == pytest.approx(mass)
+    assert build_shared_model(wanted).model.body_mass.sum() == pytest.approx(mass)
 
 
 def test_height_fields_keep_their_heights_and_shapes():

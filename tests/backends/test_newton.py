@@ -4,6 +4,7 @@ Newton takes seconds to import, so only those who run these tests do.
 """
 
 from contextlib import closing
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -17,6 +18,7 @@ from gaitgauge.backends.registry import backend_class, make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Box, HeightField, Terrain
 from gaitgauge.terrains.registry import make_terrain
+from mujoco_warp_scenes import with_shell
 
 ROBOT = load_robot("go2")
 FLAT = Terrain(name="flat", family="flat")
@@ -86,6 +88,19 @@ def test_refusals_say_what_to_change(solver, physics, says):
     with pytest.raises(BackendError, match=says) as refused:
         make_backend(f"newton:{solver}", scene(**physics))
     assert "PhysicsOptions" in str(refused.value)
+
+
+def test_what_is_seen_alone_is_weighed_before_it_is_left_out(tmp_path):
+    """Newton imports no such shapes; where MuJoCo weighs shapes, they are part of what a body weighs."""
+    pytest.importorskip("newton")
+    from gaitgauge.backends.newton.model import _compiled_robot
+
+    wanted = replace(scene(), robot=with_shell(tmp_path, 'inertiafromgeom="true" '))
+    expected = mujoco.MjModel.from_xml_path(str(wanted.robot.mjcf))
+    model, _ = _compiled_robot(wanted)
+    assert model.geom_contype.all()
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        np.testing.assert_allclose(getattr(model, name), getattr(expected, name), rtol=1e-9, atol=1e-12, err_msg=name)
 
 
 def test_devices_that_do_not_exist():
