@@ -268,10 +268,11 @@ class Survey:
         }
         dofs = model.jnt_dofadr[joints]
         servos = [motor_of.get(j) for j in joints]
-        kp = [0.0 if a is None else float(model.actuator_gainprm[a, 0]) for a in servos]
-        kd = [0.0 if a is None else -float(model.actuator_biasprm[a, 2]) for a in servos]
+        gains = [self._gains(a) for a in servos]
+        kp, kd = [k for k, _ in gains], [d for _, d in gains]
         position = all(
-            a is not None and k > 0.0 and model.actuator_biasprm[a, 1] == -k for a, k in zip(servos, kp, strict=True)
+            a is not None and k > 0.0 and model.actuator_biasprm[a, 1] == -model.actuator_gainprm[a, 0]
+            for a, k in zip(servos, kp, strict=True)
         )
         sizes = "guessed from weight and leg length"
         stiffness: Remarked = (_round(_STIFFNESS * strength), sizes)
@@ -301,6 +302,14 @@ class Survey:
                 "guessed from leg length: from here the motor drives no more",
             ),
         }
+
+    def _gains(self, actuator: int | None) -> tuple[float, float]:
+        """Stiffness and damping that a position servo gives its joint: its gear multiplies the angle that it sees, and its torque."""
+        if actuator is None:
+            return 0.0, 0.0
+        squared = float(self.model.actuator_gear[actuator, 0]) ** 2
+        kp, kd = self.model.actuator_gainprm[actuator, 0], -self.model.actuator_biasprm[actuator, 2]
+        return squared * float(kp), squared * float(kd)
 
     def _torque_limit(self, joint: int, actuator: int | None) -> float | None:
         model = self.model
