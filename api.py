@@ -200,6 +200,7 @@ def evaluate(
     from .files.parsing import shown
     from .gauge.evaluate import Request
     from .gauge.evaluate import evaluate as run
+    from .gauge.naming import run_folders
     from .gauge.report import write_report
 
     _need("a path", policy=policy, suite=suite)
@@ -211,7 +212,8 @@ def evaluate(
     _need("a whole number or None", level=level, threads=threads)
     if threads is not None and not 1 <= threads <= MOST_THREADS:
         raise ArgumentError(f"threads is {shown(threads)}; it must be 1 to {MOST_THREADS}")
-    folder = Path(out) if out is not None else Path("results") / f"{Path(policy).stem}-{Path(suite).stem}-{pipeline}"
+    usual = run_folders([str(policy)], Path("results"), suite=str(suite), pipeline=pipeline)[0]
+    folder = usual if out is None else Path(out)
     request = Request(
         policy=str(policy),
         suite=str(suite),

@@ -13,6 +13,7 @@ import viser
 
 from ..backends.base import BackendError
 from ..files.parsing import one_line
+from ..gauge.naming import distinct_names
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError
 from ..policy.finding import find_policy, shipped_policies
@@ -24,7 +25,7 @@ from .console import Terminal
 from .errors import UserError
 from .overlay import summary, table
 from .play_session import Command, PlaySession, clip
-from .worlds import WorldMaker, labels
+from .worlds import WorldMaker
 
 _REFRESH = 0.04
 """Time between two poses sent to the browser [s]."""
@@ -340,7 +341,7 @@ def _make(maker: WorldMaker, chosen: Choice, friction: float) -> list[PlaySessio
     """Worlds for a choice, all or none."""
     with ExitStack() as stack:
         sessions = []
-        for policy, label in zip(chosen.policies, labels(chosen.policies), strict=True):
+        for policy, label in zip(chosen.policies, distinct_names(chosen.policies), strict=True):
             session = maker.make(policy, chosen.terrain, chosen.level, friction, label)
             stack.callback(session.close)
             sessions.append(session)

@@ -14,9 +14,10 @@ from ..backends.registry import choose_device
 from ..gauge.comparing import compare_all
 from ..gauge.comparison import format_p
 from ..gauge.evaluate import Request
+from ..gauge.naming import joined_names
 from .console import Terminal, make_table, print_json
 from .evaluate import shower
-from .studies import joined_names, resumable
+from .studies import resumable
 
 
 def run_comparison(

@@ -14,9 +14,10 @@ from ..files.parsing import bare_name
 from ..gauge.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
 from ..gauge.consistency.request import StudyRequest, StudyStatus
 from ..gauge.consistency.study import prepare_study, study
+from ..gauge.naming import joined_names
 from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay
-from .studies import joined_names, resumable
+from .studies import resumable
 
 
 def run_consistency(

@@ -14,9 +14,9 @@ from typing import Any
 from rich.text import Text
 
 from ..backends.registry import choose_device
-from ..files.parsing import bare_name
 from ..gauge.coverage import COMPLETE, coverage_of, notes, score_label, suite_label
 from ..gauge.evaluate import Request, Status, evaluate, prepare
+from ..gauge.naming import run_folders
 from ..gauge.report import write_report
 from ..gauge.results import ALL
 from ..gauge.suite import Suite
@@ -57,7 +57,7 @@ def run_evaluation(
         **choices,
     )
     prepared = prepare(request)  # all that can be wrong with the request is said before anything is written
-    folder = out or Path("results") / f"{bare_name(policy)}-{bare_name(suite)}-{pipeline}"
+    folder = out or run_folders([policy], Path("results"), suite=suite, pipeline=pipeline)[0]
     console = Terminal(stderr=True)
     # Ray prints its nodes' logs to standard output; that a worker was lost is one of the notices
     quiet = redirect_stdout(io.StringIO() if cluster else sys.stdout)

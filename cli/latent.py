@@ -9,9 +9,10 @@ from typing import Any
 
 from ..gauge.latent.figures import SPACES, label
 from ..gauge.latent.study import PAIRS, LatentRequest, study_latents
+from ..gauge.naming import joined_names
 from .console import Terminal, make_table
 from .policies import policy_files
-from .studies import joined_names, make_study
+from .studies import make_study
 
 
 def run_latent(

@@ -65,8 +65,9 @@ def run_play(**choices: Any) -> None:
     asked = PlayRequest(**choices)
     viewer = _check(asked)
     quality = choose_renderer() if viewer == "video" else None  # before MuJoCo is imported
+    from ..gauge.naming import distinct_names
     from .play_session import beyond
-    from .worlds import WorldMaker, labels
+    from .worlds import WorldMaker
 
     console = Terminal()
     maker = WorldMaker(
@@ -80,7 +81,7 @@ def run_play(**choices: Any) -> None:
     level = maker.default_level(asked.terrain) if asked.level is None else asked.level
     with ExitStack() as stack:
         sessions = []
-        for choice, label in zip(asked.policies, labels(asked.policies), strict=True):
+        for choice, label in zip(asked.policies, distinct_names(asked.policies), strict=True):
             session = maker.make(choice, asked.terrain, level, asked.friction, label)
             stack.callback(session.close)
             sessions.append(session)

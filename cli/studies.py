@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from ..files.parsing import bare_name
 from ..files.writing import LOCK, lock_folder, make_folder
+from ..gauge.policies import lost_policy
 from .console import Terminal, print_json, shell_command
 from .errors import UserError
 from .progress import ProgressDisplay
-
-
-def joined_names(policies: Sequence[str]) -> str:
-    """Names of the first policies, for a folder's name."""
-    return "-".join(bare_name(p) for p in policies[:3])
 
 
 @contextmanager
@@ -78,6 +73,8 @@ def make_study(
     errors = Terminal(stderr=True)
     # the folder first: what is wrong with it is said before anything is played
     with _own_folder(folder), ProgressDisplay(errors, title) as display:
+        if lost := lost_policy(folder / files[0], request.policies):
+            raise UserError(f"'{folder}' holds policy {lost}, which would be lost; give another folder with --out")
         results = study(
             request,
             folder,

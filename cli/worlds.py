@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from ..backends.registry import choose_device
-from ..files.parsing import bare_name
 from ..gauge.suite import load_suite
 from ..policy.base import Policy
 from ..policy.its_robot import robot_for
@@ -61,12 +58,3 @@ class WorldMaker:
     def default_level(terrain: str) -> int | None:
         """The level where none is given: the middle one, None for a terrain without levels."""
         return LEVELS[len(LEVELS) // 2 - 1] if terrain != "flat" and terrain in gauge_terrain_names() else None
-
-
-def labels(choices: Sequence[str]) -> list[str]:
-    """Names of policies for people: as short as they go while they differ."""
-    short = [bare_name(c) or c for c in choices]
-    if len(set(short)) == len(short):
-        return short
-    longer = ["/".join(Path(c).parts[-2:]) for c in choices]
-    return longer if len(set(longer)) == len(longer) else [f"{i}: {c}" for i, c in enumerate(longer, 1)]

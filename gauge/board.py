@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -14,6 +14,7 @@ from ..files.writing import write_atomically
 from ..policy.contract import PRIVILEGED_TERMS
 from .comparison import load_result
 from .coverage import COMPLETE, coverage_of
+from .naming import distinct_names
 from .pages import page_template
 from .result_check import robot_digest_of
 from .suite import load_suite, suite_names
@@ -52,21 +53,27 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
         cards, best first, with their ``rank``) and ``others`` (parts, custom runs, levels alone and policies with privileged
         observations, which have no rank).
     """
-    tables: dict[tuple[str, str, str, str | None], list[dict[str, Any]]] = {}
-    suites: dict[tuple[str, str, str, str | None], Mapping[str, Any]] = {}
+    tables: dict[tuple[str, str, str, str | None], dict[str, Mapping[str, Any]]] = {}
     for name, card in cards.items():
         key = (card["suite"]["digest"], card["backend"], card["robot"], robot_digest_of(card))
-        suites[key] = card["suite"]
-        tables.setdefault(key, []).append(_entry(name, card, folder))
+        tables.setdefault(key, {})[name] = card
     found = []
-    for key, entries in sorted(tables.items(), key=lambda item: -len(item[1])):
+    for key, rows in sorted(tables.items(), key=lambda item: -len(item[1])):
+        # a card's own name is part of the path: it stands for a policy whose file is called as any other
+        names = distinct_names([f"{name}/{card['policy']['path']}" for name, card in rows.items()])
+        entries = [_entry(name, card, folder, policy) for (name, card), policy in zip(rows.items(), names, strict=True)]
         entries.sort(key=lambda e: -1.0 if e["score"] is None else e["score"], reverse=True)
         ranked = [e for e in entries if e["ranked"]]
         for entry in ranked:  # equal scores share a rank
             entry["rank"] = 1 + sum(other["score"] > entry["score"] for other in ranked)
         others = [e for e in entries if not e["ranked"]]
         _, backend, robot, files = key
-        place = {"suite": suites[key], "backend": backend, "robot": robot, "robot_digest": files}
+        place = {
+            "suite": next(reversed(rows.values()))["suite"],
+            "backend": backend,
+            "robot": robot,
+            "robot_digest": files,
+        }
         found.append({**place, "ranked": ranked, "others": others})
     return found
 
@@ -76,13 +83,13 @@ def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
     return page_template("board.html.j2").render(tables=tables)
 
 
-def _entry(name: str, card: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def _entry(name: str, card: Mapping[str, Any], folder: Path, policy: str) -> dict[str, Any]:
     """A line of the board."""
     terms: Sequence[str] | None = card["policy"].get("observations")
     covered, privileged = coverage_of(card), bool(set(terms or ()) & set(PRIVILEGED_TERMS))
     return {
         "card": name,
-        "policy": PurePath(card["policy"]["path"].replace("\\", "/")).name,
+        "policy": policy,
         "hash": card["policy"]["file_sha256"],
         "score": card["score"],
         "interval": card["score_interval"],

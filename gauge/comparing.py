@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..files.parsing import bare_name
 from .comparison import ComparisonError, compare, load_result
 from .comparison_report import write_comparison
-from .evaluate import Request, Status, evaluate, prepare
+from .evaluate import Request, Status, evaluate, identity, prepare
+from .naming import distinct_names, run_folders
 from .report import write_report
+from .store import check_folder
 
 
 def is_result(contestant: str) -> bool:
     """Whether an argument names results rather than a policy: a folder with ``results.json``, or a file that ends in ``.json``."""
     path = Path(contestant)
     return path.suffix == ".json" or (path / "results.json").is_file()
-
-
-def run_folders(requests: Mapping[str, Request], root: Path) -> dict[str, Path]:
-    """Where the evaluation of each policy goes: as ``evaluate`` has it, with the policy's folder where two files have one name."""
-    stems = [bare_name(r.policy) for r in requests.values()]
-    folders = {}
-    for name, request in requests.items():
-        stem = bare_name(request.policy)
-        if stems.count(stem) > 1:
-            stem = f"{Path(request.policy).resolve().parent.name}-{stem}"
-        folders[name] = root / f"{stem}-{bare_name(request.suite)}-{request.pipeline}"
-    return folders
 
 
 def compare_all(
@@ -72,8 +61,15 @@ def compare_all(
                     f"'{other}' has other environments than '{contestant}' would be given; choose them with --terrain, "
                     "--friction and --payload"
                 )
-    for contestant, target in run_folders(requests, runs).items():
+    folders = run_folders(list(requests), runs, suite=request.suite, pipeline=request.pipeline)
+    for prepared, target in zip(prepared_requests.values(), folders, strict=True):
+        check_folder(target, identity(prepared), resume=True)
+    labelled = {
+        c: f"{c}/{result['policy']['path']}" for c, result in found.items()
+    }  # a card's own name where its policy has none
+    for contestant, target in zip(requests, folders, strict=True):
         found[contestant] = evaluate(prepared_requests[contestant], target, resume=True, command=command, watch=watch)
         write_report(target)
-    comparison = compare([found[c] for c in contestants])
+    labels = distinct_names([labelled.get(c, found[c]["policy"]["path"]) for c in contestants])
+    comparison = compare([found[c] for c in contestants], labels)
     return comparison.plain(), write_comparison(folder, comparison)

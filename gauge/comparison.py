@@ -11,20 +11,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..files.parsing import bare_name, edited, one_line, read_results, shown
+from ..files.parsing import edited, one_line, read_results, shown
 from .coverage import COMPLETE, coverage_of
 from .episodes import QUALITY
 from .intervals import CONFIDENCE, Array, Chance, Evidence
+from .naming import distinct_names
 from .result_check import chance_rules_of, check_result, robot_digest_of
 from .results import ONE_SEED, SCHEMA, environment_weights
 
-_LABEL = 80
-"""Characters of a policy's short name."""
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
 """What is compared, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
 sub-commands are compared as measured, in the environments where both policies were measured at the same level; all else counts
@@ -128,14 +127,14 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
 
     Args:
         results: contents of ``results.json``, two or more.
-        labels: names of the policies; None for those of their files.
+        labels: names of the policies; None for those of their files, see ``distinct_names``.
 
     Raises:
         ComparisonError: results of different suites, engines, robots or environments, or without scores.
     """
     if len(results) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results, not {len(results)}")
-    labels = list(labels) if labels else _labels(results)
+    labels = list(labels) if labels else distinct_names([r["policy"]["path"] for r in results])
     _check(results, labels)
     rows = results[0]["environments"]
     order = {_key(row): at for at, row in enumerate(rows)}
@@ -366,17 +365,6 @@ def _sweep(rows: Sequence[Mapping[str, Any]], axis: str, other: str) -> Iterator
 
 def _key(row: Mapping[str, Any]) -> tuple[str, float, float]:
     return row["terrain"], row["friction"], row["payload"]
-
-
-def _labels(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Short names that tell the policies apart: of the file, with its folder where that is not enough, numbered at last."""
-    paths = [PurePath(r["policy"]["path"].replace("\\", "/")) for r in results]
-    labels = [one_line(bare_name(p), _LABEL) for p in paths]
-    if len(set(labels)) < len(labels):
-        labels = [one_line(f"{p.parent.name}/{bare_name(p)}".lstrip("/"), _LABEL) for p in paths]
-    if len(set(labels)) < len(labels):
-        labels = [f"{label} ({at})" for at, label in enumerate(labels, 1)]
-    return labels
 
 
 def _score_sentence(found: Difference, pairs: int) -> str:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from ..files.parsing import bare_name, one_line
+from ..files.parsing import one_line, read_results
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError, PolicyContract
 from ..policy.finding import find_policy
@@ -16,6 +18,7 @@ from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
+from .naming import distinct_names
 from .suite import Suite, SuiteError
 
 Watch = Callable[[int, int, str], None]
@@ -51,7 +54,7 @@ class PoliciesRequest:
 def load_policies(
     names: Sequence[str], robot: str | None = None, *, trust: bool = False
 ) -> tuple[dict[str, Loaded], list[Refused]]:
-    """Policies by label, the shortest that tells them apart, and those that could not be loaded.
+    """Policies by label, see ``distinct_names``, and those that could not be loaded.
 
     Args:
         names: what ``gaitgauge evaluate`` takes; one that is named twice is loaded once.
@@ -65,15 +68,14 @@ def load_policies(
     found: dict[str, Loaded] = {}
     refused: list[Refused] = []
     names = list(dict.fromkeys(names))
-    short = [one_line(bare_name(name), 80) for name in names]
-    for name, stem in zip(names, short, strict=True):
+    for name, label in zip(names, distinct_names(names), strict=True):
         try:
             policy = load_policy(name, asked, trust=trust)
             loaded = Loaded(policy=policy, robot=robot_for(policy.contract, robot))
         except (PolicyError, ContractError, RobotError) as error:
             refused.append({"what": name, "reason": str(error)})
         else:
-            found[stem if short.count(stem) == 1 else one_line(name, 4096)] = loaded
+            found[label] = loaded
     return found, refused
 
 
@@ -108,6 +110,27 @@ def file_digest(name: str) -> str:
     """SHA-256 of a policy's file, hexadecimal, as ``sha256sum`` prints it."""
     with find_policy(name).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def lost_policy(file: Path, names: Sequence[str]) -> str | None:
+    """A policy that a study's results hold and that is not among ``names``, by path or by content; None for none.
+
+    Args:
+        file: results with what ``describe`` says of each policy; there may be none.
+    """
+    if not file.is_file():
+        return None
+    digests = set()
+    for name in names:
+        with suppress(PolicyError, OSError):  # what is wrong with it is said when it is loaded
+            digests.add(file_digest(name))
+    try:
+        for entry in read_results(file, "results", PolicyError)["policies"]:
+            if entry["path"] not in names and entry["file_sha256"] not in digests:
+                return f"'{one_line(entry['label'], 80)}' ({one_line(entry['path'])})"
+    except (PolicyError, KeyError, TypeError):
+        pass  # not what a study wrote
+    return None
 
 
 def describe(label: str, loaded: Loaded) -> dict[str, Any]:

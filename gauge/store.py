@@ -33,8 +33,7 @@ class RunFolder:
                 its episodes are a link to another place.
         """
         self._episodes = folder / "episodes"
-        wanted = json.loads(json.dumps(request))
-        _present_request(folder, wanted, resume=resume)  # before anything in it is touched
+        wanted = check_folder(folder, request, resume=resume)  # before anything in it is touched
         if self._episodes.is_symlink():  # records are removed and set aside there: of whom?
             raise StoreError(
                 f"'{one_line(self._episodes)}' is a link, and a run writes to its own folder alone; "
@@ -78,6 +77,17 @@ class RunFolder:
                     path.unlink()
                 except OSError as error:
                     raise StoreError(write_failure(path, error)) from error
+
+
+def check_folder(folder: Path, request: Mapping[str, Any], *, resume: bool) -> Any:
+    """Check that a run may use a folder, as far as that can be known before it is locked; returns the request as JSON keeps it.
+
+    Raises:
+        StoreError: the folder belongs to another run, holds a run and ``resume`` is not asked for, or is a file.
+    """
+    wanted = json.loads(json.dumps(request))
+    _present_request(folder, wanted, resume=resume)
+    return wanted
 
 
 def _present_request(folder: Path, wanted: Mapping[str, Any], *, resume: bool) -> Any:

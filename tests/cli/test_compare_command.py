@@ -2,8 +2,10 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
+from gaitgauge.policy.native import save_policy
 from tiny_suite import SUITE
 
 
@@ -45,3 +47,28 @@ def test_what_cannot_be_compared_is_said_before_anything_is_played(run, refused,
     sentence = refused("compare", first, policy, "--suite", tiny, "--friction", 0.9)
     assert "other environments" in sentence
     assert not (tmp_path / "results").exists()
+
+
+def test_policies_whose_files_are_called_alike_are_told_apart_before_anything_is_played(run, tmp_path, policy, tiny):
+    for method in ("HIM", "CTS"):
+        (tmp_path / method / "seed-1" / "kept").mkdir(parents=True)
+        shutil.copy(policy, tmp_path / method / "seed-1" / "kept" / "policy.gauge.pt")
+    paths = [f"{method}/seed-1/kept/policy.gauge.pt" for method in ("HIM", "CTS")]
+    done = run("compare", *paths, "--suite", tiny, "--threads", 1, "--json")
+    assert done.exit_code == 0, done.output
+    assert [p["label"] for p in json.loads(done.stdout)["policies"]] == ["HIM seed-1", "CTS seed-1"]
+    names = {f"{m}-seed-1-tiny-stress" for m in ("HIM", "CTS")}
+    assert {p.name for p in (tmp_path / "results").iterdir()} == {"compare-HIM-seed-1-CTS-seed-1", *names}
+
+
+def test_a_folder_of_another_run_is_refused_before_the_first_policy_is_played(
+    run, refused, tmp_path, policy, contract, stored, tiny
+):
+    (tmp_path / "other").mkdir()
+    leans = {name: value + 0.1 for name, value in stored.state_dict.items()}
+    save_policy(tmp_path / "other" / "walk.gauge.pt", contract, replace(stored, state_dict=leans))
+    assert run("evaluate", "other/walk.gauge.pt", "--suite", tiny, "--threads", 1).exit_code == 0
+    shutil.copy(policy, tmp_path / "walk.gauge.pt")
+    sentence = refused("compare", policy, "walk.gauge.pt", "--suite", tiny, "--threads", 1)
+    assert "walk-tiny-stress belongs to another run" in sentence
+    assert [p.name for p in (tmp_path / "results").iterdir()] == ["walk-tiny-stress"]

@@ -13,7 +13,6 @@ from gaitgauge.backends import ResetState
 from gaitgauge.cli import scenery
 from gaitgauge.cli.picture import show
 from gaitgauge.cli.play_session import beyond
-from gaitgauge.cli.worlds import labels
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.native import save_policy
 from gaitgauge.robots import load_robot
@@ -334,12 +333,6 @@ def test_window_without_a_display(refused, policy, monkeypatch):
 def test_video_into_a_wrong_file(refused, policy):
     assert ".mp4" in refused("play", policy, "--out", "walk.avi")
     assert "nowhere" in refused("play", policy, "--out", "nowhere/walk.mp4")
-
-
-def test_labels_differ():
-    assert labels(["pretrained", "runs/a/model_50.pt", "mine.gauge.pt"]) == ["pretrained", "model_50", "mine"]
-    assert labels(["runs/a/model_50.pt", "runs/b/model_50.pt"]) == ["a/model_50.pt", "b/model_50.pt"]
-    assert labels(["latest", "latest"]) == ["1: latest", "2: latest"]
 
 
 @pytest.mark.parametrize("speed", ["nan", "inf", "1e300"])

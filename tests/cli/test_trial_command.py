@@ -2,10 +2,13 @@
 
 import csv
 import json
+import shutil
+from dataclasses import replace
 
 import pytest
 from filelock import FileLock
 from gaitgauge.files.writing import LOCK
+from gaitgauge.policy.native import save_policy
 
 STANDS = """
 name = "stands"
@@ -45,6 +48,28 @@ def scenarios(tmp_path):
     (tmp_path / "stands.toml").write_text(STANDS)
     (tmp_path / "runs.toml").write_text(RUNS)
     (tmp_path / "never.toml").write_text(STANDS.replace("survive = true", "beyond = 0.1"))
+
+
+def test_another_policy_s_trial_is_not_overwritten(run, refused, policy, contract, stored, scenarios, tmp_path):
+    trial = ("--scenario", "stands.toml", "--threads", 1)
+    for name in ("one/HIM/kept", "one/CTS/kept", "two/HIM/kept"):
+        (tmp_path / name).mkdir(parents=True)
+        shutil.copy(policy, tmp_path / name / "policy.gauge.pt")
+    for name in ("HIM", "CTS"):
+        assert run("trial", f"one/{name}/kept/policy.gauge.pt", *trial).exit_code == 0
+    found = json.loads((tmp_path / "results" / "trial-HIM" / "trials.json").read_text())
+    assert found["policies"][0]["label"] == "HIM"
+    assert {p.name for p in (tmp_path / "results").iterdir()} == {"trial-HIM", "trial-CTS"}
+    # the same again is wanted again, and so is the same file from elsewhere
+    assert run("trial", "one/HIM/kept/policy.gauge.pt", *trial).exit_code == 0
+    assert run("trial", "two/HIM/kept/policy.gauge.pt", *trial).exit_code == 0
+    other = replace(contract, provenance={"kind": "another"})
+    save_policy(tmp_path / "one" / "HIM" / "kept" / "policy.gauge.pt", other, stored)
+    before = (tmp_path / "results" / "trial-HIM" / "trials.json").read_text()
+    sentence = refused("trial", "one/HIM/kept/policy.gauge.pt", *trial)
+    assert "'results/trial-HIM' holds policy 'HIM' (two/HIM/kept/policy.gauge.pt)" in sentence
+    assert "give another folder with --out" in sentence
+    assert (tmp_path / "results" / "trial-HIM" / "trials.json").read_text() == before
 
 
 def test_what_comes_of_it_is_printed_and_written(run, policy, scenarios, tmp_path):

@@ -41,6 +41,19 @@ def test_complete_cards_are_ranked_by_score_and_others_only_listed():
     assert table["ranked"][0]["command"] == "gaitgauge verify high.json --policy FILE"
 
 
+def test_policies_whose_files_are_called_alike_are_told_apart():
+    kept = "runs/HIM/seed-1/kept/policy.gauge.pt"
+    cards = {"one.json": card(0.9, path=kept), "CTS-seed-1/results.json": card(0.8, path="policy.gauge.pt")}
+    cards |= {
+        "b.json": card(0.7, path="b\\walk.pt"),
+        "c.json": card(0.6, path="c/walk.pt"),
+        "d.json": card(0.5, path="d/trot.pt"),
+    }
+    (table, other) = board_data(cards | {"e.json": card(0.9, path="b/walk.pt", robot="a1")})
+    assert [e["policy"] for e in table["ranked"]] == ["HIM seed-1", "CTS-seed-1", "b walk", "c walk", "trot"]
+    assert [e["policy"] for e in other["ranked"]] == ["walk"]
+
+
 def test_results_that_do_not_state_their_coverage_or_have_no_score_are_not_ranked():
     old, levels = card(0.7), card(None)
     del old["coverage"]

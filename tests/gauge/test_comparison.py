@@ -149,9 +149,9 @@ def test_scores_of_three_are_corrected_for_three_pairs():
 
 def test_files_of_one_name_are_told_apart_by_their_folder():
     pair = [results(path=p) for p in ("runs/a/model_10.pt", "runs\\b\\model_10.pt")]
-    assert [p["label"] for p in compare(pair).policies] == ["a/model_10", "b/model_10"]
+    assert [p["label"] for p in compare(pair).policies] == ["a model_10", "b model_10"]
     same = [results(path="x/model.pt") for _ in range(2)]
-    assert [p["label"] for p in compare(same).policies] == ["x/model (1)", "x/model (2)"]
+    assert [p["label"] for p in compare(same).policies] == ["x (1)", "x (2)"]
 
 
 def test_parts_of_one_shape_compare_and_say_that_they_are_no_benchmark():
