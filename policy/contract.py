@@ -143,8 +143,7 @@ class PolicyContract:
         terms = [t.name for t in self.observation]
         if len(set(terms)) != len(terms):
             raise ContractError(f"contract: observation has a term twice: {', '.join(terms)}")
-        for term in self.observation:
-            width = TERM_WIDTH[term.name] or joints
+        for term, width in zip(self.observation, self.term_widths, strict=True):
             clip = term.clip if isinstance(term.clip, tuple) else (0.0,)
             for name, values in (("scale", term.scale), ("clip", clip)):
                 if len(values) not in (1, width):
@@ -158,9 +157,14 @@ class PolicyContract:
         return len(self.joint_names)
 
     @cached_property
+    def term_widths(self) -> tuple[int, ...]:
+        """Width of each observation term."""
+        return tuple(TERM_WIDTH[term.name] or self.num_joints for term in self.observation)
+
+    @cached_property
     def frame_width(self) -> int:
         """Width of one observation frame."""
-        return sum(TERM_WIDTH[t.name] or len(self.joint_names) for t in self.observation)
+        return sum(self.term_widths)
 
     @cached_property
     def observation_width(self) -> int:

@@ -22,11 +22,12 @@ from ..files.writing import make_folder, replacing, same_file
 from ..robots import Robot
 from .adapters import FOREIGN_TERMS, deploy_contract
 from .base import PROBE_EPISODES, Policy, PolicyError
-from .contract import TERM_WIDTH, HistoryOrder, ObservationTerm, PolicyContract, difference
-from .export_modules import SCRIPTS, Explained, TermMajor, term_major_order
+from .contract import HistoryOrder, ObservationTerm, PolicyContract, difference
+from .export_modules import SCRIPTS, Explained, TermMajor
 from .loading import load_policy
 from .native import NativePolicy
 from .networks import MlpNetwork
+from .observation import term_major_order
 from .torchscript import CONTRACT_FILE
 
 PARTS = ("torchscript", "onnx", "deploy")
@@ -248,8 +249,7 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
     def clips(limit: float | None) -> list[float] | None:
         return None if limit is None else [-limit, limit]
 
-    for term in contract.observation:
-        width = TERM_WIDTH[term.name] or contract.num_joints
+    for term, width in zip(contract.observation, contract.term_widths, strict=True):
         if isinstance(term.clip, tuple):
             raise ExportError(
                 f"a deploy.yaml has one clip for all entries of an observation; '{term.name}' has {len(term.clip)}"
@@ -287,11 +287,11 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
 
 def _spelled_out(contract: PolicyContract) -> PolicyContract:
     """The same contract with a scale and a clip for every single entry, so that two can be compared."""
-    terms = []
-    for term in contract.observation:
-        width = TERM_WIDTH[term.name] or contract.num_joints
-        terms.append(replace(term, scale=_every(term.scale, width), clip=term.clip and _every(term.clip, width)))
-    return replace(contract, observation=tuple(terms))
+    terms = tuple(
+        replace(term, scale=_every(term.scale, width), clip=term.clip and _every(term.clip, width))
+        for term, width in zip(contract.observation, contract.term_widths, strict=True)
+    )
+    return replace(contract, observation=terms)
 
 
 def _every(values: float | tuple[float, ...], width: int) -> tuple[float, ...]:

@@ -8,7 +8,6 @@ import torch
 from torch import nn
 
 from .composed import AcMoeNetwork, McpNetwork
-from .contract import TERM_WIDTH, PolicyContract
 from .estimators import DreamwaqNetwork, HimNetwork
 from .networks import CtsNetwork, MlpNetwork, MoeCtsNetwork
 
@@ -96,15 +95,3 @@ class TermMajor(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Actions (N, J) for term-major histories (N, H * F)."""
         return self.network(obs[:, self.order].unflatten(1, self.frames))
-
-
-def term_major_order(contract: PolicyContract, frames: int) -> torch.Tensor:
-    """Position in a term-major history of each entry of the frame-major one, (frames * F,) int64; both oldest first."""
-    columns = []
-    start = 0
-    for term in contract.observation:
-        width = TERM_WIDTH[term.name] or contract.num_joints
-        block = start + torch.arange(frames * width).view(frames, width)
-        columns.append(block)
-        start += frames * width
-    return torch.cat(columns, dim=1).flatten()

@@ -9,7 +9,7 @@ import torch
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
 from ..robots.rotation import projected_gravity, rotate_inverse
-from .contract import TERM_WIDTH, ContractError, ObservationTerm, PolicyContract, check_robot
+from .contract import ContractError, ObservationTerm, PolicyContract, check_robot
 
 NOISE_TERMS = (
     "base_linear_velocity_b",
@@ -46,7 +46,7 @@ class ObservationBuilder:
         self.contract = contract
         self.num_episodes = num_episodes
         self.device = torch.device(device)
-        self._widths = [TERM_WIDTH[t.name] or contract.num_joints for t in contract.observation]
+        widths = contract.term_widths
         identity = tuple(range(contract.num_joints))
         # An identity map is left out: indexing costs a kernel per term and step.
         self._robot_joint = None if index == identity else self._tensor(index, torch.int64)
@@ -56,14 +56,11 @@ class ObservationBuilder:
         self._action_scale = self._tensor(contract.action_scale)
         self._target_range = None if contract.target_range is None else self._tensor(contract.target_range).T
         self._scale = torch.cat(
-            [self._tensor(t.scale).expand(w) for t, w in zip(contract.observation, self._widths, strict=True)]
+            [self._tensor(t.scale).expand(w) for t, w in zip(contract.observation, widths, strict=True)]
         )
-        limits = [self._tensor(_clip(t)).expand(w) for t, w in zip(contract.observation, self._widths, strict=True)]
+        limits = [self._tensor(_clip(t)).expand(w) for t, w in zip(contract.observation, widths, strict=True)]
         self._limit = None if all(t.clip is None for t in contract.observation) else torch.cat(limits)
-        # where each entry of a history term by term is in one frame by frame
-        places = torch.arange(contract.history.length * contract.frame_width).view(-1, contract.frame_width)
-        terms = [block.flatten() for block in places.split(self._widths, dim=1)]
-        self._term_major = torch.cat(terms).to(self.device)
+        self._term_major = term_major_order(contract, contract.history.length).argsort().to(self.device)
         self._frames = torch.zeros(num_episodes, contract.history.length, contract.frame_width, device=self.device)
         self._fresh = torch.ones(num_episodes, dtype=torch.bool, device=self.device)
 
@@ -171,6 +168,13 @@ class ObservationBuilder:
         if self._target_range is not None:
             target = torch.clamp(target, self._target_range[0], self._target_range[1])
         return target if self._policy_joint is None else target[:, self._policy_joint]
+
+
+def term_major_order(contract: PolicyContract, frames: int) -> torch.Tensor:
+    """Position in a term-major history of each entry of the frame-major one, (frames * F,) int64; both oldest first."""
+    entries = torch.arange(frames * contract.frame_width)
+    blocks = entries.split([frames * width for width in contract.term_widths])
+    return torch.cat([block.view(frames, -1) for block in blocks], dim=1).flatten()
 
 
 def _clip(term: ObservationTerm) -> tuple[float, ...]:

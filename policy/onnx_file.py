@@ -27,9 +27,9 @@ from .base import (
     checked_action,
 )
 from .contract import PolicyContract
+from .fence.graph import action_output
 from .native import first_line
 
-ACTION_NAMES = ("actions", "action")
 _RUN_ERRORS: tuple[type[Exception], ...] = (
     *(e for e in vars(runtime_state).values() if isinstance(e, type) and issubclass(e, Exception)),
     RuntimeError,
@@ -66,7 +66,7 @@ class OnnxFile:
         if not outputs:
             raise PolicyError(f"'{source}' has no output")
         self.input_name: str = inputs[0].name
-        self.output_name: str = next((n for n in ACTION_NAMES if n in outputs), outputs[0])
+        self.output_name: str = action_output(outputs)
         shape = inputs[0].shape
         self.width: int | None = shape[1] if isinstance(shape[1], int) else None
         """Width of the input, None if the file leaves it open."""

@@ -14,11 +14,11 @@ import torch
 from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 
+from .fence.graph import action_output
 from .native import PROGRAM_ERRORS
 from .onnx_operators import DTYPES, OPERATORS, Node
 from .program import MOST_ELEMENTS, Budget, NotUnderstoodError, Program
 
-ACTION_NAMES = ("actions", "action")
 _MOST_NUMBERS = 1 << 16
 """Entries of a constant that may be a shape or a list of places."""
 
@@ -57,8 +57,7 @@ class _Graph:
         if len(inputs) != 1 or not graph.output:
             raise NotUnderstoodError("it has more inputs than an observation")
         self._input = inputs[0]
-        outputs = [o.name for o in graph.output]
-        self._output = next((name for name in ACTION_NAMES if name in outputs), outputs[0])
+        self._output = action_output([o.name for o in graph.output])
         self._nodes = self._needed(list(graph.node))
         self._known = [self._described(node) for node in self._nodes]
 

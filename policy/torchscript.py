@@ -29,10 +29,8 @@ from .base import (
 )
 from .contract import PolicyContract
 from .fence.operators import OPERATORS
-from .fence.script import CONTRACT_FILE
+from .fence.script import CONTRACT_FILE, RESET_METHODS
 from .native import LOAD_ERRORS, said_lines
-
-_RESET_METHODS = ("reset", "reset_memory")
 
 
 @contextmanager
@@ -334,7 +332,7 @@ def last_line(error: BaseException) -> str:
 
 
 def _reset(module: Any) -> None:
-    for name in _RESET_METHODS:
+    for name in RESET_METHODS:
         if module._c._has_method(name):
             with _plain_execution():
                 getattr(module, name)()

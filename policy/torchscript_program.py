@@ -16,11 +16,11 @@ from typing import Any
 
 import torch
 
+from .fence.script import RESET_METHODS
 from .native import PROGRAM_ERRORS
 from .program import Budget, NotUnderstoodError, Program, convolution, linear, matmul
 from .torchscript_archive import Archive, ScriptObject, read_archive
 
-_RESETS = ("reset", "reset_memory")
 _MOST_DEPTH = 50
 _MOST_STATEMENTS = 100_000
 
@@ -138,7 +138,7 @@ class _Machine:
     def reset(self) -> None:
         """Run the module's own reset, if it has one."""
         root = self.memory.root
-        for name in _RESETS:
+        for name in RESET_METHODS:
             if name in self._archive.methods.get(root.qualified_name, {}):
                 self._method(root, name, [])
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from ..backends.base import PhysicsState
-from ..policy.contract import TERM_WIDTH, PolicyContract
+from ..policy.contract import PolicyContract
 from ..policy.observation import ObservationBuilder
 from ..robots.rotation import rotate_inverse
 from .environment_configuration import NoiseConfiguration, ObservationConfiguration
@@ -28,9 +28,11 @@ HEIGHT_SCALE = 2.5
 
 def noise_amplitude(contract: PolicyContract, noise: NoiseConfiguration, device: torch.device | str) -> torch.Tensor:
     """Half-width of the noise on each entry of a frame, in scaled units, (frame width,)."""
-    terms = [(term, TERM_WIDTH[term.name] or contract.num_joints) for term in contract.observation]
-    scales = [torch.tensor(term.scale).abs().expand(width) for term, width in terms]
-    half_widths = [getattr(noise, term.name.removesuffix("_b"), 0.0) for term, _ in terms]
+    terms = contract.observation
+    scales = [
+        torch.tensor(term.scale).abs().expand(width) for term, width in zip(terms, contract.term_widths, strict=True)
+    ]
+    half_widths = [getattr(noise, term.name.removesuffix("_b"), 0.0) for term in terms]
     return torch.cat([scale * half_width for scale, half_width in zip(scales, half_widths, strict=True)]).to(device)
 
 

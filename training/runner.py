@@ -17,7 +17,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from ..policy.contract import TERM_WIDTH, PolicyContract
+from ..policy.contract import PolicyContract
 from .algorithms.methods import METHODS
 from .algorithms.symmetry import Mirror
 from .averaging import WeightAverage
@@ -398,8 +398,7 @@ class TrainingRunner:
 def command_entries(contract: PolicyContract) -> tuple[int, ...]:
     """Entries of an observation frame that hold the command."""
     start = 0
-    for term in contract.observation:
-        width = TERM_WIDTH[term.name] or len(contract.joint_names)
+    for term, width in zip(contract.observation, contract.term_widths, strict=True):
         if term.name == "command":
             return tuple(range(start, start + width))
         start += width

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import onnx
@@ -15,10 +15,17 @@ from .operators import ONNX_CONTRIBUTED, ONNX_OPERATORS
 
 MOST_NODES = 100_000
 """Most nodes of all graphs of a file."""
+ACTION_NAMES = ("actions", "action")
+"""What an output with the actions is called."""
 _DEEPEST = 16
 _OWN_SETS = ("", "ai.onnx")
 # Where onnxruntime has operators of its own: those go before a file's functions of the same name.
 _TAKEN_SETS = ("ai.onnx", "com.microsoft", "com.ms", "org.pytorch")
+
+
+def action_output(names: Sequence[str]) -> str:
+    """Which of a file's outputs holds the actions: the one of that name, else the first."""
+    return next((name for name in ACTION_NAMES if name in names), names[0])
 
 
 def check_graph(data: bytes, *, source: str, folder: Path | None) -> onnx.ModelProto:

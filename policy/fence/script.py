@@ -23,6 +23,8 @@ from .pickles import REBUILD_QUANTIZED, REBUILD_TENSOR, Call, check_tensors, rea
 MOST_CODE = 8 * 2**20
 """Most code of a file [characters]."""
 CONTRACT_FILE = "contract.json"
+RESET_METHODS = ("reset", "reset_memory")
+"""Methods with which an export forgets."""
 LONGEST_CONTRACT = 1_000_000
 
 _OWN = "__torch__"
