@@ -191,14 +191,16 @@ def _experts(
 ) -> dict[str, Any]:
     """Mean weights by terrain and by command, and how many experts are at work.
 
-    ``at_once`` is the exponential of the weights' mean entropy: 1 where a single expert decides at every moment, K where all of
-    them always count the same. ``in_all`` is that of the mean weights' entropy: how many are used at all.
+    ``at_once`` is the exponential of the mean entropy of their shares: 1 where a single expert decides at every moment, K where all
+    of them always count the same. ``in_all`` is that of the mean shares' entropy: how many are used at all. A share is a weight
+    divided by the sum of all, which is not 1 where experts are multiplied (MCP).
     """
     weights = notes.weights
     assert weights is not None
+    shares = weights / np.maximum(weights.sum(axis=-1, keepdims=True), 1e-12)
 
-    def entropy(shares: NDArray[np.float64]) -> NDArray[np.float64]:
-        found: NDArray[np.float64] = -(shares * np.log(np.maximum(shares, 1e-12))).sum(axis=-1)
+    def entropy(parts: NDArray[np.float64]) -> NDArray[np.float64]:
+        found: NDArray[np.float64] = -(parts * np.log(np.maximum(parts, 1e-12))).sum(axis=-1)
         return found
 
     means = {
@@ -210,8 +212,8 @@ def _experts(
     }
     return {
         **means,
-        "at_once": float(np.exp(entropy(weights).mean())),
-        "in_all": float(np.exp(entropy(weights.mean(axis=0)))),
+        "at_once": float(np.exp(entropy(shares).mean())),
+        "in_all": float(np.exp(entropy(shares.mean(axis=0)))),
     }
 
 

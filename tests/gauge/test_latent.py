@@ -10,7 +10,7 @@ import pytest
 import torch
 from gaitgauge.gauge.latent.collecting import Notes, collect
 from gaitgauge.gauge.latent.separation import principal_components, separation, silhouette
-from gaitgauge.gauge.latent.study import LatentError, LatentRequest, _blocks, look, study_latents
+from gaitgauge.gauge.latent.study import LatentError, LatentRequest, _blocks, _experts, look, study_latents
 from gaitgauge.gauge.policies import Loaded
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
@@ -138,6 +138,27 @@ def test_a_single_robot_that_is_left_is_no_one_to_try_a_probe_on():
     loaded = Loaded(policy=load_policy("pretrained"), robot=load_robot("go2"))
     with pytest.raises(LatentError, match=r"all robots but number 2 fell at once.*a lower --level or more --robots"):
         look("mine", loaded, notes, ["flat", "wave"])
+
+
+@pytest.mark.parametrize("total", [1.0, 2.0, 0.02])
+def test_experts_count_by_their_shares(total):
+    """Where experts are multiplied their weights do not add up to one."""
+    decided = np.eye(4)[[0, 1, 0, 1]]
+    for shares, at_once, in_all in ((np.full((4, 4), 0.25), 4.0, 4.0), (decided, 1.0, 2.0)):
+        notes = Notes(
+            latent=None,
+            weights=total * shares,
+            history=np.zeros((4, 1)),
+            terrain=np.zeros(4, dtype=np.int64),
+            command=np.zeros(4, dtype=np.int64),
+            robot=np.arange(4),
+            time=np.full(4, 0.1),
+            falls=0,
+            walkers=4,
+        )
+        found = _experts(notes, {"terrains": ["flat"]}, {"terrains": np.full(4, True)}, {"terrains": notes.terrain})
+        assert found["at_once"] == pytest.approx(at_once) and found["in_all"] == pytest.approx(in_all)
+        assert found["terrains"]["flat"] == pytest.approx(total * shares.mean(axis=0))
 
 
 @pytest.fixture(scope="module")
