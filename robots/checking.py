@@ -15,8 +15,8 @@ from .loading import MOST_PARTS, RobotError, robot_digest
 if TYPE_CHECKING:
     import mujoco
 
-_DEPTH_TOLERANCE = 1e-3
-"""Depth to which a robot that is put on the ground may reach into it [m]."""
+DEPTH_TOLERANCE = 1e-3
+"""Depth to which a robot that is put on the ground may reach into it, and its parts into each other [m]."""
 _GRAVITY = (0.0, 0.0, -9.81)
 _COUNTS = {"joint": "njnt", "body": "nbody", "geom": "ngeom", "site": "nsite"}
 _checked: set[str] = set()
@@ -260,7 +260,7 @@ class ModelChecks:
         self.mujoco.mj_fwdPosition(model, data)
         contacts = [data.contact[i] for i in range(data.ncon) if 0 in model.geom_bodyid[data.contact[i].geom]]
         deepest = min(contacts, key=lambda c: c.dist, default=None)
-        if deepest is not None and deepest.dist < -_DEPTH_TOLERANCE:
+        if deepest is not None and deepest.dist < -DEPTH_TOLERANCE:
             geom = next(int(g) for g in deepest.geom if model.geom_bodyid[g] != 0)
             part, kind = model.geom(geom).name, "geom"
             if not part:

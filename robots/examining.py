@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,8 +15,11 @@ from ..files.parsing import build, parse_json
 from .apart import run_apart
 from .base import JointParameters, Robot
 from .body_plan import body_plan, default_pose, joint_ranges, mirror_image
-from .checking import ModelChecks
+from .checking import DEPTH_TOLERANCE, ModelChecks
 from .loading import RobotError
+
+if TYPE_CHECKING:
+    import mujoco
 
 STANDING_SECONDS = 2.0
 """How long the robot is left standing [s]."""
@@ -68,6 +72,7 @@ def _findings(robot: Robot) -> str:
         note(name.replace("_", " "), getattr(checks, name))
     if all(f.passed for f in found):
         note("legs", partial(_legs, robot))
+        note("parts", partial(_parts, robot), "a start at rest")
         note("standing", partial(stand, robot))
         note("mirror image", partial(_mirror, robot), "training with symmetry")
         note("joint ranges", partial(_ranges, robot), "the metric dof_limits and the reward joint_limits")
@@ -86,8 +91,32 @@ def _legs(robot: Robot) -> str:
     )
 
 
+def _parts(robot: Robot) -> str:
+    """Parts that MuJoCo lets meet must not be inside each other in the default pose."""
+    import mujoco
+
+    model, data = default_pose(robot)
+    mujoco.mj_fwdPosition(model, data)
+    deepest = min(data.contact, key=lambda contact: contact.dist, default=None)
+    if deepest is not None and deepest.dist < -DEPTH_TOLERANCE:
+        first, second = (_part(model, int(geom)) for geom in deepest.geom)
+        raise RobotError(
+            f"robot '{robot.name}': in its default pose {first} is {-deepest.dist:.3f} m inside {second}, and every start "
+            "pushes them apart; mend default_joint_position or the shapes, or exclude the contact of the two bodies in the model"
+        )
+    return "no part is inside another in the default pose"
+
+
+def _part(model: mujoco.MjModel, geom: int) -> str:
+    """What a geom is, in words."""
+    name, body = model.geom(geom).name, model.body(int(model.geom_bodyid[geom]))
+    shape = f"the geom '{name}'" if name else "a geom"
+    return f"{shape} of the body '{body.name or body.id}'"
+
+
 def stand(robot: Robot) -> str:
-    """Let a robot stand in its default pose with the gains of its default parameters, and say how it stands.
+    """Let a robot stand in its default pose with the gains of its default parameters, and say how it stands. Its parts meet, as in
+    training and in the suites.
 
     Raises:
         RobotError: it falls, sinks or flies apart.
@@ -100,9 +129,6 @@ def stand(robot: Robot) -> str:
         spec.delete(actuator)
     spec.option.timestep = _TIMESTEP
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1)
-    for geom in spec.geoms:  # as in the suites: legs pass through each other
-        if geom.type != mujoco.mjtGeom.mjGEOM_PLANE and (geom.contype or geom.conaffinity):
-            geom.contype, geom.conaffinity = 0, 1
     model = spec.compile()
     data = mujoco.MjData(model)
     joints = [model.joint(name).id for name in robot.joint_names]
