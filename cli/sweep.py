@@ -96,7 +96,9 @@ def print_sweep(console: Terminal, found: Mapping[str, Any], folder: Path) -> No
             continue
         low_high = "" if best["score_interval"] is None else "{:.4f} to {:.4f}".format(*best["score_interval"])
         values = [f"{best['groups'][g]:.4f}" if g in (best["groups"] or {}) else "" for g in groups]
-        spread = "" if entry["deviation"] is None else f" ± {entry['deviation']:.4f}"
+        spread = ""
+        if entry["deviation"] is not None:
+            spread = " ± {:.4f} ({:.4f} to {:.4f})".format(entry["deviation"], *entry["range"])
         table.add_row(
             entry["entry"],
             f"{best['score']:.4f}",

@@ -10,7 +10,7 @@ import torch
 from gaitgauge.training.checkpoint import CheckpointError
 from gaitgauge.training.sweep.curves import by_figure, curves_csv
 from gaitgauge.training.sweep.file import SweepEntry, SweepError, load_sweep
-from gaitgauge.training.sweep.folding import across_seeds, fold_sweep
+from gaitgauge.training.sweep.folding import _entry, across_seeds, fold_sweep
 from gaitgauge.training.sweep.runs import SweepRun, plan_runs
 from gaitgauge.training.tasks import find_task
 from scipy.stats import t as student_t
@@ -210,6 +210,19 @@ def test_copies_of_a_run_are_no_seeds(tmp_path):
     sweep = replace(SWEEP, entry=(runs[0].entry,))
     found = fold_sweep(sweep, runs, {}, {}, tmp_path)
     assert "All seeds of 'same' have the same score, which says nothing of their spread." in found["sentences"]
+
+
+def test_an_entry_is_its_best_run_and_the_spread_of_all():
+    scores = {0: 0.704, 1: 0.7, 2: None, 3: 0.708}
+    rows = [
+        {"seed": seed, "score": score, "reason": "", **dict.fromkeys(("score_interval", "level", "groups", "results"))}
+        for seed, score in scores.items()
+    ]
+    entry = _entry("one", rows, None)
+    assert (entry["runs"], entry["scored"], entry["best"]["seed"]) == (4, 3, 3)
+    assert (entry["mean"], entry["deviation"]) == (pytest.approx(0.704), pytest.approx(0.004))
+    assert entry["range"] == [0.7, 0.708]
+    assert _entry("one", rows[:1], None)["range"] is None
 
 
 def test_tables_tell_what_is_missing(tmp_path):

@@ -107,7 +107,7 @@ def _fill(row: dict[str, Any], sweep: Sweep, run: SweepRun, folder: Path) -> Non
 
 
 def _entry(name: str, rows: Sequence[Mapping[str, Any]], refused: str | None) -> dict[str, Any]:
-    """An entry's runs together: its best run by the score, and the scores' mean and spread over the seeds."""
+    """An entry's runs together: its best run by the score, and the scores' mean, spread and range over the seeds."""
     scored = sorted((r for r in rows if r["score"] is not None), key=lambda r: r["score"])
     scores = [r["score"] for r in scored]
     best = scored[-1] if scored else None
@@ -118,6 +118,7 @@ def _entry(name: str, rows: Sequence[Mapping[str, Any]], refused: str | None) ->
         "scored": len(scored),
         "mean": statistics.fmean(scores) if scores else None,
         "deviation": statistics.stdev(scores) if len(scores) > 1 else None,
+        "range": [scores[0], scores[-1]] if len(scores) > 1 else None,
         "best": {k: best[k] for k in ("seed", "score", "score_interval", "level", "groups", "results")}
         if best
         else None,
