@@ -39,14 +39,14 @@ def run_consistency(
     )
     console = Terminal(stderr=True)
     prepared = prepare_study(request)  # all that can be wrong with the request is said before anything is written
-    for engine in prepared.skipped:
-        console.say(f"{engine['backend']} is left out: {engine['reason']}")
+    _print_skipped(console, prepared.skipped)
     folder = out or Path("results") / f"{joined_names(policies)}-{bare_name(request.suite)}-consistency"
     with resumable(console, "comparing", folder, "--resume") as display:
         command = ["gaitgauge", *sys.argv[1:]]
-        results = study(request, folder, resume=resume, command=command, watch=_shower(display))
+        results = study(prepared, folder, resume=resume, command=command, watch=_shower(display))
     page = write_page(folder)
     if json_output:
+        _print_skipped(console, results["skipped"][len(prepared.skipped) :])  # those that failed while they played
         print_json(results)
         return
     console = Terminal()
@@ -65,8 +65,13 @@ def _shower(display: ProgressDisplay) -> Callable[[StudyStatus], None]:
     return show
 
 
+def _print_skipped(console: Terminal, skipped: Sequence[Mapping[str, str]]) -> None:
+    for engine in skipped:
+        console.say(f"{engine['backend']} is left out: {engine['reason']}")
+
+
 def print_study(console: Terminal, results: Mapping[str, Any]) -> None:
-    """Tables of every layer, the gap last."""
+    """Tables of every layer, the gap last, and which engines are missing from them."""
     for policy in results["policies"]:
         if len(results["policies"]) > 1:
             console.rule(policy["policy"])
@@ -87,6 +92,7 @@ def print_study(console: Terminal, results: Mapping[str, Any]) -> None:
             if troubles:
                 words = f": of {health['episodes']} episodes {' and '.join(troubles)}"
                 console.say(Text.assemble((label, "red"), words))
+    _print_skipped(console, results["skipped"])
 
 
 def _print_models(console: Terminal, models: Mapping[str, Any], results: Mapping[str, Any]) -> None:

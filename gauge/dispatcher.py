@@ -65,7 +65,8 @@ def play(
         watch: called whenever a worker reports.
 
     Raises:
-        PolicyError, BackendError …: what went wrong in a worker, or that a worker is gone.
+        PolicyError, BackendError …: what went wrong in a worker.
+        WorkerError: a worker is gone.
     """
     dispatcher = Dispatcher(planners, records, workers, speculation)
     while any(plan.required for plan in dispatcher.plans):

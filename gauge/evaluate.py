@@ -243,7 +243,8 @@ def evaluate(
         The content of ``results.json``.
 
     Raises:
-        SuiteError, RobotError, PolicyError, ContractError, BackendError, ClusterError, StoreError, RecordError: one sentence.
+        SuiteError, RobotError, PolicyError, ContractError, BackendError, WorkerError, ClusterError, StoreError, RecordError: one
+            sentence.
     """
     began = time.perf_counter()
     prepared = request if isinstance(request, Prepared) else prepare(request)

@@ -27,7 +27,7 @@ from typing import Any, Protocol
 
 import torch
 
-from ..backends.base import BackendError, PhysicsBackend, Scene
+from ..backends.base import PhysicsBackend, Scene
 from ..backends.mujoco import MujocoBackend
 from ..policy.base import Policy
 from ..policy.fenced import FencedPolicy
@@ -108,6 +108,10 @@ class Lost:
     """The worker is gone with all that it had and was sent. If another one takes its place, that one's progress says so."""
 
 
+class WorkerError(RuntimeError):
+    """A worker is gone before it was told to stop; the message says how, and what to do. No fault of an engine."""
+
+
 class Transport(Protocol):
     """Workers, and the way to them. They are numbered from 0 and have started once the transport is made."""
 
@@ -123,7 +127,7 @@ class Transport(Protocol):
         """Wait for messages; returns those that are there, each with the worker's number, a worker's own in their order.
 
         Raises:
-            BackendError, ClusterError: a worker is gone, or all of them where they may come and go.
+            WorkerError, ClusterError: a worker is gone, or all of them where they may come and go.
         """
 
     def close(self) -> None:
@@ -304,11 +308,11 @@ class LocalProcesses:
                 del self._open[pipe]
         return messages
 
-    def _gone(self, worker: int) -> BackendError:
+    def _gone(self, worker: int) -> WorkerError:
         self._processes[worker].join()
         code = self._processes[worker].exitcode or 0
         how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        return BackendError(
+        return WorkerError(
             f"a process that plays episodes {how}; what had finished is kept: go on with --resume, with fewer "
             "--threads if memory ran out"
         )

@@ -99,6 +99,7 @@ def play_variant(
 
     Raises:
         BackendError: the engine cannot do what the episodes need.
+        WorkerError: a process that plays was ended; that is no fault of the engine.
         PolicyError: the policy's output is not finite.
     """
     waiting = [e for e in episodes if e not in records]

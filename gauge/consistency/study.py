@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ Watch = Callable[[StudyStatus], None]
 
 
 @dataclass(kw_only=True)
-class _Prepared:
+class PreparedStudy:
     """A request that can be carried out."""
 
     request: StudyRequest
@@ -89,7 +89,7 @@ class _Prepared:
             )
 
 
-def prepare_study(request: StudyRequest) -> _Prepared:
+def prepare_study(request: StudyRequest) -> PreparedStudy:
     """Check a request and load what it names; engines that cannot run here are left out.
 
     Raises:
@@ -139,7 +139,7 @@ def prepare_study(request: StudyRequest) -> _Prepared:
         robot = prepared_policy.robot
         policies.append((name, prepared_policy.policy))
     assert robot is not None
-    prepared = _Prepared(
+    prepared = PreparedStudy(
         request=request,
         suite=suite,
         robot=robot,
@@ -177,7 +177,7 @@ def _engines(request: StudyRequest, suite: Suite) -> tuple[Variant, list[Variant
 
 
 def study(
-    request: StudyRequest,
+    request: StudyRequest | PreparedStudy,
     folder: Path,
     *,
     resume: bool = False,
@@ -189,14 +189,17 @@ def study(
     Returns the content of ``consistency.json`` (docs/consistency.md).
 
     Args:
+        request: what to compare, as it is or prepared already.
         folder: where ``consistency.json`` and a folder for each engine go (with several policies, one for each of them above).
         watch: called after every control step.
 
     Raises:
-        ConsistencyError, SuiteError, RobotError, PolicyError, ContractError, BackendError, StoreError: one sentence.
+        ConsistencyError, SuiteError, RobotError, PolicyError, ContractError, BackendError, WorkerError, StoreError: one sentence.
     """
     began = time.perf_counter()
-    prepared = prepare_study(request)
+    prepared = request if isinstance(request, PreparedStudy) else prepare_study(request)
+    request = prepared.request
+    prepared = replace(prepared, others=list(prepared.others), skipped=list(prepared.skipped))  # engines may drop out
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
     several = len(prepared.policies) > 1
     blocks = []
@@ -231,7 +234,7 @@ class _Policy:
 
     def __init__(
         self,
-        prepared: _Prepared,
+        prepared: PreparedStudy,
         name: str,
         policy: FilePolicy,
         folder: Path,

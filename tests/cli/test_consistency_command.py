@@ -3,7 +3,9 @@
 import json
 
 import pytest
-from gaitgauge.gauge.consistency import open_loop
+import torch
+from gaitgauge.backends import BackendError, make_backend
+from gaitgauge.gauge.consistency import open_loop, variants
 
 SUITE = """
 extends = "robogauge-1.1"
@@ -59,6 +61,28 @@ def test_two_settings_of_the_c_engine(run, refused, tmp_path, policy, tiny, monk
         assert words in again.stdout
     assert "mujoco – mujoco@timestep=0.005" in again.stdout
     assert str(out / "consistency.html") in again.stdout.replace("\n", "")
+
+
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_an_engine_that_is_left_out_is_told(run, tmp_path, policy, tiny, monkeypatch, more):
+    monkeypatch.setattr(open_loop, "DURATION", 0.3)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+    def make(name, scene, **options):
+        if scene.physics.cone == "pyramidal":
+            raise BackendError("it knows no pyramids")
+        return make_backend(name, scene, **options)
+
+    monkeypatch.setattr(variants, "make_backend", make)
+    engines = "mujoco,mujoco-warp,mujoco@timestep=0.005,mujoco@cone=pyramidal"
+    command = ("consistency", policy, "--backends", engines, "--suite", tiny, "--terrain", "flat", "--seeds", 2)
+    done = run(*command, "--no-attribution", "--out", tmp_path / "study", *more)
+    assert done.exit_code == 0, done.output
+    assert "mujoco-warp is left out" in done.stderr
+    told = done.stderr if more else done.stdout
+    assert "mujoco@cone=pyramidal is left out: it knows no pyramids" in told
+    if not more:
+        assert "mujoco-warp is left out" in done.stdout
 
 
 def test_bad_input_is_one_sentence(refused, policy, tmp_path):

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import os
 import re
+import signal
 import zlib
 from unittest.mock import patch
 
@@ -18,6 +20,7 @@ from gaitgauge.gauge.consistency.page import render, verdict, write_page
 from gaitgauge.gauge.consistency.request import ConsistencyError, StudyRequest
 from gaitgauge.gauge.consistency.statistics import Estimate
 from gaitgauge.gauge.store import StoreError
+from gaitgauge.gauge.workers import WorkerError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import MlpNetwork
@@ -247,6 +250,34 @@ def test_engine_that_fails_while_playing_is_left_out(request_of, tmp_path):
     assert results["policies"][0]["attribution"][0]["not_run"] == "it has no impratio"
     with pytest.raises(ConsistencyError, match="it has no impratio"):
         study(request_of(backends=("fake", "fake@impratio=1")), tmp_path / "three", make=make)
+
+
+def test_a_process_that_is_lost_ends_the_study_and_no_engine_is_left_out_for_it(request_of, tmp_path):
+    """Nothing was said of it, the exit code was 0, and --resume went on without the engine."""
+    parent = os.getpid()
+
+    def make(name, scene, *, device, threads):
+        if scene.physics.ls_iterations == 7 and os.getpid() != parent:
+            os.kill(os.getpid(), signal.SIGKILL)  # as the system does where memory runs out
+        return FakeBackend(scene, script=FakeScript(joint_law="track"))
+
+    engines = ("mujoco", "mujoco@cone=pyramidal", "mujoco@ls_iterations=7")
+    with pytest.raises(WorkerError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
+        study(request_of(backends=engines, threads=2), tmp_path / "out", make=make)
+    assert not (tmp_path / "out" / "consistency.json").exists()
+
+
+def test_what_was_prepared_is_not_prepared_again_nor_changed(request_of, tmp_path, monkeypatch):
+    def make(name, scene, *, device, threads):
+        if scene.physics.impratio == 1.0:
+            raise BackendError("it has no impratio")
+        return FakeBackend(scene)
+
+    prepared = studying.prepare_study(request_of(backends=("fake", "fake@cone=pyramidal", "fake@impratio=1")))
+    monkeypatch.setattr(studying, "prepare_study", None)
+    results = study(prepared, tmp_path / "out", make=make)
+    assert [s["backend"] for s in results["skipped"]] == ["fake@impratio=1"]
+    assert prepared.skipped == [] and len(prepared.others) == 2
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from gaitgauge.backends.base import BackendError
+from gaitgauge.gauge.workers import WorkerError
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
@@ -106,7 +106,7 @@ def test_a_process_that_is_killed_costs_nothing_that_was_finished(real_request, 
             os.kill(child, signal.SIGKILL)
             killed.append(child)
 
-    with pytest.raises(BackendError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
+    with pytest.raises(WorkerError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
         evaluate(request, tmp_path / "run", watch=kill)
     assert children() == []
     evaluate(request, tmp_path / "run", resume=True)

@@ -3,8 +3,7 @@
 import time
 
 import pytest
-from gaitgauge.backends.base import BackendError
-from gaitgauge.gauge.workers import Drop, Failed, Finished, Job, LocalProcesses, Play, Progress, Stop
+from gaitgauge.gauge.workers import Drop, Failed, Finished, Job, LocalProcesses, Play, Progress, Stop, WorkerError
 from gaitgauge.policy.base import PolicyError
 from scripted_gauge import DIAGONAL, GO2, MAXIMUM, Puppet, ScriptedPolicy, episode, short_suite
 
@@ -92,5 +91,5 @@ def test_errors_keep_their_class_and_words():
 
 def test_a_process_that_is_gone_is_one_sentence(two):
     two._processes[1].kill()
-    with pytest.raises(BackendError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
+    with pytest.raises(WorkerError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
         until(two, lambda heard: False)
