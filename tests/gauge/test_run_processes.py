@@ -1,6 +1,7 @@
 """Real processes and real physics: threads change nothing, and a process that ends takes nothing with it."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from gaitgauge.gauge.store import RunFolder
 from gaitgauge.gauge.workers import WorkerError
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
@@ -95,19 +97,22 @@ def test_an_error_in_a_process_is_the_runs_error(real_request, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_process_that_is_killed_costs_nothing_that_was_finished(real_request, tmp_path):
+def test_a_process_that_is_killed_costs_nothing_that_was_finished(real_request, tmp_path, monkeypatch):
     request = replace(real_request, threads=2)
     evaluate(request, tmp_path / "whole")
-    killed = []
+    put = RunFolder.put
 
-    def kill(status):
-        if status.done and not killed:
-            (child, *_) = children()
-            os.kill(child, signal.SIGKILL)
-            killed.append(child)
+    def put_and_kill(folder, record):
+        """The first record is kept; then a worker ends, which has not been told to stop, whatever it is at."""
+        put(folder, record)
+        monkeypatch.setattr(RunFolder, "put", put)
+        (worker,) = [p for p in multiprocessing.active_children() if p.name == "worker-1"]
+        os.kill(worker.pid, signal.SIGKILL)
 
+    monkeypatch.setattr(RunFolder, "put", put_and_kill)
     with pytest.raises(WorkerError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
-        evaluate(request, tmp_path / "run", watch=kill)
+        evaluate(request, tmp_path / "run")
+    assert len(list((tmp_path / "run" / "episodes").glob("*.npz"))) > 0
     assert children() == []
     evaluate(request, tmp_path / "run", resume=True)
     assert without_provenance(tmp_path / "run") == without_provenance(tmp_path / "whole")
