@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 
 from ...backends.base import PhysicsBackend, PhysicsState, Randomization, Scene
 from ...policy.base import Policy
+from ...policy.contract import PolicyContract
 from ...policy.observation import ObservationBuilder
 from ...robots import Robot
 from ...terrains.registry import make_terrain
+from ..motors import joint_parameters
 from ..suite import Suite
 from .models import finite
 from .variants import Variant
@@ -63,11 +65,15 @@ class Trajectory:
     """Kinetic and potential energy of the whole robot [J], (T, 3)."""
 
 
-def open_loop_scene(suite: Suite, robot: Robot) -> Scene:
-    """Flat ground, one world for each test."""
+def open_loop_scene(suite: Suite, robot: Robot, contract: PolicyContract) -> Scene:
+    """Flat ground, one world for each test; motors as the suite plays a policy of this contract.
+
+    Raises:
+        ContractError: the policy is not for this robot.
+    """
     return Scene(
         robot=robot,
-        parameters=robot.parameters[suite.parameters],
+        parameters=joint_parameters(suite, robot, contract),
         terrains=(make_terrain("flat"),),
         terrain_index=(0,) * len(TESTS),
         physics=suite.physics,
@@ -125,7 +131,7 @@ def record_targets(
     Raises:
         BackendError: the engine cannot do what the tests need.
     """
-    scene = open_loop_scene(suite, robot)
+    scene = open_loop_scene(suite, robot, policy.contract)
     steps = round(DURATION / scene.physics.control_period)
     backend = variant.worlds(scene, threads=threads)
     try:
@@ -173,9 +179,19 @@ def _begin(backend: PhysicsBackend, friction: float) -> None:
 
 
 def replay(
-    variant: Variant, targets: Array, *, suite: Suite, robot: Robot, friction: float, threads: int = 1
+    variant: Variant,
+    targets: Array,
+    *,
+    suite: Suite,
+    robot: Robot,
+    contract: PolicyContract,
+    friction: float,
+    threads: int = 1,
 ) -> tuple[Trajectory, Mapping[str, list[float]] | None]:
     """Play targets (T, 3, J) in an engine.
+
+    Args:
+        contract: of the policy that the targets are for.
 
     Returns:
         What came of them, and what the engine says of its model (``PhysicsBackend.describe``).
@@ -183,7 +199,7 @@ def replay(
     Raises:
         BackendError: the engine cannot do what the tests need.
     """
-    scene = open_loop_scene(suite, robot)
+    scene = open_loop_scene(suite, robot, contract)
     meter = EnergyMeter(scene)
     backend = variant.worlds(scene, threads=threads)
     rows: dict[str, list[Array]] = {name: [] for name in ("position", "quaternion", "joints", "ground_force", "energy")}

@@ -383,7 +383,9 @@ class _Policy:
         descriptions: dict[str, Mapping[str, list[float]] | None] = {}
         floor = rounded(prepared.reference)
         for variant in [*prepared.engines, floor]:
-            runs[variant.label], descriptions[variant.label] = replay(variant, targets, **settings)
+            runs[variant.label], descriptions[variant.label] = replay(
+                variant, targets, contract=self._policy.contract, **settings
+            )
         del descriptions[floor.label]
         weight = GRAVITY * total_mass(prepared.robot)
         base = prepared.reference.label

@@ -20,11 +20,13 @@ from gaitgauge.gauge.consistency.open_loop import (
 )
 from gaitgauge.gauge.consistency.variants import parse_variant
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.contract import standard_contract
 from gaitgauge.robots import load_robot
 from gaitgauge.robots.body_plan import total_mass
 
 GO2 = load_robot("go2")
 SUITE = load_suite("robogauge-1.1")
+CONTRACT = standard_contract(GO2)
 MASS = total_mass(GO2)
 
 
@@ -33,7 +35,7 @@ def standing_targets(steps):
 
 
 def test_energy_is_that_of_mechanics():
-    scene = open_loop_scene(SUITE, GO2)
+    scene = open_loop_scene(SUITE, GO2, CONTRACT)
     meter, backend = EnergyMeter(scene), make_backend("mujoco", scene)
 
     def energy(height=1.0, **velocity):
@@ -53,7 +55,7 @@ def test_energy_is_that_of_mechanics():
 
 
 def test_energy_is_kept_in_free_fall_without_motors():
-    scene = open_loop_scene(SUITE, GO2)
+    scene = open_loop_scene(SUITE, GO2, CONTRACT)
     meter, backend = EnergyMeter(scene), make_backend("mujoco", scene)
     position = torch.tensor([0.0, 0.0, 20.0], dtype=torch.float64).repeat(3, 1)
     backend.reset(
@@ -70,7 +72,7 @@ def test_energy_is_kept_in_free_fall_without_motors():
 
 
 def test_an_engine_agrees_with_itself_and_another_timestep_does_not():
-    settings = {"suite": SUITE, "robot": GO2, "friction": 0.6}
+    settings = {"suite": SUITE, "robot": GO2, "contract": CONTRACT, "friction": 0.6}
     targets = standing_targets(60)
     first, description = replay(parse_variant("mujoco"), targets, **settings)
     second, _ = replay(parse_variant("mujoco"), targets, **settings)
@@ -89,7 +91,9 @@ def test_an_engine_agrees_with_itself_and_another_timestep_does_not():
 
 def test_resting_feet_carry_the_weight():
     steps = round(DURATION / SUITE.physics.control_period)
-    run, _ = replay(parse_variant("mujoco"), standing_targets(steps), suite=SUITE, robot=GO2, friction=0.6)
+    run, _ = replay(
+        parse_variant("mujoco"), standing_targets(steps), suite=SUITE, robot=GO2, contract=CONTRACT, friction=0.6
+    )
     found = compare_trajectories(run, run, period=SUITE.physics.control_period, weight=9.81 * MASS)
     assert found["stand"]["support"] == pytest.approx([1.0, 1.0], abs=1e-3)
 
@@ -138,7 +142,7 @@ def test_opposite_quaternions_are_the_same_turn():
 
 
 def test_models_differ_where_randomization_made_them():
-    scene = open_loop_scene(SUITE, GO2)
+    scene = open_loop_scene(SUITE, GO2, CONTRACT)
     plain, heavy = make_backend("mujoco", scene), make_backend("mujoco", scene)
     ones = torch.ones(3, dtype=torch.float64)
     plain.randomize(Randomization(friction=0.6 * ones))
@@ -174,7 +178,7 @@ def test_a_limit_that_only_one_has_is_no_small_matter():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["mujoco-warp", "newton"])
 def test_warp_engines_hold_the_same_model(name):
-    scene = open_loop_scene(SUITE, GO2)
+    scene = open_loop_scene(SUITE, GO2, CONTRACT)
     descriptions = {}
     for engine in ("mujoco", name):
         backend = make_backend(engine, scene)

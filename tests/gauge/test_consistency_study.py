@@ -6,6 +6,8 @@ import os
 import re
 import signal
 import zlib
+from dataclasses import replace
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -265,6 +267,24 @@ def test_a_process_that_is_lost_ends_the_study_and_no_engine_is_left_out_for_it(
     with pytest.raises(WorkerError, match=r"was ended by signal 9; what had finished is kept: go on with --resume"):
         study(request_of(backends=engines, threads=2), tmp_path / "out", make=make)
     assert not (tmp_path / "out" / "consistency.json").exists()
+
+
+def test_every_layer_plays_with_the_gains_of_the_suite_s_rule(request_of, tmp_path):
+    request = request_of()
+    contract = replace(standard_contract(GO2), stiffness=(40.0,) * 12, damping=(1.0,) * 12)
+    arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
+    zeros = MlpNetwork(**arguments).state_dict()
+    save_policy(request.policies[0], contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=zeros))
+    for gains, wanted in (("contract", 40.0), ("suite", 20.0)):
+        Path(request.suite).write_text(SUITE.replace('name = "tiny"', f'name = "tiny"\ngains = "{gains}"'))
+        seen = set()
+
+        def make(name, scene, *, device, threads, seen=seen):
+            seen.add(scene.parameters.stiffness)
+            return FakeBackend(scene, script=FakeScript(joint_law="track"))
+
+        study(request, tmp_path / gains, make=make)
+        assert seen == {(wanted,) * 12}
 
 
 def test_what_was_prepared_is_not_prepared_again_nor_changed(request_of, tmp_path, monkeypatch):
