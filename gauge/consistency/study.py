@@ -283,7 +283,7 @@ class _Policy:
         return {
             "policy": self._name,
             "contract_hash": self._policy.contract.hash,
-            "file_sha256": self._digest,
+            "file_sha256": self._policy.file_sha256,
             "models": models,
             "open_loop": open_loop,
             "gaps": gaps,

@@ -1,6 +1,7 @@
 """The whole study on scripted engines, whose differences are known."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import re
@@ -285,6 +286,13 @@ def test_every_layer_plays_with_the_gains_of_the_suite_s_rule(request_of, tmp_pa
 
         study(request, tmp_path / gains, make=make)
         assert seen == {(wanted,) * 12}
+
+
+def test_the_sha_256_is_that_of_the_policy_s_file(request_of, tmp_path):
+    request = request_of()
+    results = study(request, tmp_path / "out", make=engine())
+    file = Path(request.policies[0]).read_bytes()
+    assert results["policies"][0]["file_sha256"] == hashlib.sha256(file).hexdigest()
 
 
 def test_what_was_prepared_is_not_prepared_again_nor_changed(request_of, tmp_path, monkeypatch):
