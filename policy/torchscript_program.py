@@ -315,6 +315,8 @@ class _Machine:
                 return tensor.dtype
             if name == "device":
                 return self._device
+            if name in ("is_cpu", "is_cuda"):
+                return name == "is_cpu"  # where a file's own code is run
             raise NotUnderstoodError("its course depends on what it observes")
         if name in ("bool", "int", "float") and len(arguments) == 1 and isinstance(arguments[0], (bool, int, float)):
             return {"bool": bool, "int": int, "float": float}[name](arguments[0])

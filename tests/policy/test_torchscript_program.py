@@ -118,8 +118,21 @@ class Squeezed(Published):
         return self.actor(torch.cat([self.history.mean(dim=1)[:, :32], x], dim=1)).squeeze(0)
 
 
+class AskingForItsDevice(Published):
+    """Calculates otherwise on a GPU, as networks of this project do where they are scripted, not traced."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        self.remember(x)
+        latent = self.history.mean(dim=1)[:, :32]
+        if latent.is_cuda or not x.is_cpu:
+            latent = latent.half().float()
+        return self.actor(torch.cat([latent, x], dim=1))
+
+
 @pytest.mark.parametrize(
-    "module", [SharedHead, GroupedHeads, ListOfExperts, Loop, Squeezed], ids=lambda module: module.__name__
+    "module",
+    [SharedHead, GroupedHeads, ListOfExperts, Loop, Squeezed, AskingForItsDevice],
+    ids=lambda module: module.__name__,
 )
 def test_acts_as_the_file(module, contract, run):
     data = script(module())
