@@ -44,6 +44,17 @@ Payload = Annotated[float, Field(ge=-5.0, le=50.0)]
 GoalName = Literal["diagonal_velocity", "max_velocity", "target_pos_velocity"]
 """The paper's goals, whose commands are written in ``goals.py``: the reference's clock and its rounding errors are part of them."""
 _AIMED = "target_pos_velocity"
+METRIC_NAMES = (
+    "lin_vel_err",
+    "ang_vel_err",
+    "dof_limits",
+    "dof_power",
+    "orientation_stability",
+    "torque_smoothness",
+    "zmp_margin",
+    "friction_margin",
+)
+"""What ``metrics.py`` measures."""
 
 
 class SuiteError(ValueError):
@@ -369,14 +380,17 @@ def _goal_rules(suite: Suite) -> dict[str, bool]:
     }
     for goal in suite.goals:
         own, name = goal.name not in paper, f"the goal '{goal.name}'"
+        wanted = 0 if goal.name == _AIMED else 2
         largest = max((abs(v) for row in goal.sub_commands for phase in row for v in phase.velocity), default=0.0)
         rules |= {
             f"{name} has no commands; give it sub_commands, or choose one of {', '.join(paper)}": (
                 bool(goal.sub_commands) or not own
             ),
-            f"{name} lacks phases": own or bool(goal.phases) or goal.name == _AIMED,
             f"{name} has phases or sub_commands that it cannot have; the paper's goals have phases and no sub_commands, one's "
             "own have sub_commands and no phases": not (goal.phases if own else goal.sub_commands),
+            f"{name} has the phases {shown(list(goal.phases))}; give it {wanted} lengths [s]": (
+                own or len(goal.phases) == wanted
+            ),
             f"{name} commands {largest:g} times a limit; velocities of a suite are multiples of its limits, -1 to 1": (
                 largest <= 1.0
             ),
@@ -433,6 +447,11 @@ def _check(suite: Suite, source: str) -> None:
             f"matrix.{one} ({nominal:g}) is none of matrix.{among} ({', '.join(f'{v:g}' for v in values)}); add it there, or "
             f"let {one} be one of them"
         ] = nominal in values
+    for name in metrics.weights:
+        rules[
+            f"metrics.weights has the unknown metric {shown(name)}{did_you_mean(name, METRIC_NAMES)}; choose from "
+            f"{', '.join(METRIC_NAMES)}"
+        ] = name in METRIC_NAMES
     for rule, kept in rules.items():
         if not kept:
             raise SuiteError(f"{source}: {rule}")
