@@ -406,7 +406,8 @@ def _check(suite: Suite, source: str) -> None:
     """
     physics, events, metrics, settling = suite.physics, suite.events, suite.metrics, suite.settling
     goals = [g.name for g in suite.goals]
-    matrix = suite.matrix
+    matrix, scoring = suite.matrix, suite.scoring
+    best = scoring.level_weight * (scoring.levels - 1) + scoring.quality_weight
     rules = {
         f"events.fall_tilt ({events.fall_tilt}) and physics.watch_tilt ({physics.watch_tilt}) must be the same": (
             events.fall_tilt == physics.watch_tilt
@@ -422,9 +423,11 @@ def _check(suite: Suite, source: str) -> None:
         f"settling.shortest ({settling.shortest}) must not be above settling.longest ({settling.longest})": (
             settling.shortest <= settling.longest
         ),
+        f"scoring: a perfect score would be {best:g} (level_weight {scoring.level_weight:g} for each of {scoring.levels - 1} "
+        f"levels, quality_weight {scoring.quality_weight:g}); it must be 1 at most": best <= 1.0 + 1e-9,
         f"goals has a goal twice: {', '.join(goals)}": len(set(goals)) == len(goals),
-        f"scoring.bracket_seeds is {suite.scoring.bracket_seeds}; at most the {len(matrix.search_seeds)} of matrix.search_seeds "
-        "are possible": suite.scoring.level == "bisection" or suite.scoring.bracket_seeds <= len(matrix.search_seeds),
+        f"scoring.bracket_seeds is {scoring.bracket_seeds}; at most the {len(matrix.search_seeds)} of matrix.search_seeds "
+        "are possible": scoring.level == "bisection" or scoring.bracket_seeds <= len(matrix.search_seeds),
     }
     for name in ("projected_gravity", "base_linear_velocity"):
         half = getattr(suite.noise, name)

@@ -179,6 +179,12 @@ def test_a_suite_may_limit_torque_by_speed(suite_file):
         ("[noise]\nlatency = -1", "noise.latency is -1; it must be greater than or equal to 0"),
         ("[scoring]\npass_rate = 1.2", "scoring.pass_rate is 1.2; it must be less than or equal to 1"),
         ("[scoring]\nbootstrap = 1000000000", "scoring.bootstrap is 1000000000; it must be less than or equal to"),
+        (
+            "[scoring]\nlevel_weight = 0.5",
+            r"a perfect score would be 4.69 \(level_weight 0.5 for each of 9 levels, quality_weight 0.19\)",
+        ),
+        ("[scoring]\nlevels = 11", "a perfect score would be 1.09"),
+        ("[scoring]\nquality_weight = 0.2", "a perfect score would be 1.01"),
         ("[scoring]\nlevels = 0", "scoring.levels is 0; it must be greater than or equal to 1"),
         (
             "[metrics]\nweights = { dof_power = 1.0 }",
