@@ -77,7 +77,6 @@ class InTurn(PolicySession):
 
     def __init__(self, fenced: PolicySession, alone: PolicySession, child: Child) -> None:
         self._sessions, self._child = (fenced, alone), child
-        self.batched = fenced.batched
         self.first: tuple[list[Times], list[Times]] = ([], [])
         """Of the steps in which each was first."""
         self.second = Times(0.0, 0.0)

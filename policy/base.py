@@ -31,11 +31,6 @@ class PolicySession(ABC):
     size only.
     """
 
-    batched: bool = True
-    """Whether all episodes go through the network at once; False for a foreign file that can only be run one episode at
-    a time.
-    """
-
     @abstractmethod
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """Forget what the policy remembers of the masked episodes, (N,) bool, None for all."""
@@ -57,8 +52,6 @@ class PolicySession(ABC):
 
 class RowwiseSession(PolicySession):
     """Every episode goes through the network alone: slower, and the same in every row."""
-
-    batched = False
 
     def __init__(self, begin: Callable[[int], PolicySession], num_episodes: int) -> None:
         """``begin`` starts a session of so many episodes."""

@@ -35,9 +35,7 @@ class FencedPolicy(FilePolicy):
         """
         self.stored, self.contract, self.path = stored, contract, path
         self._child = child
-        found = child.ask("prepare", contract=contract.to_json(), attributes=sorted(attributes))
-        self.batched = bool(found["batched"])
-        """Whether one run of the program serves all episodes."""
+        child.ask("prepare", contract=contract.to_json(), attributes=sorted(attributes))
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes; the program runs on the CPU wherever the tensors are."""
@@ -64,7 +62,6 @@ class FencedSession(PolicySession):
     ) -> None:
         self._ask, self._contract, self._source = child.act, contract, source
         self._session = child.session(num_episodes, contract.observation_width, contract.num_joints, rowwise=rowwise)
-        self.batched = self._session.batched
         self._device = None if device.type == "cpu" else device
         self._shape = torch.Size((num_episodes, contract.observation_width))
         self._forget: torch.Tensor | None = None

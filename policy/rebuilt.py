@@ -16,8 +16,6 @@ from .program import NotUnderstoodError, Program, ProgramSession
 class RebuiltPolicy(FilePolicy):
     """A policy that is played without the file's own code."""
 
-    batched = True
-
     def __init__(self, contract: PolicyContract, stored: ForeignFile, program: Program, *, path: str) -> None:
         """Keep what was rebuilt.
 

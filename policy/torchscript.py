@@ -171,7 +171,7 @@ class ScriptProgram:
         if request["do"] == "width":
             return {"width": input_width(self._module, request["candidates"], source=self.source)}
         self.prepare(PolicyContract.from_json(request["contract"]), request["attributes"])
-        return {"batched": self.memories is not None}
+        return {}
 
     def prepare(self, contract: PolicyContract, attributes: Collection[str]) -> None:
         """Find out how to run the module in batches.
@@ -253,8 +253,6 @@ class ScriptProgram:
 class BatchSession(PolicySession):
     """One module for all episodes; its memories have a row per episode."""
 
-    batched = True
-
     def __init__(
         self, module: Any, num_episodes: int, contract: PolicyContract, source: str, memories: Sequence[Memory]
     ) -> None:
@@ -289,8 +287,6 @@ class BatchSession(PolicySession):
 
 class CopiesSession(PolicySession):
     """One copy of the module for each episode, run one after another."""
-
-    batched = False
 
     def __init__(self, module: Any, num_episodes: int, contract: PolicyContract, source: str) -> None:
         """Copy the module, which must be freshly reset."""

@@ -150,7 +150,7 @@ class Child:
         dropped, self._dropped = self._dropped, []
         answer = self.ask("session", rows=rows, width=width, joints=joints, rowwise=rowwise, dropped=dropped)
         number = int(answer["number"])
-        session = ChildSession(number, _Numbers(self._memory, rows, width, joints), batched=bool(answer["batched"]))
+        session = ChildSession(number, _Numbers(self._memory, rows, width, joints))
         weakref.finalize(session, self._dropped_later, number)
         return session
 
@@ -272,8 +272,6 @@ class ChildSession:
 
     number: int
     numbers: _Numbers
-    batched: bool
-    """Whether one run of the program serves all rows."""
 
 
 def _shared_memory() -> tuple[Any, Any]:
@@ -380,4 +378,4 @@ def _answer(
     made = program.session(request["rows"], rowwise=request["rowwise"])
     number = max(sessions, default=0) + 1
     sessions[number] = made, _Numbers(memory, request["rows"], request["width"], request["joints"])
-    return {"number": number, "batched": made.batched}
+    return {"number": number}

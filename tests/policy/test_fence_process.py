@@ -16,7 +16,7 @@ from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.fence import child as fence_child
 from gaitgauge.policy.fenced import FencedPolicy, FencedSession
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.policy.torchscript import ScriptProgram
+from gaitgauge.policy.torchscript import BatchSession, ScriptProgram
 from torch import nn
 
 
@@ -288,7 +288,8 @@ def test_a_program_acts_to_the_last_bit_as_in_its_owner(contract, module, infere
     data = script(module())
     child, here = fence_child.Child(ScriptProgram, data, source="policy"), ScriptProgram(data, "policy")
     details = {"contract": contract.to_json(), "attributes": ["last", "seen"]}
-    assert child.ask("prepare", **details) == here.answer({"do": "prepare", **details}) == {"batched": True}
+    assert child.ask("prepare", **details) == here.answer({"do": "prepare", **details})
+    assert isinstance(here.session(5), BatchSession)
     fenced, alone = FencedSession(child, 5, contract, "policy", device=torch.device("cpu")), here.session(5)
     with torch.inference_mode(inference):
         for step, observation in enumerate(torch.randn(8, 5, 45)):

@@ -8,11 +8,13 @@ import onnx
 import pytest
 import torch
 import yaml
-from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.contract import History
+from gaitgauge.policy.base import PolicyError, RowwiseSession
+from gaitgauge.policy.contract import History, PolicyContract
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import first_line
+from gaitgauge.policy.onnx_file import GraphProgram, OnnxSession
+from gaitgauge.policy.rebuilt import RebuiltPolicy
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
@@ -79,6 +81,13 @@ def linear(
     return path
 
 
+def own_code(path: Path, contract: PolicyContract) -> GraphProgram:
+    """The file as it is run where its graph is not understood."""
+    program = GraphProgram(path.read_bytes(), "policy.onnx")
+    program.prepare(contract)
+    return program
+
+
 def deploy_settings(**changes: object) -> dict:
     """Settings as the makers' exporters write them; the joints interleaved, as Isaac Lab orders them."""
     interleaved = [3, 0, 9, 6, 4, 1, 10, 7, 5, 2, 11, 8]
@@ -128,31 +137,34 @@ def test_fixed_batch_and_history_are_opened(tmp_path, term_major, cts_network):
     path = tmp_path / "policy.onnx"
     path.write_bytes(term_major)
     policy = load_policy(path)
-    assert policy.batched
     assert policy.contract.history == History(length=5, order="term-major", start="zeros")
     history = torch.randn(EPISODES, 5, 45, generator=torch.Generator().manual_seed(2))
     observation = torch.cat([block.flatten(1) for block in history.split(TERM_WIDTHS, dim=2)], dim=1)
-    session = policy.session(EPISODES)
-    assert session.batched
-    np.testing.assert_allclose(session.act(observation), cts_network(history), atol=1e-5)
-    session.reset()
-    session.reset(torch.ones(EPISODES, dtype=torch.bool))
-    np.testing.assert_allclose(session.act(observation), cts_network(history), atol=1e-5)
+    opened = own_code(path, policy.contract).session(EPISODES)
+    assert isinstance(opened, OnnxSession)
+    for session in (policy.session(EPISODES), opened):
+        np.testing.assert_allclose(session.act(observation), cts_network(history), atol=1e-5)
+        session.reset()
+        session.reset(torch.ones(EPISODES, dtype=torch.bool))
+        np.testing.assert_allclose(session.act(observation), cts_network(history), atol=1e-5)
 
 
 @pytest.mark.parametrize(("batch", "over_batch"), [(1, False), ("n", False), (1, True)])
 def test_batch_equals_rows(tmp_path, batch, over_batch):
-    policy = load_policy(linear(tmp_path / "policy.onnx", batch=batch, over_batch=over_batch))
-    session, single = policy.session(EPISODES), policy.session(1)
-    assert policy.batched and session.batched
+    path = linear(tmp_path / "policy.onnx", batch=batch, over_batch=over_batch)
+    policy = load_policy(path)
+    single, own = policy.session(1), own_code(path, policy.contract).session(EPISODES)
+    assert isinstance(policy, RebuiltPolicy)
+    assert isinstance(own, RowwiseSession if over_batch else OnnxSession)
     observation = torch.randn(EPISODES, 45, generator=torch.Generator().manual_seed(2))
     rows = torch.cat([single.act(observation[i : i + 1]) for i in range(EPISODES)])
-    np.testing.assert_allclose(session.act(observation), rows, atol=1e-6)
     poisoned = observation.clone()
     poisoned[1] = float("nan")
     others = torch.arange(EPISODES) != 1
-    assert torch.equal(session.act(poisoned)[others], session.act(observation)[others])
-    assert session.act(poisoned)[1].isnan().all()
+    for session in (policy.session(EPISODES), own):
+        np.testing.assert_allclose(session.act(observation), rows, atol=1e-6)
+        assert torch.equal(session.act(poisoned)[others], session.act(observation)[others])
+        assert session.act(poisoned)[1].isnan().all()
 
 
 def test_deploy_file_gives_the_contract(tmp_path, term_major, go2):

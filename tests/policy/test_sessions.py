@@ -9,6 +9,7 @@ from gaitgauge.policy.contract import PolicyContract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks import ARCHITECTURES, unit
+from gaitgauge.policy.rebuilt import RebuiltPolicy
 from torch import nn
 from torch.nn import functional
 
@@ -122,8 +123,9 @@ def test_a_torchscript_session_gives_what_its_module_gives(tmp_path: Path, contr
     torch.jit.save(torch.jit.script(module), archive)
     path = tmp_path / "policy.pt"
     path.write_bytes(archive.getvalue())
-    session, observations = load_policy(path).session(EPISODES), frames()
-    assert session.batched
+    policy, observations = load_policy(path), frames()
+    assert isinstance(policy, RebuiltPolicy)
+    session = policy.session(EPISODES)
     with torch.inference_mode():
         module.history = torch.zeros(EPISODES, 3, 45)
         for step, frame in enumerate(observations):

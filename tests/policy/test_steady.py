@@ -46,7 +46,7 @@ def test_rows_do_not_matter(tiny, count):
 
 def test_the_shipped_policy_runs_batched():
     session, _ = steady_session(load_policy("pretrained", ROBOT), 24)
-    assert session.batched and not isinstance(session, RowwiseSession)
+    assert not isinstance(session, RowwiseSession)
 
 
 @pytest.mark.parametrize("architecture", ["ac_moe", "mcp", "him", "dreamwaq"])
@@ -56,7 +56,7 @@ def test_rows_of_the_other_methods_networks_do_not_matter(architecture):
     state = ARCHITECTURES[architecture](**arguments).state_dict()
     stored = StoredNetwork(architecture=architecture, arguments=arguments, state_dict=state)
     session, _ = steady_session(NativePolicy(standard_contract(ROBOT), stored, path=architecture), 24)
-    assert session.batched and not isinstance(session, RowwiseSession)
+    assert not isinstance(session, RowwiseSession)
 
 
 @pytest.fixture(scope="module", params=["own", "torchscript", "onnx", "row by row"])

@@ -10,10 +10,11 @@ import pytest
 import torch
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import History
+from gaitgauge.policy.fence.script import check_script
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.rebuilt import RebuiltPolicy
-from gaitgauge.policy.torchscript import CopiesSession
+from gaitgauge.policy.torchscript import BatchSession, CopiesSession, ScriptProgram
 from torch import nn
 
 EPISODES, RESET_STEP, RESET_ROW = 4, 6, 2
@@ -159,8 +160,17 @@ def modules(network) -> dict[str, nn.Module]:
 
 
 REBUILT = ("history", "in place", "nested", "plain", "normalized", "fixed")
-BATCHED = (*REBUILT, "recurrent")
-COPIED = ("counting",)
+TOGETHER = ("history", "in place", "nested", "plain", "recurrent")
+"""Whose own code takes all episodes at once."""
+KINDS = (*REBUILT, "recurrent", "counting")
+
+
+def own_code(path, contract) -> ScriptProgram:
+    """The file as it is run where its code is not understood."""
+    script = check_script(path.read_bytes(), source="policy")
+    program = ScriptProgram(script.data, "policy")
+    program.prepare(contract, script.attributes)
+    return program
 
 
 @pytest.fixture(scope="module")
@@ -176,14 +186,14 @@ def loaded(tmp_path_factory, cts_network):
     return load
 
 
-@pytest.mark.parametrize("name", BATCHED + COPIED)
+@pytest.mark.parametrize("name", KINDS)
 def test_batch_equals_single_modules(loaded, observations, name, run):
     """The reference is the exported module itself, loaded anew for each episode and for each reset."""
     path, policy = loaded(name)
-    session = policy.session(EPISODES)
-    assert policy.batched == session.batched == (name in BATCHED)
+    own = own_code(path, policy.contract).session(EPISODES)
     assert isinstance(policy, RebuiltPolicy) == (name in REBUILT)
-    actions = run(session, observations)
+    assert isinstance(own, BatchSession if name in TOGETHER else CopiesSession)
+    played = [run(session, observations) for session in (policy.session(EPISODES), own)]
     with warnings.catch_warnings(), torch.no_grad(), torch.jit.optimized_execution(False):
         warnings.simplefilter("ignore", DeprecationWarning)
         for row in range(EPISODES):
@@ -192,7 +202,8 @@ def test_batch_equals_single_modules(loaded, observations, name, run):
                 if row == RESET_ROW and step == RESET_STEP:
                     module = torch.jit.load(str(path))
                 expected = module(observations[step, row : row + 1])
-                np.testing.assert_allclose(actions[step, row], expected[0], atol=1e-5)
+                for actions in played:
+                    np.testing.assert_allclose(actions[step, row], expected[0], atol=1e-5)
 
 
 def test_what_is_not_rebuilt_is_said(tmp_path, cts_network, caplog):
@@ -277,7 +288,7 @@ class InList(WithHistory):
 )
 def test_actions_are_first_in_every_kind_of_output(tmp_path, cts_network, cts_file, observations, variant, run):
     policy = load_policy(save(variant(cts_network), tmp_path / "policy.pt"))
-    assert policy.batched
+    assert isinstance(policy, RebuiltPolicy)
     expected = run(load_policy(cts_file).session(EPISODES), observations)
     np.testing.assert_allclose(run(policy.session(EPISODES), observations), expected, atol=1e-5)
 
