@@ -83,6 +83,8 @@ class Walk:
         limited = replace(suite.physics, torque_limits=True, torque_speed_limit=by_speed)
         gauge = limited if changes.motor_limits else suite.physics
         self.physics = own if changes.training else gauge
+        self.noise = replace(suite.noise, projected_gravity=changes.gravity_noise)
+        self.latency = round(suite.noise.latency * suite.physics.timestep / self.physics.timestep)
         self.terrain, self.changes, self.speed = terrain, changes, suite.commands.target_speed[terrain.family]
         self.target = torch.tensor(terrain.target, dtype=torch.float64)
         self.random = torch.Generator().manual_seed(seed)
@@ -121,14 +123,13 @@ class Walk:
         command *= (self.walking & (number >= STANDING))[:, None]
         joints = self.action.shape[1]
         noise = {
-            "base_angular_velocity_b": self._noise(0.8, count, 3),
-            "joint_position": self._noise(0.01, count, joints),
-            "joint_velocity": self._noise(3.0, count, joints),
-            "projected_gravity_b": self._noise(self.changes.gravity_noise, count, 3),
+            "base_angular_velocity_b": self._noise(self.noise.base_angular_velocity, count, 3),
+            "joint_position": self._noise(self.noise.joint_position, count, joints),
+            "joint_velocity": self._noise(self.noise.joint_velocity, count, joints),
+            "projected_gravity_b": self._noise(self.noise.projected_gravity, count, 3),
         }
         self.action = self.session.act(self.builder.build(state, command, self.action, noise))
-        last = self.physics.substeps - (not self.changes.training)
-        delay = torch.randint(last + 1, (count,), generator=self.random)
+        delay = torch.randint(self.latency + 1, (count,), generator=self.random)
         before = yaw_of(state.base_quaternion_w).clone()
         self.backend.step(self.builder.targets(self.action), delay=delay)
         if self.changes.push and number % 200 == 150:
