@@ -17,6 +17,7 @@ from ..gauge.naming import distinct_names
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError
 from ..policy.finding import find_policy, shipped_policies
+from ..robots import RobotError
 from ..terrains.gauge_terrains import LEVELS
 from ..terrains.registry import TerrainError, gauge_terrain_names
 from .browser_access import check_host, is_loopback, own_requests_only
@@ -37,7 +38,7 @@ _LOST = 4.0
 """How far from the robots a camera may look before it is aimed again [m]."""
 _FRICTIONS = (0.05, 1.5)
 _OF_RUNS = ("best", "latest")
-_REFUSALS = (PolicyError, ContractError, TerrainError, BackendError, UserError)
+_REFUSALS = (PolicyError, ContractError, RobotError, TerrainError, BackendError, UserError)
 """What may be wrong with a choice; the page says it and goes on as before."""
 
 

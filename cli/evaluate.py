@@ -14,7 +14,7 @@ from typing import Any
 from rich.text import Text
 
 from ..backends.registry import choose_device
-from ..gauge.coverage import COMPLETE, coverage_of, notes, score_label, suite_label
+from ..gauge.coverage import COMPLETE, coverage_of, coverage_words, notes, score_label, suite_label
 from ..gauge.evaluate import Request, Status, evaluate, prepare
 from ..gauge.naming import run_folders
 from ..gauge.report import write_report
@@ -153,7 +153,7 @@ def print_results(console: Terminal, results: Mapping[str, Any]) -> None:
         interval = results["level_interval"]
         note = f"  (95 % interval {_interval(interval, 2)})" if interval else ""
         covered = coverage_of(results)
-        note += "" if covered["kind"] == COMPLETE else f"  {covered['kind']}: {covered['text']}"
+        note += "" if covered["kind"] == COMPLETE else f"  {coverage_words(covered)}"
         console.say(Text.assemble((f"mean level {results['level']:.2f}", "bold"), note))
 
 

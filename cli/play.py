@@ -133,6 +133,8 @@ def _told(sessions: Sequence[PlaySession]) -> str:
 
 def _check(asked: PlayRequest) -> str:
     """The viewer that is asked for, or the best that this machine has; ``UserError`` for options that make no sense."""
+    from ..gauge.pipelines import check_friction
+
     films = {"--out": (asked.out, VIDEO_ENDINGS), "--gif": (asked.gif, CLIP_ENDINGS)}
     named = [option for option, (path, _) in films.items() if path is not None]
     viewer = _viewer(asked.viewer, named, several=len(asked.policies) > 1)
@@ -143,8 +145,7 @@ def _check(asked: PlayRequest) -> str:
         raise UserError(
             f"--gamepad steers the window and the viewer is '{viewer}'; add --viewer native, or leave it out"
         )
-    if not 0.0 < asked.friction <= 10.0:
-        raise UserError(f"--friction is {asked.friction:g}; give a coefficient above 0 and at most 10")
+    check_friction(asked.friction)
     if asked.command and not all(abs(speed) <= _FASTEST for speed in asked.command):
         told = " ".join(f"{speed:g}" for speed in asked.command)
         raise UserError(f"--command is {told}; give speeds from -{_FASTEST:g} to {_FASTEST:g}")

@@ -122,8 +122,8 @@ class PlaySession:
         Raises:
             BackendError: the engine cannot do this.
             ContractError: the policy is not for this robot.
-            UserError: the policy's control period is no multiple of the physics step, or the robot lacks the suite's joint
-                parameters.
+            RobotError: the robot lacks the suite's joint parameters.
+            UserError: the policy's control period is no multiple of the physics step.
         """
         period = policy.contract.control_period
         physics = replace(suite.physics, substeps=max(1, round(period / suite.physics.timestep)))
@@ -136,11 +136,6 @@ class PlaySession:
         """Largest commands that the policy was made for."""
         self._own_limits = clip(suite.command_limits(terrain.family), self.limits)
         self._speed = min(suite.commands.target_speed.get(terrain.family, 0.5 * self._own_limits[0]), self.limits[0])
-        if suite.parameters not in robot.parameters:
-            raise UserError(
-                f"robot '{robot.name}' lacks the joint parameters '{suite.parameters}', with which it is played; it has "
-                f"{', '.join(robot.parameters)} (robot.toml)"
-            )
         self._model_order = model_joint_order(robot)
         scene = Scene(
             robot=robot,

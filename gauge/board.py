@@ -13,7 +13,7 @@ from ..files.parsing import edited, one_line
 from ..files.writing import write_atomically
 from ..policy.contract import PRIVILEGED_TERMS
 from .comparison import load_result
-from .coverage import COMPLETE, coverage_of
+from .coverage import COMPLETE, coverage_of, coverage_words
 from .naming import distinct_names
 from .pages import page_template
 from .result_check import robot_digest_of
@@ -97,7 +97,7 @@ def _entry(name: str, card: Mapping[str, Any], folder: Path, policy: str) -> dic
         "level": card["level"],
         "observations": "not stated" if terms is None else "privileged" if privileged else "measurable",
         "terms": list(terms or ()),
-        "coverage": f"{covered['kind']}" if covered["kind"] == COMPLETE else f"{covered['kind']}: {covered['text']}",
+        "coverage": coverage_words(covered),
         "ranked": covered["kind"] == COMPLETE and card["score"] is not None and not privileged,
         "rank": None,
         "command": f"gaitgauge verify {shlex.quote(str(folder / name))} --policy FILE",

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..files.parsing import edited, one_line, read_results, shown
-from .coverage import COMPLETE, coverage_of
+from .coverage import COMPLETE, coverage_of, coverage_words
 from .episodes import QUALITY
 from .intervals import CONFIDENCE, Array, Chance, Evidence
 from .naming import distinct_names
@@ -89,7 +89,7 @@ class Comparison:
 
     def _coverage_sentence(self) -> str:
         suite = f"{self.suite['name']} {self.suite['version']}"
-        texts = {p["label"]: _words(p["coverage"]) for p in self.policies}
+        texts = {p["label"]: coverage_words(p["coverage"]) for p in self.policies}
         if len(set(texts.values())) == 1:
             return f"None of these is a score of {suite}; all hold the same, {next(iter(texts.values()))}."
         each = "; ".join(f"'{label}' {text}" for label, text in texts.items())
@@ -393,8 +393,3 @@ def format_p(value: float | None) -> str:
     if value is None:
         return "–"
     return "< 0.001" if value < 0.001 else f"= {value:.3f}"
-
-
-def _words(covered: Mapping[str, Any]) -> str:
-    """A coverage in words: ``complete``, or ``part: 1 of 7 terrains``."""
-    return COMPLETE if covered["kind"] == COMPLETE else f"{covered['kind']}: {covered['text']}"

@@ -76,6 +76,11 @@ def coverage_of(results: Mapping[str, Any]) -> Mapping[str, Any]:
     return results.get("coverage") or {"kind": UNKNOWN, "text": "results that do not say what of the suite they hold"}
 
 
+def coverage_words(covered: Mapping[str, Any]) -> str:
+    """A coverage in words: ``complete``, or ``part: 1 of 7 terrains``."""
+    return COMPLETE if covered["kind"] == COMPLETE else f"{covered['kind']}: {covered['text']}"
+
+
 def suite_label(results: Mapping[str, Any]) -> str:
     """The suite's name and version as results may use it: bare only where they hold all of it."""
     name = f"{results['suite']['name']} {results['suite']['version']}"

@@ -36,7 +36,7 @@ from .dispatcher import Dispatcher, Speculation, play
 from .episodes import QUALITY
 from .goals import TARGET, check_terrain, count_sub_commands
 from .motors import gains_note, joint_parameters
-from .pipelines import PIPELINES, Environment, make_environments
+from .pipelines import PIPELINES, Environment, check_friction, check_payload, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
 from .policies import check_fit
 from .progress import ProgressMeter, Status
@@ -118,13 +118,9 @@ def prepare(request: Request) -> Prepared:
             )
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:
-        if not 0.0 < friction <= 10.0:
-            raise SuiteError(
-                f"friction {friction:g} is not possible; give a coefficient above 0 and at most 10 (--friction)"
-            )
+        check_friction(friction)
     for payload in request.payloads:
-        if not -5.0 <= payload <= 50.0:
-            raise SuiteError(f"payload {payload:g} kg is not possible; give -5 to 50 kg (--payload)")
+        check_payload(payload)
     for seed in request.seeds:
         if not 0 <= seed < 2**63:
             raise SuiteError(

@@ -6,9 +6,24 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ..policy.contract import PolicyContract, check_robot
-from ..robots import Robot
+from ..robots import Robot, RobotError
 from ..robots.base import JointParameters
 from .suite import Suite
+
+
+def suite_parameters(suite: Suite, robot: Robot) -> JointParameters:
+    """The robot's joint and motor constants that a suite names.
+
+    Raises:
+        RobotError: the robot lacks them.
+    """
+    found = robot.parameters.get(suite.parameters)
+    if found is None:
+        raise RobotError(
+            f"suite '{suite.name}' needs the joint parameters '{suite.parameters}', which robot '{robot.name}' lacks; "
+            f"it has {', '.join(sorted(robot.parameters))} (robot.toml)"
+        )
+    return found
 
 
 def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> JointParameters:
@@ -16,8 +31,9 @@ def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> Jo
 
     Raises:
         ContractError: the policy is not for this robot.
+        RobotError: the robot lacks what the suite names.
     """
-    own = robot.parameters[suite.parameters]
+    own = suite_parameters(suite, robot)
     if suite.gains == "suite":
         return own
     stiffness, damping = list(own.stiffness), list(own.damping)
@@ -29,7 +45,7 @@ def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> Jo
 
 def gains_note(suite: Suite, robot: Robot, contract: PolicyContract) -> str | None:
     """One sentence on gains that are not the ones that a policy was made for, or not the suite's usual ones; None where all agree."""
-    usual = robot.parameters[suite.parameters]
+    usual = suite_parameters(suite, robot)
     made_for = joint_parameters(replace(suite, gains="contract"), robot, contract)
     if (made_for.stiffness, made_for.damping) == (usual.stiffness, usual.damping):
         return None

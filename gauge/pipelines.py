@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .suite import Suite, SuiteError
+from .suite import LEAST_PAYLOAD, MOST_FRICTION, MOST_PAYLOAD, Suite, SuiteError
 
 PIPELINES = ("base", "multi", "level", "stress")
 
@@ -30,6 +30,22 @@ class Environment:
     def key(self) -> str:
         """Unique name."""
         return f"{self.terrain}-f{self.friction:.12g}-m{self.payload:.12g}"
+
+
+def check_friction(friction: float) -> None:
+    """Raise SuiteError for a coefficient with which nothing is played."""
+    if not 0.0 < friction <= MOST_FRICTION:
+        raise SuiteError(
+            f"friction {friction:g} is not possible; give a coefficient above 0 and at most {MOST_FRICTION:g} (--friction)"
+        )
+
+
+def check_payload(payload: float) -> None:
+    """Raise SuiteError for a payload [kg] with which nothing is played."""
+    if not LEAST_PAYLOAD <= payload <= MOST_PAYLOAD:
+        raise SuiteError(
+            f"payload {payload:g} kg is not possible; give {LEAST_PAYLOAD:g} to {MOST_PAYLOAD:g} kg (--payload)"
+        )
 
 
 def make_environments(

@@ -18,6 +18,7 @@ from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
 from ..robots import Robot, RobotError, load_robot
+from .motors import suite_parameters
 from .naming import distinct_names
 from .suite import Suite, SuiteError
 
@@ -89,11 +90,7 @@ def check_fit(suite: Suite, robot: Robot, contract: PolicyContract, *, longest: 
         RobotError: the robot lacks the suite's joint parameters.
         SuiteError: the policy was made for another control period, or for one above ``longest``.
     """
-    if suite.parameters not in robot.parameters:
-        raise RobotError(
-            f"suite '{suite.name}' needs the joint parameters '{suite.parameters}', which robot '{robot.name}' lacks; "
-            f"it has {', '.join(sorted(robot.parameters))} (robot.toml)"
-        )
+    suite_parameters(suite, robot)
     if abs(contract.control_period - suite.physics.control_period) > 1e-9:
         raise SuiteError(
             f"the policy was made for a control period of {contract.control_period:g} s, suite '{suite.name}' runs "

@@ -13,6 +13,7 @@ from pydantic import Field
 from ..files.parsing import Name, Seed, Text, one_line, shown, take
 from .intervals import ChanceRules
 from .results import environment_weights
+from .suite import Friction, Payload
 
 MOST_ROWS = 10_000
 """Environments of one result."""
@@ -73,8 +74,8 @@ class _Coverage:
 @dataclass(frozen=True, kw_only=True)
 class _Row:
     terrain: Text
-    friction: Annotated[float, Field(gt=0.0, le=10.0)]
-    payload: Annotated[float, Field(ge=-5.0, le=50.0)]
+    friction: Friction
+    payload: Payload
     level: _Level | None = None
     score: _Score | None = None
     quality: Mapping[Text, _Value] | None = None

@@ -37,9 +37,11 @@ _Noise = Annotated[float, Field(ge=0.0, le=1000.0)]
 _Force = Annotated[float, Field(ge=0.0, le=10_000.0)]
 _Tilt = Annotated[float, Field(gt=0.0, le=3.1416)]
 Limits = tuple[_Speed, _Speed, _Speed]
-Friction = Annotated[float, Field(gt=0.0, le=10.0)]
+MOST_FRICTION = 10.0
+LEAST_PAYLOAD, MOST_PAYLOAD = -5.0, 50.0
+Friction = Annotated[float, Field(gt=0.0, le=MOST_FRICTION)]
 """Sliding friction coefficient."""
-Payload = Annotated[float, Field(ge=-5.0, le=50.0)]
+Payload = Annotated[float, Field(ge=LEAST_PAYLOAD, le=MOST_PAYLOAD)]
 """Mass added to the base [kg]."""
 GoalName = Literal["diagonal_velocity", "max_velocity", "target_pos_velocity"]
 """The paper's goals, whose commands are written in ``goals.py``: the reference's clock and its rounding errors are part of them."""

@@ -20,6 +20,7 @@ from ...policy.contract import ContractError
 from ...robots import RobotError
 from ...terrains.base import Terrain
 from ...terrains.registry import gauge_terrain_names, make_terrain
+from ..pipelines import check_friction
 from ..policies import Loaded, Watch, describe, load_policies
 from ..suite import Suite, SuiteError, load_suite
 from .collecting import COMMANDS, LatentRequest, Notes, collect
@@ -99,10 +100,7 @@ def study_latents(
 def _ground(request: LatentRequest) -> tuple[Suite, tuple[Terrain, ...]]:
     """The rules, and what is walked on."""
     suite = load_suite(request.suite)
-    if not 0.0 < request.friction <= 10.0:
-        raise SuiteError(
-            f"friction {request.friction:g} is not possible; give a coefficient above 0 and at most 10 (--friction)"
-        )
+    check_friction(request.friction)
     names = request.terrains or tuple(gauge_terrain_names())
     terrains = tuple(make_terrain(n, None if n == "flat" else request.level) for n in dict.fromkeys(names))
     for terrain in terrains:

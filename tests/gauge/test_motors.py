@@ -7,6 +7,7 @@ from gaitgauge.gauge.coverage import notes, score_label
 from gaitgauge.gauge.motors import gains_note, joint_parameters
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import ContractError, ObservationTerm, kind_of_observations, standard_contract
+from gaitgauge.robots import RobotError
 from scripted_gauge import GO2
 
 OWN, REFERENCE = load_suite("gaitgauge-1"), load_suite("robogauge-1.1")
@@ -44,6 +45,15 @@ def test_gains_go_to_the_joints_that_they_are_for():
         zip(order, contract.stiffness, strict=True)
     )
     assert "kp 1 to 12 N·m/rad" in gains_note(OWN, GO2, contract)
+
+
+def test_a_robot_without_the_suite_s_parameters_is_one_sentence():
+    suite = replace(OWN, parameters="heavy")
+    for ask in (joint_parameters, gains_note):
+        with pytest.raises(
+            RobotError, match=r"suite 'gaitgauge-1' needs the joint parameters 'heavy', .*; it has gauge"
+        ):
+            ask(suite, GO2, USUAL)
 
 
 # ---- what a robot can measure -----------------------------------------------------------------------------------------
