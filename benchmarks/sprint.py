@@ -19,8 +19,11 @@ import torch
 from gaitgauge.backends.base import PhysicsState
 from gaitgauge.gauge.trials.running import Trial, run_scenario
 from gaitgauge.gauge.trials.scenario import Scenario, load_scenario
+from gaitgauge.policy.base import Policy
 from gaitgauge.policy.its_robot import robot_for
 from gaitgauge.policy.loading import load_policy
+from gaitgauge.robots import Robot
+from gaitgauge.robots.body_plan import body_plan
 
 
 def scenario(*, speed: float, reach: float, runway: float, friction: float, suite: str) -> Scenario:
@@ -40,26 +43,23 @@ def scenario(*, speed: float, reach: float, runway: float, friction: float, suit
     return replace(whole, commands=(stand, run, brake), success=success, friction=friction, suite=suite)
 
 
-def run(policy_path: str, sprint: Scenario, *, robots: int, seed: int) -> tuple[list[Trial], torch.Tensor]:
+def run(policy: Policy, robot: Robot, sprint: Scenario, *, robots: int, seed: int) -> tuple[list[Trial], torch.Tensor]:
     """Let robots run, each with noise of its own.
 
     Returns:
         What came of each, and absolute joint speeds of those that were told to run, (T, J) [rad/s].
     """
-    policy = load_policy(policy_path)
     joint_speeds: list[torch.Tensor] = []
 
     def watch(state: PhysicsState, moving: torch.Tensor) -> None:
         joint_speeds.append(state.joint_velocity[moving].float().abs())
 
-    trials = run_scenario(
-        policy, robot_for(policy.contract), sprint, range(seed, seed + robots), backend="mujoco", watch=watch
-    )
+    trials = run_scenario(policy, robot, sprint, range(seed, seed + robots), backend="mujoco", watch=watch)
     return trials, torch.cat(joint_speeds)
 
 
-def lines(trials: Sequence[Trial], joint_speeds: torch.Tensor, *, reach: float) -> list[str]:
-    """What is printed, a line each."""
+def lines(trials: Sequence[Trial], joint_speeds: torch.Tensor, robot: Robot, *, reach: float) -> list[str]:
+    """What is printed, a line each; ``joint_speeds`` are those of ``run``, in the robot's order."""
     times = [t.speed_time for t in trials if t.speed_time is not None]
     errors = [t.tracking_error for t in trials if t.speed_time is not None and t.tracking_error is not None]
     rows = [
@@ -73,8 +73,13 @@ def lines(trials: Sequence[Trial], joint_speeds: torch.Tensor, *, reach: float) 
             f"time to {reach:g} m/s             {mean:.2f} s ({least:.2f} to {largest:.2f})",
             f"error from there on          {math.fsum(errors) / len(errors):.2f} m/s",
         ]
-    for joint, name in enumerate(("hips", "thighs", "calves")):
-        seen = joint_speeds[:, joint::3].flatten()
+    plan = body_plan(robot)
+    parts = [plan.part(joint) for joint in range(robot.num_joints)]
+    for part, name in {"hip": "hips", "thigh": "thighs", "calf": "calves", "": "other joints"}.items():
+        joints = [joint for joint, moved in enumerate(parts) if moved == part]
+        if not joints:
+            continue
+        seen = joint_speeds[:, joints].flatten()
         rows.append(f"{name + ' turn at up to':<28} {seen.max():.1f} rad/s, 99 % below {seen.quantile(0.99):.1f} rad/s")
     return rows
 
@@ -94,8 +99,10 @@ def main() -> None:
     sprint = scenario(
         speed=given.speed, reach=given.reach, runway=given.runway, friction=given.friction, suite=given.suite
     )
-    trials, joint_speeds = run(given.policy, sprint, robots=given.robots, seed=given.seed)
-    print("\n".join(lines(trials, joint_speeds, reach=given.reach)))
+    policy = load_policy(given.policy)
+    robot = robot_for(policy.contract)
+    trials, joint_speeds = run(policy, robot, sprint, robots=given.robots, seed=given.seed)
+    print("\n".join(lines(trials, joint_speeds, robot, reach=given.reach)))
 
 
 if __name__ == "__main__":
