@@ -10,9 +10,9 @@ import jinja2
 
 from ..files.parsing import edited, one_line
 from ..files.writing import csv_text, make_folder, write_atomically
+from . import interval_charts
 from .charts import terrain_label
 from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p
-from .consistency import charts
 from .pages import page_template
 from .report import metric_label
 
@@ -89,10 +89,10 @@ def as_page(found: Comparison) -> str:
         kinds = []
         for kind, group in _by_kind(found, first, second).items():
             known = [{"value": d.difference, "interval": d.interval} if d.interval else None for d in group]
-            scale = charts.common_scale(known, signed=True)
-            strips = [None if k is None else charts.strip(k, scale) for k in known]
+            scale = interval_charts.common_scale(known, signed=True)
+            strips = [None if k is None else interval_charts.strip(k, scale) for k in known]
             rows = list(zip(group, strips, strict=True))
-            kinds.append({"kind": kind, "scale": charts.strip_scale(scale), "rows": rows})
+            kinds.append({"kind": kind, "scale": interval_charts.strip_scale(scale), "rows": rows})
         pairs.append({"first": first, "second": second, "kinds": kinds})
     template = page_template("comparison.html.j2", signed=_signed, odds=_odds, label=label)
     return template.render(

@@ -112,6 +112,14 @@ def welch(variances: Array, freedoms: Array) -> float:
     return float(variances.sum()) ** 2 / uncertain if uncertain > 0.0 else math.inf
 
 
+def wilson_interval(share: float, trials: float) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share of successes among so many independent trials (Wilson 1927)."""
+    z = float(special.ndtri(0.5 + 0.5 * CONFIDENCE))
+    centre = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    reach = z / (1 + z**2 / trials) * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
+    return max(centre - reach, 0.0), min(centre + reach, 1.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ChanceRules:
     """What a suite says that decides about chance."""

@@ -7,11 +7,12 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ...files.parsing import shown
+from .. import interval_charts
 from ..charts import number, terrain_label
 from ..pages import page_of, page_template
 from ..report import metric_label
 from ..store import StoreError
-from . import charts
+from .charts import curves
 from .statistics import DIFFERENT, EQUIVALENT
 from .study import SCHEMA
 
@@ -100,15 +101,15 @@ def page_data(results: Mapping[str, Any]) -> dict[str, Any]:
 def _policy(block: Mapping[str, Any], reference: str, margin: float) -> dict[str, Any]:
     """One policy's part of the page."""
     gaps = [{"pair": g["pair"], "place": "overall", **g["overall"]} for g in block["gaps"]]
-    scale = charts.common_scale([g["gap"] for g in gaps] + [block["floor"]["overall"]["gap"]], signed=False)
+    scale = interval_charts.common_scale([g["gap"] for g in gaps] + [block["floor"]["overall"]["gap"]], signed=False)
     for row in gaps:
-        row["strip"] = charts.strip(row["gap"], scale, block["floor"]["overall"]["gap"])
+        row["strip"] = interval_charts.strip(row["gap"], scale, block["floor"]["overall"]["gap"])
     return {
         "title": PurePath(block["policy"].replace("\\", "/")).name,
         "contract_hash": block["contract_hash"],
         "file_sha256": block["file_sha256"],
         "gaps": gaps,
-        "gap_scale": charts.strip_scale(scale),
+        "gap_scale": interval_charts.strip_scale(scale),
         "floor": block["floor"]["overall"]["gap"],
         "verdicts": [
             {"label": label, "text": verdict(pair["overall"], margin)} for label, pair in block["pairs"].items()
@@ -159,24 +160,26 @@ def cause(to: Mapping[str, Any]) -> str:
 def _pair(pair: Mapping[str, Any]) -> dict[str, Any]:
     """Terrains, metrics and outcomes of one comparison."""
     places = {"overall": pair["overall"], **pair["terrains"]}
-    gap_scale = charts.common_scale([p[k] for p in places.values() for k in ("gap", "floor")], signed=False)
-    difference_scale = charts.common_scale([p["difference"] for p in places.values()], signed=True)
+    gap_scale = interval_charts.common_scale([p[k] for p in places.values() for k in ("gap", "floor")], signed=False)
+    difference_scale = interval_charts.common_scale([p["difference"] for p in places.values()], signed=True)
     metrics = pair["overall"]["metrics"]
-    metric_scale = charts.common_scale([m["difference"] for m in metrics.values()], signed=True)
+    metric_scale = interval_charts.common_scale([m["difference"] for m in metrics.values()], signed=True)
     return {
         "rows": [
             {
                 "place": name,
                 **place,
-                "gap_strip": charts.strip(place["gap"], gap_scale, place["floor"]),
-                "difference_strip": charts.strip(place["difference"], difference_scale),
+                "gap_strip": interval_charts.strip(place["gap"], gap_scale, place["floor"]),
+                "difference_strip": interval_charts.strip(place["difference"], difference_scale),
             }
             for name, place in places.items()
         ],
-        "gap_scale": charts.strip_scale(gap_scale),
-        "difference_scale": charts.strip_scale(difference_scale),
-        "metrics": {n: {**m, "strip": charts.strip(m["difference"], metric_scale)} for n, m in metrics.items()},
-        "metric_scale": charts.strip_scale(metric_scale),
+        "gap_scale": interval_charts.strip_scale(gap_scale),
+        "difference_scale": interval_charts.strip_scale(difference_scale),
+        "metrics": {
+            n: {**m, "strip": interval_charts.strip(m["difference"], metric_scale)} for n, m in metrics.items()
+        },
+        "metric_scale": interval_charts.strip_scale(metric_scale),
         "matrix": {
             name: {m: row["difference"] for m, row in place["metrics"].items()}
             for name, place in pair["terrains"].items()
@@ -191,7 +194,7 @@ def _open_loop(block: Mapping[str, Any], reference: str) -> dict[str, Any]:
     tests = []
     for test, title in TESTS.items():
         panels = [
-            charts.curves(
+            curves(
                 {
                     label: (differences[label][test]["time"], differences[label][test]["curves"][name])
                     for label in labels
@@ -211,14 +214,14 @@ def _open_loop(block: Mapping[str, Any], reference: str) -> dict[str, Any]:
 def _attribution(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Interval charts of what each switch does."""
     played = [r for r in rows if r["not_run"] is None]
-    scale = charts.common_scale([r["difference"] for r in played], signed=True)
-    changes = charts.common_scale([t["change"] for r in played for t in r["to"].values()], signed=True)
+    scale = interval_charts.common_scale([r["difference"] for r in played], signed=True)
+    changes = interval_charts.common_scale([t["change"] for r in played for t in r["to"].values()], signed=True)
     shown: list[dict[str, Any]] = [
         {
             **r,
-            "strip": charts.strip(r["difference"], scale),
+            "strip": interval_charts.strip(r["difference"], scale),
             "to": {
-                label: {**t, "cause": cause(t), "strip": charts.strip(t["change"], changes)}
+                label: {**t, "cause": cause(t), "strip": interval_charts.strip(t["change"], changes)}
                 for label, t in r["to"].items()
             },
         }
@@ -226,8 +229,8 @@ def _attribution(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     ]
     return {
         "rows": shown,
-        "scale": charts.strip_scale(scale),
-        "change_scale": charts.strip_scale(changes),
+        "scale": interval_charts.strip_scale(scale),
+        "change_scale": interval_charts.strip_scale(changes),
         "engines": list(dict.fromkeys(label for r in shown for label in r["to"])),
         "metrics": list(shown[0]["metrics"]) if shown else [],
         "not_run": [r for r in rows if r["not_run"] is not None],

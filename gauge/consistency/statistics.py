@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from ..intervals import CONFIDENCE, welch, wilson_interval
 from ..results import environment_weights
 
 Array = NDArray[np.float64]
 
-CONFIDENCE = 0.95
 EQUIVALENT, DIFFERENT, UNDECIDED = "equivalent", "different", "undecided"
 MARGIN = 0.02
 """Difference of quality that does not matter: it moves the score of a levelled terrain by 0.004, less than its repeatability."""
@@ -61,9 +61,7 @@ def spread_of_mean(values: Array, weights: Array, *, shared: bool) -> tuple[floa
     if shared:
         return float((weights @ values).std(ddof=1) / math.sqrt(seeds)), float(seeds - 1)
     parts = weights**2 * values.var(axis=1, ddof=1) / seeds
-    total = float(parts.sum())
-    freedom = total**2 / float((parts**2).sum() / (seeds - 1)) if total > 0.0 else float(seeds - 1)
-    return math.sqrt(total), freedom
+    return math.sqrt(float(parts.sum())), welch(parts, np.full(len(parts), seeds - 1.0))
 
 
 def tail_probability(seeds: int, freedom: float) -> float:
@@ -201,14 +199,6 @@ def _share_interval(same: Array, cluster: NDArray[np.intp]) -> tuple[float, floa
         student = stats.t.ppf(0.5 + 0.5 * CONFIDENCE, [count - 1, clusters - 1])
         effective /= max(seen / independent if independent > 0.0 else 1.0, 1.0) * (student[1] / student[0]) ** 2
     return wilson_interval(share, effective)
-
-
-def wilson_interval(share: float, trials: float) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share of successes among so many independent trials (Wilson 1927)."""
-    z = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
-    centre = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
-    reach = z / (1 + z**2 / trials) * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
-    return max(centre - reach, 0.0), min(centre + reach, 1.0)
 
 
 def sign_flip(differences: NDArray[np.int64]) -> float:

@@ -17,7 +17,7 @@ from ...files.writing import csv_text, json_text, make_folder, write_atomically
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
-from ..consistency.statistics import wilson_interval
+from ..intervals import wilson_interval
 from ..policies import PoliciesRequest, Watch, describe, load_policies
 from ..suite import SuiteError
 from .page import render_page

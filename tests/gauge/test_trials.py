@@ -8,7 +8,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 import torch
-from gaitgauge.gauge.consistency.statistics import wilson_interval
+from gaitgauge.gauge.intervals import wilson_interval
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.gauge.trials import running
 from gaitgauge.gauge.trials.running import Trial, draws, run_scenario
