@@ -105,6 +105,21 @@ class Scene:
     """Terrain of every world at the start; its length is the number of worlds."""
     physics: PhysicsOptions = PhysicsOptions()
 
+    def __post_init__(self) -> None:
+        if self.terrain_index:
+            self.check_terrains(min(self.terrain_index), max(self.terrain_index))
+
+    def check_terrains(self, first: int, last: int) -> None:
+        """Refuse terrains that the palette does not have.
+
+        Raises:
+            BackendError: the smallest or the largest index of some worlds is none of its.
+        """
+        if first < 0 or last >= len(self.terrains):
+            raise BackendError(
+                f"terrain_index holds {first} to {last}, but the terrains are 0 to {len(self.terrains) - 1}"
+            )
+
     @property
     def num_worlds(self) -> int:
         """Number of worlds."""
@@ -281,7 +296,11 @@ DESCRIPTION_KEYS: tuple[str, ...] = (
 
 
 class PhysicsBackend(ABC):
-    """N worlds of one robot. See the module docstring for frames and units."""
+    """N worlds of one robot. See the module docstring for frames and units.
+
+    Arguments that are none (a mask, shape, terrain or number of substeps that cannot be) raise ``BackendError`` before anything
+    changes; ``arguments.py`` holds these checks for all engines.
+    """
 
     name: ClassVar[str]
     """Registry name, for example ``mujoco``."""

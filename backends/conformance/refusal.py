@@ -1,16 +1,19 @@
-"""Checks that an engine refuses what it says it cannot do, one for each capability: nothing is silently ignored."""
+"""Checks that an engine refuses what it says it cannot do, one for each capability, and arguments that are none: nothing is
+silently ignored.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from ...terrains.base import Box, HeightField, Terrain
-from ..base import BackendError
-from .bench import FLAT, Bench, Worlds, expect
-from .suite import check
+from ..base import BackendError, Randomization
+from .bench import FLAT, Bench, ConformanceError, Worlds, expect
+from .suite import ENGINE_ERRORS, check
 
 _BOX = Terrain(name="conformance_box", family="box", boxes=(Box(center=(0.0, 0.0, 0.1), half_size=(1.0, 1.0, 0.1)),))
 _FIELD = Terrain(
@@ -92,6 +95,65 @@ def accepts_or_refuses(capability: str) -> Callable[[Bench], str]:
 
     run.__doc__ = f"The engine takes a request for '{capability}' if it declares it, and raises BackendError if not."
     return run
+
+
+def _mistakes(worlds: Worlds) -> dict[str, Callable[[], None]]:
+    """Calls with arguments that cannot be, by what is wrong with them."""
+    backend, n = worlds.backend, worlds.count
+    start = backend.standing()
+
+    def zeros(*shape: int) -> torch.Tensor:
+        return torch.zeros(shape, dtype=backend.dtype, device=backend.device)
+
+    def numbers(*shape: int, value: int = 1) -> torch.Tensor:
+        return torch.full(shape, value, dtype=torch.int64, device=backend.device)
+
+    joints, some = worlds.robot.num_joints, torch.arange(n, device=backend.device) < 1
+    pose = zeros(n, joints)
+    mistakes: dict[str, Callable[[], None]] = {
+        "one base_position for all masked worlds": lambda: backend.reset(
+            replace(start, base_position=start.base_position[:1]), some
+        ),
+        "one held_target for all worlds": lambda: backend.reset(replace(start, held_target=zeros(1, joints))),
+        "a mask for one world more": lambda: backend.reset(start, torch.cat((some, some[:1]))),
+        "joint_targets for one world": lambda: backend.step(zeros(1, joints)),
+        "joint_targets for one joint": lambda: backend.step(zeros(n, 1)),
+        "a delay for one world": lambda: backend.step(pose, delay=numbers(1)),
+        "a sample_at for one world": lambda: backend.step(pose, sample_at=numbers(1)),
+        "a mask of numbers": lambda: backend.step(pose, worlds=numbers(n)),
+        "no substeps": lambda: backend.step(pose, substeps=0),
+        "one velocity to push all worlds to": lambda: backend.push(linear_velocity_w=zeros(3)),
+        "one force for all worlds": lambda: backend.apply_force(zeros(3)),
+        "one motor_strength for all joints": lambda: backend.randomize(Randomization(motor_strength=zeros(n, 1))),
+    }
+    if not start.base_position.is_cuda:  # to look at them would mean to wait for the device
+        for value in (-1, len(backend.scene.terrains)):
+            index = numbers(n, value=value)
+            mistakes[f"terrain {value}"] = lambda index=index: backend.reset(replace(start, terrain_index=index))
+    return mistakes
+
+
+@check("refusal/arguments")
+def arguments(bench: Bench) -> str:
+    """Arguments that cannot be (shape, mask, terrain, substeps) are refused and change nothing."""
+    with bench.worlds() as worlds:
+        worlds.reset()
+        worlds.step(worlds.default_pose)
+        before, mistakes = worlds.read(), _mistakes(worlds)
+        for what, call in mistakes.items():
+            try:
+                call()
+            except BackendError as refusal:
+                expect(len(str(refusal)) > 20, f"the refusal of {what} says too little: '{refusal}'")
+            except ENGINE_ERRORS as error:
+                kind = type(error).__name__
+                raise ConformanceError(f"{what} raises {kind} ('{error}') in place of BackendError") from error
+            else:
+                raise ConformanceError(f"{what} is accepted")
+        after = worlds.read()
+        for name, value in vars(before).items():
+            expect(np.array_equal(getattr(after, name), value), f"state.{name} changes though everything was refused")
+    return f"{len(mistakes)} mistakes"
 
 
 for _name in REQUESTS:

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..arguments import check_force, check_push, check_randomization, check_start, check_step
 from ..base import (
     CAPABILITY_NAMES,
     SMALLEST_BASE_MASS,
@@ -144,16 +145,11 @@ class MujocoBackend(PhysicsBackend):
 
     def _rows(self, worlds: torch.Tensor | None) -> NDArray[np.int64]:
         """Indices of the masked worlds."""
-        if worlds is None:
-            return self._everyone
-        if worlds.dtype != torch.bool or worlds.shape != (self.num_worlds,):
-            raise BackendError(
-                f"the mask of worlds must be {self.num_worlds} booleans, not {tuple(worlds.shape)} of {worlds.dtype}"
-            )
-        return np.flatnonzero(worlds.numpy())
+        return self._everyone if worlds is None else np.flatnonzero(worlds.numpy())
 
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.reset``."""
+        check_start(self.scene, start, worlds)
         rows = self._rows(worlds)
         if len(rows) == 0:
             return
@@ -200,12 +196,14 @@ class MujocoBackend(PhysicsBackend):
         substeps: int | None = None,
     ) -> None:
         """See ``PhysicsBackend.step``."""
+        total = check_step(
+            self.scene, joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=substeps
+        )
         rows = self._rows(worlds)
         n = len(rows)
         if n == 0:
             return
         those = slice(None) if n == self.num_worlds else rows  # a slice gives views, which saves copies
-        total = self.scene.physics.substeps if substeps is None else substeps
         held, offset, some_limp = self._held[those], self._offset[those], bool(self._limp[those].any())
         targets, waits = held, None
         if joint_targets is not None:
@@ -340,6 +338,7 @@ class MujocoBackend(PhysicsBackend):
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``. Worlds whose values stay as they are cost nothing: constants of a model are slow to make."""
+        check_randomization(self.scene, randomization, worlds)
         rows = self._rows(worlds)
         values = {f.name: value for f in fields(Randomization) if (value := getattr(randomization, f.name)) is not None}
         for name, value in values.items():
@@ -410,6 +409,7 @@ class MujocoBackend(PhysicsBackend):
         angular_velocity_b: torch.Tensor | None = None,
     ) -> None:
         """See ``PhysicsBackend.push``."""
+        check_push(self.scene, worlds, linear_velocity_w=linear_velocity_w, angular_velocity_b=angular_velocity_b)
         rows = self._rows(worlds)
         for first, value in ((0, linear_velocity_w), (3, angular_velocity_b)):
             if value is not None:
@@ -420,6 +420,7 @@ class MujocoBackend(PhysicsBackend):
 
     def apply_force(self, force_w: torch.Tensor) -> None:
         """See ``PhysicsBackend.apply_force``."""
+        check_force(self.scene, force_w)
         applied = self._applied.reshape(self.num_worlds, -1, 6)
         applied[:, self._base, 0:3] = force_w.numpy()
 

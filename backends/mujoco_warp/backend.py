@@ -13,6 +13,7 @@ import mujoco_warp
 import torch
 import warp as wp
 
+from ..arguments import check_force
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Randomization, Scene, Support
 from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
@@ -195,7 +196,8 @@ class MujocoWarpBackend(WarpBackend):
 
     def apply_force(self, force_w: torch.Tensor) -> None:
         """See ``PhysicsBackend.apply_force``."""
-        self._fill(self._external[:, self._shared.base, 0:3], force_w, "force_w")
+        check_force(self.scene, force_w)
+        self._external[:, self._shared.base, 0:3].copy_(force_w)
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``. Fields may also have a row for every world; then the masked rows count."""

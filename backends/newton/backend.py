@@ -16,6 +16,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ..arguments import check_force
 from ..base import BackendError, Capability, PhysicsOptions, Randomization, Scene
 from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
@@ -324,9 +325,8 @@ class NewtonBackend(WarpBackend):
 
     def apply_force(self, force_w: torch.Tensor) -> None:
         """See ``PhysicsBackend.apply_force``."""
+        check_force(self.scene, force_w)
         n, layout = self.num_worlds, self._world.layout
-        if force_w.shape != (n, 3):
-            raise BackendError(f"force_w must have the shape {(n, 3)}, not {tuple(force_w.shape)}")
         with self._scope():
             for state in (self._now, self._next):
                 wrenches = wp.to_torch(state.body_f).view(n, layout.bodies, 6)

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import torch
 import warp as wp
 
+from ..arguments import check_push, check_randomization, check_start, check_step
 from ..base import BackendError, PhysicsBackend, PhysicsState, Randomization, ResetState, Scene
 from ..devices import find_device
 from .device import DeviceScope
@@ -115,20 +116,20 @@ class WarpBackend(PhysicsBackend):
         return self._sample
 
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
-        """See ``PhysicsBackend.reset``."""
+        """See ``PhysicsBackend.reset``. On a GPU, where looking at terrains would mean to wait, the kernel clamps them."""
+        check_start(self.scene, start, worlds)
         self._select(worlds)
-        self._fill(self._pose[:, 0:3], start.base_position, "base_position")
-        self._fill(self._pose[:, 3:7], start.base_quaternion, "base_quaternion")
-        self._fill(self._twist[:, 0:3], start.base_linear_velocity, "base_linear_velocity")
-        self._fill(self._twist[:, 3:6], start.base_angular_velocity, "base_angular_velocity")
-        self._fill(self._new_position, start.joint_position, "joint_position", self._default_joints)
-        self._fill(self._new_velocity, start.joint_velocity, "joint_velocity")
-        self._fill(self._motors.requested, start.held_target, "held_target")
+        self._fill(self._pose[:, 0:3], start.base_position)
+        self._fill(self._pose[:, 3:7], start.base_quaternion)
+        self._fill(self._twist[:, 0:3], start.base_linear_velocity)
+        self._fill(self._twist[:, 3:6], start.base_angular_velocity)
+        self._fill(self._new_position, start.joint_position, self._default_joints)
+        self._fill(self._new_velocity, start.joint_velocity)
+        self._fill(self._motors.requested, start.held_target)
         self._has_request.fill_(int(start.held_target is not None))
         terrain = start.terrain_index
         if terrain is not None:
-            self._check_terrain(terrain, worlds)
-            self._fill(self._new_terrain, terrain, "terrain_index")
+            self._fill(self._new_terrain, terrain)
         with self._scope():
             if terrain is not None:
                 self._place_terrain()
@@ -144,15 +145,15 @@ class WarpBackend(PhysicsBackend):
         substeps: int | None = None,
     ) -> None:
         """See ``PhysicsBackend.step``."""
-        total = self.scene.physics.substeps if substeps is None else substeps
-        if total < 1:
-            raise BackendError(f"substeps is {total}, but a step has at least one")
+        total = check_step(
+            self.scene, joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=substeps
+        )
         self._select(worlds)
         self._has_request.fill_(int(joint_targets is not None))
-        self._fill(self._motors.requested, joint_targets, "joint_targets")
-        self._fill(self._motors.delay, delay, "delay", 0)
+        self._fill(self._motors.requested, joint_targets)
+        self._fill(self._motors.delay, delay, 0)
         if sample_at is not None:
-            self._fill(self._sample_at, sample_at, "sample_at")
+            self._fill(self._sample_at, sample_at)
             self._sample_at.mul_(self._active)
         masked, sampled = self.always_masked or worlds is not None, sample_at is not None
         if not self._scope.on_gpu:
@@ -172,9 +173,10 @@ class WarpBackend(PhysicsBackend):
         angular_velocity_b: torch.Tensor | None = None,
     ) -> None:
         """See ``PhysicsBackend.push``."""
+        check_push(self.scene, worlds, linear_velocity_w=linear_velocity_w, angular_velocity_b=angular_velocity_b)
         self._select(worlds)
-        self._fill(self._twist[:, 0:3], linear_velocity_w, "linear_velocity_w", math.nan)
-        self._fill(self._twist[:, 3:6], angular_velocity_b, "angular_velocity_b", math.nan)
+        self._fill(self._twist[:, 0:3], linear_velocity_w, math.nan)
+        self._fill(self._twist[:, 3:6], angular_velocity_b, math.nan)
         with self._scope():
             self._push_base()
 
@@ -188,34 +190,17 @@ class WarpBackend(PhysicsBackend):
         """Write the mask of the worlds that the next kernels touch."""
         if worlds is None:
             self._active.fill_(1)
-            return
-        if worlds.dtype != torch.bool or worlds.shape != (self.num_worlds,):
-            raise BackendError(
-                f"the mask of worlds must be {self.num_worlds} booleans, not {tuple(worlds.shape)} of {worlds.dtype}"
-            )
-        self._active.copy_(worlds)
+        else:
+            self._active.copy_(worlds)
 
     @staticmethod
-    def _fill(buffer: torch.Tensor, value: torch.Tensor | None, name: str, default: torch.Tensor | float = 0.0) -> None:
+    def _fill(buffer: torch.Tensor, value: torch.Tensor | None, default: torch.Tensor | float = 0.0) -> None:
         """Copy an argument with a row for each world into its buffer."""
-        if value is not None and value.shape != buffer.shape:
-            raise BackendError(f"{name} has shape {tuple(value.shape)}, but must be {tuple(buffer.shape)}")
         source = default if value is None else value
         if isinstance(source, torch.Tensor):
             buffer.copy_(source)
         else:
             buffer.fill_(source)
-
-    def _check_terrain(self, index: torch.Tensor, worlds: torch.Tensor | None) -> None:
-        """Refuse indices outside the palette; on a GPU, where looking would mean to wait, the kernel clamps them."""
-        if self._scope.on_gpu:
-            return
-        chosen = index if worlds is None else index[worlds]
-        last = len(self.scene.terrains) - 1
-        if chosen.numel() and (int(chosen.min()) < 0 or int(chosen.max()) > last):
-            raise BackendError(
-                f"terrain_index holds {int(chosen.min())} to {int(chosen.max())}, but the terrains are 0 to {last}"
-            )
 
     def _changes(self, randomization: Randomization, worlds: torch.Tensor | None) -> dict[str, torch.Tensor]:
         """The fields that change, each with a row for every world; what stands in rows outside of the mask is void.
@@ -223,8 +208,9 @@ class WarpBackend(PhysicsBackend):
         The mask is written into ``_active``. A field may have a row for each masked world, or one for every world.
 
         Raises:
-            BackendError: a field has another number of rows.
+            BackendError: mask or shape, or a field has another number of rows.
         """
+        check_randomization(self.scene, randomization, worlds)
         self._select(worlds)
         rows: dict[str, torch.Tensor] = {}
         for item in fields(Randomization):

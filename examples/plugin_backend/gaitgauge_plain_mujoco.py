@@ -20,6 +20,7 @@ from gaitgauge.backends import (
     Scene,
     Support,
 )
+from gaitgauge.backends.arguments import check_force, check_push, check_randomization, check_start, check_step
 from gaitgauge.backends.base import CAPABILITY_NAMES
 from gaitgauge.backends.motor_law import MotorLimits, motor_torque
 from gaitgauge.terrains.base import Terrain
@@ -145,6 +146,7 @@ class PlainMujocoBackend(PhysicsBackend):
 
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """Put worlds into a state."""
+        check_start(self.scene, start, worlds)
         for row in self._rows(worlds):
             if start.terrain_index is not None and int(start.terrain_index[row]) != self._terrain[row]:
                 self._terrain[row] = int(start.terrain_index[row])
@@ -174,7 +176,9 @@ class PlainMujocoBackend(PhysicsBackend):
         substeps: int | None = None,
     ) -> None:
         """Advance one control period."""
-        count = self.scene.physics.substeps if substeps is None else substeps
+        count = check_step(
+            self.scene, joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=substeps
+        )
         for row in self._rows(worlds):
             late = 0 if delay is None else int(delay[row])
             wanted = 0 if sample_at is None else int(sample_at[row])
@@ -287,6 +291,7 @@ class PlainMujocoBackend(PhysicsBackend):
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """Change the model of some worlds."""
+        check_randomization(self.scene, randomization, worlds)
         if randomization.link_mass_scale is not None:
             raise BackendError(f"backend '{self.name}' cannot scale link masses; leave link_mass_scale None")
         for name in ("friction", "base_mass_offset", "base_com_offset", *MOTOR_FIELDS):
@@ -318,6 +323,7 @@ class PlainMujocoBackend(PhysicsBackend):
         angular_velocity_b: torch.Tensor | None = None,
     ) -> None:
         """Set base velocities; NaN keeps the present value."""
+        check_push(self.scene, worlds, linear_velocity_w=linear_velocity_w, angular_velocity_b=angular_velocity_b)
         for row in self._rows(worlds):
             for start, velocity in ((0, linear_velocity_w), (3, angular_velocity_b)):
                 if velocity is not None:
@@ -327,5 +333,6 @@ class PlainMujocoBackend(PhysicsBackend):
 
     def apply_force(self, force_w: torch.Tensor) -> None:
         """Force on the base's centre of mass, where MuJoCo's applied body forces act."""
+        check_force(self.scene, force_w)
         for data, force in zip(self._data, force_w.numpy(), strict=True):
             data.xfrc_applied[self._base, :3] = force

@@ -243,6 +243,32 @@ class SwallowsRequests(MujocoBackend):
         return {**super().capabilities(), "external_force": nothing, "boxes": nothing, "motor_offset": nothing}
 
 
+class OneRowForAll(MujocoBackend):
+    def apply_force(self, force_w):
+        super().apply_force(force_w.expand(self.num_worlds, 3))
+
+
+class LastTerrainFirst(MujocoBackend):
+    def reset(self, start, worlds=None):
+        index = start.terrain_index
+        wrapped = None if index is None else index % len(self.scene.terrains)
+        super().reset(replace(start, terrain_index=wrapped), worlds)
+
+
+class ErrorsOfItsOwn(MujocoBackend):
+    def step(self, joint_targets, *, substeps=None, **rest):
+        if substeps == 0:
+            raise ValueError("nstep must be > 0")
+        super().step(joint_targets, substeps=substeps, **rest)
+
+
+class RefusesTooLate(MujocoBackend):
+    def step(self, joint_targets, *, delay=None, **rest):
+        super().step(joint_targets, **rest)
+        if delay is not None:
+            super().step(None, delay=delay, **rest)
+
+
 class OverPromises(MujocoBackend):
     def apply_force(self, force_w):
         raise BackendError("external forces are not there in this engine; leave them out of the task")
@@ -289,6 +315,10 @@ FAULTS = [
     (SwallowsRequests, "refusal/boxes"),
     (SwallowsRequests, "refusal/motor_offset"),
     (OverPromises, "refusal/external_force"),
+    (OneRowForAll, "refusal/arguments"),
+    (LastTerrainFirst, "refusal/arguments"),
+    (ErrorsOfItsOwn, "refusal/arguments"),
+    (RefusesTooLate, "refusal/arguments"),
 ]
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import torch
+from gaitgauge.backends.arguments import check_force, check_push, check_randomization, check_start, check_step
 from gaitgauge.backends.base import (
     CAPABILITY_NAMES,
     BackendError,
@@ -218,6 +219,7 @@ class FakeBackend(PhysicsBackend):
 
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """Put worlds into a state, as the contract says."""
+        check_start(self.scene, start, worlds)
         mask, state = self._mask(worlds), self._state
         for f in fields(PhysicsState):
             getattr(state, f.name)[mask] = 0
@@ -252,8 +254,10 @@ class FakeBackend(PhysicsBackend):
         substeps: int | None = None,
     ) -> None:
         """Advance one control period, as the contract says."""
+        count = check_step(
+            self.scene, joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=substeps
+        )
         mask, state = self._mask(worlds), self._state
-        count = self.scene.physics.substeps if substeps is None else substeps
         late = torch.zeros_like(self._substeps_since_reset) if delay is None else delay.to(self.device)
         state.tilt_substep[mask] = 0
         state.penetration_substep[mask] = 0
@@ -274,6 +278,7 @@ class FakeBackend(PhysicsBackend):
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """Record the values; those of the motors act."""
+        check_randomization(self.scene, randomization, worlds)
         mask = self._mask(worlds)
         for f in fields(Randomization):
             value = getattr(randomization, f.name)
@@ -288,6 +293,7 @@ class FakeBackend(PhysicsBackend):
         angular_velocity_b: torch.Tensor | None = None,
     ) -> None:
         """Set base velocities; a scripted motion overrides them at the next substep."""
+        check_push(self.scene, worlds, linear_velocity_w=linear_velocity_w, angular_velocity_b=angular_velocity_b)
         mask, state = self._mask(worlds)[:, None], self._state
         for old, new in (
             (state.base_linear_velocity_w, linear_velocity_w),
@@ -300,6 +306,7 @@ class FakeBackend(PhysicsBackend):
 
     def apply_force(self, force_w: torch.Tensor) -> None:
         """External force; it accelerates the base as a point mass of the robot's mass, unless a motion is scripted."""
+        check_force(self.scene, force_w)
         self.force_w.copy_(force_w)
 
     @property
