@@ -1,11 +1,14 @@
-"""What a wheel holds: every package and every data file of the repository."""
+"""What a wheel holds, every package and every data file of the repository, and what it asks for."""
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
 import tomllib
 import zipfile
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import gaitgauge
@@ -15,8 +18,51 @@ ROOT = Path(gaitgauge.__path__[0])
 TOP = ("backends", "cli", "files", "gauge", "policy", "robots", "terrains", "training")
 
 
+PARTS = {"google": "protobuf", "pydantic_core": "pydantic", "pygame": "pygame-ce"}
+"""Who provides a module, where that is not told by what is installed."""
+
+
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
 def settings() -> dict:
-    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    return project()["tool"]["setuptools"]
+
+
+def distribution(requirement: str) -> str:
+    """The name in a requirement, spelled in one way."""
+    return re.sub(r"[-_.]+", "-", re.split(r"[\[<>=~! ]", requirement)[0]).lower()
+
+
+def imported() -> dict[str, str]:
+    """What the package imports of others, and where: distributions."""
+    known, found = packages_distributions(), {}
+    for top in TOP:
+        for file in (ROOT / top).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+                if isinstance(node, ast.ImportFrom) and not node.level and node.module:
+                    names = [node.module]
+                for module in {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {"gaitgauge"}:
+                    found[distribution(PARTS.get(module) or known.get(module, [module])[0])] = str(file)
+    return found
+
+
+def test_what_is_imported_is_asked_for_and_nothing_else():
+    listed, extras = project()["project"]["dependencies"], project()["project"]["optional-dependencies"]
+    asked = {distribution(text) for text in listed}
+    optional = {distribution(text) for name in ("gamepad", "cluster") for text in extras[name]}
+    found = imported()
+    assert {name: file for name, file in found.items() if name not in asked | optional} == {}
+    assert asked - found.keys() == set()
+
+
+def test_what_is_asked_for_is_pinned():
+    pinned = {distribution(line) for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()}
+    listed, extras = project()["project"]["dependencies"], project()["project"]["optional-dependencies"]
+    named = {distribution(text) for text in (*listed, *extras["dev"], *extras["docs"])}
+    assert named - pinned == set()
 
 
 def test_every_package_is_named_in_pyproject():
