@@ -2,16 +2,16 @@
 
     python benchmarks/contact_accuracy.py                                    # MuJoCo, all settings, all grounds
     python benchmarks/contact_accuracy.py --engine mujoco-warp --worlds 8 --seconds 2 --settings pyramidal,1,6
-    python benchmarks/contact_accuracy.py --settings elliptic,10,6 --foot-condim 4 --self-collision
+    python benchmarks/contact_accuracy.py --settings elliptic,10,6 --foot-condim 4 --no-self-collision
 
 Robots walk with a policy (the shipped one unless ``--policy`` names another) in the physics of training
-(``TRAINING_PHYSICS`` but for what is varied; no torque limits by speed, which the policy was not trained with) on flat
-ground, on stairs (forwards level 7, backwards level 5) and on a height field (waves, level 6). Every physics step after
-the first half second counts until a robot falls. Printed are, for each ground and setting: the force on a foot that 99
-% and 99.9 % of all feet and steps stay below and the largest; the depth of loaded feet (over 20 N) in the ground and
-the horizontal speed of their centres, likewise; and how many robots fell or diverged. ``converged`` stands for MuJoCo's
-solver with 200 iterations and a tolerance of 1e-10; the first row is MuJoCo's at 1 ms with an elliptic cone. Runs on
-the CPU.
+(``TRAINING_PHYSICS`` but for what is varied, and motors whose torque does not fall with speed: the contacts are compared,
+not what a policy makes of motors, of which the shipped one learned with some up to five times as fast) on flat ground, on
+stairs (forwards level 7, backwards level 5) and on a height field (waves, level 6). Every physics step after the first
+half second counts until a robot falls. Printed are, for each ground and setting: the force on a foot that 99 % and 99.9 %
+of all feet and steps stay below and the largest; the depth of loaded feet (over 20 N) in the ground and the horizontal
+speed of their centres, likewise; and how many robots fell or diverged. ``converged`` stands for MuJoCo's solver with 200
+iterations and a tolerance of 1e-10; the first row is MuJoCo's at 1 ms with an elliptic cone. Runs on the CPU.
 """
 
 from __future__ import annotations

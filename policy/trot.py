@@ -1,11 +1,10 @@
 """A hand-made trotting controller as a network: it has no weights, and everything it knows is in its arguments.
 
-It walks the demonstration until a trained policy ships, and is a baseline that a trained policy has to beat. Diagonal
-pairs of legs take turns. Swing feet are set down where half a stance at the commanded speed, and a share of the speed
-error, puts them (Raibert, Legged Robots That Balance, 1986, ch. 2); stance feet sweep back under the body. Joint
-targets come from the inverse kinematics of the leg, with the torque that carries the body, divided by the motor's
-stiffness, on top. The speed is estimated from the stance legs' encoders, the tilt rate from successive gravity
-directions, which is far less noisy than gyroscope and joint velocities.
+It is a baseline that a trained policy has to beat. Diagonal pairs of legs take turns. Swing feet are set down where half
+a stance at the commanded speed, and a share of the speed error, puts them (Raibert, Legged Robots That Balance, 1986,
+ch. 2); stance feet sweep back under the body. Joint targets come from the inverse kinematics of the leg, with the torque
+that carries the body, divided by the motor's stiffness, on top. The speed is estimated from the stance legs' encoders,
+the tilt rate from successive gravity directions, which is far less noisy than gyroscope and joint velocities.
 
 Lengths in m, angles in rad, base frame: x forward, y left, z up. Leg order FL, FR, RL, RR; joints hip, thigh, calf.
 """
