@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -128,8 +129,8 @@ def _mistakes(worlds: Worlds) -> dict[str, Callable[[], None]]:
     }
     if not start.base_position.is_cuda:  # to look at them would mean to wait for the device
         for value in (-1, len(backend.scene.terrains)):
-            index = numbers(n, value=value)
-            mistakes[f"terrain {value}"] = lambda index=index: backend.reset(replace(start, terrain_index=index))
+            beyond = replace(start, terrain_index=numbers(n, value=value))
+            mistakes[f"terrain {value}"] = partial(backend.reset, beyond)
     return mistakes
 
 
