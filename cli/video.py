@@ -63,6 +63,7 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
             start_new_session=True,
         )
         assert encoder.stdin is not None
+        sent = encoder.stdin
 
         def failure() -> UserError:
             code = encoder.wait()
@@ -72,18 +73,18 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
 
         def add(picture: np.ndarray) -> None:
             try:
-                encoder.stdin.write(np.ascontiguousarray(picture).data)
+                sent.write(np.ascontiguousarray(picture).data)
             except OSError as error:
                 raise failure() from error
 
         try:
             yield add
             with suppress(OSError):  # it has ended by itself, and says why
-                encoder.stdin.close()
+                sent.close()
             if encoder.wait():
                 raise failure()
         finally:
             encoder.kill()
             encoder.wait()
             with suppress(OSError):
-                encoder.stdin.close()
+                sent.close()
