@@ -19,6 +19,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from multiprocessing.connection import Connection, wait
@@ -287,11 +288,9 @@ class LocalProcesses:
             raise
 
     def send(self, worker: int, message: Play | Drop | Stop) -> None:
-        """See ``Transport.send``."""
-        try:
+        """See ``Transport.send``. What is sent to a process that has ended is lost; ``receive`` says why it has."""
+        with suppress(OSError):
             self._pipes[worker].send(message)
-        except OSError as error:
-            raise self._gone(worker) from error
 
     def receive(self) -> list[tuple[int, Finished | Progress | Failed]]:
         """See ``Transport.receive``."""

@@ -77,11 +77,17 @@ def test_no_record_comes_of_an_episode_that_is_cancelled_before_it_begins(two):
     assert finished(until(two, lambda heard: any(isinstance(m, Progress) and m.stopped for _, m in heard)), 0) == []
 
 
-def test_errors_keep_their_class_and_words():
+@pytest.mark.parametrize("late", [False, True])
+def test_errors_keep_their_class_and_words(late):
+    """Also where something is sent to a process that has ended, and its error was not heard yet."""
+
     def broken(scene, *, threads):
         raise PolicyError("no such thing; take another")
 
     workers = LocalProcesses(job(build=broken), 1)
+    if late:
+        workers._processes[0].join()
+        workers.send(0, Stop())
     ((worker, message),) = until(workers, bool)
     workers.close()
     assert (worker, type(message)) == (0, Failed)
