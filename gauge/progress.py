@@ -17,6 +17,8 @@ from .suite import Suite
 
 _ENOUGH = 0.02
 """Share of the work from which on the time that is left is estimated."""
+_SOONEST = 5.0
+"""Time before which it is not [s]: workers start, and what is short ends first."""
 _ALMOST = 0.95
 """Largest share of an episode that counts as done while it runs."""
 
@@ -60,7 +62,7 @@ class ProgressMeter:
             for g in suite.goals
         }
         self._began = began
-        self._found_done: float | None = None
+        self._open: set[Episode] = set()  # those that had not ended at some look: of an earlier run they are not
 
     def usual_steps(self, episode: Episode) -> float:
         """Control steps that an episode usually takes."""
@@ -82,15 +84,16 @@ class ProgressMeter:
         left += sum(probability * self.usual_steps(e) for e, probability in possible.items())
         total = done + left
         under_way = sum(min(age, _ALMOST * self.usual_steps(e)) for e, age in active.items() if e in required)
-        done, left = done + under_way, max(left - under_way, 0.0)
-        if self._found_done is None:  # what an earlier run has done took none of this one's time
-            self._found_done = done
-        own, seconds = done - self._found_done, (time.perf_counter() if now is None else now) - self._began
+        left = max(left - under_way, 0.0)
+        # what an earlier run has done took none of this one's time, even where it counts only since a search has asked for it
+        own = under_way + sum(self.usual_steps(e) for e in ended if e in self._open)
+        self._open.update(required, possible)
+        seconds = (time.perf_counter() if now is None else now) - self._began
         return Status(
             done=len(ended),
             expected=round(len(ended) + len(required) + sum(possible.values())),
             active=tuple(active),
             seconds=seconds,
-            seconds_left=seconds * left / own if own > _ENOUGH * (own + left) else None,
+            seconds_left=seconds * left / own if seconds >= _SOONEST and own > _ENOUGH * (own + left) else None,
             remaining_work=left / total if total else 0.0,
         )

@@ -58,6 +58,23 @@ def test_what_an_earlier_run_did_took_no_time_of_this_one():
     assert status.done == 6
 
 
+def test_what_an_earlier_run_played_ahead_took_no_time_of_this_one_either():
+    """Its records count from when the search asks for them: the first estimate was a second, of a quarter of an hour."""
+    meter = ProgressMeter(SUITE, began=0.0)
+    searching = Plan(level=None, counted=tuple(TESTS), required=tuple(TESTS), possible={QUALITY[2]: 1.0})
+    meter.look([searching], {}, now=0.0)
+    status = meter.look([found(QUALITY[2:])], {}, now=10.0)  # two of three were there
+    assert status.done == 7
+    assert status.seconds_left == pytest.approx(10.0 * QUALITY_STEPS / (5 * TEST_STEPS))
+
+
+def test_nothing_is_estimated_from_the_first_moments():
+    meter = ProgressMeter(SUITE, began=0.0)
+    meter.look([found((*TESTS, *QUALITY))], {}, now=0.0)
+    assert meter.look([found(QUALITY)], {}, now=0.5).seconds_left is None
+    assert meter.look([found(QUALITY)], {}, now=6.0).seconds_left is not None
+
+
 def test_episodes_that_may_be_required_count_by_their_probability():
     searching = Plan(level=None, counted=tuple(TESTS), required=tuple(TESTS), possible=dict.fromkeys(QUALITY, 0.4))
     half_done = {TESTS[0]: round(TEST_STEPS / 2)}
