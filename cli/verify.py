@@ -66,6 +66,8 @@ def run_verification(
             console.say(f"score on the card {found['score']:.4f} ({band}), here {found['replayed']:.4f}")
         if found["equal"]:
             console.say("the card holds: every outcome is the same to the last digit")
+        elif found["holds"] and found["band"] is not None and found["replayed"] > found["band"][1]:
+            console.say("the card holds: with other seeds the score is higher still")
         elif found["holds"]:
             console.say("the card holds: the score lies within its band, single outcomes differ")
         elif fresh is not None:

@@ -161,16 +161,21 @@ def verify(
     Returns:
         Plain data of ``judge``, and the number that ``fresh`` seeds were made from.
     """
-    return judge(card, evaluate(prepared, folder, resume=True, command=command, watch=watch)) | {"fresh": fresh}
+    replay = evaluate(prepared, folder, resume=True, command=command, watch=watch)
+    return judge(card, replay, fresh=fresh is not None) | {"fresh": fresh}
 
 
 @edited("the card", CardError)
-def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
+def judge(card: Mapping[str, Any], replay: Mapping[str, Any], *, fresh: bool = False) -> dict[str, Any]:
     """Whether a card holds, given the results of a replay of all or some of its environments.
 
     It holds where the replay's score lies within the band of the card's (``tolerance_band``); for a sample the interval is that
     of the card's own rows over the sampled environments. Where the card has no interval (one seed, or levels alone) only the
     same outcome holds.
+
+    Args:
+        fresh: whether the replay had other seeds than the card. Then a score above the band holds as well: it owes nothing to
+            the card's seeds.
 
     Returns:
         ``holds``, ``equal`` (every outcome the same to the last digit), ``quick``, ``environments`` (played, of the card),
@@ -188,7 +193,7 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any]) -> dict[str, Any]:
         score = round(float(weights @ np.array([row["score"] for row in olds])), 6)
         interval = Evidence(olds, chance_rules_of(card, "the card", CardError)).chance(weights).interval(score)
     band = tolerance_band(score, interval)
-    within = band is not None and here is not None and band[0] <= here <= band[1]
+    within = band is not None and here is not None and band[0] <= here and (fresh or here <= band[1])
     return {
         "holds": equal or within,
         "equal": equal,

@@ -32,6 +32,8 @@ def test_a_score_within_the_band_holds_and_one_outside_does_not(card):
         replay["environments"][0]["score"] += 0.001
         found = judge(card, replay)
         assert (found["holds"], found["equal"], found["replayed"]) == (holds, False, value)
+        # a policy that other seeds judge better was not fitted to those of the card
+        assert judge(card, replay, fresh=True)["holds"] == (value > low)
 
 
 def test_levels_that_differ_are_listed(card):
