@@ -20,14 +20,11 @@ from ..gauge.naming import run_folders
 from ..gauge.report import write_report
 from ..gauge.results import ALL
 from ..gauge.suite import Suite
-from ..policy.adapters import assumptions
+from ..policy.adapters import AT_ONCE, doubt
 from ..policy.contract import PolicyContract
 from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay, duration
 from .studies import resumable
-
-_AT_ONCE = 1.0
-"""Time after settling within which a fall says that the policy is run wrongly [s]."""
 
 
 def run_evaluation(
@@ -85,21 +82,15 @@ def run_evaluation(
 
 
 def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -> str | None:
-    """What to do, and what was taken for granted of the policy, where in most episodes the robot fell within a second of
-    standing.
-    """
-    at_once = _AT_ONCE + suite.settling.longest
+    """What to do where the robot fell at once in most episodes."""
+    at_once = AT_ONCE + suite.settling.longest
     with (folder / "episodes.csv").open(encoding="utf-8", newline="") as file:
         whole = [row for row in csv.DictReader(file) if row["command"] == ALL]
     counts = [(int(row["falls"]), int(row["control_steps"])) for row in whole]
     fell = [falls > 0 and steps * contract.control_period <= falls * at_once for falls, steps in counts]
     if 2 * sum(fell) <= len(fell):
         return None
-    taken = assumptions(contract)
-    return (
-        f"the robot fell at once in {sum(fell)} of {len(fell)} episodes: 'gaitgauge doctor POLICY' tries what may be wrong"
-        + (f". The policy does not say how it is to be run; {taken}" if taken else "")
-    )
+    return f"the robot fell at once in {sum(fell)} of {len(fell)} episodes: {doubt(contract)}"
 
 
 def shower(display: ProgressDisplay) -> Callable[[Status], None]:

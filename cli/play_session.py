@@ -17,7 +17,7 @@ from ..gauge.goals import target_command, target_offset
 from ..gauge.motors import joint_parameters
 from ..gauge.suite import Suite
 from ..gauge.walking import Walk
-from ..policy.adapters import assumptions
+from ..policy.adapters import AT_ONCE, doubt
 from ..policy.base import Policy
 from ..robots import Robot
 from ..robots.body_plan import model_joint_order
@@ -34,8 +34,6 @@ _SETTLE = 0.4
 """Time after a reset in which the robot is told to stand [s]."""
 _FALLEN_TILT = 1.4
 """Tilt of the base at which the robot starts again [rad]."""
-_AT_ONCE = 1.0
-"""Time after that within which a fall says that the policy is run wrongly [s]."""
 _LONG_DOWN = 1.0
 """How long a fallen robot is shown [s]."""
 
@@ -76,9 +74,7 @@ class Readout:
 @cache  # once for each policy
 def _doubt(policy: Policy) -> None:
     """Say that a policy may be run otherwise than it was made for."""
-    sentence = "'%s': the robot falls at once; 'gaitgauge doctor POLICY' tries what may be wrong%s"
-    taken = assumptions(policy.contract)
-    logging.getLogger(__name__).warning(sentence, policy.path, f"; {taken}" if taken else "")
+    logging.getLogger(__name__).warning("'%s': the robot falls at once; %s", policy.path, doubt(policy.contract))
 
 
 def clip(command: Command, limits: Command) -> Command:
@@ -215,7 +211,7 @@ class PlaySession:
             self._down += self.period
             if self._down >= _LONG_DOWN or bool(self.state.diverged[0]):
                 self.falls += 1
-                if self.since_reset - self._down < _SETTLE + _AT_ONCE:
+                if self.since_reset - self._down < _SETTLE + AT_ONCE:
                     _doubt(self.policy)
                 self.reset()
             return

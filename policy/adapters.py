@@ -27,6 +27,8 @@ from .contract import (
 )
 from .native import StoredNetwork
 
+AT_ONCE = 1.0
+"""Time after standing within which a fall says that the policy is run wrongly [s]."""
 # Observation terms as Isaac Lab and mjlab name them.
 FOREIGN_TERMS: Mapping[str, str] = {
     "base_lin_vel": "base_linear_velocity_b",
@@ -121,6 +123,12 @@ def assumptions(contract: PolicyContract) -> str | None:
         f"action scale {min(contract.action_scale):g} rad, gains {gains}; where this is wrong the robot falls: put a "
         "contract.json or deploy.yaml beside the file that says it"
     )
+
+
+def doubt(contract: PolicyContract) -> str:
+    """What to do where the robot falls within ``AT_ONCE`` of standing, and what was taken for granted of its policy."""
+    taken = assumptions(contract)
+    return "'gaitgauge doctor POLICY' tries what may be wrong" + (f"; {taken}" if taken else "")
 
 
 def find_deploy_file(path: Path) -> Path | None:
