@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from copy import copy
@@ -63,3 +64,11 @@ def robots_that_ship_are_read_once() -> Iterator[None]:
         patch.setattr(loading, "model_files", model_files)
         patch.setattr(mujoco.MjModel, "from_xml_path", staticmethod(from_xml_path))
         yield
+
+
+@pytest.fixture
+def hangups() -> Iterator[None]:
+    """SIGHUP ends a process, as in a terminal, also where the tests run under nohup, which hands on that it is ignored."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)

@@ -124,20 +124,16 @@ def test_signal_writes_a_checkpoint_and_says_how_to_go_on(run, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("hangups")
 def test_a_terminal_that_is_closed_is_a_stop_like_a_signal(tmp_path):
     """SIGHUP, and then nothing can be written any more."""
-
-    def take_the_terminal() -> None:
-        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests may run under nohup
-
     window, terminal = pty.openpty()
     command = ["train", "go2-flat", *FAKE, *SMALL, "--iterations", 100_000, "training.run.save_interval=2"]
     training = subprocess.Popen(
         [*PROGRAM, *map(str, command), "--log-root", str(tmp_path)],
         **dict.fromkeys(("stdin", "stdout", "stderr"), terminal),
         start_new_session=True,
-        preexec_fn=take_the_terminal,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )
     os.close(terminal)
     while not list(tmp_path.rglob("model_2.pt")):

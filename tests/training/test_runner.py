@@ -141,6 +141,7 @@ def test_logged_reward_is_the_mean_of_finished_episodes():
     assert runner.logger.episode_length.tolist() == [8.0, 8.0, 8.0, 6.0, 4.0, 8.0, 8.0, 8.0]
 
 
+@pytest.mark.usefixtures("hangups")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_writes_a_checkpoint(tmp_path, number):
     messages = []

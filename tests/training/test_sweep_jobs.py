@@ -116,6 +116,7 @@ def test_a_second_interrupt_shortens_the_wait_and_leaves_no_training(tmp_path, m
     assert not alive(run) and time.monotonic() - began < 30.0
 
 
+@pytest.mark.usefixtures("hangups")
 def test_a_terminal_that_is_closed_stops_a_sweep_like_a_signal(tmp_path):
     run = scripted(tmp_path, "long")
     sender = signals_once(run.folder / "pid", signal.SIGHUP)
