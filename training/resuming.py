@@ -100,8 +100,8 @@ def write_learned(runner: TrainingRunner, path: Path, learned: Mapping[str, Any]
 def resume_run(runner: TrainingRunner, path: Path) -> None:
     """Continue from a checkpoint as if the run had never stopped.
 
-    An environment without ``load_state_dict``, or another number of processes, starts fresh episodes; this is said
-    through the runner's ``message``.
+    An environment without ``load_state_dict``, or another number of processes, starts fresh episodes, at the point of the
+    schedules and on the levels that the checkpoint knows; this is said through the runner's ``message``.
 
     Raises:
         CheckpointError: damaged, of another task, contract, network or number of environments.
@@ -131,9 +131,10 @@ def _take_over(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], n
     local: Mapping[str, Any] | None = training
     if numbers.world_size != runner.processes.count:
         local = None
+        where = _begin_anew(runner, path, training, numbers)
         runner.message(
             f"'{path}' was written by {numbers.world_size or 'what was left of several'} processes, not "
-            f"{runner.processes.count}: episodes start anew."
+            f"{runner.processes.count}: episodes start anew{where}."
         )
     elif runner.processes.rank != 0:
         local = read_rank(path, runner.processes.rank)
@@ -201,6 +202,33 @@ def _load_environment(runner: TrainingRunner, path: Path, state: Any) -> bool:
             f"Cannot resume from '{path}': its environment does not fit this run's settings: {one_line(error)}"
         ) from error
     return True
+
+
+def _begin_anew(runner: TrainingRunner, path: Path, training: Mapping[str, Any], numbers: RunNumbers) -> str:
+    """Begin new episodes where the run was: at its point of the schedules, on the levels of its first process, whose worlds
+    have the same kinds of tiles as any other's.
+
+    Returns:
+        Where that is, the rest of a sentence; empty for an environment that has neither.
+    """
+    env: Any = runner.env
+    own = env.progress_dict() if hasattr(env, "progress_dict") else {}
+    if not own.keys() >= {"step", "level"}:
+        return ""
+    state = _table(training["environment"]) if training.get("environment") is not None else {}
+    reached = _table(state.get("memory", state))
+    done = numbers.iteration * runner.configuration.run.steps_per_iteration
+    if "step" in reached:
+        own["step"] = reached["step"]
+    elif "progress" in training:
+        own["step"] = torch.tensor(round(training["progress"] * env.cfg.schedule.horizon_steps))
+    else:
+        own["step"] = own["step"] + done
+    own["level"] = reached.get("level", own["level"])
+    own["common_step_counter"] = state.get("common_step_counter", done)
+    _load_environment(runner, path, own)
+    levels = "on the levels reached and " if "level" in reached else ""
+    return f", {levels}at {100.0 * float(env.progress):.0f} % of the schedules"
 
 
 def _check_fits(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> None:

@@ -335,6 +335,8 @@ class TrainingRunner:
         aside = torch.cuda.stream(torch.cuda.Stream(self.device)) if on_gpu else nullcontext()
         with aside:
             local = {"num_envs": self.env.num_envs, "log": self.logger.state_dict(), "world_size": 0}
+            if hasattr(self.env, "progress_dict"):
+                local["environment"] = self.env.progress_dict()
             write_learned(self, path, learned, local)
         return ProcessLostError(sentence)
 
