@@ -59,8 +59,8 @@ class ScheduleConfiguration:
     """What "a fraction of the run" means."""
 
     horizon_steps: Count = 240_000
-    """Environment steps, per environment, of the whole run: 24 steps times 10,000 iterations. Every ramp and stage is
-    a fraction of it."""
+    """Environment steps, per environment, of the whole run, of which every ramp and stage is a fraction. A task sets it to the
+    steps of its iterations, unless it is given on the command line."""
     begin: Share = 0.0
     """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin
     with the commands of a robot that cannot walk yet."""
@@ -240,7 +240,7 @@ class RewardConfiguration:
     height scan count."""
     foot_height_scale: float = 0.025
     """Foot regulation fades with foot height over this share of ``base_height_target``."""
-    foot_height_over: str = "foot"
+    foot_height_over: Literal["foot", "base"] = "foot"
     """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
     collision_force: float = 0.1
     """Contact force from which a thigh, a calf or the base counts as touching [N]."""
@@ -387,16 +387,16 @@ class PushConfiguration:
 class TerminationConfiguration:
     """What ends an episode early (``training/terminations.py``)."""
 
-    trunk_contact: float | None = None
+    trunk_contact: NotNegative | None = None
     """Force of the ground on the trunk, head and chin apart, that ends an episode [N]. None for never."""
-    tilt: float | None = 1.4
+    tilt: NotNegative | None = 1.4
     """Angle between the base's z axis and the world's [rad]; None for no limit."""
-    joint_velocity: float = 150.0
+    joint_velocity: Positive = 150.0
     """Joint speed beyond anything real, which counts as a diverged world [rad/s]."""
-    stuck: float | None = None
+    stuck: Positive | None = None
     """Time without progress after which a robot that did as commanded before is stuck [s]: its episode ends as a failure and moves
     the level down. None for never."""
-    stuck_from: float = 0.1
+    stuck_from: NotNegative = 0.1
     """Fraction of the run from which being stuck ends episodes: a robot that cannot walk yet is always stuck."""
     own: tuple[OwnTermination, ...] = ()
     """Rules of one's own."""

@@ -179,8 +179,9 @@ class EnvironmentStep:
         memory.remember(inputs)
         self.levels.follow(memory, inputs)
         push = self.pushes(done, self.inputs, memory, self.uniform)
-        # A diverged world is the engine's failure: it moves no level.
-        start = self.begin_episodes(done, ends.failed & ~inputs.diverged, progress, inputs.heading_xy)
+        # A diverged world is the engine's failure: it moves no level, wherever it was flung.
+        memory.moves_level.logical_and_(~inputs.diverged)
+        start = self.begin_episodes(done, ends.failed, progress, inputs.heading_xy)
         return StepResult(reward=rewards.sum(dim=1), done=done, time_out=ends.time_out, start=start, push=push)
 
     def begin_episodes(

@@ -19,7 +19,6 @@ from .environment_configuration import (
     Ramp,
     RandomizationConfiguration,
     RewardConfiguration,
-    ScheduleConfiguration,
     TerminationConfiguration,
 )
 from .overrides import TaskError, apply_overrides
@@ -148,7 +147,6 @@ def _flat() -> Task:
     """
     environment = EnvironmentConfiguration(
         num_envs=8192,
-        schedule=ScheduleConfiguration(horizon_steps=24 * _FLAT_ITERATIONS),
         terrain=_LEVEL_GROUND,
         termination=TerminationConfiguration(trunk_contact=1.0),
         commands=CommandConfiguration(
@@ -187,7 +185,6 @@ def _sprint() -> Task:
     """
     environment = EnvironmentConfiguration(
         num_envs=8192,
-        schedule=ScheduleConfiguration(horizon_steps=24 * _SPRINT_ITERATIONS),
         terrain=replace(_LEVEL_GROUND, tiles=(replace(FLAT_TILE, command_limits=(4.5, 1.0, 2.0)),)),
         termination=TerminationConfiguration(trunk_contact=1.0),
         randomization=RandomizationConfiguration(friction=(0.4, 1.25)),
@@ -246,7 +243,7 @@ def _own_task(path: str) -> Task:
 def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = None) -> Task:
     """A task, for a robot, with settings changed.
 
-    Schedules are spread over the run's iterations, unless ``environment.schedule.horizon_steps`` is set.
+    Schedules are spread over the run's iterations, unless an override sets ``environment.schedule.horizon_steps``.
 
     Args:
         name: one of ``TASKS``, or ``module:attribute`` of a ``Task`` of one's own.

@@ -79,7 +79,7 @@ TERMINATIONS: dict[str, Termination] = {
     "stuck": Termination(rule=stuck),
     "diverged": Termination(rule=diverged),
 }
-"""All rules by name. A rule whose setting of the same name is None or false is left out; ``own`` adds more."""
+"""All rules by name. A rule whose setting of the same name is None is left out; ``own`` adds more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class Terminations:
             ConfigurationError: a rule of one's own is not there.
         """
         self._settings = configuration
-        used = {name: t for name, t in TERMINATIONS.items() if getattr(configuration, name, True) not in (None, False)}
+        used = {name: t for name, t in TERMINATIONS.items() if getattr(configuration, name, True) is not None}
         own = resolve_own(
             configuration.own,
             "termination.own",

@@ -139,6 +139,20 @@ def test_divergence_moves_no_level():
     assert environment.parts.memory.level.tolist() == [2, 2]
 
 
+@pytest.mark.parametrize(("farthest", "commanded"), [(4.5, 0.0), (0.1, 6.0)])
+def test_divergence_moves_no_level_wherever_the_robot_was_flung(farthest, commanded):
+    """Its state may be numbers: here the joints are too fast."""
+    limits = TerminationConfiguration(joint_velocity=1e-6)
+    environment = make(2, terrain=replace(STAIRS, tiles=STAIRS.tiles[:1]), termination=limits)
+    memory = environment.parts.memory
+    memory.level.fill_(2)
+    memory.farthest.fill_(farthest)
+    memory.commanded_farthest.fill_(commanded)
+    while not idle(environment)[2].any():
+        pass
+    assert memory.level.tolist() == [2, 2]
+
+
 def test_episodes_spread_over_the_tile_do_not_move_levels():
     spread = replace(STAIRS, spread_probability=1.0, tiles=STAIRS.tiles[:1])
     environment = make(8, script=gliding(8.0), terrain=spread)
