@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +17,7 @@ from ..files.parsing import build, check_fields, shown
 from ..files.writing import lock_folder
 from ..gauge.suite import load_suite
 from ..policy.contract import PolicyContract
-from ..policy.finding import find_policy, shipped_policies
+from ..policy.finding import find_policy, latest_checkpoint, shipped_policies
 from ..policy.its_robot import robot_for
 from ..robots.registry import lasting
 from .algorithms.symmetry import build_mirror
@@ -121,6 +120,8 @@ class TrainPlan:
     """What is continued, None for a new run."""
     run: Path | None
     """Run directory that is continued, None to make a new one."""
+    weights: Path | None
+    """What a new run's networks begin with, None for nothing."""
     needs_trust: bool
     """Whether a later resume imports functions that the task does not name, and wants ``trust`` or their names again."""
     settings: Mapping[str, Any]
@@ -146,7 +147,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
     own = _own_overrides(request)
     robot = None if request.robot is None else lasting(request.robot)
     known, task = find_task(request.task), find_task(request.task, own, robot=robot)
-    checkpoint, run, notice = None, None, ""
+    checkpoint, run, weights, notice = None, None, None, ""
     if request.resume is not None:
         checkpoint = find_checkpoint(
             request.resume, experiment=task.training.run.experiment, task=request.task, root=request.log_root
@@ -155,10 +156,18 @@ def prepare(request: TrainRequest) -> TrainPlan:
         run = checkpoint.parent if read_run_json(checkpoint.parent).get("task") == request.task else None
         if run is not None:
             refuse_links(run)
-        kept, kept_backend = _kept(checkpoint, request.task)
+        branched = ""
+        kept, kept_backend, iteration = _kept(checkpoint, request.task)
+        if run is not None and (last := _last_iteration(run)) > iteration:
+            # Two branches in one folder would be one run: whoever asks for its last checkpoint would get the other's.
+            branched = (
+                f"'{run}' has gone on to iteration {last}: what comes of {iteration} has a run directory of its own"
+            )
+            run = None
         backend = request.backend or kept_backend
         named, task = task, kept.with_overrides(own)
         task, notice = _own_logger(task, named, checkpoint)
+        notice = "; ".join(filter(None, (branched, notice)))
         if (foreign := foreign_functions([task.environment, task.training], [named.environment, named.training])) and (
             not request.trust
         ):
@@ -173,7 +182,8 @@ def prepare(request: TrainRequest) -> TrainPlan:
             )
     else:
         backend = request.backend or DEFAULT_BACKEND
-        begun = _going_on(task, _first_weights(request, task)) if request.init_from is not None else []
+        weights = None if request.init_from is None else _first_weights(request, task).absolute()
+        begun = [] if weights is None else _going_on(task, weights)
         task = find_task(request.task, [*begun, *own], robot=robot)
     check_logger(task.training.run.logger)
     device = own_device(request.device, backend)
@@ -200,6 +210,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         device=device,
         checkpoint=checkpoint,
         run=run,
+        weights=weights,
         needs_trust=bool(foreign_functions(settings, to_plain([known.environment, known.training]))),
         settings=settings,
         notice=notice,
@@ -221,15 +232,22 @@ def _own_logger(task: Task, named: Task, checkpoint: Path) -> tuple[Task, str]:
     return replace(task, training=replace(task.training, run=run)), notice
 
 
-def _kept(checkpoint: Path, name: str) -> tuple[Task, str]:
-    """The task as a checkpoint's run has it, and its backend.
+def _last_iteration(run: Path) -> int:
+    """Iteration in the name of the last checkpoint in a run directory, 0 where there is none."""
+    last = latest_checkpoint(run)
+    return 0 if last is None else int(last.stem.rpartition("_")[2])
+
+
+def _kept(checkpoint: Path, name: str) -> tuple[Task, str, int]:
+    """The task as a checkpoint's run has it, its backend, and how many iterations the run had done.
 
     Raises:
         CheckpointError: it is of another task, or its settings are not those of this version.
     """
     entries = read_checkpoint(checkpoint)
     training = entries["training"]
-    if (its := run_numbers(entries, checkpoint).task) != name:
+    numbers = run_numbers(entries, checkpoint)
+    if (its := numbers.task) != name:
         hint = f"write gaitgauge train {its}" if its in TASKS else "give that task's name"
         raise CheckpointError(
             f"Cannot resume from '{checkpoint}': it is of task {shown(its)}, this run trains '{name}'; {hint}."
@@ -246,7 +264,7 @@ def _kept(checkpoint: Path, name: str) -> tuple[Task, str]:
         environment=build(EnvironmentConfiguration, stored["environment"], source, CheckpointError),
         training=build(TrainingConfiguration, stored["training"], source, CheckpointError),
     )
-    return task, str(stored["backend"])
+    return task, str(stored["backend"]), numbers.iteration
 
 
 def _going_on(task: Task, weights: Path) -> list[str]:
@@ -403,8 +421,8 @@ def _learn(plan: TrainPlan, runner: TrainingRunner, began: float) -> TrainingOut
     request, iterations = plan.request, plan.task.training.run.iterations
     if plan.checkpoint is not None:
         resume_run(runner, plan.checkpoint)
-    elif request.init_from is not None:
-        begin_with(runner, _first_weights(request, plan.task))
+    elif plan.weights is not None:
+        begin_with(runner, plan.weights)
     if (left := iterations - runner.iteration) <= 0:
         raise ConfigurationError(
             f"the run has done {runner.iteration} of {iterations} iterations; to go on, give a larger --iterations"
@@ -427,15 +445,20 @@ def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment) -> None:
     )
     earlier = read_run_json(run)
     if earlier:
-        now = f"{datetime.now().astimezone():%Y-%m-%dT%H:%M:%S%z}"
         note = {
-            "started": now,
+            "started": description["started"],
             "checkpoint": plan.checkpoint.name if plan.checkpoint else "",
             "command": description["command"],
         }
-        update_run_json(run, {"resumed": [*earlier.get("resumed", []), note]})
+        of_its_begin = ("started", "date", "command")
+        update_run_json(
+            run,
+            {k: v for k, v in description.items() if k not in of_its_begin}
+            | {"settings": plan.settings, "resumed": [*earlier.get("resumed", []), note]},
+        )
         return
-    begun_with = plan.checkpoint or plan.request.init_from
+    shipped = plan.request.init_from in shipped_policies()  # known by its name wherever it is installed
+    begun_with = plan.checkpoint or (plan.request.init_from if shipped else plan.weights)
     update_run_json(
         run, description | {"settings": plan.settings, "begun_with": str(begun_with) if begun_with else None}
     )

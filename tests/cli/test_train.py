@@ -61,6 +61,31 @@ def test_carried_checkpoint_continues_in_a_new_directory(run, trained, tmp_path)
     assert json.loads((new / "run.json").read_text())["begun_with"] == str(carried)
 
 
+def test_an_earlier_checkpoint_goes_on_in_a_directory_of_its_own(run, trained, tmp_path):
+    """Or the run's last checkpoint, for --resume, latest and play, would be the other branch's."""
+    before = {f: f.read_bytes() for f in trained.rglob("*") if f.is_file()}
+    (trained / "model_9.pt").write_bytes((trained / "model_2.pt").read_bytes())
+    result = run("train", "go2-flat", "--resume", trained / "model_2.pt", *FAKE[2:4], "--no-score", "--iterations", 3)
+    (trained / "model_9.pt").unlink()
+    assert result.exit_code == 0, result.output
+    assert "has gone on to iteration 9: what comes of 2 has a run directory of its own" in result.output
+    (new,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    assert [f.name for f in new.glob("model_*.pt")] == ["model_3.pt"]
+    assert {f: f.read_bytes() for f in trained.rglob("*") if f.is_file()} == before
+
+
+def test_a_run_that_is_resumed_says_what_it_is_trained_with_now(run, trained):
+    before = (trained / "run.json").read_text()
+    changed = ("--iterations", 3, "training.algorithm.epochs=2")
+    assert run("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", *changed).exit_code == 0
+    found, earlier = json.loads((trained / "run.json").read_text()), json.loads(before)
+    (trained / "model_3.pt").unlink()
+    (trained / "run.json").write_text(before)
+    assert found["settings"]["training"]["algorithm"]["epochs"] == 2
+    assert found["started"] == earlier["started"] and found["command"] == earlier["command"]
+    assert len(found["resumed"]) == len(earlier.get("resumed", ())) + 1
+
+
 def test_initial_weights_from_other_settings(run, trained, tmp_path):
     command = ("train", "go2-flat", *FAKE[:4], "--num-envs", 12, "--no-score", "--iterations", 1, *SMALL)
     slow = ("training.algorithm.learning_rate=1e-12", "training.algorithm.student_learning_rate=1e-12")
