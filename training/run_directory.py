@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -42,7 +43,7 @@ def new_run_directory(root: Path, experiment: str, run_name: str = "", now: date
         for second in range(60):
             moment = datetime.fromtimestamp(stamp.timestamp() + second)
             run = root / experiment / f"{moment:%Y-%m-%d_%H-%M-%S}{suffix}"
-            if not run.exists():
+            with suppress(FileExistsError):  # another run's, perhaps made just now
                 run.mkdir()
                 return run
     except OSError as error:

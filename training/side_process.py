@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..files.parsing import one_line
+
 PROGRAM = (sys.executable, "-m", f"{__name__.partition('.')[0]}.cli.main")
 """This package's command line."""
 ENVIRONMENT: Mapping[str, str] = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
@@ -97,17 +99,18 @@ class SideProcess:
         if self._running is not None or not self._waiting:
             return
         job = self._waiting.popleft()
-        job.output.parent.mkdir(parents=True, exist_ok=True)
-        with job.output.open("wb") as out, job.log.open("wb") as log:
-            try:
+        try:
+            job.output.parent.mkdir(parents=True, exist_ok=True)
+            with job.output.open("wb") as out, job.log.open("wb") as log:
                 # A session of its own: Ctrl-C in the terminal is for the training, which decides what becomes of the rest.
                 process = subprocess.Popen(
                     list(job.command), stdout=out, stderr=log, env={**os.environ, **ENVIRONMENT}, start_new_session=True
                 )
-            except OSError as error:
-                failure = f"cannot start {job.command[0]}: {error.strerror}"
-                self._finished.append(Finished(job=job, failure=failure))
-                return
+        except OSError as error:
+            where = "" if error.filename in (None, job.command[0]) else f"'{one_line(error.filename)}': "
+            failure = f"cannot start {job.command[0]}: {where}{error.strerror}"
+            self._finished.append(Finished(job=job, failure=failure))
+            return
         self._running = (job, process)
 
 

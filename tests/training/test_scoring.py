@@ -46,6 +46,17 @@ def test_failures_are_reported(tmp_path):
     assert side.poll()[0].failure == "cannot start /no/such/program: No such file or directory"
 
 
+def test_a_folder_that_cannot_be_is_the_failure_of_its_job(tmp_path):
+    """A full disk, or a file where the folder of scores would be: the training goes on."""
+    (tmp_path / "gauge").touch()
+    side = SideProcess()
+    side.submit(
+        Job(command=["true"], checkpoint=tmp_path / "model_1.pt", iteration=1, output=tmp_path / "gauge" / "1.json")
+    )
+    (finished,) = side.drain(10.0)
+    assert finished.failure.startswith("cannot start true: ") and "gauge" in finished.failure
+
+
 def test_the_oldest_waiting_job_is_given_up_and_a_running_one_can_be_stopped(tmp_path):
     side = SideProcess()
     for number in range(3):
