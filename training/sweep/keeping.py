@@ -7,9 +7,10 @@ such a run again: it gauges it where that is left, goes on with the others, and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ...files.parsing import one_line
 from ...files.provenance import without_place
@@ -84,5 +85,15 @@ def _keep(sweep: Sweep, run: SweepRun, target: SweepRun) -> bool:
         card["provenance"] = without_place(card["provenance"])
         write_atomically(place / RESULTS, json_text(card), SweepError)
     done = run.description() | {"outcome": "finished", "kept_iteration": run.wanted_iteration(sweep)}
-    write_atomically(place / "run.json", json_text(without_place(done)), SweepError)
+    write_atomically(place / "run.json", json_text(_for_everybody(done)), SweepError)
     return True
+
+
+def _for_everybody(description: Mapping[str, Any]) -> dict[str, Any]:
+    """What is said of a run without machine, commands and folders, those of its resumes too."""
+    found = without_place(description)
+    if found.get("begun_with"):
+        found["begun_with"] = Path(found["begun_with"]).name
+    if found.get("resumed"):
+        found["resumed"] = [without_place(note) for note in found["resumed"]]
+    return found
