@@ -62,21 +62,22 @@ def save_run(runner: TrainingRunner, path: Path) -> None:
         write_checkpoint(rank_file(path, runner.processes.rank), local)
         return
     learned = host_copy(runner.learned(), runner.device)
-    for part in ("actor_state_dict", "critic_state_dict"):
-        if not all(bool(torch.isfinite(value).all()) for value in learned[part].values()):
-            raise TrainingDivergedError(
-                f"A weight in {part} is not finite; '{path}' was not written, earlier checkpoints are intact."
-            )
     write_learned(runner, path, learned, local | {"world_size": runner.processes.count})
     runner.logger.send(path, runner.iteration)
 
 
 def write_learned(runner: TrainingRunner, path: Path, learned: Mapping[str, Any], local: Mapping[str, Any]) -> None:
-    """Write a checkpoint of what was learned and of what this process holds beside it.
+    """Write a checkpoint of what was learned, in the host's memory, and of what this process holds beside it.
 
     Raises:
+        TrainingDivergedError: a weight is not finite.
         CheckpointError: the file cannot be written.
     """
+    for part in ("actor_state_dict", "critic_state_dict"):
+        if not all(bool(torch.isfinite(value).all()) for value in learned[part].values()):
+            raise TrainingDivergedError(
+                f"A weight in {part} is not finite; '{path}' was not written, earlier checkpoints are intact."
+            )
     training = {
         **local,
         "version": TRAINING_VERSION,

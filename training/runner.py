@@ -164,11 +164,10 @@ class TrainingRunner:
                         break
             except ProcessLostError as error:
                 raise self._rescue(error, begin) from error
-            except BaseException:
-                # of several processes, those that are left say how it ended
-                if self.log_dir is not None and not self.processes.several:
-                    with suppress(CheckpointError):  # a full disk may be what it failed of
-                        update_run_json(self.log_dir, {"outcome": "failed"})
+            except BaseException as error:
+                # of several processes, those that are left say how it ended, unless it is in what was learned
+                if not self.processes.several or isinstance(error, TrainingDivergedError):
+                    self._note_failure()
                 raise
             if reason != "signal":
                 self._submit(written)
@@ -317,7 +316,9 @@ class TrainingRunner:
                 self.message(sentence)
 
     def _rescue(self, error: ProcessLostError, begin: float) -> ProcessLostError:
-        """Write what the last complete iteration had learned; the first process that is left does it and speaks."""
+        """Write what the last complete iteration had learned; the first process that is left does it and speaks, unless the one
+        that is gone diverged and has said so.
+        """
         time.sleep(float(self.processes.rank))
         learned = self._kept.take()
         if learned is None or self.log_dir is None:
@@ -325,11 +326,23 @@ class TrainingRunner:
         self.iteration = self._kept.iteration
         path = self.log_dir / f"model_{self.iteration}.pt"
         sentence = f"{error}; iteration {self.iteration} is in '{path}', go on with --resume {self.log_dir}"
-        if read_run_json(self.log_dir).get("outcome") != "running":
+        known = read_run_json(self.log_dir).get("outcome")
+        if known not in ("running", "failed"):
             raise SystemExit(2)  # another one has done it
-        self._record(TrainingOutcome(reason="lost a process", iteration=self.iteration, checkpoint=path, exit_code=2))
-        if path.exists() and time.time() - path.stat().st_mtime < time.monotonic() - begin:
-            return ProcessLostError(sentence)
+        if known == "running":
+            lost = TrainingOutcome(reason="lost a process", iteration=self.iteration, checkpoint=path, exit_code=2)
+            self._record(lost)
+        if not (path.exists() and time.time() - path.stat().st_mtime < time.monotonic() - begin):
+            try:
+                self._write_kept(path, learned)
+            except TrainingDivergedError as diverged:
+                self._note_failure()
+                sentence = f"{error}; {diverged}"
+        if known == "failed":
+            raise SystemExit(2)
+        return ProcessLostError(sentence)
+
+    def _write_kept(self, path: Path, learned: Mapping[str, Any]) -> None:
         # The device's own stream may wait for the lost process forever; the environment is not touched by that.
         on_gpu = torch.device(self.device).type == "cuda"
         aside = torch.cuda.stream(torch.cuda.Stream(self.device)) if on_gpu else nullcontext()
@@ -338,7 +351,11 @@ class TrainingRunner:
             if hasattr(self.env, "progress_dict"):
                 local["environment"] = self.env.progress_dict()
             write_learned(self, path, learned, local)
-        return ProcessLostError(sentence)
+
+    def _note_failure(self) -> None:
+        if self.log_dir is not None:
+            with suppress(CheckpointError):  # a full disk may be what it failed of
+                update_run_json(self.log_dir, {"outcome": "failed"})
 
     # The gauge
 

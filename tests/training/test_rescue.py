@@ -1,0 +1,94 @@
+"""What is left when one of several processes is lost or diverges, as one process can show it."""
+
+import json
+
+import pytest
+import torch
+from gaitgauge.training.checkpoint import read_checkpoint
+from gaitgauge.training.processes import Processes, ProcessLostError
+from gaitgauge.training.resuming import TrainingDivergedError
+from gaitgauge.training.run_directory import update_run_json
+from gaitgauge.training.runner import TrainingRunner
+from gaitgauge.training.seeding import seed_everything
+from toy_training import ToyEnv, toy_configuration, toy_contract
+
+
+def make(log_dir, env=None):
+    seed_everything(0)
+    return TrainingRunner(
+        env or ToyEnv(),
+        toy_configuration(),
+        contract=toy_contract(),
+        task="toy",
+        log_dir=log_dir,
+        processes=LostProcesses(rank=1, count=2),
+    )
+
+
+class LostProcesses(Processes):
+    """Two processes, of which the other one is lost when ``lost`` says so."""
+
+    lost = False
+
+    def average(self, values):
+        pass
+
+    def copy_first(self, tensors):
+        pass
+
+    def firsts(self, value):
+        return value
+
+    def largest(self, number):
+        if LostProcesses.lost:
+            raise ProcessLostError("another process has gone: connection closed")
+        return number
+
+
+def lose(tmp_path, monkeypatch, *, outcome, broken):
+    """What the second process raises when the first one is lost after its second iteration, having said an outcome."""
+    runner = make(tmp_path)
+    update_run_json(tmp_path, {"outcome": "running"})
+    monkeypatch.setattr(LostProcesses, "lost", False)
+    monkeypatch.setattr("gaitgauge.training.runner.time.sleep", lambda _: None)
+    runner.learn(1)
+    if broken:
+        with torch.no_grad():
+            runner.alg.actor.student.actor[0].weight[0, 0] = float("nan")
+        monkeypatch.setattr(runner, "_iterate", lambda obs, _: runner._kept.keep(runner.learned(), 2, "cpu") or obs)
+    update_run_json(tmp_path, {"outcome": outcome})
+    monkeypatch.setattr(LostProcesses, "lost", True)
+    with pytest.raises((ProcessLostError, SystemExit)) as caught:
+        runner.learn(1)
+    return caught.value
+
+
+def noted(folder):
+    return json.loads((folder / "run.json").read_text())["outcome"]
+
+
+def test_a_rescued_checkpoint_is_of_the_last_iteration(tmp_path, monkeypatch):
+    error = lose(tmp_path, monkeypatch, outcome="running", broken=False)
+    assert "iteration 2 is in" in str(error) and read_checkpoint(tmp_path / "model_2.pt")["iter"] == 2
+    assert noted(tmp_path) == "lost a process"
+
+
+def test_broken_weights_are_not_rescued(tmp_path, monkeypatch):
+    error = lose(tmp_path, monkeypatch, outcome="running", broken=True)
+    assert isinstance(error, ProcessLostError) and "not finite" in str(error) and "--resume" not in str(error)
+    assert not (tmp_path / "model_2.pt").exists() and noted(tmp_path) == "failed"
+
+
+@pytest.mark.parametrize("broken", [True, False])
+def test_a_run_in_which_another_process_diverged_has_failed(tmp_path, monkeypatch, broken):
+    """The one that diverged has said so; what is finite is kept all the same."""
+    assert isinstance(lose(tmp_path, monkeypatch, outcome="failed", broken=broken), SystemExit)
+    assert (tmp_path / "model_2.pt").exists() == (not broken) and noted(tmp_path) == "failed"
+
+
+def test_a_process_that_diverges_says_so_for_all(tmp_path):
+    env = ToyEnv()
+    env.poison = 2
+    with pytest.raises(TrainingDivergedError):
+        make(tmp_path, env=env).learn(1)
+    assert noted(tmp_path) == "failed"
