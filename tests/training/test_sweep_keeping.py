@@ -45,6 +45,7 @@ def finished(tmp_path_factory):
             writer.add_scalar("Train/mean_reward", 0.5 * step, step)
     shutil.copy(PRETRAINED, made / "model_3.pt")
     note = {"task": "go2-moe-cts", "host": "lab-7", "command": "gaitgauge train --log-root /home/me", "seed": 0}
+    note |= {"begun_with": "/home/me/first.pt", "resumed": [{"checkpoint": "model_1.pt", "command": "train /home/me"}]}
     note |= {"outcome": "finished", "iteration": 3, "environment_steps": 3_000_000, "training_seconds": 4.5}
     (made / "run.json").write_text(json.dumps(note))
     results = runs[0].folder / "gauge" / "model_3"
