@@ -228,6 +228,32 @@ def test_beginning_with_a_bare_policy(method, tmp_path):
 
 
 @pytest.mark.parametrize("method", NAMES)
+def test_a_bare_policy_still_stands_still_in_a_resumed_run(method, tmp_path):
+    """Its critic and teacher were untrained, and full updates began at once."""
+    configuration = replace(
+        settings(method), run=replace(settings(method).run, bootstrap_iterations=3, nonfinite_limit=0.5)
+    )
+    network = stored_network(runner(method, configuration=configuration))
+    write_checkpoint(tmp_path / "policy.pt", checkpoint_entries(toy_contract(), network, {}))
+    whole = runner(method, seed=5, configuration=configuration)
+    begin_with(whole, tmp_path / "policy.pt")
+    whole.learn(4)
+    begun = runner(method, tmp_path, seed=5, configuration=configuration)
+    begin_with(begun, tmp_path / "policy.pt")
+    begun.learn(2)
+    resumed = runner(method, tmp_path, seed=7, configuration=configuration)
+    resume_run(resumed, tmp_path / "model_2.pt")
+    resumed.learn(1)
+    for name, value in network.state_dict.items():
+        assert torch.equal(stored_network(resumed).state_dict[name], value), name
+    assert resumed.alg.bootstrap is None and "bootstrap" not in read_checkpoint(tmp_path / "model_3.pt")
+    resumed.learn(1)
+    for part in ("actor", "critic"):
+        for name, value in getattr(whole.alg, part).state_dict().items():
+            assert torch.equal(getattr(resumed.alg, part).state_dict()[name], value), name
+
+
+@pytest.mark.parametrize("method", NAMES)
 def test_a_minibatch_that_is_not_finite_spoils_nothing_learned_for_a_bare_policy(method):
     algorithm, env = build(method, epochs=3, minibatches=2)
     algorithm.follow_student(2)

@@ -7,13 +7,14 @@ is learned for it. Afterwards training goes on as if it had never been cut in tw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
 
-from .optimization import FlatGradients, take_step
+from ...files.parsing import shown
+from .optimization import FlatGradients, load_moments, take_step
 
 if TYPE_CHECKING:
     from .ppo import PPO
@@ -51,6 +52,22 @@ class Bootstrap:
     def over(self) -> bool:
         """Whether it has done its iterations."""
         return self._left <= 0
+
+    def save(self) -> dict[str, Any]:
+        """Iterations left, and the optimizer's moments."""
+        return {"left": self._left, "optimizer": self._optimizer.state_dict()}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Take over what ``save`` returned.
+
+        Raises:
+            ValueError, LookupError, TypeError, AttributeError: it does not fit.
+        """
+        left = state["left"]
+        if type(left) is not int or left < 1:
+            raise ValueError(f"what a bare policy lacks is learned for {shown(left)} more iterations")
+        self._left = left
+        load_moments(self._optimizer, state["optimizer"])
 
     def update(self) -> dict[str, float]:
         """All passes over one rollout.

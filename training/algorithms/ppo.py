@@ -404,8 +404,9 @@ class PPO:
     # Checkpoints
 
     def save(self) -> dict[str, Any]:
-        """State of all networks and of both optimizers, under rsl_rl's names."""
-        return {
+        """State of all networks and of both optimizers, under rsl_rl's names, and of ``bootstrap`` while it lasts."""
+        bare = {} if self.bootstrap is None else {"bootstrap": self.bootstrap.save()}
+        return bare | {
             "actor_state_dict": self.actor.state_dict(),
             "critic_state_dict": self.critic.state_dict(),
             "optimizer_state_dict": self.optimizer.state_dict(),
@@ -423,6 +424,10 @@ class PPO:
         if optimizers:
             self.learning_rate = load_moments(self.optimizer, state["optimizer_state_dict"])
             load_moments(self.student_optimizer, state["student_optimizer_state_dict"])
+            self.bootstrap = None
+            if "bootstrap" in state:
+                self.bootstrap = self.make_bootstrap(1)
+                self.bootstrap.load(state["bootstrap"])
             # Loading replaced the rate's tensor by a copy.
             for group in self.optimizer.param_groups:
                 group["lr"] = self._rate
