@@ -141,8 +141,7 @@ def _take_over(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], n
         local = read_rank(path, runner.processes.rank)
     runner.logger.load_state_dict(_table((local or training)["log"]))
     if local is not None:
-        loaded = _load_environment(runner, path, local["environment"])
-        runner.fresh = not loaded or not runner.configuration.run.keep_episodes
+        runner.fresh = not (_load_environment(runner, path, local["environment"]) and _runs_on(runner, local))
         restore_random_state(_table(local["random"]), runner.device)
 
 
@@ -203,6 +202,12 @@ def _load_environment(runner: TrainingRunner, path: Path, state: Any) -> bool:
             f"Cannot resume from '{path}': its environment does not fit this run's settings: {one_line(error)}"
         ) from error
     return True
+
+
+def _runs_on(runner: TrainingRunner, local: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint holds running episodes; of an environment of another kind, the settings tell."""
+    state = local["environment"]
+    return "memory" in state if "bodies" in state else runner.configuration.run.keep_episodes
 
 
 def _begin_anew(runner: TrainingRunner, path: Path, training: Mapping[str, Any], numbers: RunNumbers) -> str:

@@ -77,3 +77,22 @@ def test_a_checkpoint_without_an_environment_goes_on_with_its_schedules(tmp_path
     assert torch.equal(resumed.env.parts.memory.level, start)
     assert resumed.env.common_step_counter == 36
     assert "what was left of several processes, not 1: episodes start anew, at 48 % of the schedules" in said[0]
+
+
+def test_running_episodes_of_a_whole_checkpoint_keep_their_ages(tmp_path):
+    """Whatever the setting of the resumed run, which only says what its own checkpoints hold."""
+    reached, path = trained(tmp_path)
+    ages = reached.env.episode_length_buf.clone()
+    resumed = build(seed=5, keep_episodes=False)
+    resume_run(resumed, path)
+    resumed.learn(0)
+    assert torch.equal(resumed.env.episode_length_buf, ages)
+
+
+def test_episodes_that_begin_anew_from_a_slim_checkpoint_have_random_ages(tmp_path):
+    """Without them all worlds would time out at once, again and again."""
+    _, path = trained(tmp_path, keep_episodes=False)
+    resumed = build(seed=5, keep_episodes=True)
+    resume_run(resumed, path)
+    resumed.learn(0)
+    assert len(set(resumed.env.episode_length_buf.tolist())) > 4
