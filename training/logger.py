@@ -236,8 +236,11 @@ class RunLogger:
             "episode_length": self.episode_length.cpu(),
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over what ``state_dict`` returned; running episodes only if the number of environments is the same.
+    def load_state_dict(self, state: Mapping[str, Any], *, running: bool) -> None:
+        """Take over what ``state_dict`` returned.
+
+        Args:
+            running: whether the environments' episodes run on; theirs are then taken over too.
 
         Raises:
             LookupError, TypeError, ValueError, AttributeError: it is no such state.
@@ -247,7 +250,7 @@ class RunLogger:
         self.returns = _window(state["returns"])
         self.lengths = _window(state["lengths"])
         self.group_returns = {name: _window(state["group_returns"][name]) for name in self.group_returns}
-        if state["reward_sum"].shape == self.reward_sum.shape:
+        if running and state["reward_sum"].shape == self.reward_sum.shape:
             self.reward_sum.copy_(state["reward_sum"])
             self.episode_length.copy_(state["episode_length"])
 

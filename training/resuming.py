@@ -139,10 +139,10 @@ def _take_over(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], n
         )
     elif runner.processes.rank != 0:
         local = read_rank(path, runner.processes.rank)
-    runner.logger.load_state_dict(_table((local or training)["log"]))
     if local is not None:
         runner.fresh = not (_load_environment(runner, path, local["environment"]) and _runs_on(runner, local))
         restore_random_state(_table(local["random"]), runner.device)
+    runner.logger.load_state_dict(_table((local or training)["log"]), running=not runner.fresh)
 
 
 def _table(value: Any) -> Mapping[str, Any]:

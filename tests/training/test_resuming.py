@@ -96,3 +96,18 @@ def test_episodes_that_begin_anew_from_a_slim_checkpoint_have_random_ages(tmp_pa
     resume_run(resumed, path)
     resumed.learn(0)
     assert len(set(resumed.env.episode_length_buf.tolist())) > 4
+
+
+@pytest.mark.parametrize("kept", ["whole", "slim", "of two processes"])
+def test_the_log_takes_over_running_episodes_where_they_run_on(tmp_path, kept):
+    reached, path = trained(tmp_path, keep_episodes=kept != "slim")
+    length = reached.logger.episode_length
+    assert bool((length > 0).any())
+    if kept == "of two processes":
+        edit(path, world_size=2)
+    resumed = build(seed=5)
+    resume_run(resumed, path)
+    going = kept == "whole"
+    assert torch.equal(resumed.logger.episode_length, length if going else torch.zeros(8))
+    assert torch.equal(resumed.logger.reward_sum, reached.logger.reward_sum if going else torch.zeros(8))
+    assert resumed.logger.total_steps == reached.logger.total_steps
