@@ -179,13 +179,16 @@ def run_numbers(entries: Mapping[str, Any], path: Path) -> RunNumbers:
     return build(RunNumbers, found, f"Cannot resume from '{path}': its training state", CheckpointError)
 
 
-def read_rank(path: Path, rank: int) -> dict[str, Any]:
-    """What process ``rank`` of a run kept beside a checkpoint.
+def read_rank(path: Path, rank: int, written: Any) -> dict[str, Any] | None:
+    """What process ``rank`` of a run kept beside a checkpoint; None if there is nothing that was ``written`` with it: the first
+    process may have been the only one that came to write, or the checkpoint is a copy.
 
     Raises:
-        CheckpointError: the file is missing, damaged or holds more than tensors and plain data.
+        CheckpointError: the file is damaged or holds more than tensors and plain data.
     """
-    return _load(rank_file(path, rank), "resume from")
+    file = rank_file(path, rank)
+    entries = _load(file, "resume from") if file.exists() else {}
+    return entries if entries and entries.get("written") == written else None
 
 
 def _load(file: Path, purpose: str) -> dict[str, Any]:

@@ -58,6 +58,8 @@ def save_run(runner: TrainingRunner, path: Path) -> None:
         "num_envs": runner.env.num_envs,
         "log": runner.logger.state_dict(),
     }
+    if runner.processes.several:
+        local["written"] = f"{runner.learning} {runner.iteration}"
     if runner.processes.rank != 0:
         write_checkpoint(rank_file(path, runner.processes.rank), local)
         return
@@ -101,7 +103,8 @@ def write_learned(runner: TrainingRunner, path: Path, learned: Mapping[str, Any]
 def resume_run(runner: TrainingRunner, path: Path) -> None:
     """Continue from a checkpoint as if the run had never stopped.
 
-    An environment without ``load_state_dict``, or another number of processes, starts fresh episodes, at the point of the
+    An environment without ``load_state_dict``, another number of processes, or one without a part of its own beside the
+    checkpoint, starts fresh episodes, at the point of the
     schedules and on the levels that the checkpoint knows; this is said through the runner's ``message``.
 
     Raises:
@@ -111,10 +114,18 @@ def resume_run(runner: TrainingRunner, path: Path) -> None:
     numbers = run_numbers(entries, path)
     _check_fits(runner, path, entries, numbers)
     with edited(f"Cannot resume from '{path}': its training state", CheckpointError, RuntimeError):
-        _take_over(runner, path, entries, numbers)
+        whole = _take_over(runner, path, entries, numbers)
+    if numbers.world_size == runner.processes.count and (
+        lacking := runner.processes.largest(0 if whole else runner.processes.rank)
+    ):
+        runner.message(
+            f"'{path}' has no part of process {lacking} beside it that was written with it: episodes of such a process "
+            "start anew, on the levels of the first."
+        )
 
 
-def _take_over(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> None:
+def _take_over(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> bool:
+    """Returns whether this process had a part of the checkpoint to itself."""
     training = entries["training"]
     try:
         runner.alg.load(entries)
@@ -129,20 +140,23 @@ def _take_over(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], n
     noted = read_run_json(runner.log_dir) if runner.log_dir else {}
     if (score := noted.get("best_score")) is not None and (runner.best_score is None or score > runner.best_score):
         runner.best_score, runner.best_iteration = score, noted.get("best_iteration")
-    local: Mapping[str, Any] | None = training
-    if numbers.world_size != runner.processes.count:
-        local = None
-        where = _begin_anew(runner, path, training, numbers)
-        runner.message(
-            f"'{path}' was written by {numbers.world_size or 'what was left of several'} processes, not "
-            f"{runner.processes.count}: episodes start anew{where}."
-        )
-    elif runner.processes.rank != 0:
-        local = read_rank(path, runner.processes.rank)
+    local: Mapping[str, Any] | None = None
+    if numbers.world_size == runner.processes.count:
+        rank = runner.processes.rank
+        local = read_rank(path, rank, training.get("written")) if rank else training
     if local is not None:
         runner.fresh = not (_load_environment(runner, path, local["environment"]) and _runs_on(runner, local))
         restore_random_state(_table(local["random"]), runner.device)
-    runner.logger.load_state_dict(_table((local or training)["log"]), running=not runner.fresh)
+    else:
+        where = _begin_anew(runner, path, training, numbers)
+        runner.fresh = True
+        if numbers.world_size != runner.processes.count:
+            runner.message(
+                f"'{path}' was written by {numbers.world_size or 'what was left of several'} processes, not "
+                f"{runner.processes.count}: episodes start anew{where}."
+            )
+    runner.logger.load_state_dict(_table((training if local is None else local)["log"]), running=not runner.fresh)
+    return local is not None
 
 
 def _table(value: Any) -> Mapping[str, Any]:

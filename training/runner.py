@@ -7,6 +7,7 @@ it goes on with the 501st.
 from __future__ import annotations
 
 import math
+import secrets
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
@@ -113,6 +114,8 @@ class TrainingRunner:
         """Completed iterations of the whole run."""
         self.fresh = True
         """Whether the environment is at the beginning of its first episodes."""
+        self.learning = ""
+        """One call of ``learn`` in several processes: what they write in it belongs together."""
         self.best_score: float | None = None
         self.best_iteration: int | None = None
         self._progress = progress or (lambda _: None)
@@ -146,6 +149,8 @@ class TrainingRunner:
         self.fresh = False
         obs = self.env.get_observations().to(self.device)
         self.alg.share()
+        if self.processes.several:
+            self.learning = self.processes.firsts(secrets.token_hex(8))
         if self.logger.writer is None and self.log_dir is not None and speaks:
             self.logger.writer = make_writer(self.configuration, self.log_dir, self.env.cfg)
         self._submitted = self.iteration

@@ -132,7 +132,7 @@ def test_optimizers_keep_the_settings_of_this_run(entries, tmp_path):
     mine.learn(1)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no archive", {"log": 3}, {"log": {}, "random": MANY}, [1], "pickle"])
+@pytest.mark.parametrize("content", [b"", b"no archive", {"log": 3}, {"log": {}, "random": MANY}, [1], "pickle"])
 def test_the_file_of_another_process_is_read_as_carefully(entries, mine, tmp_path, content, monkeypatch):
     """``model_1.rank1.pt`` lies beside the checkpoint, and is a stranger's as well."""
     path = tmp_path / "model_1.pt"
@@ -142,7 +142,7 @@ def test_the_file_of_another_process_is_read_as_carefully(entries, mine, tmp_pat
         beside.write_bytes(content)
     elif content == "pickle":
         torch.save({"log": Path("x")}, beside)
-    elif content is not None:
+    else:
         torch.save(content, beside)
     monkeypatch.setattr(mine, "processes", Processes(rank=1, count=2))
     refused(resume_run, mine, path)

@@ -2,7 +2,9 @@
 
 import pytest
 import torch
+from gaitgauge.training.checkpoint import copy_checkpoint, rank_file
 from gaitgauge.training.environment_configuration import ScheduleConfiguration
+from gaitgauge.training.processes import Processes
 from gaitgauge.training.resuming import resume_run
 from gaitgauge.training.runner import TrainingRunner
 from gaitgauge.training.seeding import seed_everything
@@ -111,3 +113,85 @@ def test_the_log_takes_over_running_episodes_where_they_run_on(tmp_path, kept):
     assert torch.equal(resumed.logger.episode_length, length if going else torch.zeros(8))
     assert torch.equal(resumed.logger.reward_sum, reached.logger.reward_sum if going else torch.zeros(8))
     assert resumed.logger.total_steps == reached.logger.total_steps
+
+
+class Both(Processes):
+    """One of two processes that agree on all that the first one says; what they ask each other is remembered."""
+
+    said = "one learning"
+    asked = ()
+
+    def average(self, values):
+        pass
+
+    def copy_first(self, tensors):
+        pass
+
+    def firsts(self, value):
+        return Both.said
+
+    def largest(self, number):
+        Both.asked = (*Both.asked, number)
+        return max(Both.asked[-2:])
+
+
+def of_two(folder, monkeypatch, said="one learning"):
+    """A checkpoint of two processes after one iteration; returns its path and the second one's ages."""
+    monkeypatch.setattr(Both, "said", said)
+    build(folder, processes=Both(rank=0, count=2)).learn(1)
+    second = build(folder, seed=1, processes=Both(rank=1, count=2))
+    second.learn(1)
+    monkeypatch.setattr(Both, "asked", ())
+    return folder / "model_1.pt", second.env.episode_length_buf.clone()
+
+
+def resume_both(path):
+    """Resume in both processes, the second one first; returns it and what the first one says."""
+    said, second = [], build(seed=6, processes=Both(rank=1, count=2))
+    resume_run(second, path)
+    resume_run(build(seed=5, message=said.append, processes=Both(rank=0, count=2)), path)
+    return second, " ".join(said)
+
+
+def test_both_parts_of_a_checkpoint_are_resumed(tmp_path, monkeypatch):
+    path, ages = of_two(tmp_path, monkeypatch)
+    second, said = resume_both(path)
+    assert torch.equal(second.env.episode_length_buf, ages) and not second.fresh and not said
+
+
+def test_parts_from_before_they_were_told_apart_are_resumed(tmp_path, monkeypatch):
+    path, ages = of_two(tmp_path, monkeypatch)
+    for file in (path, rank_file(path, 1)):
+        entries = torch.load(file, weights_only=True)
+        del (entries["training"] if file is path else entries)["written"]
+        torch.save(entries, file)
+    second, said = resume_both(path)
+    assert torch.equal(second.env.episode_length_buf, ages) and not said
+
+
+def test_the_best_checkpoint_is_resumed_by_several_processes(tmp_path, monkeypatch):
+    """It is a copy of the first process's part alone."""
+    path, _ = of_two(tmp_path, monkeypatch)
+    copy_checkpoint(path, tmp_path / "best.pt")
+    second, said = resume_both(tmp_path / "best.pt")
+    first = torch.load(path, weights_only=True)["training"]["environment"]["memory"]
+    assert second.fresh and float(second.env.progress) == pytest.approx(6 / 75)
+    assert torch.equal(second.env.parts.memory.level, first["level"])
+    assert "best.pt' has no part of process 1" in said and "start anew, on the levels of the first" in said
+
+
+@pytest.mark.parametrize("change", ["another learning", "another iteration"])
+def test_a_part_that_was_not_written_with_the_checkpoint_is_not_taken(tmp_path, monkeypatch, change):
+    """An earlier branch left it, and the run was killed before this one's second process had written."""
+    path, _ = of_two(tmp_path, monkeypatch)
+    old = rank_file(path, 1).read_bytes()
+    if change == "another learning":
+        path, _ = of_two(tmp_path, monkeypatch, said=change)
+    else:
+        path = path.rename(tmp_path / "model_7.pt")
+        entries = torch.load(path, weights_only=True)
+        entries["training"]["written"] = entries["training"]["written"].replace("1", "7")
+        torch.save(entries, path)
+    rank_file(path, 1).write_bytes(old)
+    second, said = resume_both(path)
+    assert second.fresh and "has no part of process 1" in said
