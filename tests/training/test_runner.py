@@ -232,7 +232,9 @@ class SlowScorer:
 
 
 def test_best_is_chosen_by_the_gauge(tmp_path, monkeypatch):
-    monkeypatch.setattr("gaitgauge.policy.finding.LOG_ROOT", tmp_path.parent.parent)
+    monkeypatch.setattr("gaitgauge.policy.finding.LOG_ROOT", tmp_path)
+    tmp_path = tmp_path / "toy" / "run"  # alone under its root: other tests have a best.pt, too
+    tmp_path.mkdir(parents=True)
     scorer = SlowScorer({1: 0.2, 2: 0.6, 3: 0.4})
     seen = []
     configuration = toy_configuration(run={"gauge_interval": 1})
