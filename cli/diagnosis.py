@@ -23,12 +23,16 @@ _SHOWN = 8
 """Changes that the table shows."""
 
 
+_SECONDS = 2.0
+"""How long each description is played unless the user says so [s]."""
+
+
 def examine_policy(
     choice: str,
     *,
     contract: Path | None,
     robot: str | None,
-    seconds: float,
+    seconds: float | None,
     threads: int | None,
     out: Path | None,
     json_output: bool,
@@ -45,6 +49,8 @@ def examine_policy(
         raise UserError(f"--out is '{out}'; give a file that ends in .toml")
     if out is not None and any(same_file(out, given) for given in (contract, robot) if given):
         raise UserError(f"--out is '{out}', which is read as --contract or --robot; give another file")
+    if out is not None and not out.absolute().parent.is_dir():
+        raise UserError(f"folder '{out.parent}' of --out does not exist; create it first")
     asked = None if robot is None else load_robot(robot)
     policy = load_policy(policy_file(choice), asked, trust=trust, contract_file=contract)
     body = robot_for(policy.contract, robot)
@@ -56,7 +62,9 @@ def examine_policy(
             )
             display.update(played / count, text)
 
-        found = diagnose(policy, body, seconds=seconds, threads=threads or os.cpu_count() or 1, report=report)
+        found = diagnose(
+            policy, body, seconds=seconds or _SECONDS, threads=threads or os.cpu_count() or 1, report=report
+        )
     lines = toml_lines(found.best.contract, policy.contract)
     if out is not None:
         lines_of_file = [f"# {found.verdict()}", *toml_lines(found.best.contract)]

@@ -55,8 +55,8 @@ def run_doctor(*, policy: str | None, json_output: bool, **choices: Any) -> None
         UserError: an option is for a policy, and none is named.
     """
     if policy is None:
-        for name in ("contract", "robot", "out"):
-            if choices[name] is not None:
+        for name in ("contract", "robot", "out", "seconds", "trust"):
+            if choices[name]:
                 raise UserError(
                     f"--{name} is for the examination of a policy; name one: gaitgauge doctor POLICY --{name} …"
                 )

@@ -9,8 +9,8 @@ from pathlib import Path
 import typer
 
 from ..backends.registry import choose_device
-from ..files.parsing import bare_name
 from ..gauge.comparison import load_result
+from ..gauge.naming import distinct_names, folder_name
 from ..gauge.verify import prepare_replay, verify
 from .console import Terminal, print_json
 from .evaluate import shower
@@ -32,9 +32,11 @@ def run_verification(
 ) -> None:
     """Replay, show progress, print whether the card holds; exit code 1 where it does not."""
     content = load_result(card)
+    place = card.resolve()
     prepared = prepare_replay(
         content,
         policy=policy,
+        beside=place if place.is_dir() else place.parent,
         suite=suite,
         device=choose_device(content["backend"], device),
         threads=threads or os.cpu_count() or 1,
@@ -42,8 +44,8 @@ def run_verification(
         fresh=fresh,
         trust=trust,
     )
-    place = card.resolve()
-    stem = bare_name(place.parent if place.name == "results.json" else place)
+    (name,) = distinct_names([str(place.parent if place.name == "results.json" else place)])
+    stem = folder_name(name)
     folder = (
         out or Path("results") / f"verify-{stem}{'-quick' if quick else ''}{'' if fresh is None else f'-fresh-{fresh}'}"
     )

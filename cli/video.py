@@ -15,6 +15,8 @@ from .errors import UserError
 
 VIDEO_ENDINGS = (".mp4",)
 CLIP_ENDINGS = (".gif", ".webp")
+_OPTION_OF = {**dict.fromkeys(VIDEO_ENDINGS, "--out"), **dict.fromkeys(CLIP_ENDINGS, "--gif")}
+"""Option of ``play`` by the ending of its file."""
 _PALETTE = "split[a][b];[a]palettegen=max_colors=96:stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
 _CODECS: dict[str, tuple[str, str, list[str]]] = {
     ".mp4": ("libx264", "yuv420p", ["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"]),
@@ -31,7 +33,9 @@ def check_film_path(path: Path, option: str, endings: tuple[str, ...]) -> None:
         UserError: the folder is not there, or the name ends in something else.
     """
     if path.suffix.lower() not in endings:
-        raise UserError(f"{option} is '{path}'; give a name that ends in {' or '.join(endings)}")
+        other = _OPTION_OF.get(path.suffix.lower())
+        hint = f", or write {other} {path}" if other else ""
+        raise UserError(f"{option} is '{path}'; give a name that ends in {' or '.join(endings)}{hint}")
     if not path.absolute().parent.is_dir():
         raise UserError(f"folder '{path.parent}' of {option} does not exist; create it first")
 

@@ -59,8 +59,8 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
         tables.setdefault(key, {})[name] = card
     found = []
     for key, rows in sorted(tables.items(), key=lambda item: -len(item[1])):
-        # a card's own name is part of the path: it stands for a policy whose file is called as any other
-        names = distinct_names([f"{name}/{card['policy']['path']}" for name, card in rows.items()])
+        # a card's own name and folder are part of the path: they stand for a policy whose file is called as any other
+        names = distinct_names([f"{folder.absolute() / name}/{card['policy']['path']}" for name, card in rows.items()])
         entries = [_entry(name, card, folder, policy) for (name, card), policy in zip(rows.items(), names, strict=True)]
         entries.sort(key=lambda e: -1.0 if e["score"] is None else e["score"], reverse=True)
         ranked = [e for e in entries if e["ranked"]]
@@ -86,6 +86,7 @@ def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
 def _entry(name: str, card: Mapping[str, Any], folder: Path, policy: str) -> dict[str, Any]:
     """A line of the board."""
     terms: Sequence[str] | None = card["policy"].get("observations")
+    found = ((folder / name).parent / card["policy"]["path"]).is_file()
     covered, privileged = coverage_of(card), bool(set(terms or ()) & set(PRIVILEGED_TERMS))
     return {
         "card": name,
@@ -100,5 +101,5 @@ def _entry(name: str, card: Mapping[str, Any], folder: Path, policy: str) -> dic
         "coverage": coverage_words(covered),
         "ranked": covered["kind"] == COMPLETE and card["score"] is not None and not privileged,
         "rank": None,
-        "command": f"gaitgauge verify {shlex.quote(str(folder / name))} --policy FILE",
+        "command": f"gaitgauge verify {shlex.quote(str(folder / name))}{'' if found else ' --policy FILE'}",
     }

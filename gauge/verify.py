@@ -38,6 +38,7 @@ def prepare_replay(
     card: Mapping[str, Any],
     *,
     policy: str | None = None,
+    beside: Path | None = None,
     suite: str | None = None,
     device: str = "cpu",
     threads: int = 1,
@@ -49,6 +50,7 @@ def prepare_replay(
 
     Args:
         policy: the policy's file, where it is not at the card's path and none that ships.
+        beside: the card's folder, where its policy is looked for as well.
         suite: name or ``.toml`` file, where the suite is one of the user's own.
         quick: one environment of each terrain, at nominal friction and payload where the card has it, else the card's first.
         fresh: number from which other seeds than the card's are made; None for the card's.
@@ -61,9 +63,12 @@ def prepare_replay(
     if fresh is not None and card["score_interval"] is None:
         raise CardError("the card has no interval, so that nothing can be said of other seeds; leave out --fresh")
     if policy is None and path not in shipped_policies() and not Path(path).is_file():
-        raise CardError(
-            f"the card's policy is not at '{one_line(path)}' on this machine; say where it is with --policy"
-        )
+        if beside is not None and (beside / path).is_file():
+            path = str(beside / path)
+        else:
+            raise CardError(
+                f"the card's policy is not at '{one_line(path)}' on this machine; say where it is with --policy"
+            )
     found = file_digest(path)
     if found != card["policy"]["file_sha256"]:
         raise CardError(

@@ -50,7 +50,9 @@ def doctor(
         Path | None, typer.Option(help="A contract.toml that says how the policy is to be run.", metavar="PATH")
     ] = None,
     robot: options.Robot = None,
-    seconds: Annotated[float, typer.Option(min=0.5, max=20.0, help="How long each description is played [s].")] = 2.0,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.5, max=20.0, help="How long each description is played [s]. Default: 2.")
+    ] = None,
     threads: options.Threads = None,
     out: Annotated[Path | None, typer.Option(help="Write the contract.toml that fits best.")] = None,
     json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,

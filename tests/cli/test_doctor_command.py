@@ -71,9 +71,16 @@ def test_a_file_that_is_no_policy_is_refused(refused, tmp_path):
     assert "there is no policy file" in refused("doctor", tmp_path / "nothing.pt")
 
 
-@pytest.mark.parametrize("option", ["contract", "robot", "out"])
+@pytest.mark.parametrize(
+    "option", [("--contract", "it"), ("--robot", "it"), ("--out", "it"), ("--seconds", 1), ("--trust",)]
+)
 def test_what_is_for_a_policy_is_refused_without_one(refused, option):
-    assert f"--{option} is for the examination of a policy" in refused("doctor", f"--{option}", "nothing")
+    assert f"{option[0]} is for the examination of a policy" in refused("doctor", *option)
+
+
+def test_a_folder_that_is_not_there_is_told_before_anything_is_played(refused, monkeypatch):
+    monkeypatch.setattr("gaitgauge.cli.diagnosis.diagnose", None)
+    assert "of --out does not exist" in refused("doctor", "pretrained", "--out", "nowhere/mended.toml")
 
 
 def test_the_machine_is_told_as_json(run, monkeypatch):

@@ -74,3 +74,24 @@ def test_a_card_s_folder_by_default_has_its_whole_name_whatever_names_the_card(r
     for named in (folder, folder / "results.json", ".", "results.json"):
         assert run("verify", named, *options, "--quick").exit_code == 0
     assert [f.name for f in (folder / "results").iterdir()] == ["verify-tiny-1.1-stress-quick"]
+
+
+def test_the_policy_is_found_beside_its_card_and_the_replay_named_after_both(
+    run, refused, tmp_path, monkeypatch, policy, card
+):
+    """As sweeps keep them: ``kept/results.json`` names ``policy.gauge.pt``, and so does every other one."""
+    _, content, options = card
+    content["policy"]["path"] = "policy.gauge.pt"
+    monkeypatch.chdir(tmp_path)
+    for method in ("HIM", "CTS"):
+        kept = tmp_path / "runs" / method / "seed-1" / "kept"
+        kept.mkdir(parents=True)
+        (kept / "results.json").write_text(json.dumps(content))
+        assert "the card's policy is not at 'policy.gauge.pt'" in refused("verify", kept, *options)
+        (kept / "policy.gauge.pt").write_bytes(policy.read_bytes())
+        assert run("verify", kept, *options, "--quick").exit_code == 0
+    names = {f.name for f in (tmp_path / "results").iterdir()}
+    assert names == {"verify-HIM-seed-1-quick", "verify-CTS-seed-1-quick"}
+    run("board", tmp_path / "runs" / "HIM" / "seed-1", "--out", "board.html")
+    page = (tmp_path / "board.html").read_text()
+    assert "HIM seed-1" in page and "--policy FILE" not in page
