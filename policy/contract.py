@@ -253,6 +253,13 @@ def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyCon
     return replace(contract, joint_names=tuple(joint_names), observation=terms, **values)
 
 
+def other_width(contract: PolicyContract, width: int) -> str:
+    """What a contract says of its observation's width, for a sentence on a network that takes another one, and which history it fits."""
+    frames, rest = divmod(width, contract.frame_width)
+    fits = f"; {frames} frames are {width}: history = {{ length = {frames} }}" if frames and not rest else ""
+    return f"but its contract's observation has {contract.observation_width}{fits}"
+
+
 def difference(a: PolicyContract, b: PolicyContract) -> str:
     """What differs between two contracts, one line per field (``field: value in a -> value in b``); empty if they are
     equal.

@@ -37,7 +37,7 @@ from torch import nn
 from ..files.parsing import shown
 from ..files.writing import make_folder, replacing
 from .base import Policy, PolicyError, PolicySession, check_observation, checked_action
-from .contract import ContractError, PolicyContract
+from .contract import ContractError, PolicyContract, other_width
 from .fence.archive import packed, read_archive
 from .fence.pickles import REBUILD_TENSOR, check_tensors, read_pickle
 from .networks import ARCHITECTURES
@@ -266,8 +266,7 @@ def build_network(stored: StoredNetwork, contract: PolicyContract, *, source: st
     network = network.float().eval().requires_grad_(False)
     if network.frame_width != contract.observation_width:
         raise PolicyError(
-            f"'{source}': the network takes {network.frame_width} values, "
-            f"but its contract's observation has {contract.observation_width}"
+            f"'{source}': the network takes {network.frame_width} values, {other_width(contract, network.frame_width)}"
         )
     session = NativeSession(network, 1, contract, torch.device("cpu"), source)
     session.act(torch.zeros(1, contract.observation_width))

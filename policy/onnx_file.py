@@ -26,7 +26,7 @@ from .base import (
     check_observation,
     checked_action,
 )
-from .contract import PolicyContract
+from .contract import PolicyContract, other_width
 from .fence.graph import action_output
 from .native import first_line
 
@@ -151,8 +151,7 @@ class GraphProgram:
         self.contract = contract
         if self.file.width is not None and self.file.width != contract.observation_width:
             raise PolicyError(
-                f"'{self.source}' takes {self.file.width} values, "
-                f"but its contract's observation has {contract.observation_width}"
+                f"'{self.source}' takes {self.file.width} values, {other_width(contract, self.file.width)}"
             )
         self._rows = _Runner(self.file.data, self.file, contract)
         self._rows.run(np.zeros((1, contract.observation_width), np.float32))

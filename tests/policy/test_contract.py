@@ -9,6 +9,7 @@ from gaitgauge.policy.contract import (
     PolicyContract,
     check_robot,
     difference,
+    other_width,
     standard_contract,
 )
 from gaitgauge.robots import load_robot
@@ -168,3 +169,9 @@ def test_difference_names_the_fields(contract):
         "observation.last_action.scale",
     ]
     assert "control_period: 0.02 -> 0.01" in lines
+
+
+def test_a_width_that_is_some_frames_says_how_to_write_them():
+    one = replace(standard_contract(load_robot("go2")), history=History(length=1))
+    assert other_width(one, 225).endswith("observation has 45; 5 frames are 225: history = { length = 5 }")
+    assert other_width(one, 47).endswith("observation has 45")
