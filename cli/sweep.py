@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time as clock
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,29 +87,32 @@ def print_kept(console: Terminal, kept: Kept, of_all: str) -> None:
 def print_sweep(console: Terminal, found: Mapping[str, Any], folder: Path) -> None:
     """A table of the entries, the comparison's sentences, and where the files are."""
     groups = list(dict.fromkeys(g for e in found["entries"] if e["best"] for g in e["best"]["groups"] or {}))
-    columns = ("entry", "score", "95 % interval", *groups, "level", "seed", "mean of seeds")
+    several = any(e["range"] for e in found["entries"])
+    columns = ("entry", "score", "95 % interval", *groups, "level", "seed", "mean of seeds", *["range"] * several)
     table = make_table(f"{found['title']} ({found['suite']})", *columns, numbers=True)
     for entry in found["entries"]:
         best = entry["best"]
         if best is None:
             table.add_row(entry["entry"], entry["reason"] and "failed")
             continue
-        low_high = "" if best["score_interval"] is None else "{:.4f} to {:.4f}".format(*best["score_interval"])
         values = [f"{best['groups'][g]:.4f}" if g in (best["groups"] or {}) else "" for g in groups]
-        spread = ""
-        if entry["deviation"] is not None:
-            spread = " ± {:.4f} ({:.4f} to {:.4f})".format(entry["deviation"], *entry["range"])
+        deviation = "" if entry["deviation"] is None else f" ± {entry['deviation']:.4f}"
         table.add_row(
             entry["entry"],
             f"{best['score']:.4f}",
-            low_high,
+            _low_high(best["score_interval"]),
             *values,
             "" if best["level"] is None else f"{best['level']:.2f}",
             str(best["seed"]),
-            f"{entry['mean']:.4f}{spread}",
+            f"{entry['mean']:.4f}{deviation}",
+            *[_low_high(entry["range"])] * several,
         )
     console.print(table)
     for sentence in found["sentences"]:
         console.say(sentence)
     for name in ("sweep.html", *(["comparison.html"] if found["compared"] else []), "curves.csv"):
         console.say(f"{name.partition('.')[0]:11}{folder / name}")
+
+
+def _low_high(pair: Sequence[float] | None) -> str:
+    return "{:.4f} to {:.4f}".format(*pair) if pair else ""

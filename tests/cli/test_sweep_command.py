@@ -1,12 +1,15 @@
 """``gaitgauge sweep``: one sentence for what is wrong, and a whole sweep of small trainings."""
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from gaitgauge.cli.sweep import print_sweep
 from gaitgauge.training.sweep.jobs import Jobs, SweepOutcome
 from small_run import SMALL
 from tiny_suite import SUITE
@@ -120,6 +123,37 @@ def test_a_run_that_is_damaged_leaves_a_table_and_the_others_are_kept(run, tmp_p
     place.write_text("{")
     result = run("sweep", file, "--out", "out", "--report", "--keep", "kept")
     assert result.exit_code == 1 and "DreamWaQ, seed 0 is not kept: " in result.stderr and str(place) in result.stderr
+
+
+def test_the_range_of_the_seeds_is_a_column_of_its_own():
+    """In brackets behind mean and deviation it read as an interval of the mean."""
+    best = {"seed": 1, "score": 0.7046, "score_interval": [0.6978, 0.7113], "level": 8.48, "groups": None}
+    one = {"entry": "one", "reason": "", "best": best, "mean": 0.7046, "deviation": None, "range": None}
+    several = one | {"entry": "several", "mean": 0.7031, "deviation": 0.0021, "range": [0.7007, 0.7046]}
+    tables = []
+    console = SimpleNamespace(print=tables.append, say=lambda _: None)
+    for entries in ([several, one], [one]):
+        found = {"title": "toy", "suite": "tiny", "entries": entries, "sentences": [], "compared": False}
+        print_sweep(console, found, Path())
+    first, second = ({str(c.header): list(c.cells) for c in table.columns} for table in tables)
+    assert first["mean of seeds"] == ["0.7031 ± 0.0021", "0.7046"] and first["range"] == ["0.7007 to 0.7046", ""]
+    assert second["mean of seeds"] == ["0.7046"] and "range" not in second
+
+
+def test_on_a_narrow_screen_every_value_of_the_page_has_its_column_s_name(run, tmp_path):
+    """There the rows are cards, and no table hides what it has no room for."""
+    shutil.copytree(ROOT / "docs/data/sweeps/from-nothing", tmp_path / "out")
+    assert run("sweep", ROOT / "benchmarks/sweeps/from-nothing.toml", "--out", "out", "--report").exit_code == 0
+    tables = re.findall(r"<table.*?</table>", (tmp_path / "out/sweep.html").read_text(), re.DOTALL)
+    assert len(tables) == 2
+    for table in tables:
+        head, body = table.split("<tbody>")
+        names = re.findall("<th[^>]*>(.*?)</th>", head)
+        rows = re.findall("<tr>(.*?)</tr>", body)
+        assert re.match('<table class="[^"]*stack', head) and rows
+        for row in rows:  # the first cell is the card's title, a policy's path needs no name
+            assert re.findall('data-label="(.*?)"', row) == [n for n in names[1:] if n != "policy"]
+    assert '<td data-label="mean of seeds">0.7031</td>' in tables[0] and 'data-label="range">0.7007 to' in tables[0]
 
 
 def test_a_suite_that_is_not_there(refused, tmp_path):
