@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -27,6 +27,7 @@ from ..files.parsing import (
     read_text,
     shown,
 )
+from ..terrains.registry import terrain_names
 from .commands import Phase
 
 SUITE_FOLDER = Path(__file__).parent / "suites"
@@ -310,7 +311,7 @@ def load_suite(name: str) -> Suite:
     """
     path, data = _tables(name, ())
     source = f"suite file {one_line(path)}"
-    suite = build(Suite, _none_for_false(Suite, data), source, SuiteError)
+    suite = _build(data, source)
     _check(suite, source)
     if path.resolve().parent != SUITE_FOLDER.resolve() and suite.name in suite_names():
         raise SuiteError(f"{source} is called '{suite.name}' as a suite that ships with the project; {_OWN_NAME}")
@@ -357,6 +358,25 @@ _LONGEST_CHAIN = 10
 
 
 _hints = cache(get_type_hints)
+
+
+def _build(data: dict[str, Any], source: str) -> Suite:
+    """The suite of a file's tables, where ``false`` stands for None; a refusal says where it could."""
+    try:
+        return build(Suite, _none_for_false(Suite, data), source, SuiteError)
+    except SuiteError as error:
+        if str(error).startswith(tuple(f"{source}: {path} is " for path in _optional_fields(Suite))):
+            raise SuiteError(f"{error}, or false") from error
+        raise
+
+
+def _optional_fields(kind: type, table: str = "") -> Iterator[str]:
+    """Paths of the fields that may be None: ``push``, ``metrics.zmp_span`` …"""
+    for name, hint in _hints(kind).items():
+        if isinstance(hint, type) and is_dataclass(hint):
+            yield from _optional_fields(hint, f"{table}{name}.")
+        elif type(None) in get_args(hint):
+            yield f"{table}{name}"
 
 
 def _none_for_false(kind: type, data: dict[str, Any]) -> dict[str, Any]:
@@ -452,6 +472,12 @@ def _check(suite: Suite, source: str) -> None:
             f"matrix.{one} ({nominal:g}) is none of matrix.{among} ({', '.join(f'{v:g}' for v in values)}); add it there, or "
             f"let {one} be one of them"
         ] = nominal in values
+    grounds = terrain_names()
+    for name in matrix.terrains:
+        rules[
+            f"matrix.terrains has the unknown terrain {shown(name)}{did_you_mean(name, grounds)}; choose from "
+            f"{', '.join(grounds)}"
+        ] = name in grounds
     for name in metrics.weights:
         rules[
             f"metrics.weights has the unknown metric {shown(name)}{did_you_mean(name, METRIC_NAMES)}; choose from "
