@@ -104,7 +104,7 @@ class Comparison:
             return f"None of the {len(details)} differences in detail is real after Holm's correction."
         pairs = len(self.policies) > 2
         shown = ", ".join(
-            f"{d.kind} {d.name}{f' ({d.second} and {d.first})' if pairs else ''} {d.difference:+.4f}" for d in real[:4]
+            f"{_named(d)}{f' ({d.second} and {d.first})' if pairs else ''} {d.difference:+.4f}" for d in real[:4]
         )
         more = f" and {len(real) - 4} more" if len(real) > 4 else ""
         return f"Of {len(details)} differences in detail {len(real)} are real after Holm's correction: {shown}{more}."
@@ -365,6 +365,10 @@ def _sweep(rows: Sequence[Mapping[str, Any]], axis: str, other: str) -> Iterator
 
 def _key(row: Mapping[str, Any]) -> tuple[str, float, float]:
     return row["terrain"], row["friction"], row["payload"]
+
+
+def _named(found: Difference) -> str:
+    return found.name if found.kind == "level" else f"{found.kind} {found.name}"
 
 
 def _score_sentence(found: Difference, pairs: int) -> str:

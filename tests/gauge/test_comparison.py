@@ -296,3 +296,11 @@ def test_score_cards_that_ship_can_be_compared(suite):
     found = compare([card for card in cards if card["robot"] == "go2"])
     assert len(found.policies) >= 2
     assert next(d for d in found.differences if d.kind == "score").real
+
+
+def test_details_are_named_once():
+    """They read 'level mean level'."""
+    found = compare(both())
+    real = [replace(d, corrected=0.01, difference=0.5) for d in found.differences if d.kind in ("level", "group")]
+    (sentence,) = [s for s in replace(found, differences=tuple(real)).sentences if "in detail" in s]
+    assert "correction: mean level +0.5000, group " in sentence
