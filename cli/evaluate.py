@@ -131,11 +131,14 @@ def print_results(console: Terminal, results: Mapping[str, Any]) -> None:
     for note in notes(results):
         console.say(note)
     health = results["health"]
-    troubles = [f"{health[k]} {k}" for k in ("falls", "diverged", "overflowed") if health[k]]
+    falls = "fall" if health["falls"] == 1 else "falls"
+    counts = {falls: health["falls"], **{k: health[k] for k in ("diverged", "overflowed")}}
+    troubles = [f"{count} {what}" for what, count in counts.items() if count]
     if health.get("self_contact"):
         troubles.append(f"parts of the robot touch each other in {100 * health['self_contact']:.1f} % of the samples")
     if troubles:
-        console.say(f"in {health['episodes']} quality episodes: {', '.join(troubles)}")
+        episodes = "quality episode" if health["episodes"] == 1 else "quality episodes"
+        console.say(f"in {health['episodes']} {episodes}: {', '.join(troubles)}")
     if results["score"] is not None:
         interval = results["score_interval"]
         note = f"95 % interval {_interval(interval)}" if interval else results["chance"]["note"]

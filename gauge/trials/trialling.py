@@ -151,10 +151,13 @@ def summary(label: str, contract: PolicyContract, scenario: Scenario, trials: Se
     limits = contract.command_limits
     above = [
         f"{a:g} {unit}"
-        for a, limit, unit in zip(asked, limits, ("m/s", "m/s sideways", "rad/s"), strict=True)
+        for a, limit, unit in zip(asked, limits, ("m/s forward", "m/s sideways", "rad/s"), strict=True)
         if a > limit
     ]
-    note = f"told up to {', '.join(above)}; made for up to {limits[0]:g}, {limits[1]:g} m/s and {limits[2]:g} rad/s"
+    note = (
+        f"told up to {', '.join(above)}; made for up to {limits[0]:g} m/s forward, {limits[1]:g} m/s sideways and "
+        f"{limits[2]:g} rad/s"
+    )
     medians: dict[str, float | None] = {}
     for name in MEASURES:
         values = [v for t in trials if (v := getattr(t, name)) is not None]

@@ -34,6 +34,9 @@ def test_what_went_wrong_is_said_in_words(run, tmp_path, policy, tiny):
     results["health"] = {"episodes": 3, "falls": 2, "diverged": 0, "overflowed": 0, "self_contact": 0.0429}
     print_results(console, results)
     assert "in 3 quality episodes: 2 falls, parts of the robot touch each other in 4.3 % of the samples" in said
+    results["health"] = {"episodes": 1, "falls": 1, "diverged": 1, "overflowed": 0, "self_contact": None}
+    print_results(console, results)
+    assert "in 1 quality episode: 1 fall, 1 diverged" in said
     said.clear()
     results["health"] = {"episodes": 3, "falls": 0, "diverged": 0, "overflowed": 0, "self_contact": None}
     print_results(console, results)

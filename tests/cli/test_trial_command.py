@@ -78,7 +78,10 @@ def test_what_comes_of_it_is_printed_and_written(run, policy, scenarios, tmp_pat
     )
     assert result.exit_code == 0, result.output
     assert "2/2" in result.stdout and "0/2" in result.stdout and "Theirs: 5/20" in result.stdout
-    assert "standing in runs: told up to 3 m/s; made for up to 2, 1 m/s and 2 rad/s" in result.stdout
+    assert (
+        "standing in runs: told up to 3 m/s forward; made for up to 2 m/s forward, 1 m/s sideways and 2 rad/s"
+        in result.stdout
+    )
     found = json.loads((tmp_path / "here" / "trials.json").read_text())
     stands, runs = [entry["results"][0] for entry in found["scenarios"]]
     assert (stands["successes"], stands["trials"]) == (2, 2)
