@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -15,13 +16,20 @@ import numpy as np
 
 from ..files.parsing import build, one_line, parse_json
 from .apart import run_apart
+from .base import JointParameters
 from .checking import compiled
+from .examining import stand_still
 from .loading import RobotError
-from .surveying import GRAVITY, Survey
+from .surveying import GRAVITY, Remarked, Survey
 
 _CLEARANCE = 0.02
 """Height above the ground at which an episode is to start [m]."""
 _GUESSED = "guessed"
+_STIFFER = (1.0, 2.0, 4.0, 8.0)
+"""Factors of the stiffness with which the robot is tried."""
+_LOWEST, _MOST_TILT = 0.75, 0.2
+"""Share of its height to which a robot may sink, and tilt to which it may lean [rad], with a stiffness that is guessed: less than what
+``robot check`` lets pass."""
 _LINE = 100
 """Longest line of a list [characters]."""
 
@@ -44,7 +52,8 @@ class Draft:
     name: str
     entries: tuple[Entry, ...]
     model: str
-    """The model as MJCF, with names for what the description has to name; empty where the file itself has them."""
+    """The model as MJCF, with names for what the description has to name and spheres for feet that it lacks; empty where the file
+    itself has them."""
 
     @property
     def guesses(self) -> list[str]:
@@ -110,6 +119,11 @@ def _draft(path: Path, name: str | None, home: Path) -> str:
     imu = next((site for site in sites if "imu" in site.lower()), None)
     order = f"{_GUESSED} order: leg by leg, the front left one first, from the base outwards"
     feet = f"{_GUESSED}: the shape at the end of each leg, legs in the same order"
+    if survey.added_feet:
+        feet += (
+            f"; {survey.added_feet} are small spheres added at the ends of shapes that are a whole shank, since a foot's position is the "
+            "centre of its shape"
+        )
     trunk = f"{_GUESSED}: the largest shape of the base; others count as head and sensors"
     above = f"{_GUESSED}: {_CLEARANCE:g} m above where the feet touch the ground in the default pose"
     commands = f"{_GUESSED} from legs of {length:.3f} m: forward, sideways [m/s], turning [rad/s]"
@@ -129,7 +143,7 @@ def _draft(path: Path, name: str | None, home: Path) -> str:
         Entry("action_scale", 0.25, f"{_GUESSED}: how far an output of 1 moves a joint's target [rad]"),
         Entry("default_parameters", "gauge"),
     ]
-    for key, (value, remark) in survey.motors(joints, length).items():
+    for key, (value, remark) in _standing_motors(survey, pose, joints, length).items():
         entries.append(Entry(f"parameters.gauge.{key}", value, remark))
     text = ""
     if survey.renamed:
@@ -139,6 +153,38 @@ def _draft(path: Path, name: str | None, home: Path) -> str:
         for assets in {spec.meshdir, spec.texturedir}:  # MuJoCo had to find them from here, and will have to from there
             text = text.replace(f'dir="{assets}', f'dir="{os.path.relpath(assets, home.resolve())}')
     return json.dumps(asdict(Draft(name=entries[0].value, entries=tuple(entries), model=text)))
+
+
+def _standing_motors(
+    survey: Survey, pose: Mapping[int, float], joints: list[int], length: float
+) -> dict[str, Remarked]:
+    """Constants of the joints; a stiffness that is guessed is doubled until the placed robot stands."""
+    first = survey.motors(joints, length)
+    guess, remark = first["stiffness"]
+    if not remark.startswith(_GUESSED):
+        return first
+    angles = {survey.model.joint(j).name: round(pose[j], 4) for j in joints}
+    height, stances = survey.feet_depth(), []
+    for stiffer in _STIFFER:
+        motors = first if stiffer == 1.0 else survey.motors(joints, length, stiffer)
+        constants = {key: tuple(np.broadcast_to(value, len(joints)).tolist()) for key, (value, _) in motors.items()}
+        stances.append(stand_still(survey.spec.copy(), angles, JointParameters(**constants), height))
+        if stances[-1].stands(lowest=_LOWEST, most_tilt=_MOST_TILT):
+            if stiffer > 1.0:
+                motors["stiffness"] = (
+                    motors["stiffness"][0],
+                    f"{remark}, and raised from {guess:g}, with which it does not stand well",
+                )
+            return motors
+        if stances[-1].apart_after is not None:
+            break
+    how = "it flies apart" if stances[0].apart_after is not None else str(stances[0])
+    first["stiffness"] = (
+        guess,
+        f"{remark}; it does not stand well with it, nor with up to {motors['stiffness'][0]:g}: {how}; mend default_joint_position, "
+        "torque_limit and stiffness until robot check passes",
+    )
+    return first
 
 
 def _toml(value: Any) -> str:

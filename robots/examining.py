@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -14,8 +14,9 @@ import numpy as np
 from ..files.parsing import build, parse_json
 from .apart import run_apart
 from .base import JointParameters, Robot
-from .body_plan import body_plan, default_pose, joint_ranges, mirror_image
+from .body_plan import body_plan, default_pose, joint_chain, joint_ranges, lowest_point, mirror_image
 from .checking import DEPTH_TOLERANCE, ModelChecks
+from .feet import shank_end
 from .loading import RobotError
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def _findings(robot: Robot) -> str:
         note(name.replace("_", " "), getattr(checks, name))
     if all(f.passed for f in found):
         note("legs", partial(_legs, robot))
+        note("foot shapes", partial(_foot_shapes, robot), "what is rewarded and judged of feet")
         note("parts", partial(_parts, robot), "a start at rest")
         note("standing", partial(stand, robot))
         note("mirror image", partial(_mirror, robot), "training with symmetry")
@@ -89,6 +91,23 @@ def _legs(robot: Robot) -> str:
         f"{len(plan.legs)} legs of {plan.leg_length:.3f} m, {sideways}; the base stands {plan.standing_height:.3f} m high in the "
         "default pose"
     )
+
+
+def _foot_shapes(robot: Robot) -> str:
+    """The centre of a foot's shape is the foot's position, and must not be in the middle of a shank."""
+    model, data = default_pose(robot)
+    base, heights = model.body(robot.base_body).id, []
+    for name, shape in zip(robot.foot_names, robot.foot_geoms, strict=True):
+        geom = model.geom(shape).id
+        heights.append(float(data.geom_xpos[geom, 2]) - lowest_point(model, data, geom))
+        chain = joint_chain(model, int(model.geom_bodyid[geom]), base)
+        end = shank_end(model, data, geom, data.xanchor[chain[-1]]) if chain else None
+        if end is not None:
+            raise RobotError(
+                f"the foot '{name}' is {end.length:.3g} m long: its centre, which counts as the foot's position, is {heights[-1]:.3f} m "
+                "above where it meets the ground; add a small sphere at its end, and name that in foot_names or foot_shapes"
+            )
+    return f"in the default pose the centre of a foot is up to {max(heights):.3f} m above where it meets the ground"
 
 
 def _parts(robot: Robot) -> str:
@@ -123,42 +142,89 @@ def stand(robot: Robot) -> str:
     """
     import mujoco
 
-    plan, motors = body_plan(robot), robot.parameters[robot.default_parameters]
-    spec = mujoco.MjSpec.from_file(str(robot.mjcf))
-    for actuator in list(spec.actuators):
-        spec.delete(actuator)
+    stance = stand_still(
+        mujoco.MjSpec.from_file(str(robot.mjcf)),
+        dict(zip(robot.joint_names, robot.default_joint_position, strict=True)),
+        robot.parameters[robot.default_parameters],
+        body_plan(robot).standing_height,
+    )
+    if stance.apart_after is not None:
+        raise RobotError(
+            f"robot '{robot.name}': it flies apart within {stance.apart_after:.2f} s of standing; lower stiffness and damping of "
+            f"parameters.{robot.default_parameters}, or give its joints armature"
+        )
+    if not stance.stands():
+        raise RobotError(
+            f"robot '{robot.name}': it does not stand: {stance}; raise the stiffness and torque_limit of "
+            f"parameters.{robot.default_parameters}, or mend default_joint_position"
+        )
+    return f"stands in its default pose: {stance}, with up to {100 * stance.torque:.0f} % of a motor's torque"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stance:
+    """How a robot stands that was left standing in a pose."""
+
+    height: float
+    """Of its base at the end [m]."""
+    start: float
+    """Of its base at the beginning [m]."""
+    tilt: float
+    """Of its base at the end [rad]."""
+    torque: float
+    """Largest share of a motor's torque limit at the end."""
+    apart_after: float | None = None
+    """When it flew apart [s]."""
+
+    def stands(self, *, lowest: float = _LOWEST, most_tilt: float = _MOST_TILT) -> bool:
+        """Whether it has neither flown apart nor sunk below a share of its first height nor leans further than that [rad]."""
+        return self.apart_after is None and self.tilt <= most_tilt and self.height >= lowest * self.start
+
+    def __str__(self) -> str:
+        return f"after {STANDING_SECONDS:g} s its base is {self.height:.3f} m high and leans by {self.tilt:.2f} rad"
+
+
+def stand_still(spec: mujoco.MjSpec, pose: Mapping[str, float], motors: JointParameters, height: float) -> Stance:
+    """Leave a robot standing on level ground.
+
+    Args:
+        spec: the robot alone; it is given ground, and its actuators are switched off.
+        pose: the angle that each joint is to keep [rad].
+        motors: of the joints, in the order of ``pose``.
+        height: of the base at the beginning [m].
+    """
+    import mujoco
+
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # sensors may refer to actuators: they stay
     spec.option.timestep = _TIMESTEP
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1)
     model = spec.compile()
     data = mujoco.MjData(model)
-    joints = [model.joint(name).id for name in robot.joint_names]
+    joints = [model.joint(name).id for name in pose]
     at_q, at_v = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     model.dof_armature[at_v] = motors.armature
     model.dof_damping[at_v] = motors.joint_damping
     model.dof_frictionloss[at_v] = motors.friction_loss
     mujoco.mj_setConst(model, data)
-    pose, limit = np.array(robot.default_joint_position), np.array(motors.torque_limit)
-    data.qpos[:7] = (0.0, 0.0, plan.standing_height, 1.0, 0.0, 0.0, 0.0)
-    data.qpos[at_q] = pose
+    angles, limit = np.array(list(pose.values())), np.array(motors.torque_limit)
+    data.qpos[:7] = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
+    data.qpos[at_q] = angles
+    apart_after = None
     for _ in range(round(STANDING_SECONDS / _TIMESTEP)):
-        torque = np.multiply(motors.stiffness, pose - data.qpos[at_q]) - np.multiply(motors.damping, data.qvel[at_v])
+        torque = np.multiply(motors.stiffness, angles - data.qpos[at_q]) - np.multiply(motors.damping, data.qvel[at_v])
         data.qfrc_applied[at_v] = np.clip(torque, -limit, limit)
         mujoco.mj_step(model, data)
         if not np.isfinite(data.qpos).all() or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
-            raise RobotError(
-                f"robot '{robot.name}': it flies apart within {data.time:.2f} s of standing; lower stiffness and damping of "
-                f"parameters.{robot.default_parameters}, or give its joints armature"
-            )
-    largest = float(np.max(np.abs(data.qfrc_applied[at_v]) / np.maximum(limit, 1e-9)))
-    height, (_, x, y, _) = float(data.qpos[2]), data.qpos[3:7]
-    tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
-    how = f"after {STANDING_SECONDS:g} s its base is {height:.3f} m high and leans by {tilt:.2f} rad"
-    if tilt > _MOST_TILT or height < _LOWEST * plan.standing_height:
-        raise RobotError(
-            f"robot '{robot.name}': it does not stand: {how}; raise the stiffness and torque_limit of "
-            f"parameters.{robot.default_parameters}, or mend default_joint_position"
-        )
-    return f"stands in its default pose: {how}, with up to {100 * largest:.0f} % of a motor's torque"
+            apart_after = float(data.time)
+            break
+    _, x, y, _ = data.qpos[3:7]
+    return Stance(
+        height=float(data.qpos[2]),
+        start=height,
+        tilt=math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y)))),
+        torque=float(np.max(np.abs(data.qfrc_applied[at_v]) / np.maximum(limit, 1e-9))),
+        apart_after=apart_after,
+    )
 
 
 def _mirror(robot: Robot) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..files.parsing import one_line
 from .body_plan import joint_chain, lowest_point, sideways_and_swinging, stretched_length
 from .checking import solid
+from .feet import add_foot, shank_end
 from .loading import RobotError
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Leg:
 
 
 class Survey:
-    """A model that is looked over. Names that it lacks and a description needs are given to its spec."""
+    """A model that is looked over. Names and feet that it lacks and a description needs are given to its spec."""
 
     def __init__(self, path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
         """Find the base and the legs.
@@ -62,6 +63,7 @@ class Survey:
         self.mujoco, self.path, self.spec, self.model = mujoco, path, spec, model
         self.data = mujoco.MjData(model)
         self.renamed = False
+        self.added_feet = 0
         free = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
         if len(free) != 1:
             first = model.body(1).name if model.nbody > 1 else ""
@@ -80,7 +82,7 @@ class Survey:
         if unnamed:
             raise self._error(f"has {len(unnamed)} joints without a name; name them")
         self.place({})
-        self.legs = self._find_legs()
+        self.legs = self._with_feet(self._find_legs())
 
     def _error(self, problem: str) -> RobotError:
         return RobotError(f"'{one_line(self.path)}' {problem}")
@@ -108,6 +110,37 @@ class Survey:
         hips = {leg.foot: self.data.xanchor[leg.joints[0]] for leg in legs}
         middle = np.mean([hip[0] for hip in hips.values()])
         return sorted(legs, key=lambda leg: (bool(hips[leg.foot][0] < middle - 1e-3), -hips[leg.foot][1]))
+
+    def _with_feet(self, legs: list[Leg]) -> list[Leg]:
+        """The legs, with a sphere added for a foot to each that ends in a whole shank."""
+        geoms, bodies = (
+            {e.id: e for e in kind} for kind in (self.spec.geoms, self.spec.bodies)
+        )  # ids go as one is added
+        names: dict[int, str] = {}
+        for leg in legs:
+            end = shank_end(self.model, self.data, leg.foot, self.data.xanchor[leg.joints[-1]])
+            if end is not None:
+                body = int(self.model.geom_bodyid[leg.foot])
+                bodies[body].name = bodies[body].name or f"body_{body}"
+                names[leg.foot] = self._free_name(bodies[body].name, "foot")
+                add_foot(bodies[body], names[leg.foot], end, geoms[leg.foot])
+        if not names:
+            return legs
+        self.renamed, self.added_feet = True, len(names)
+        old, self.model = self.model, self.spec.compile()
+        self.data = self.mujoco.MjData(self.model)
+        self.place({})
+        # a body's own shapes keep their order, and what is added comes behind them
+        moved = self.model.body_geomadr - old.body_geomadr
+        return [
+            replace(
+                leg,
+                foot=self.model.geom(names[leg.foot]).id
+                if leg.foot in names
+                else leg.foot + int(moved[old.geom_bodyid[leg.foot]]),
+            )
+            for leg in legs
+        ]
 
     def _ancestors(self, body: int) -> list[int]:
         found = []
@@ -209,6 +242,10 @@ class Survey:
         """How far the placed robot reaches below its base [m]."""
         return -min(lowest_point(self.model, self.data, g) for g in range(self.model.ngeom) if self._solid(g))
 
+    def feet_depth(self) -> float:
+        """How far the feet of the placed robot reach below its base [m]."""
+        return -min(lowest_point(self.model, self.data, leg.foot) for leg in self.legs)
+
     # ---- names ------------------------------------------------------------------------------------------------------
 
     def geom_name(self, geom: int, kind: str) -> str:
@@ -218,13 +255,14 @@ class Survey:
             return name
         element = next(g for g in self.spec.geoms if g.id == geom)
         if not element.name:
-            body = self.body_name(int(self.model.geom_bodyid[geom]))
-            taken = {g.name for g in self.spec.geoms}
-            element.name = next(
-                n for i in range(1, 10_000) if (n := f"{body}_{kind}" + (f"_{i}" if i > 1 else "")) not in taken
-            )
+            element.name = self._free_name(self.body_name(int(self.model.geom_bodyid[geom])), kind)
             self.renamed = True
         return element.name
+
+    def _free_name(self, body: str, kind: str) -> str:
+        """A name for a geom of a body that no other has."""
+        taken = {g.name for g in self.spec.geoms}
+        return next(n for i in range(1, 10_000) if (n := f"{body}_{kind}" + (f"_{i}" if i > 1 else "")) not in taken)
 
     def body_name(self, body: int) -> str:
         """A body's name; one without is given one."""
@@ -257,8 +295,14 @@ class Survey:
 
     # ---- motors -----------------------------------------------------------------------------------------------------
 
-    def motors(self, joints: list[int], length: float) -> dict[str, Remarked]:
-        """Constants of the joints by the keys of ``JointParameters``; ``length`` is that of the legs [m]."""
+    def motors(self, joints: list[int], length: float, stiffer: float = 1.0) -> dict[str, Remarked]:
+        """Constants of the joints by the keys of ``JointParameters``.
+
+        Args:
+            joints: in the robot's order.
+            length: of the legs [m].
+            stiffer: factor of a stiffness that is guessed.
+        """
         model = self.model
         strength = GRAVITY * float(model.body_mass.sum()) * length
         motor_of = {
@@ -275,7 +319,7 @@ class Survey:
             for a, k in zip(servos, kp, strict=True)
         )
         sizes = "guessed from weight and leg length"
-        stiffness: Remarked = (_round(_STIFFNESS * strength), sizes)
+        stiffness: Remarked = (_round(stiffer * _STIFFNESS * strength), sizes)
         if position:
             stiffness = (kp, "of the model's position actuators")
         damping: Remarked = (_round(_DAMPING * float(np.mean(stiffness[0]))), "guessed: a fortieth of the stiffness")

@@ -1,0 +1,97 @@
+"""Where a leg ends whose foot is a whole shank: a foot's position is the centre of its shape, which there is no place to stand on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import mujoco
+
+_LONG = 2.0
+"""Length over width from which a shape that lies along the shank is taken for it."""
+_ALONG = 0.7
+"""Smallest cosine between a shape that lies along the shank and the line from the knee to its end."""
+_WIDER = 1.25
+"""Radius of a sphere at the end of a shape over that of what it covers: the sphere alone meets the ground."""
+_TIP = 0.1
+"""Share of a mesh's length whose points are its end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShankEnd:
+    """The end of a shank, and a sphere there that would be a foot."""
+
+    length: float
+    """Of the shape [m]."""
+    center: NDArray[np.float64]
+    """Of the sphere, in the frame of the shape's body [m]."""
+    radius: float
+    """Of the sphere [m]."""
+
+
+def shank_end(model: mujoco.MjModel, data: mujoco.MjData, geom: int, knee: NDArray[np.float64]) -> ShankEnd | None:
+    """The end of a foot's shape that is a whole shank; None for what is a foot.
+
+    Args:
+        model: the robot.
+        data: its kinematics.
+        geom: the foot's shape.
+        knee: where the last joint above it is, world frame [m].
+    """
+    import mujoco
+
+    kinds = mujoco.mjtGeom
+    kind = kinds(int(model.geom_type[geom]))
+    if kind not in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER, kinds.mjGEOM_BOX, kinds.mjGEOM_MESH):
+        return None
+    middle, half = model.geom_aabb[geom, :3].copy(), model.geom_aabb[geom, 3:]
+    long = int(half.argmax())
+    across = [i for i in range(3) if i != long]
+    if half[long] < _LONG * half[across].max():
+        return None
+    # in the shape's own frame; its end is what is further from the knee
+    turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+    from_knee = turn.T @ (knee - place)
+    outwards = 1.0 if from_knee[long] < middle[long] else -1.0
+    end = middle.copy()
+    end[long] += outwards * half[long]
+    if abs(end[long] - from_knee[long]) < _ALONG * np.linalg.norm(end - from_knee):
+        return None
+    if kind == kinds.mjGEOM_MESH:
+        first, count = model.mesh_vertadr[model.geom_dataid[geom]], model.mesh_vertnum[model.geom_dataid[geom]]
+        points = model.mesh_vert[first : first + count].astype(float)
+        points = points[outwards * (points[:, long] - end[long]) > -_TIP * 2.0 * half[long]]
+        low, high = points[:, across].min(axis=0), points[:, across].max(axis=0)
+        end[across] = 0.5 * (low + high)
+        width = float(np.linalg.norm(points[:, across] - end[across], axis=1).max())
+    elif kind == kinds.mjGEOM_BOX:
+        width = float(np.linalg.norm(half[across]))
+    else:
+        width = float(model.geom_size[geom, 0])
+    # round a capsule's end; at a flat end half a width back, from where its rim is 1.12 widths away
+    end[long] -= outwards * width * (1.0 if kind == kinds.mjGEOM_CAPSULE else 0.5)
+    body = model.geom_bodyid[geom]
+    center = data.xmat[body].reshape(3, 3).T @ (place + turn @ end - data.xpos[body])
+    return ShankEnd(length=2.0 * float(half[long]), center=center, radius=_WIDER * width)
+
+
+def add_foot(body: mujoco.MjsBody, name: str, end: ShankEnd, shank: mujoco.MjsGeom) -> None:
+    """Add a sphere without a mass to the end of a shank, to meet the ground as the shank does."""
+    import mujoco
+
+    foot = body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[round(end.radius, 5), 0.0, 0.0],
+        pos=[round(float(x), 5) for x in end.center],
+        mass=0.0,
+    )
+    for key in (
+        *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp"),
+        *("margin", "gap", "group", "rgba"),
+    ):
+        setattr(foot, key, getattr(shank, key))
