@@ -64,7 +64,7 @@ def new_robot(*, model: Path, out: Path | None, name: str | None, force: bool) -
     console = Terminal()
     console.say(f"wrote {description}: {robot.title}, {len(robot.foot_names)} legs, {robot.num_joints} joints")
     if draft.model:
-        console.say(f"wrote {own}: the model with names for shapes that the description has to name")
+        console.say(f"wrote {own}: the model with names, and feet, that the description needs")
     console.say("guessed, so look at it:")
     for guess in draft.guesses:
         console.say(f"  {guess}")

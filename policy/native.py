@@ -264,9 +264,10 @@ def build_network(stored: StoredNetwork, contract: PolicyContract, *, source: st
             f"'{source}': the weights or arguments do not fit the network '{stored.architecture}': {message}"
         ) from error
     network = network.float().eval().requires_grad_(False)
-    if network.frame_width != contract.observation_width:
+    width: int = network.frame_width  # type: ignore[assignment]
+    if width != contract.observation_width:
         raise PolicyError(
-            f"'{source}': the network takes {network.frame_width} values, {other_width(contract, network.frame_width)}"
+            f"'{source}': the network takes {width} values, {other_width(contract, width)}"
         )
     session = NativeSession(network, 1, contract, torch.device("cpu"), source)
     session.act(torch.zeros(1, contract.observation_width))
