@@ -266,9 +266,7 @@ def build_network(stored: StoredNetwork, contract: PolicyContract, *, source: st
     network = network.float().eval().requires_grad_(False)
     width: int = network.frame_width  # type: ignore[assignment]
     if width != contract.observation_width:
-        raise PolicyError(
-            f"'{source}': the network takes {width} values, {other_width(contract, width)}"
-        )
+        raise PolicyError(f"'{source}': the network takes {width} values, {other_width(contract, width)}")
     session = NativeSession(network, 1, contract, torch.device("cpu"), source)
     session.act(torch.zeros(1, contract.observation_width))
     return network
