@@ -348,9 +348,11 @@ class TrainingEnvironment(VecEnv):
             self._begin_from(state)
             return
         parts, now = self.parts, self.backend.state
-        # A run from before headings were remembered goes on with the robots' own, one from before motor speeds with 1.
+        # A run from before headings were remembered goes on with the robots' own, one from before motor speeds with 1, one from
+        # before the steps of the rewards with the episodes' length.
         headings = heading(state["physics"]["base_quaternion_w"])
         older = {"commanded_heading": headings, "holds_heading": torch.zeros_like(parts.memory.holds_heading)}
+        older["episode_steps"] = state["memory"]["episode_length"]
         restore({**older, **state["memory"]}, parts.memory.by_name())
         self._require_below(parts.memory.level, self.palette.num_levels, "level")
         self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")

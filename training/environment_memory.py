@@ -25,6 +25,7 @@ EPISODE = (
     "joint_torque",
     "foot_force",
     "episode_rewards",
+    "episode_steps",
 )
 SUMS = ("finished_rewards", "finished_steps", "finished_ends", "metric_sums", "metric_steps")
 
@@ -97,6 +98,8 @@ class EnvironmentMemory:
     """Offset of each world's push clock, control steps, (N,) int64."""
     episode_rewards: torch.Tensor
     """Weighted rewards of the present episode by term, (N, T)."""
+    episode_steps: torch.Tensor
+    """Control steps over which these are added up, (N,): fewer than ``episode_length``, which begins at random in a run."""
     finished_rewards: torch.Tensor
     """Weighted rewards of the episodes finished since the last log, (T,)."""
     finished_steps: torch.Tensor
@@ -143,7 +146,7 @@ class EnvironmentMemory:
         def flags() -> torch.Tensor:
             return torch.zeros(num_envs, dtype=torch.bool, device=device)
 
-        widths = (None, 2, None, 2, None, joints, joints, joints, joints, joints, feet, terms)
+        widths = (None, 2, None, 2, None, joints, joints, joints, joints, joints, feet, terms, None)
         episode, columns = _block(numbers, num_envs, names=EPISODE, widths=widths)
         sums, totals = _block(numbers, names=SUMS, widths=(terms, None, ends, metrics, None))
         return cls(

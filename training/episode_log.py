@@ -49,10 +49,11 @@ class EpisodeLog:
     ) -> None:
         """Add a step: weighted rewards (N, terms), and whose episode is over, (N,) bool."""
         memory.episode_rewards.add_(rewards)
+        memory.episode_steps.add_(1.0)
         linear = (inputs.command[:, :2] - inputs.base_linear_velocity_b[:, :2]).norm(dim=1)
         yaw = (inputs.command[:, 2] - inputs.base_angular_velocity_b[:, 2]).abs()
         errors = torch.stack((linear, yaw), dim=1).masked_fill(inputs.diverged[:, None], 0.0)
-        finished = torch.cat((memory.episode_rewards, memory.episode_length[:, None]), dim=1) * done[:, None]
+        finished = torch.cat((memory.episode_rewards, memory.episode_steps[:, None]), dim=1) * done[:, None]
         # In the order of ``SUMS``.
         memory.sums.add_(torch.cat((finished, ends.by_rule, errors, self._one), dim=1).sum(dim=0))
         memory.diverged_total.add_(inputs.diverged.sum())

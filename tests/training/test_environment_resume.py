@@ -80,6 +80,16 @@ def test_observations_come_back():
     assert all(torch.equal(before[name], after[name]) for name in ("policy", "history", "privileged"))
 
 
+def test_a_run_from_before_steps_of_rewards_were_counted_goes_on():
+    environment = busy()
+    run(environment, 5, 1)
+    saved = environment.state_dict()
+    del saved["memory"]["episode_steps"]
+    environment.load_state_dict(saved)
+    memory = environment.parts.memory
+    assert memory.episode_steps.tolist() == memory.episode_length.tolist()
+
+
 def test_a_saved_state_does_not_change_with_the_run():
     environment = busy()
     run(environment, 5, 1)
