@@ -103,9 +103,9 @@ def write_learned(runner: TrainingRunner, path: Path, learned: Mapping[str, Any]
 def resume_run(runner: TrainingRunner, path: Path) -> None:
     """Continue from a checkpoint as if the run had never stopped.
 
-    An environment without ``load_state_dict``, another number of processes, or one without a part of its own beside the
-    checkpoint, starts fresh episodes, at the point of the
-    schedules and on the levels that the checkpoint knows; this is said through the runner's ``message``.
+    Episodes start anew, at the point of the schedules and on the levels that the checkpoint knows, where the environment has no
+    ``load_state_dict``, the number of processes is another one, or a process finds no part of its own beside the checkpoint; this
+    is said through the runner's ``message``.
 
     Raises:
         CheckpointError: damaged, of another task, contract, network or number of environments.

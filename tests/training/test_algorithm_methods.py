@@ -206,14 +206,19 @@ def test_a_run_is_resumed_exactly_and_its_checkpoint_is_a_policy(method, tmp_pat
         torch.testing.assert_close(policy.session(8).act(observation), student(history), rtol=0, atol=1e-5)
 
 
+def bare_policy(method, path, *, bootstrap_iterations):
+    """Write an untrained policy alone; settings of a run that begins with it, and its network."""
+    run = replace(settings(method).run, bootstrap_iterations=bootstrap_iterations, nonfinite_limit=0.5)
+    configuration = replace(settings(method), run=run)
+    network = stored_network(runner(method, configuration=configuration))
+    write_checkpoint(path, checkpoint_entries(toy_contract(), network, {}))
+    return configuration, network
+
+
 @pytest.mark.parametrize("method", NEW)
 def test_beginning_with_a_bare_policy(method, tmp_path):
     """It stands still until what it lacks is learned for it."""
-    configuration = replace(
-        settings(method), run=replace(settings(method).run, bootstrap_iterations=2, nonfinite_limit=0.5)
-    )
-    network = stored_network(runner(method, configuration=configuration))
-    write_checkpoint(tmp_path / "policy.pt", checkpoint_entries(toy_contract(), network, {}))
+    configuration, network = bare_policy(method, tmp_path / "policy.pt", bootstrap_iterations=2)
     begun = runner(method, seed=5, configuration=configuration)
     begin_with(begun, tmp_path / "policy.pt")
     for _ in range(2):
@@ -230,11 +235,7 @@ def test_beginning_with_a_bare_policy(method, tmp_path):
 @pytest.mark.parametrize("method", NAMES)
 def test_a_bare_policy_still_stands_still_in_a_resumed_run(method, tmp_path):
     """Its critic and teacher were untrained, and full updates began at once."""
-    configuration = replace(
-        settings(method), run=replace(settings(method).run, bootstrap_iterations=3, nonfinite_limit=0.5)
-    )
-    network = stored_network(runner(method, configuration=configuration))
-    write_checkpoint(tmp_path / "policy.pt", checkpoint_entries(toy_contract(), network, {}))
+    configuration, network = bare_policy(method, tmp_path / "policy.pt", bootstrap_iterations=3)
     whole = runner(method, seed=5, configuration=configuration)
     begin_with(whole, tmp_path / "policy.pt")
     whole.learn(4)
