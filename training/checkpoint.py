@@ -35,6 +35,7 @@ from ..policy.native import (
     policy_entries,
     read_policy,
 )
+from .algorithms.bootstrap import iterations_left
 
 TRAINING_VERSION = 1
 
@@ -257,11 +258,13 @@ def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False)
         training = {
             name: entries["training"][name] for name in ("version", "task", "progress") if name in entries["training"]
         }
+        bare = {"bootstrap": {"left": iterations_left(entries["bootstrap"])}} if "bootstrap" in entries else {}
         write_checkpoint(
             Path(destination),
             kept
             # The student is in there twice; tensors that are the same object are stored once.
             | {"state_dict": student_state(actor), "actor_state_dict": actor, "critic_state_dict": critic}
             | {"iter": entries["iter"]}
+            | bare
             | {"training": training},
         )

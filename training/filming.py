@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from .side_process import PROGRAM, Job, SideProcess
+from .side_process import CHILD_PROGRAM, Job, SideProcess
 
 VIDEO_FOLDER = "videos"
 """Folder of a run directory that holds ``model_<iteration>.mp4``."""
@@ -29,7 +29,7 @@ class Filmer:
             return
         video = self._folder / f"{path.stem}.mp4"
         options = ["--terrain", self._terrain, "--seconds", f"{SECONDS:g}", "--out", str(video)]
-        command, output = [*PROGRAM, "play", str(path), *options], self._folder / f"{path.stem}.txt"
+        command, output = [*CHILD_PROGRAM, "play", str(path), *options], self._folder / f"{path.stem}.txt"
         self._side.submit(Job(command=command, checkpoint=path, iteration=iteration, output=output))
 
     def take(

@@ -29,7 +29,7 @@ from .filming import Filmer
 from .logger import check_logger
 from .own_terms import foreign_functions
 from .processes import Processes, ProcessLostError, idle_gpus, own_device, told_number
-from .resuming import begin_with, resume_run
+from .resuming import begin_with, check_environments, resume_run
 from .run_directory import (
     LOG_ROOT,
     describe_run,
@@ -175,11 +175,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
                 f"Cannot resume from '{checkpoint}': its settings would import {shown(foreign[0])}, code that neither this "
                 "package nor the task nor this command names; if you know whose it is, add --trust"
             )
-        if task.environment.num_envs != kept.environment.num_envs:
-            raise CheckpointError(
-                f"Cannot resume from '{checkpoint}': it has {kept.environment.num_envs} environments, this run "
-                f"{task.environment.num_envs}; leave --num-envs out, or begin a new run with --init-from."
-            )
+        check_environments(checkpoint, kept.environment.num_envs, task.environment.num_envs)
     else:
         backend = request.backend or DEFAULT_BACKEND
         weights = None if request.init_from is None else _first_weights(request, task).absolute()

@@ -12,6 +12,7 @@ import torch
 from ..files.parsing import edited, one_line, shown
 from ..policy.contract import PolicyContract, difference
 from ..policy.native import StoredNetwork
+from .algorithms.bootstrap import iterations_left
 from .checkpoint import (
     TRAINING_VERSION,
     CheckpointError,
@@ -169,7 +170,7 @@ def begin_with(runner: TrainingRunner, path: Path) -> None:
     """Begin with the averaged networks of another run's checkpoint; optimizers, counters and episodes start anew.
 
     A policy file without training state gives the student alone; the first ``run.bootstrap_iterations`` then find
-    a teacher and a critic for it.
+    a teacher and a critic for it. A checkpoint that was written among them has some of them left, which come first here, too.
 
     Raises:
         CheckpointError: damaged, of other joints or another observation, or of other networks.
@@ -188,12 +189,16 @@ def _begin(runner: TrainingRunner, path: Path, entries: Mapping[str, Any]) -> No
                 f"{one_line(getattr(runner.contract, name))}."
             )
     _check_network(runner, path, entries, "start")
+    if bare := "training" not in entries:
+        left = runner.configuration.run.bootstrap_iterations
+    else:
+        left = iterations_left(entries["bootstrap"]) if "bootstrap" in entries else 0
     try:
-        if "training" in entries:
-            runner.alg.load(learned_networks(entries), optimizers=False)
-        else:
+        if bare:
             runner.alg.actor.student.load_state_dict(entries["state_dict"])
-            runner.alg.follow_student(runner.configuration.run.bootstrap_iterations)
+        else:
+            runner.alg.load(learned_networks(entries), optimizers=False)
+        runner.alg.follow_student(left)
     except (RuntimeError, KeyError, ValueError) as error:
         raise _misfit("start", path, error) from error
     runner.average.load_state_dict(None)
@@ -260,10 +265,19 @@ def _check_fits(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], 
         first = lines.splitlines()[0]
         raise CheckpointError(f"Cannot resume from '{path}': its policy contract differs from this task's: {first}")
     _check_network(runner, path, entries, "resume")
-    if numbers.num_envs != runner.env.num_envs:
+    check_environments(path, numbers.num_envs, runner.env.num_envs)
+
+
+def check_environments(path: Path, theirs: int, mine: int) -> None:
+    """Refuse to resume a checkpoint of another number of environments in each process.
+
+    Raises:
+        CheckpointError: it is.
+    """
+    if theirs != mine:
         raise CheckpointError(
-            f"Cannot resume from '{path}': it has {numbers.num_envs} environments, this run "
-            f"{runner.env.num_envs}; give --num-envs {numbers.num_envs}."
+            f"Cannot resume from '{path}': it has {theirs} environments in each process, this run {mine}; leave --num-envs and "
+            f"environment.num_envs out, or begin a new run with --init-from {path}."
         )
 
 

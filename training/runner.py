@@ -170,8 +170,8 @@ class TrainingRunner:
             except ProcessLostError as error:
                 raise self._rescue(error, begin) from error
             except BaseException as error:
-                # of several processes, those that are left say how it ended, unless it is in what was learned
-                if not self.processes.several or isinstance(error, TrainingDivergedError):
+                # of several processes, those that are left say how it ended, unless it is in what was learned, or nothing was
+                if not self.processes.several or isinstance(error, TrainingDivergedError) or self._kept.iteration < 0:
                     self._note_failure()
                 raise
             if reason != "signal":
@@ -246,11 +246,10 @@ class TrainingRunner:
         return clean, torch.where(broken, 0.0, rewards), torch.where(broken, torch.ones_like(dones), dones)
 
     def _check_finite(self, losses: Mapping[str, float]) -> None:
-        run, algorithm, iteration = self.configuration.run, self.configuration.algorithm, self.iteration - 1
+        run, iteration = self.configuration.run, self.iteration - 1
         broken = int(self._nonfinite.item())
         samples = run.steps_per_iteration * self.env.num_envs
-        minibatches = 2 * algorithm.epochs * algorithm.minibatches
-        skipped = losses.get("skipped_minibatches", 0.0)
+        skipped, minibatches = losses.get("skipped_minibatches", 0.0), self.alg.steps
         self.logger.scalars["Physics/nonfinite_samples"] = float(broken)
         self.logger.write({"Physics/nonfinite_samples": float(broken)}, iteration)
         survives = f" The last checkpoint in '{self.log_dir}' is intact." if self.log_dir else ""
@@ -326,17 +325,18 @@ class TrainingRunner:
         """
         time.sleep(float(self.processes.rank))
         learned = self._kept.take()
+        known = None if self.log_dir is None else read_run_json(self.log_dir).get("outcome")
         if learned is None or self.log_dir is None:
-            return ProcessLostError(f"{error}; no iteration was complete, so there is no checkpoint")
+            if known == "running":
+                self._record_loss(None)
+            return ProcessLostError(f"{error}; no iteration was complete, so there is no new checkpoint")
         self.iteration = self._kept.iteration
         path = self.log_dir / f"model_{self.iteration}.pt"
         sentence = f"{error}; iteration {self.iteration} is in '{path}', go on with --resume {self.log_dir}"
-        known = read_run_json(self.log_dir).get("outcome")
         if known not in ("running", "failed"):
             raise SystemExit(2)  # another one has done it
         if known == "running":
-            lost = TrainingOutcome(reason="lost a process", iteration=self.iteration, checkpoint=path, exit_code=2)
-            self._record(lost)
+            self._record_loss(path)
         if not (path.exists() and time.time() - path.stat().st_mtime < time.monotonic() - begin):
             try:
                 self._write_kept(path, learned)
@@ -404,6 +404,11 @@ class TrainingRunner:
             scalars=dict(self.logger.scalars),
             best_score=self.best_score,
             best_iteration=self.best_iteration,
+        )
+
+    def _record_loss(self, checkpoint: Path | None) -> None:
+        self._record(
+            TrainingOutcome(reason="lost a process", iteration=self.iteration, checkpoint=checkpoint, exit_code=2)
         )
 
     def _record(self, outcome: TrainingOutcome) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..files.parsing import edited, read_results
 from ..gauge.suite import load_suite
-from .side_process import PROGRAM, Finished, Job, SideProcess
+from .side_process import CHILD_PROGRAM, Finished, Job, SideProcess
 
 GAUGE_FOLDER = "gauge"
 """Folder of a run directory that holds what the gauge left behind, by suite and checkpoint."""
@@ -56,7 +56,7 @@ class Scorer:
         # A resumed run may come by the same iteration again, with other weights.
         shutil.rmtree(out, ignore_errors=True)
         options = ["--suite", self._asked, "--json", "--no-clip", "--threads", str(self._threads), "--out", str(out)]
-        command, output = [*PROGRAM, "evaluate", str(path), *options], self._folder / f"{path.stem}.json"
+        command, output = [*CHILD_PROGRAM, "evaluate", str(path), *options], self._folder / f"{path.stem}.json"
         self._side.submit(Job(command=command, checkpoint=path, iteration=iteration, output=output))
 
     @property

@@ -9,12 +9,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from ..files.parsing import one_line
 
 PROGRAM = (sys.executable, "-m", f"{__name__.partition('.')[0]}.cli.main")
 """This package's command line."""
+CHILD_PROGRAM = (*PROGRAM[:2], f"{__package__}.child", PROGRAM[-1])
+"""The same in a process whose standard input is ``parent_pipe()``: when this one is gone, it is asked to stop."""
 ENVIRONMENT: Mapping[str, str] = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
 """A side process has no business on the GPU that trains."""
 
@@ -104,7 +107,12 @@ class SideProcess:
             with job.output.open("wb") as out, job.log.open("wb") as log:
                 # A session of its own: Ctrl-C in the terminal is for the training, which decides what becomes of the rest.
                 process = subprocess.Popen(
-                    list(job.command), stdout=out, stderr=log, env={**os.environ, **ENVIRONMENT}, start_new_session=True
+                    list(job.command),
+                    stdin=parent_pipe(),
+                    stdout=out,
+                    stderr=log,
+                    env={**os.environ, **ENVIRONMENT},
+                    start_new_session=True,
                 )
         except OSError as error:
             where = "" if error.filename in (None, job.command[0]) else f"'{one_line(error.filename)}': "
@@ -112,6 +120,13 @@ class SideProcess:
             self._finished.append(Finished(job=job, failure=failure))
             return
         self._running = (job, process)
+
+
+@cache
+def parent_pipe() -> int:
+    """The standard input of ``CHILD_PROGRAM``: a pipe in which nothing is written, open as long as this process lives."""
+    child_end, _ = os.pipe()
+    return child_end
 
 
 def await_end(process: subprocess.Popen[bytes], seconds: float) -> None:

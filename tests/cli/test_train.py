@@ -282,7 +282,7 @@ def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):
     for iteration in (5, 6, 7):
         scorer.submit(tmp_path / f"model_{iteration}.pt", iteration)
     ((command, environment),) = started
-    assert command[1:5] == ["-m", "gaitgauge.cli.main", "evaluate", str(tmp_path / "model_5.pt")]
+    assert command[3:6] == ["gaitgauge.cli.main", "evaluate", str(tmp_path / "model_5.pt")]
     assert command[command.index("--threads") + 1] == "3"
     assert environment["CUDA_VISIBLE_DEVICES"] == ""
     assert not old.exists(), "results of the same iteration before a resume would be refused"

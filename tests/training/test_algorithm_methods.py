@@ -8,7 +8,7 @@ from gaitgauge.policy.loading import load_policy
 from gaitgauge.training.algorithms.him import sinkhorn, swapped_prediction
 from gaitgauge.training.algorithms.methods import METHODS
 from gaitgauge.training.algorithms.ppo import PPO
-from gaitgauge.training.checkpoint import checkpoint_entries, read_checkpoint, write_checkpoint
+from gaitgauge.training.checkpoint import checkpoint_entries, read_checkpoint, trim_checkpoint, write_checkpoint
 from gaitgauge.training.configuration import METHODS as NAMES
 from gaitgauge.training.configuration import ConfigurationError, HimConfiguration, TrainingConfiguration
 from gaitgauge.training.resuming import begin_with, resume_run, stored_network
@@ -252,6 +252,30 @@ def test_a_bare_policy_still_stands_still_in_a_resumed_run(method, tmp_path):
     for part in ("actor", "critic"):
         for name, value in getattr(whole.alg, part).state_dict().items():
             assert torch.equal(getattr(resumed.alg, part).state_dict()[name], value), name
+
+
+@pytest.mark.parametrize("trimmed", [False, True])
+@pytest.mark.parametrize("method", NAMES)
+def test_a_bare_policy_still_stands_still_in_a_run_that_begins_with_its_checkpoint(method, trimmed, tmp_path):
+    """Of three iterations two were done: one is left, and what they learned is taken over."""
+    configuration, network = bare_policy(method, tmp_path / "policy.pt", bootstrap_iterations=3)
+    first = runner(method, tmp_path, seed=5, configuration=configuration)
+    begin_with(first, tmp_path / "policy.pt")
+    first.learn(2)
+    path = tmp_path / "model_2.pt"
+    if trimmed:
+        trim_checkpoint(path, path := tmp_path / "trimmed.pt")
+    begun = runner(method, seed=7, configuration=configuration)
+    begin_with(begun, path)
+    critic = read_checkpoint(tmp_path / "model_2.pt")["average"]["critic_state_dict"]
+    assert all(torch.equal(value, critic[name]) for name, value in begun.alg.critic.state_dict().items())
+    assert begun.alg.bootstrap is not None
+    begun.learn(1)
+    for name, value in network.state_dict.items():
+        assert torch.equal(stored_network(begun).state_dict[name], value), name
+    assert begun.alg.bootstrap is None
+    begun.learn(1)
+    assert "Loss/surrogate" in begun.logger.scalars
 
 
 @pytest.mark.parametrize("method", NAMES)

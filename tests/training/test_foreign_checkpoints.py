@@ -113,6 +113,16 @@ def test_numbers_out_of_range_are_named(entries, mine, tmp_path, field, value, n
     refused(resume_run, mine, path, named=named)
 
 
+@pytest.mark.parametrize("value", [{"left": 1.5}, {"left": 0}, {}, [3], "many"])
+def test_beginning_with_an_odd_number_of_iterations_for_a_bare_policy_is_one_sentence(entries, mine, tmp_path, value):
+    path = tmp_path / "model_1.pt"
+    changed = put(entries, ("bootstrap",), value)
+    changed.pop("checksum")
+    torch.save(changed, path)
+    refused(begin_with, mine, path, named=r"model_1\.pt")
+    refused(trim_checkpoint, path, tmp_path / "out.pt", named=r"model_1\.pt")
+
+
 def test_weights_that_were_edited_are_found(entries, mine, tmp_path):
     path = tmp_path / "model_1.pt"
     changed = copy.deepcopy(entries)

@@ -92,3 +92,27 @@ def test_a_process_that_diverges_says_so_for_all(tmp_path):
     with pytest.raises(TrainingDivergedError):
         make(tmp_path, env=env).learn(1)
     assert noted(tmp_path) == "failed"
+
+
+@pytest.mark.parametrize("begun_at", [0, 3])
+def test_a_run_that_loses_a_process_before_its_first_iteration_says_so(tmp_path, monkeypatch, begun_at):
+    runner = make(tmp_path)
+    runner.iteration = begun_at
+    update_run_json(tmp_path, {"outcome": "running"})
+    monkeypatch.setattr("gaitgauge.training.runner.time.sleep", lambda _: None)
+    monkeypatch.setattr(LostProcesses, "lost", True)
+    monkeypatch.setattr(runner, "_iterate", lambda *_: runner.processes.largest(0))
+    with pytest.raises(ProcessLostError, match=r"no iteration was complete, so there is no new checkpoint$"):
+        runner.learn(1)
+    said = json.loads((tmp_path / "run.json").read_text())
+    assert (said["outcome"], said["iteration"]) == ("lost a process", begun_at)
+
+
+def test_a_process_that_fails_before_its_first_iteration_says_so_for_all(tmp_path, monkeypatch):
+    """A reward that raises does so in every process: none is left to say it."""
+    runner = make(tmp_path)
+    update_run_json(tmp_path, {"outcome": "running"})
+    monkeypatch.setattr(runner.env, "step", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        runner.learn(1)
+    assert noted(tmp_path) == "failed"

@@ -196,6 +196,24 @@ def test_nan_in_the_environment_is_counted_and_stops_the_run(tmp_path):
     assert json.loads((tmp_path / "run.json").read_text())["outcome"] == "failed"
 
 
+@pytest.mark.parametrize(("bare", "minibatches"), [(True, 4), (False, 8)])
+def test_skipped_minibatches_are_a_share_of_those_of_the_iteration(tmp_path, monkeypatch, bare, minibatches):
+    """Two passes over two minibatches, for the policy and for the student; for a bare policy there is one learner."""
+    runner = make(tmp_path, configuration=toy_configuration(run={"nonfinite_limit": 1.9 / minibatches}))
+    if bare:
+        runner.alg.follow_student(5)
+    compute = runner.alg.compute_returns
+    runner.learn(1)
+
+    def broken(obs):
+        compute(obs)
+        runner.alg.storage.returns[0, 0] = torch.nan  # one sample, in one minibatch of each of two passes
+
+    monkeypatch.setattr(runner.alg, "compute_returns", broken)
+    with pytest.raises(TrainingDivergedError, match=f"2 of {minibatches} minibatches"):
+        runner.learn(1)
+
+
 def test_broken_weights_are_never_written(tmp_path):
     runner = make(tmp_path)
     runner.learn(1)
@@ -257,7 +275,10 @@ def test_resume_refuses_what_does_not_fit(tmp_path):
     path = tmp_path / "model_1.pt"
     with pytest.raises(CheckpointError, match="of task 'toy', this run trains 'other'"):
         resume_run(make(task="other"), path)
-    with pytest.raises(CheckpointError, match="--num-envs 8"):
+    worlds = (
+        "8 environments in each process, this run 16; leave --num-envs and environment.num_envs out, or .* --init-from"
+    )
+    with pytest.raises(CheckpointError, match=worlds):
         resume_run(make(env=ToyEnv(num_envs=16)), path)
     with pytest.raises(CheckpointError, match="network"):
         resume_run(make(configuration=toy_configuration(encoder="mlp")), path)

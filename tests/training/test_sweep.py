@@ -164,7 +164,7 @@ def test_a_seed_that_is_new_is_not_noted_with_settings_that_are_refused(tmp_path
 def test_a_training_begins_or_goes_on(tmp_path):
     (run,), _ = plan_runs(replace(SWEEP, settings=("environment.num_envs=8",)), tmp_path)
     begins = run.training_command(SWEEP, seconds=None, score_threads=2)
-    assert begins[3:7] == ["train", "go2-cts", "environment.num_envs=8", "--no-score"]
+    assert begins[4:8] == ["train", "go2-cts", "environment.num_envs=8", "--no-score"]
     assert begins[begins.index("--seed") + 1] == "0" and "--resume" not in begins
     directory = run.folder / "logs" / "go2_cts" / "2026-01-01_00-00-00"
     directory.mkdir(parents=True)
@@ -173,7 +173,7 @@ def test_a_training_begins_or_goes_on(tmp_path):
     (directory / "run.json").write_text(json.dumps({"outcome": "finished", "iteration": run.iterations - 1}))
     assert not run.trained, "a shorter one was finished"
     goes_on = run.training_command(replace(SWEEP, training_suite="quick"), seconds=90.2, score_threads=2)
-    assert goes_on[3:] == [
+    assert goes_on[4:] == [
         *("train", "go2-cts", "environment.num_envs=8", "--resume", str(directory)),
         *("--score-suite", "quick", "--score-threads", "2", "--time", "90s", "--device", "cpu"),
         *("--log-root", str(run.folder / "logs")),
@@ -198,7 +198,7 @@ def test_a_gauging_is_played_where_it_is_told(tmp_path):
     (run.folder / "logs" / "x" / "2026").mkdir(parents=True)
     (run.folder / "logs" / "x" / "2026" / "model_3.pt").touch()
     command = SweepRun.gauging_command(run, SWEEP, where=["--cluster", "auto", "--threads", "4"])
-    assert command[3:] == [
+    assert command[4:] == [
         *("evaluate", str(run.policy(SWEEP)), "--suite", SWEEP.suite, "--cluster", "auto", "--threads", "4"),
         *("--out", str(results), "--json", "--no-clip"),
     ]

@@ -123,7 +123,7 @@ def test_what_is_not_gauged_yet_is_kept_and_gauged_where_there_is_no_gpu(finishe
     assert refused == {} and run.trained and not run.gauged(alone)
     command = run.gauging_command(alone, where=[])
     policy, out = run.folder / "kept" / "policy.gauge.pt", run.folder / "gauge" / "policy.gauge"
-    assert command[3:5] == ["evaluate", str(policy)] and command[command.index("--out") + 1] == str(out)
+    assert command[4:6] == ["evaluate", str(policy)] and command[command.index("--out") + 1] == str(out)
     # once it is gauged, here or where it was trained, its results are kept too
     (tmp_path / "results.json").rename(results)
     assert keep_runs(alone, runs, kept) == (["one, seed 0"], {})

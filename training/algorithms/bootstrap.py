@@ -20,6 +20,18 @@ if TYPE_CHECKING:
     from .ppo import PPO
 
 
+def iterations_left(state: Mapping[str, Any]) -> int:
+    """Iterations left of what ``Bootstrap.save`` returned.
+
+    Raises:
+        ValueError, LookupError, TypeError: it is no such state.
+    """
+    left: object = state["left"]
+    if type(left) is not int or left < 1:
+        raise ValueError(f"what a bare policy lacks is learned for {shown(left)} more iterations")
+    return left
+
+
 class Bootstrap:
     """Learns what a bare policy lacks from the policy's behaviour, for a number of iterations."""
 
@@ -63,10 +75,7 @@ class Bootstrap:
         Raises:
             ValueError, LookupError, TypeError, AttributeError: it does not fit.
         """
-        left = state["left"]
-        if type(left) is not int or left < 1:
-            raise ValueError(f"what a bare policy lacks is learned for {shown(left)} more iterations")
-        self._left = left
+        self._left = iterations_left(state)
         load_moments(self._optimizer, state["optimizer"])
 
     def update(self) -> dict[str, float]:

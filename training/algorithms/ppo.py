@@ -69,6 +69,8 @@ class PPO:
         self.configuration = configuration
         self.processes = processes or Processes()
         self.bootstrap: Bootstrap | None = None
+        self.steps = 0
+        """Minibatches of the last update, counted once in each pass over them."""
         self._graphs = on_gpu and configuration.cuda_graphs is not False
         self.losses: Any = self.losses_class(
             actor,
@@ -289,7 +291,7 @@ class PPO:
             Means over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
             and were dropped.
         """
-        self.storage.step = 0
+        self.storage.step = self.steps = 0
         if self.bootstrap is not None:
             losses = self.bootstrap.update()
             if self.bootstrap.over:
@@ -311,6 +313,7 @@ class PPO:
         for turned in passes(self.configuration.epochs, alternate=self.configuration.symmetry == "alternate"):
             for minibatch in zip(*groups, strict=True):
                 step(*map(turned, minibatch))
+                self.steps += 1
 
     def _report(self) -> dict[str, float]:
         """Read the counters back, the update's only wait for the device."""

@@ -18,7 +18,7 @@ from typing import BinaryIO
 import torch
 
 from ...files.parsing import one_line
-from ..side_process import ENVIRONMENT, await_end
+from ..side_process import ENVIRONMENT, await_end, parent_pipe
 from ..stopping import STOP_SIGNALS, StopSignals
 from .file import Sweep, SweepError
 from .runs import RUN_ERRORS, SweepRun, what_failed
@@ -190,7 +190,7 @@ class Jobs:
             # A session of its own: Ctrl-C in the terminal is for the sweep, which hands it on.
             process = subprocess.Popen(
                 list(command),
-                stdin=subprocess.DEVNULL,
+                stdin=parent_pipe(),
                 stdout=output,
                 stderr=output,
                 env=environment,

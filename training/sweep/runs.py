@@ -23,7 +23,7 @@ from ..configuration import ConfigurationError
 from ..launch import TrainRequest, prepare
 from ..overrides import TaskError
 from ..run_directory import read_run_json
-from ..side_process import PROGRAM
+from ..side_process import CHILD_PROGRAM
 from .file import NO_SUITE, Sweep, SweepEntry, SweepError
 
 KEPT = "kept"
@@ -224,17 +224,17 @@ class SweepRun:
         options += ["--log-root", str(self.folder / "logs")]
         if (run := self.directory) is not None:
             # The settings are those of the checkpoint; given again, functions that they name need no --trust.
-            return [*PROGRAM, "train", self.entry.task, *self.settings, "--resume", str(run), *options]
+            return [*CHILD_PROGRAM, "train", self.entry.task, *self.settings, "--resume", str(run), *options]
         options += ["--backend", self.backend, "--seed", str(self.seed)]
         options += [] if self.init_from is None else ["--init-from", self.init_from]
-        return [*PROGRAM, "train", self.entry.task, *self.settings, *options]
+        return [*CHILD_PROGRAM, "train", self.entry.task, *self.settings, *options]
 
     def gauging_command(self, sweep: Sweep, *, where: Sequence[str]) -> list[str]:
         """Gauges its policy, or goes on with that; ``where`` are the options ``--threads`` and ``--cluster``."""
         policy, results = self.policy(sweep), self.results(sweep)
         assert policy is not None and results is not None
         options = ["--suite", sweep.suite, *where, "--out", str(results), "--json", "--no-clip"]
-        return [*PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
+        return [*CHILD_PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
 
     def claim(self, *, option: str = "--out", note: bool = True) -> None:
         """Check that its folder holds no training with other settings, and ``note`` there what it is trained with.
