@@ -10,7 +10,7 @@ import json
 import re
 import reprlib
 import tomllib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
@@ -250,23 +250,25 @@ def _path(steps: Iterable[str | int]) -> str:
 # ---- dataclasses ----------------------------------------------------------------------------------------------------
 
 
-def build(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
+def build(kind: type[Kind], data: object, source: str, error: type[Exception], *, false_is_none: bool = False) -> Kind:
     """A (nested) frozen dataclass from plain data.
 
     Args:
         kind: the dataclass; its annotations are the rules.
         data: what a parser above gave; lists stand for tuples.
         source: where the data come from, the beginning of every sentence.
+        false_is_none: ``false`` stands for None where a field may be None, and sentences say so: TOML has no null.
 
     Raises:
         error: an unknown or missing field, a value of another type or out of range, or what ``__post_init__`` refuses.
     """
-    text = json.dumps([plain(data, source, error)])
+    data = plain(data, source, error)
+    text = json.dumps([_none_for_false(kind, data) if false_is_none else data])
     try:
         checker: TypeAdapter[tuple[Kind]] = _adapter(kind)  # type: ignore[arg-type]
         return checker.validate_json(text)[0]
     except ValidationError as problem:
-        raise _error(problem, kind, source, error) from problem
+        raise _error(problem, kind, source, error, "false" if false_is_none else "") from problem
 
 
 def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
@@ -304,7 +306,7 @@ def from_text(hint: Any, text: str, key: str, error: type[Exception]) -> Any:
     """
     hint = _without_ranges(hint)
     options = get_args(hint)
-    if type(None) in options and text.lower() in ("none", "null"):
+    if _may_be_none(hint) and text.lower() in ("none", "null"):
         return None
     try:
         if get_origin(hint) is tuple:
@@ -315,7 +317,7 @@ def from_text(hint: Any, text: str, key: str, error: type[Exception]) -> Any:
             return tuple(from_text(k, part, key, error) for k, part in zip(kinds, parts, strict=True))
         return _text_adapter(hint).validate_strings(text)
     except ValidationError as problem:
-        rule = _rule(problem.errors(include_url=False)[-1]) + (", or none" if type(None) in options else "")
+        rule = _rule(problem.errors(include_url=False)[-1]) + (", or none" if _may_be_none(hint) else "")
         raise error(f"'{key}' is {shown(text)}; {rule}") from problem
 
 
@@ -334,13 +336,22 @@ def _field_adapters(kind: Any) -> dict[str, TypeAdapter[Any]]:
     return {name: TypeAdapter(table, config=config) for name, table in tables.items()}
 
 
-def _error(problem: ValidationError, kind: Any, source: str, error: type[Exception]) -> Exception:
+def _none_for_false(hint: Any, data: Any) -> Any:
+    """Plain data in which None stands where ``false`` does and may."""
+    if isinstance(data, dict):
+        return {key: _none_for_false(_hint_at(hint, [key]), value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_none_for_false(_hint_at(hint, [i]), value) for i, value in enumerate(data)]
+    return None if data is False and _may_be_none(hint) else data
+
+
+def _error(problem: ValidationError, kind: Any, source: str, error: type[Exception], none: str = "") -> Exception:
     """An error of the class asked for; one that a dataclass raised itself stays as it is."""
     own = problem.errors(include_url=False)[0].get("ctx", {}).get("error")
     return (
         own
         if isinstance(own, error) and str(own).startswith(source)
-        else error(f"{source}: {_sentence(problem, kind)}")
+        else error(f"{source}: {_sentence(problem, kind, none)}")
     )
 
 
@@ -353,12 +364,12 @@ _MEMBER = re.compile(r"(float|int|str|bool|constrained-\w+|(tuple|dict|function|
 """How pydantic names the members of a union in a path."""
 
 
-def _sentence(problem: ValidationError, kind: Any) -> str:
-    """The first of the errors, a misspelt field before one that is missing for it."""
+def _sentence(problem: ValidationError, kind: Any, none: str) -> str:
+    """The first of the errors, a misspelt field before one that is missing for it; ``none`` is how None is written, if it can be."""
     errors = problem.errors(include_url=False)
     order = ("unexpected_keyword_argument", "missing")
     first = min(errors, key=lambda e: order.index(e["type"]) if e["type"] in order else len(order))
-    steps = first["loc"][first["loc"][0] == 0 :]  # a number: the place in the tuple around it
+    steps: tuple[int | str, ...] = first["loc"][first["loc"][0] == 0 :]  # a number: the place in the tuple around it
     path = _path(step for step in steps if isinstance(step, int) or not _MEMBER.match(step))
     if first["type"] == "missing" and isinstance(first["loc"][-1], int):
         return f"{path.rpartition('[')[0]} is {shown(first['input'])}; more entries are needed"
@@ -366,12 +377,14 @@ def _sentence(problem: ValidationError, kind: Any) -> str:
         lacking = [str(e["loc"][-1]) for e in errors if e["type"] == "missing" and e["loc"][:-1] == first["loc"][:-1]]
         return f"{path.rpartition('.')[0] or 'it'} lacks {', '.join(lacking)}"
     if first["type"] == "unexpected_keyword_argument":
-        known = _fields_at(kind, first["loc"][first["loc"][0] == 0 : -1])
+        table = _without_none(_hint_at(kind, steps[:-1]))
+        known = list(_hints(table)) if is_dataclass(table) else []
         hint = did_you_mean(first["loc"][-1], known) or f"; choose from {', '.join(known)}"
         return f"unknown field '{path}'{hint}"
     if first["type"] == "value_error":
         return f"{path} {first['ctx']['error']}".strip()
-    return f"{path or 'it'} is {shown(first['input'])}; {_rule(first)}"
+    more = f", or {none}" if none and _may_be_none(_hint_at(kind, steps)) else ""
+    return f"{path or 'it'} is {shown(first['input'])}; {_rule(first)}{more}"
 
 
 def _rule(error: Mapping[str, Any]) -> str:
@@ -391,12 +404,24 @@ def _without_ranges(hint: Any) -> Any:
     return inner if get_origin(inner) is tuple else hint
 
 
-def _fields_at(kind: Any, loc: tuple[int | str, ...]) -> list[str]:
-    """Names of the fields of the dataclass that lies at a path."""
-    for step in loc:
-        if is_dataclass(kind):
-            kind = get_type_hints(kind)[str(step)]
-        elif get_args(kind):
-            kind = get_args(kind)[-1 if isinstance(step, str) else 0]
-        kind = next((k for k in get_args(kind) if is_dataclass(k)), kind) if type(None) in get_args(kind) else kind
-    return list(get_type_hints(kind)) if is_dataclass(kind) else []
+_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
+
+
+def _hint_at(hint: Any, steps: Iterable[int | str]) -> Any:
+    """The annotation of what lies at a path; None for an unknown field."""
+    for step in steps:
+        hint = _without_none(hint)
+        if is_dataclass(hint):
+            hint = _hints(hint).get(str(step))
+        elif get_args(hint):
+            hint = get_args(hint)[-1 if isinstance(step, str) else 0]
+    return hint
+
+
+def _may_be_none(hint: Any) -> bool:
+    return type(None) in get_args(hint)
+
+
+def _without_none(hint: Any) -> Any:
+    """The dataclass of which there may be none; any other annotation as it is."""
+    return next((k for k in get_args(hint) if is_dataclass(k)), hint) if _may_be_none(hint) else hint

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, is_dataclass
-from functools import cache
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
@@ -311,7 +310,7 @@ def load_suite(name: str) -> Suite:
     """
     path, data = _tables(name, ())
     source = f"suite file {one_line(path)}"
-    suite = _build(data, source)
+    suite = build(Suite, data, source, SuiteError, false_is_none=True)
     _check(suite, source)
     if path.resolve().parent != SUITE_FOLDER.resolve() and suite.name in suite_names():
         raise SuiteError(f"{source} is called '{suite.name}' as a suite that ships with the project; {_OWN_NAME}")
@@ -355,41 +354,6 @@ def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
 
 
 _LONGEST_CHAIN = 10
-
-
-_hints = cache(get_type_hints)
-
-
-def _build(data: dict[str, Any], source: str) -> Suite:
-    """The suite of a file's tables, where ``false`` stands for None; a refusal says where it could."""
-    try:
-        return build(Suite, _none_for_false(Suite, data), source, SuiteError)
-    except SuiteError as error:
-        if str(error).startswith(tuple(f"{source}: {path} is " for path in _optional_fields(Suite))):
-            raise SuiteError(f"{error}, or false") from error
-        raise
-
-
-def _optional_fields(kind: type, table: str = "") -> Iterator[str]:
-    """Paths of the fields that may be None: ``push``, ``metrics.zmp_span`` …"""
-    for name, hint in _hints(kind).items():
-        if isinstance(hint, type) and is_dataclass(hint):
-            yield from _optional_fields(hint, f"{table}{name}.")
-        elif type(None) in get_args(hint):
-            yield f"{table}{name}"
-
-
-def _none_for_false(kind: type, data: dict[str, Any]) -> dict[str, Any]:
-    """TOML has no null: ``false`` stands for None where a field may be None."""
-    hints = _hints(kind)
-
-    def value(key: str, given: Any) -> Any:
-        hint = hints.get(key)
-        if isinstance(hint, type) and is_dataclass(hint) and isinstance(given, dict):
-            return _none_for_false(hint, given)
-        return None if given is False and type(None) in get_args(hint) else given
-
-    return {key: value(key, given) for key, given in data.items()}
 
 
 def _goal_rules(suite: Suite) -> dict[str, bool]:

@@ -46,8 +46,6 @@ def shank_end(model: mujoco.MjModel, data: mujoco.MjData, geom: int, knee: NDArr
 
     kinds = mujoco.mjtGeom
     kind = kinds(int(model.geom_type[geom]))
-    if kind not in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER, kinds.mjGEOM_BOX, kinds.mjGEOM_MESH):
-        return None
     middle, half = model.geom_aabb[geom, :3].copy(), model.geom_aabb[geom, 3:]
     long = int(half.argmax())
     across = [i for i in range(3) if i != long]
@@ -71,9 +69,9 @@ def shank_end(model: mujoco.MjModel, data: mujoco.MjData, geom: int, knee: NDArr
     elif kind == kinds.mjGEOM_BOX:
         width = float(np.linalg.norm(half[across]))
     else:
-        width = float(model.geom_size[geom, 0])
-    # round a capsule's end; at a flat end half a width back, from where its rim is 1.12 widths away
-    end[long] -= outwards * width * (1.0 if kind == kinds.mjGEOM_CAPSULE else 0.5)
+        width = float(half[across].max())
+    # round a capsule's end, which an ellipsoid's is within; at a flat end half a width back, from where its rim is 1.12 widths away
+    end[long] -= outwards * width * (1.0 if kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_ELLIPSOID) else 0.5)
     body = model.geom_bodyid[geom]
     center = data.xmat[body].reshape(3, 3).T @ (place + turn @ end - data.xpos[body])
     return ShankEnd(length=2.0 * float(half[long]), center=center, radius=_WIDER * width)

@@ -1,6 +1,7 @@
 """A robot of one's own: from a model to a description, a check, and a score."""
 
 import json
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -11,6 +12,7 @@ from gaitgauge.robots.examining import examine
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "robots"))
 
+from stick_robot import write_stick
 from unseen_robot import LEGS, write_unseen
 
 WITHOUT_DISPLAY = "--no-picture"
@@ -39,6 +41,19 @@ def test_new_and_check(run, model):
     assert rows["standing"]["sentence"].startswith("stands in its default pose: after 2 s its base is 0.38")
     assert [name for name, row in rows.items() if not row["passed"]] == ["SDK order"]
     assert rows["SDK order"]["needed_for"] == "export of a deploy.yaml"
+
+
+def test_a_bare_process_has_loaded_what_its_enclosed_one_calls(tmp_path):
+    """The enclosed one cannot read the package's own files, and a test's process has loaded more than a user's."""
+    program = [sys.executable, "-m", "gaitgauge.cli.main", "robot"]
+    for words, said in (
+        (["new", write_stick(tmp_path), "--out", "mine"], "wrote mine/robot.toml: stick, 4 legs, 12 joints"),
+        (["check", "mine", WITHOUT_DISPLAY], "the robot is sound"),
+        (["check", "go2", WITHOUT_DISPLAY], "the robot is sound"),
+    ):
+        done = subprocess.run([*program, *words], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert said in done.stdout
 
 
 def test_nothing_that_was_there_is_lost(refused, run, model):

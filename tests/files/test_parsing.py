@@ -26,6 +26,7 @@ class TextError(ValueError):
 class Leg:
     name: str
     length: Annotated[float, Field(gt=0.0)] = 1.0
+    toes: Annotated[int, Field(ge=1)] | None = 5
 
     def __post_init__(self):
         if self.name == "tail":
@@ -67,6 +68,30 @@ def test_mistakes_are_sentences_with_place_and_value(data, sentence):
     assert str(caught.value) == (sentence or str(caught.value))
     assert len(str(caught.value)) < 200
     assert str(caught.value).isprintable()
+
+
+def test_false_stands_for_none_where_the_file_has_no_other_word():
+    made = build(Animal, {"legs": [{"name": "hoof", "toes": False}]}, "zoo", TextError, false_is_none=True)
+    assert made == Animal(legs=(Leg(name="hoof", toes=None),))
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        ({"legs": [], "age": "old"}, "zoo: age is 'old'; it must be a whole number, or false"),
+        (
+            {"legs": [{"name": "a", "toes": 0}]},
+            "zoo: legs[0].toes is 0; it must be greater than or equal to 1, or false",
+        ),
+        ({"legs": [{"name": "a", "length": False}]}, "zoo: legs[0].length is False; it must be a number"),
+        ({"legs": False}, "zoo: legs is False; it must be a list"),
+        ({"legs": [], "agee": False}, "zoo: unknown field 'agee'; did you mean 'age'?"),
+    ],
+)
+def test_where_false_may_stand_is_said(data, sentence):
+    with pytest.raises(TextError) as caught:
+        build(Animal, data, "zoo", TextError, false_is_none=True)
+    assert str(caught.value) == sentence
 
 
 LAUGHS = "a0: &a0 [1, 1]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9))

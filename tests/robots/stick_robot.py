@@ -7,6 +7,7 @@ LINK, RADIUS, MASS = 0.2, 0.02, 7.3
 SHANKS = {
     "capsule": f'<geom type="capsule" fromto="0 0 0 0 0 {-LINK}" size="{RADIUS}" mass="0.2"/>',
     "cylinder": f'<geom type="cylinder" fromto="0 0 0 0 0 {-LINK}" size="{RADIUS}" mass="0.2"/>',
+    "ellipsoid": f'<geom type="ellipsoid" pos="0 0 {-LINK / 2}" size="{RADIUS} {RADIUS / 2} {LINK / 2}" mass="0.2"/>',
     "box": f'<geom type="box" pos="0 0 {-LINK / 2}" size="{RADIUS} {RADIUS} {LINK / 2}" mass="0.2"/>',
     "mesh": '<geom type="mesh" mesh="cone" mass="0.2"/>',
 }
