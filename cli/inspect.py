@@ -70,6 +70,10 @@ def import_file(
         policy = import_policy(source, destination, robot, trust=trust, contract_file=contract)
     console = Terminal()
     console.say(f"wrote {destination}")
+    if contract is not None:
+        console.say(
+            f"it is run as {contract} says and the robot's standard where it says nothing; what {source} itself says is not used"
+        )
     if isinstance(policy.stored, ForeignFile):
         console.say("it carries the program of its source, not weights alone: commands that run it need --trust")
     console.print(contract_table(policy.contract))

@@ -262,12 +262,13 @@ def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]
         series: by label, for each line the x and y of its points; values that are not finite are left out.
 
     Returns:
-        ``size``, ``frame``, ``x_ticks``, ``y_ticks`` and ``lines``, each with its ``label``, the label's ``turn`` and ``points``.
+        ``size``, ``frame``, ``x_ticks``, ``y_ticks`` and ``lines``, each with its ``label``, the label's ``turn``, its ``place`` among
+        the label's lines, and ``points``.
     """
     lines = [
-        (label, turn, [(x, y) for x, y in zip(*line, strict=True) if math.isfinite(x) and math.isfinite(y)])
+        (label, turn, place, [(x, y) for x, y in zip(*line, strict=True) if math.isfinite(x) and math.isfinite(y)])
         for turn, (label, own) in enumerate(series.items())
-        for line in own
+        for place, line in enumerate(own)
     ]
     points = [point for *_, line in lines for point in line] or [(1.0, 1.0)]
     end = max(x for x, _ in points) or 1.0
@@ -288,8 +289,8 @@ def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]
         "x_ticks": [{"x": x_of(v), "label": number(v)} for v in _round_values(0.0, end)],
         "y_ticks": [{"y": y_of(v), "label": number(v)} for v in _round_values(low, high)],
         "lines": [
-            {"label": label, "turn": turn, "points": [(x_of(x), y_of(y)) for x, y in line]}
-            for label, turn, line in lines
+            {"label": label, "turn": turn, "place": place, "points": [(x_of(x), y_of(y)) for x, y in line]}
+            for label, turn, place, line in lines
         ],
     }
 

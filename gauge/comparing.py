@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from .comparison import ComparisonError, compare, load_result
+from ..policy.finding import find_policy
+from .comparison import ComparisonError, check_different, compare, load_result
 from .comparison_report import write_comparison
 from .evaluate import Request, Status, evaluate, identity, prepare
 from .naming import distinct_names, run_folders
@@ -46,6 +47,7 @@ def compare_all(
     found = {c: load_result(Path(c)) for c in contestants if is_result(c)}
     requests = {c: replace(request, policy=c) for c in contestants if c not in found}
     prepared_requests = {c: prepare(wanted) for c, wanted in requests.items()}
+    check_different([found.get(c) or find_policy(c).resolve() for c in contestants], contestants)
     for contestant, prepared in prepared_requests.items():
         suite = prepared.suite
         for other, result in found.items():

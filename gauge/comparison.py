@@ -130,7 +130,7 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
         labels: names of the policies; None for those of their files, see ``distinct_names``.
 
     Raises:
-        ComparisonError: results of different suites, engines, robots or environments, or without scores.
+        ComparisonError: results of different suites, engines, robots or environments, without scores, or the same twice.
     """
     if len(results) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results, not {len(results)}")
@@ -224,8 +224,22 @@ def load_result(path: Path) -> dict[str, Any]:
     return found
 
 
+def check_different(contestants: Sequence[object], labels: Sequence[str]) -> None:
+    """Refuse the same results, or the same file, twice.
+
+    Raises:
+        ComparisonError: one sentence.
+    """
+    for (one, first), (other, second) in combinations(zip(labels, contestants, strict=True), 2):
+        if first == second:
+            raise ComparisonError(
+                f"'{one}' and '{other}' are one and the same; a comparison needs different policies or results"
+            )
+
+
 def _check(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
-    """Refuse results that were not given the same episodes."""
+    """Refuse results that were not given the same episodes, or are the same."""
+    check_different(results, labels)
     for label, found in zip(labels, results, strict=True):
         if found["score"] is None:
             raise ComparisonError(

@@ -161,7 +161,7 @@ def warnings(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     rows: Sequence[Row] = results["environments"]
     health = results["health"]
-    total = f"{health['episodes']} quality episodes"
+    total = _plural(health["episodes"], "quality episode")
     found = []
     if health["diverged"]:
         headline = f"physics diverged in {health['diverged']} of {total}"
@@ -184,8 +184,8 @@ def warnings(results: Mapping[str, Any]) -> list[dict[str, Any]]:
         found.append(_warning("note", headline, meaning, _places(rows, "self_contact", _percent)))
     failed = [r for r in rows if r["level"] == 0]
     if failed:
-        searched = sum("search" in r for r in rows)
-        headline = f"not even level 1 passed in {len(failed)} of {searched} searched environments"
+        searched = _plural(sum("search" in r for r in rows), "searched environment")
+        headline = f"not even level 1 passed in {len(failed)} of {searched}"
         meaning = "They score zero and no quality is measured there."
         found.append(_warning("note", headline, meaning, _places(failed, None)))
     found += [

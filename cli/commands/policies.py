@@ -140,7 +140,10 @@ def import_command(
     ] = False,
     trust: options.Trust = False,
     contract: Annotated[
-        Path | None, typer.Option(help="A contract.toml that says how a TorchScript or ONNX file is to be run.")
+        Path | None,
+        typer.Option(
+            help="A contract.toml that says how a TorchScript or ONNX file is to be run, in place of what the file says."
+        ),
     ] = None,
     robot: Annotated[
         str | None, typer.Option(help="Robot name, or a robot.toml. Default: go2.", autocompletion=completion.robots)

@@ -39,9 +39,15 @@ def test_policies_and_results_side_by_side(run, tmp_path, policy, tiny):
 def test_what_cannot_be_compared_is_said_before_anything_is_played(run, refused, tmp_path, policy, tiny):
     assert "at least two" in refused("compare", policy)
     assert "there are no results at 'none.json'" in refused("compare", policy, "none.json")
+    (tmp_path / "link.gauge.pt").symlink_to(policy)
+    same = "are one and the same; a comparison needs different policies or results"
+    assert refused("compare", policy, "link.gauge.pt", "--suite", tiny) == f"'{policy}' and 'link.gauge.pt' {same}"
     first = tmp_path / "first"
     done = run("evaluate", policy, "--suite", tiny, "--threads", 1, "--out", first)
     assert done.exit_code == 0, done.output
+    shutil.copy(first / "results.json", "card.json")
+    for other in ("first", "first/results.json", "card.json"):
+        assert refused("compare", "first", policy, other, "--suite", tiny) == f"'first' and '{other}' {same}"
     sentence = refused("compare", first, policy, "--suite", "demo")
     assert "results of different suites do not compare" in sentence and "choose with --suite" in sentence
     sentence = refused("compare", first, policy, "--suite", tiny, "--friction", 0.9)

@@ -50,6 +50,17 @@ def test_exported_file_is_not_exported_again(run, refused, policy, tmp_path):
     assert "exported file already" in refused("export", Path(tmp_path) / "policy.pt", "--out", tmp_path / "again")
 
 
+def test_a_contract_file_that_takes_the_place_of_the_export_s_own_is_said(run, policy, tmp_path):
+    """What it leaves out is the robot's standard, not what the export holds."""
+    assert run("export", policy, "--format", "torchscript", "--out", tmp_path).exit_code == 0
+    (tmp_path / "contract.toml").write_text("control_period = 0.01")
+    words = "the robot's standard where it says nothing; what policy.pt itself says is not used"
+    for options, said in (((), False), (("--contract", "contract.toml"), True)):
+        done = run("import", "policy.pt", "mine.gauge.pt", "--force", *options)
+        assert done.exit_code == 0, done.output
+        assert (words in done.stdout.replace("\n", " ")) == said
+
+
 def test_the_policy_is_not_written_over(refused, policy, tmp_path):
     policy = policy.rename(tmp_path / "policy.pt")
     before = policy.read_bytes()

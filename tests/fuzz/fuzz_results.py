@@ -32,6 +32,7 @@ from gaitgauge.training.scoring import scores_of
 CARD = (SEEDS / "results" / "results.json").read_bytes()
 ROBOT = load_robot("go2")
 TRUE = json.loads(CARD)
+OTHER = TRUE | {"policy": TRUE["policy"] | {"path": "other.pt"}}
 
 
 def _into(name: str, read: Callable[[Path], Any]) -> Callable[[bytes, Path], None]:
@@ -52,7 +53,7 @@ def _results(folder: Path) -> None:
 
 
 def _compared(folder: Path) -> None:
-    found = compare([load_result(folder), TRUE], ["one", "two"])
+    found = compare([load_result(folder), OTHER], ["one", "two"])
     write_comparison(folder / "comparison", found)
 
 

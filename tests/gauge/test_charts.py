@@ -1,9 +1,11 @@
 """The charts of the report: where they put known data."""
 
 import math
+import re
 
 import pytest
 from gaitgauge.gauge import charts
+from gaitgauge.gauge.pages import page_template
 from gaitgauge.gauge.report import STATISTIC_LABELS, report_data
 from sample_results import PIPELINES, row, sample
 
@@ -99,3 +101,25 @@ def test_curves_have_round_ticks_and_leave_out_what_is_not_finite():
     assert [t["label"] for t in data["x_ticks"]] == ["0", "1", "2", "3", "4"]
     assert [t["label"] for t in data["y_ticks"]] == ["−1", "0", "1", "2", "3"]
     assert charts.curves({"none": []})["lines"] == []
+
+
+@pytest.mark.parametrize(
+    ("seeds", "legend"),
+    [
+        (1, "a line for each seed."),
+        (2, "a line for each seed of an entry: first second."),
+        (5, "a line for each seed of an entry: first second third fourth, then the same again."),
+    ],
+)
+def test_seeds_of_a_sweep_s_entry_share_its_colour_and_differ_in_their_dashes(seeds, legend):
+    data = charts.curves({name: [([0.0, 1.0], [0.0, 1.0])] * seeds for name in ("CTS", "HIM")})
+    sweep = {"title": "", "name": "", "suite": "", "entries": [], "sentences": [], "runs": [], "compared": False}
+    page = page_template("sweep.html.j2").render(sweep=sweep, groups=[], names=["CTS", "HIM"], figures={"level": data})
+    drawn = re.findall(r'<polyline class="curve (c\d d\d)"', page)
+    dashes = [f"d{place % 4}" for place in range(seeds)]
+    assert drawn == [f"{colour} {dash}" for colour in ("c0", "c1") for dash in dashes]
+    (note,) = re.findall(r'<p class="note"><span.*', page)
+    assert re.sub(" +", " ", re.sub("<[^>]*>", " ", note)).replace(" ,", ",").replace(" .", ".").strip() == (
+        f"CTS HIM ; {legend}"
+    )
+    assert re.findall(r"curve c3 (d\d)", note) == (dashes[:4] if seeds > 1 else [])

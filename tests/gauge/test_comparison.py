@@ -52,6 +52,12 @@ def test_a_policy_does_not_differ_from_itself():
     assert "None of the" in found.sentences[1]
 
 
+def test_the_same_results_twice_are_refused():
+    """They read as two policies that differ by nothing, with a chance of their own."""
+    with pytest.raises(ComparisonError, match=r"'first \(1\)' and 'first \(2\)' are one and the same;"):
+        compare([results(), results()])
+
+
 def test_everything_that_the_issue_names_is_compared():
     kinds = {d.kind for d in compare(both()).differences}
     assert kinds == {"score", "level", "group", "terrain", "friction", "metric", "command"}
@@ -150,7 +156,7 @@ def test_scores_of_three_are_corrected_for_three_pairs():
 def test_files_of_one_name_are_told_apart_by_their_folder():
     pair = [results(path=p) for p in ("runs/a/model_10.pt", "runs\\b\\model_10.pt")]
     assert [p["label"] for p in compare(pair).policies] == ["a model_10", "b model_10"]
-    same = [results(path="x/model.pt") for _ in range(2)]
+    same = [results(path="x/model.pt", change=change) for change in (0.0, 0.1)]
     assert [p["label"] for p in compare(same).policies] == ["x (1)", "x (2)"]
 
 

@@ -119,7 +119,7 @@ def test_many_rows_with_many_replicates_are_too_many(edited):
     many = load_result(file)
     many["chance"]["resamples"] = 100_000
     with pytest.raises(ComparisonError, match="1000 environments with 100,000 replicates"):
-        compare([many, many], ["one", "two"])
+        compare([many, many | {"policy": TRUE["policy"] | {"path": "other.pt"}}], ["one", "two"])
 
 
 def test_scores_that_no_evaluation_writes_are_not_compared(edited):

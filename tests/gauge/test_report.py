@@ -185,7 +185,7 @@ def test_edited_results_are_one_clear_sentence_or_a_page(tmp_path, stress, key, 
         write_report(tmp_path)
     except StoreError as error:
         assert "results.json was edited or is damaged" in str(error) and str(error).isprintable()
-    for read in (lambda: compare([load_result(tmp_path)] * 2, ["a", "b"]), lambda: load_results(tmp_path)):
+    for read in (lambda: compare([load_result(tmp_path), stress], ["a", "b"]), lambda: load_results(tmp_path)):
         with suppress(ComparisonError, ResultsError):
             read()
 
@@ -216,8 +216,19 @@ def test_warnings_name_what_failed_and_where():
     assert [w["severity"] for w in found] == ["grave", "grave", "note", "note"]
     assert found[0]["headline"] == "physics diverged in 1 of 6 quality episodes"
     assert found[1]["places"] == ["slope, forward, μ 0.6 (5)", "stairs, forward, μ 0.6 (2)"]
-    assert found[2]["headline"] == "not even level 1 passed in 1 of 1 searched environments"
+    assert found[2]["headline"] == "not even level 1 passed in 1 of 1 searched environment"
     assert found[3]["places"] == ["slope, forward, μ 0.6 (3)"]
+
+
+def test_one_episode_is_no_plural():
+    rows = [row(falls=1, restarted=1)]
+    health = {"episodes": 1, "falls": 1, "diverged": 1, "overflowed": 1}
+    assert [w["headline"] for w in warnings({"environments": rows, "health": health})] == [
+        "physics diverged in 1 of 1 quality episode",
+        "contacts dropped in 1 of 1 quality episode",
+        "1 fall in 1 quality episode",
+        "restarts in 1 of 1 quality episode",
+    ]
 
 
 def test_parts_that_touch_are_told_with_the_worst_places_first():
