@@ -33,6 +33,17 @@ class BackendError(RuntimeError):
     """An engine cannot do what it was asked for; the message says what, why and what to change."""
 
 
+class DeviceError(BackendError):
+    """An engine cannot run where it is to; ``reason`` is the message without what to change on the command line."""
+
+    def __init__(self, reason: str, change: str) -> None:
+        super().__init__(reason, change)
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return "; ".join(self.args)
+
+
 @dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
     """How the world is simulated."""

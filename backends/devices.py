@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..files.parsing import one_line, shown
-from .base import BackendError
+from .base import BackendError, DeviceError
 
 
 def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
@@ -17,7 +17,8 @@ def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
         gpu: whether the engine runs on GPUs.
 
     Raises:
-        BackendError: the machine has no such device, or the engine does not run on it.
+        BackendError: no device is called so.
+        DeviceError: the machine has no such device, or the engine does not run on it.
     """
     try:
         device = torch.device(name)
@@ -28,14 +29,16 @@ def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
     if device.type == "cpu":
         return torch.device("cpu")
     if not gpu:
-        raise BackendError(f"backend '{backend}' runs on the CPU, not on '{name}'; use --device cpu, or mujoco-warp")
+        raise DeviceError(f"backend '{backend}' runs on the CPU, not on '{name}'", "use --device cpu, or mujoco-warp")
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if (device.index or 0) >= count:
         have = f"torch finds {count}" if count else "torch finds none (see 'gaitgauge doctor')"
-        raise BackendError(f"there is no GPU for device '{name}': {have}; use --device cpu")
+        raise DeviceError(f"there is no GPU for device '{name}': {have}", "use --device cpu")
     if device.index is not None:
         return device
     try:
         return torch.device("cuda", torch.cuda.current_device())
     except (AssertionError, RuntimeError) as error:  # a torch for the CPU alone asserts
-        raise BackendError(f"the GPU of device '{name}' cannot be used: {one_line(error)}; use --device cpu") from error
+        raise DeviceError(
+            f"the GPU of device '{name}' cannot be used: {one_line(error)}", "use --device cpu"
+        ) from error

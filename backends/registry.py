@@ -12,7 +12,7 @@ from importlib.util import find_spec
 
 from ..files.parsing import one_line, shown
 from ..files.plugins import guarded, load_plugin, origin, plugins
-from .base import BackendError, PhysicsBackend, Scene, Support
+from .base import BackendError, DeviceError, PhysicsBackend, Scene, Support
 
 GROUP = "gaitgauge.backends"
 _OWN = {
@@ -105,8 +105,8 @@ def find_backend(name: str, device: str) -> type[PhysicsBackend]:
     """The class that ``make_backend`` builds, variant and device checked, without building anything.
 
     Raises:
-        BackendError: unknown engine or variant, missing package, or a device that is not there or that the engine
-            cannot use.
+        BackendError: unknown engine, variant or device, or a missing package.
+        DeviceError: a device that is not there or that the engine cannot use.
     """
     from .devices import find_device  # listing engines must not wait for torch
 
@@ -119,7 +119,8 @@ def choose_device(name: str, asked: str | None = None) -> str:
     """Where an engine runs: the device asked for, else a GPU where it can use one, else the CPU.
 
     Raises:
-        BackendError: as ``find_backend``, or an engine that is made for a GPU on a machine without one.
+        BackendError: as ``find_backend``.
+        DeviceError: so, too, or an engine that is made for a GPU on a machine without one.
     """
     from torch import cuda
 
@@ -128,8 +129,9 @@ def choose_device(name: str, asked: str | None = None) -> str:
         return asked
     made_for_gpu = _ABOUT.get(name.partition(":")[0], ("", (), ""))[0] == "GPU"
     if made_for_gpu and not cuda.is_available():
-        raise BackendError(
-            f"backend '{name}' wants a GPU and this machine has none; add --device cpu (slow), or use --backend mujoco"
+        raise DeviceError(
+            f"backend '{name}' wants a GPU and this machine has none",
+            "add --device cpu (slow), or use --backend mujoco",
         )
     plugin = name.partition(":")[0] not in _OWN
     return "cuda" if made_for_gpu or (plugin and _can_use_gpu(found) and cuda.is_available()) else "cpu"

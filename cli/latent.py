@@ -38,7 +38,8 @@ def print_latents(console: Terminal, results: Mapping[str, Any]) -> None:
                 if (found := entry[pair].get(space)) is not None:
                     numbers = (found["silhouette"], found["probe"], found["chance"], *found["recall"].values())
                     table.add_row(entry["label"], name, *(f"{n:.2f}" for n in numbers))
-        console.print(table)
+        if table.row_count:
+            console.print(table)
     for entry in results["policies"]:
         if (experts := entry["experts"]) is None:
             console.say(f"{entry['label']} has no experts, so there are no weights of them to show")

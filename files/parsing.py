@@ -83,7 +83,10 @@ def bare_name(path: object) -> str:
 
 
 def did_you_mean(word: object, known: Collection[str]) -> str:
-    """``; did you mean 'a' or 'b'?`` for words of ``known`` close to ``word``, else an empty string."""
+    """``; did you mean 'a' or 'b'?`` for words of ``known`` close to ``word``, else an empty string.
+
+    Where the sentence goes on, it is joined as ``f"{did_you_mean(word, known) or ';'} choose one of …"``.
+    """
     close = get_close_matches(str(word)[:_SHOWN], list(known), n=3)
     return "; did you mean " + " or ".join(f"'{c}'" for c in close) + "?" if close else ""
 

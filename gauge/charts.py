@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from typing import Any
 
 Row = Mapping[str, Any]
@@ -286,8 +287,8 @@ def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]
     return {
         "size": (_CURVE_WIDTH, _CURVE_HEIGHT),
         "frame": (left, right, upper, lower),
-        "x_ticks": [{"x": x_of(v), "label": number(v)} for v in _round_values(0.0, end)],
-        "y_ticks": [{"y": y_of(v), "label": number(v)} for v in _round_values(low, high)],
+        "x_ticks": [{"x": x_of(v), "label": _tick(v)} for v in _round_values(0.0, end)],
+        "y_ticks": [{"y": y_of(v), "label": _tick(v)} for v in _round_values(low, high)],
         "lines": [
             {"label": label, "turn": turn, "place": place, "points": [(x_of(x), y_of(y)) for x, y in line]}
             for label, turn, place, line in lines
@@ -300,6 +301,11 @@ def _round_values(low: float, high: float) -> list[float]:
     power = 10.0 ** math.floor(math.log10((high - low) / 4.0))
     step = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= (high - low) / 4.0 * (1.0 + 1e-9))
     return [float(f"{i * step:.6g}") for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+
+
+def _tick(value: float) -> str:
+    """A round value with all of its decimals and a true minus sign."""
+    return f"{Decimal(f'{value:.6g}'):f}".replace("-", "−")
 
 
 def _by_terrain(rows: Sequence[Row], quantity: str) -> dict[str, list[Row]]:

@@ -327,13 +327,13 @@ def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
     if own and behind:
         path = behind[-1].parent / path
     if not own and name not in suite_names():
-        hint = did_you_mean(name, suite_names())
+        hint = did_you_mean(name, suite_names()) or ";"
         known = ", ".join(suite_names())
         if behind:
             raise SuiteError(
-                f"suite file {one_line(behind[-1])}: extends is {shown(name)}; it must be one of {known}, or a .toml file{hint}"
+                f"suite file {one_line(behind[-1])}: extends is {shown(name)}{hint} it must be one of {known}, or a .toml file"
             )
-        raise SuiteError(f"there is no suite '{one_line(name, 80)}'{hint}; choose one of {known}, or give a .toml file")
+        raise SuiteError(f"there is no suite '{one_line(name, 80)}'{hint} choose one of {known}, or give a .toml file")
     source = f"suite file {one_line(path)}"
     data = parse_toml(read_text(path, "suite file", SuiteError), source, SuiteError)
     base = data.pop("extends", None)
@@ -439,12 +439,12 @@ def _check(suite: Suite, source: str) -> None:
     grounds = terrain_names()
     for name in matrix.terrains:
         rules[
-            f"matrix.terrains has the unknown terrain {shown(name)}{did_you_mean(name, grounds)}; choose from "
+            f"matrix.terrains has the unknown terrain {shown(name)}{did_you_mean(name, grounds) or ';'} choose from "
             f"{', '.join(grounds)}"
         ] = name in grounds
     for name in metrics.weights:
         rules[
-            f"metrics.weights has the unknown metric {shown(name)}{did_you_mean(name, METRIC_NAMES)}; choose from "
+            f"metrics.weights has the unknown metric {shown(name)}{did_you_mean(name, METRIC_NAMES) or ';'} choose from "
             f"{', '.join(METRIC_NAMES)}"
         ] = name in METRIC_NAMES
     for rule, kept in rules.items():

@@ -169,7 +169,8 @@ def aggregate_errors(real: Table, predicted: Table, commands: Mapping[str, str] 
             if missing:
                 hint = did_you_mean(motion, table) if motion not in table else ""
                 raise ValidationError(
-                    f"the {source} values lack {one_line(missing[0], 80)} of motion {shown(motion)}{hint}; both sides need the same motions"
+                    f"the {source} values lack {one_line(missing[0], 80)} of motion {shown(motion)}{hint or ';'} "
+                    "both sides need the same motions"
                 )
     rows = {
         command: {m: _mean([abs(predicted[o][m] - real[o][m]) for o in motions]) for m in metrics}
@@ -249,7 +250,7 @@ def validate(real: Measurements, simulators: Sequence[Measurements], *, ranks_on
             for side in (real, simulator):
                 if policy not in side.values:
                     raise ValidationError(
-                        f"'{one_line(side.name)}' has no rows of policy {shown(policy)}{did_you_mean(policy, side.values)}; "
+                        f"'{one_line(side.name)}' has no rows of policy {shown(policy)}{did_you_mean(policy, side.values) or ';'} "
                         "both sides need the same policies"
                     )
         for of in real.values.values():

@@ -94,7 +94,7 @@ class Levels:
         """
         self._settings, self._kind, self._num_levels = configuration, kind, palette.num_levels
         self._index = palette.index.to(kind.device)
-        self._rule = resolve(configuration.level_rule, "terrain.level_rule")
+        self._rule = resolve(configuration.level_rule, "environment.terrain.level_rule")
 
     def follow(self, memory: EnvironmentMemory, inputs: StepInputs) -> None:
         """Remember how far the robots came, and how far they should have come."""
@@ -120,8 +120,8 @@ class Levels:
         )
         if not isinstance(level, torch.Tensor) or level.shape != memory.level.shape or level.dtype is not torch.int64:
             raise ConfigurationError(
-                f"terrain.level_rule is {shown(self._settings.level_rule)}, which gave {shown(level)}; it must be a level from 0 "
-                "for each world, (N,) int64"
+                f"environment.terrain.level_rule is {shown(self._settings.level_rule)}, which gave {shown(level)}; it must be a "
+                "level from 0 for each world, (N,) int64"
             )
         torch.where(worlds & memory.moves_level, level, memory.level, out=memory.level)
         variants = self._index.shape[2]

@@ -83,12 +83,14 @@ class TrainingEnvironment(VecEnv):
                 f"capture=True needs a CUDA device, but the environment is on '{device}'; use capture=False there"
             )
         if configuration.num_envs < 1:
-            raise ConfigurationError(f"num_envs is {configuration.num_envs}; an environment needs at least 1 world")
+            raise ConfigurationError(
+                f"environment.num_envs is {configuration.num_envs}; an environment needs at least 1 world"
+            )
         slow, fast = configuration.randomization.motor_speed
         if (slow, fast) != (1.0, 1.0) and not configuration.physics.torque_speed_limit:
             raise ConfigurationError(
-                f"randomization.motor_speed is {slow:g} to {fast:g} while physics.torque_speed_limit is off, without which "
-                "it does nothing; turn the limit on, or leave motor_speed at 1,1"
+                f"environment.randomization.motor_speed is {slow:g} to {fast:g} while environment.physics.torque_speed_limit is "
+                "off, without which it does nothing; turn the limit on, or leave motor_speed at 1,1"
             )
         self.cfg = configuration
         self.configuration = configuration
@@ -126,14 +128,16 @@ class TrainingEnvironment(VecEnv):
         self.max_episode_length = self.parts.max_episode_length
         self.kind = self.parts.kind
         self.common_step_counter = 0
-        self._events = resolve_own(configuration.events, "events").values()
+        self._events = resolve_own(configuration.events, "environment.events").values()
         self._bodies = draw_bodies(
             configuration.randomization, self.num_envs, len(self.robot.collision_bodies), self._generator
         )
         self.backend.randomize(Randomization(**self._bodies))
         schedule = configuration.schedule
         if not 0.0 <= schedule.begin <= 1.0:
-            raise ConfigurationError(f"schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1")
+            raise ConfigurationError(
+                f"environment.schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1"
+            )
         self.parts.memory.step.fill_(round(schedule.begin * schedule.horizon_steps))
         self._begin(level.to(self.device))
         self._after_physics: Callable[[], StepResult] = self.parts.after_physics
@@ -418,7 +422,9 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
     settings = configuration.joints
     if settings.parameters not in robot.parameters:
         known = ", ".join(robot.parameters)
-        raise ConfigurationError(f"joints.parameters is '{settings.parameters}', but robot '{robot.name}' has: {known}")
+        raise ConfigurationError(
+            f"environment.joints.parameters is '{settings.parameters}', but robot '{robot.name}' has: {known}"
+        )
     changed = {
         name: (value,) * robot.num_joints
         for name in ("armature", "joint_damping", "friction_loss")

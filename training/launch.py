@@ -29,7 +29,7 @@ from .filming import Filmer
 from .logger import check_logger
 from .own_terms import foreign_functions
 from .processes import Processes, ProcessLostError, idle_gpus, own_device, told_number
-from .resuming import begin_with, check_environments, resume_run
+from .resuming import begin_with, check_environments, check_network, resume_run
 from .run_directory import (
     LOG_ROOT,
     describe_run,
@@ -157,7 +157,8 @@ def prepare(request: TrainRequest) -> TrainPlan:
         if run is not None:
             refuse_links(run)
         branched = ""
-        kept, kept_backend, iteration = _kept(checkpoint, request.task)
+        entries = read_checkpoint(checkpoint)
+        kept, kept_backend, iteration = _kept(entries, checkpoint, request.task)
         if run is not None and (last := _last_iteration(run)) > iteration:
             # Two branches in one folder would be one run: whoever asks for its last checkpoint would get the other's.
             branched = (
@@ -176,10 +177,15 @@ def prepare(request: TrainRequest) -> TrainPlan:
                 "package nor the task nor this command names; if you know whose it is, add --trust"
             )
         check_environments(checkpoint, kept.environment.num_envs, task.environment.num_envs)
+        check_network(checkpoint, entries, task, "resume")
     else:
         backend = request.backend or DEFAULT_BACKEND
-        weights = None if request.init_from is None else _first_weights(request, task).absolute()
-        begun = [] if weights is None else _going_on(task, weights)
+        begun: list[str] = []
+        if request.init_from is not None:
+            weights = _first_weights(request, task).absolute()
+            entries = read_checkpoint(weights, training_state=False, purpose="start from")
+            check_network(weights, entries, task, "start")
+            begun = _going_on(task, entries)
         task = find_task(request.task, [*begun, *own], robot=robot)
     check_logger(task.training.run.logger)
     device = own_device(request.device, backend)
@@ -234,13 +240,12 @@ def _last_iteration(run: Path) -> int:
     return 0 if last is None else int(last.stem.rpartition("_")[2])
 
 
-def _kept(checkpoint: Path, name: str) -> tuple[Task, str, int]:
+def _kept(entries: Mapping[str, Any], checkpoint: Path, name: str) -> tuple[Task, str, int]:
     """The task as a checkpoint's run has it, its backend, and how many iterations the run had done.
 
     Raises:
         CheckpointError: it is of another task, or its settings are not those of this version.
     """
-    entries = read_checkpoint(checkpoint)
     training = entries["training"]
     numbers = run_numbers(entries, checkpoint)
     if (its := numbers.task) != name:
@@ -263,13 +268,13 @@ def _kept(checkpoint: Path, name: str) -> tuple[Task, str, int]:
     return task, str(stored["backend"]), numbers.iteration
 
 
-def _going_on(task: Task, weights: Path) -> list[str]:
-    """Settings of a run that begins with trained networks, before those of the request: schedules go on where that
+def _going_on(task: Task, entries: Mapping[str, Any]) -> list[str]:
+    """Settings of a run that begins with the trained networks of a file, before those of the request: schedules go on where that
     training left them, robots that can walk start on all levels, steps are smaller, and a policy without its
     exploration noise gets little.
     """
     return [
-        f"environment.schedule.begin={reached(read_checkpoint(weights, training_state=False, purpose='start from')):g}",
+        f"environment.schedule.begin={reached(entries):g}",
         f"environment.terrain.highest_start_level={task.environment.terrain.levels - 1}",
         *(f"{key}={value}" for key, value in _GOING_ON.items()),
     ]

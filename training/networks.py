@@ -15,6 +15,7 @@ from rsl_rl.modules.distribution import Distribution, GaussianDistribution
 from torch import nn
 from torch.nn import functional
 
+from ..policy.contract import PolicyContract
 from ..policy.layers import linear
 from ..policy.networks import ARCHITECTURES, ExpertMixture, multilayer_perceptron
 from .configuration import ConfigurationError, NetworkConfiguration, TrainingConfiguration
@@ -47,6 +48,16 @@ class Widths:
         }
 
 
+def command_entries(contract: PolicyContract) -> tuple[int, ...]:
+    """Entries of an observation frame that hold the command."""
+    start = 0
+    for term, width in zip(contract.observation, contract.term_widths, strict=True):
+        if term.name == "command":
+            return tuple(range(start, start + width))
+        start += width
+    return ()
+
+
 def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason: str) -> dict[str, Any]:
     """Arguments of a network of ``policy.networks`` whose encoder is plain.
 
@@ -56,7 +67,7 @@ def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason
     network, method = configuration.network, configuration.algorithm.method
     if network.student_encoder != "mlp":
         raise ConfigurationError(
-            f"student_encoder is {network.student_encoder!r}; the method {method!r} {reason} and takes 'mlp'."
+            f"training.network.student_encoder is {network.student_encoder!r}; the method {method!r} {reason} and takes 'mlp'."
         )
     return {**widths.arguments(network.latent_width), "encoder_hidden": list(network.student_hidden)}
 
@@ -92,7 +103,7 @@ def student_architecture(configuration: NetworkConfiguration, widths: Widths) ->
     blind = list(widths.command_entries) if configuration.student_encoder == "moe_ng" else []
     if configuration.student_encoder == "moe_ng" and not blind:
         raise ConfigurationError(
-            "student_encoder is 'moe_ng', but the observation frame has no command to hide from the experts."
+            "training.network.student_encoder is 'moe_ng', but the observation frame has no command to hide from the experts."
         )
     return "moe_cts", {
         **common,

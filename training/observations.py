@@ -146,7 +146,7 @@ class Observer:
         """
         own = resolve_own(
             configuration.own,
-            "observations.own",
+            "environment.observations.own",
             taken=PRIVILEGED_TERMS,
             gives=lambda inputs, found: found.ndim == 2 and found.shape[:1] == inputs.frame.shape[:1],
             rule="it must be numbers for each world, (N, width)",

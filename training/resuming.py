@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +12,11 @@ import torch
 
 from ..files.parsing import edited, one_line, shown
 from ..policy.contract import PolicyContract, difference
+from ..policy.estimators import VELOCITY
+from ..policy.finding import latest_checkpoint
 from ..policy.native import StoredNetwork
 from .algorithms.bootstrap import iterations_left
+from .algorithms.methods import METHODS
 from .checkpoint import (
     TRAINING_VERSION,
     CheckpointError,
@@ -27,15 +31,23 @@ from .checkpoint import (
     write_checkpoint,
 )
 from .keepsake import host_copy
+from .networks import Widths, command_entries
 from .run_directory import read_run_json
 from .seeding import random_state, restore_random_state
 
 if TYPE_CHECKING:
     from .runner import TrainingRunner
+    from .tasks import Task
 
 
 class TrainingDivergedError(RuntimeError):
     """Too many numbers are not finite for training to go on; the message says which and what survives."""
+
+
+def what_is_left(run: Path | None) -> str:
+    """A sentence on the last checkpoint of a run directory, behind another one; empty where there is none."""
+    last = None if run is None else latest_checkpoint(run)
+    return "" if last is None else f" The last checkpoint, '{last}', is intact."
 
 
 def stored_network(runner: TrainingRunner, average: Mapping[str, Any] | None = None) -> StoredNetwork:
@@ -79,7 +91,7 @@ def write_learned(runner: TrainingRunner, path: Path, learned: Mapping[str, Any]
     for part in ("actor_state_dict", "critic_state_dict"):
         if not all(bool(torch.isfinite(value).all()) for value in learned[part].values()):
             raise TrainingDivergedError(
-                f"A weight in {part} is not finite; '{path}' was not written, earlier checkpoints are intact."
+                f"A weight in {part} is not finite; '{path}' was not written.{what_is_left(path.parent)}"
             )
     training = {
         **local,
@@ -188,7 +200,6 @@ def _begin(runner: TrainingRunner, path: Path, entries: Mapping[str, Any]) -> No
                 f"Cannot start from '{path}': its {name} is {one_line(getattr(theirs, name))}, this run's is "
                 f"{one_line(getattr(runner.contract, name))}."
             )
-    _check_network(runner, path, entries, "start")
     if bare := "training" not in entries:
         left = runner.configuration.run.bootstrap_iterations
     else:
@@ -264,7 +275,6 @@ def _check_fits(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], 
     if lines := difference(PolicyContract.from_json(entries["contract"]), runner.contract):
         first = lines.splitlines()[0]
         raise CheckpointError(f"Cannot resume from '{path}': its policy contract differs from this task's: {first}")
-    _check_network(runner, path, entries, "resume")
     check_environments(path, numbers.num_envs, runner.env.num_envs)
 
 
@@ -281,12 +291,41 @@ def check_environments(path: Path, theirs: int, mine: int) -> None:
         )
 
 
-def _check_network(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], verb: str) -> None:
-    mine = checkpoint_entries(runner.contract, stored_network(runner), {})["network"]
-    theirs = {name: str(entries["network"].get(name)) for name in mine}
-    if theirs != mine:
-        raise CheckpointError(
-            f"Cannot {verb} from '{path}': its network is {one_line(theirs['architecture'])} "
-            f"{one_line(theirs['arguments'])}, this run's is {mine['architecture']} {mine['arguments']}; give the same "
-            "training.network.* settings."
+def check_network(path: Path, entries: Mapping[str, Any], task: Task, verb: str) -> None:
+    """Refuse to ``resume`` or ``start`` from a file whose network is not the one that a task trains; nothing is built for it.
+
+    Raises:
+        CheckpointError: it is not.
+        ConfigurationError: the task's settings of the network do not fit together.
+    """
+    training, cannot = task.training, f"Cannot {verb} from '{path}': its network"
+    contract = PolicyContract.from_json(entries["contract"])
+    widths = Widths(
+        environments=1,
+        frame=contract.frame_width,
+        history=task.environment.observations.history_length,
+        privileged=VELOCITY + contract.frame_width,  # seen by what only training has
+        actions=len(contract.joint_names),
+        command_entries=command_entries(contract),
+    )
+    with torch.device("meta"):
+        mine, _ = METHODS[training.algorithm.method].networks(training, widths)
+    with edited(cannot, CheckpointError):
+        its, given = str(entries["network"]["architecture"]), dict(json.loads(entries["network"]["arguments"]))
+    own = mine.arguments
+    other = [name for name in {**own, **given} if given.get(name) != own.get(name)]
+    if its != mine.architecture:
+        what = f"is {one_line(its, 80)}, this run's is {mine.architecture}"
+        change = f"begin with a file of {mine.architecture}, or with none"
+    elif other:
+        pairs = [f"{one_line(n, 80)} {shown(given.get(n))} (this run's {shown(own.get(n))})" for n in other[:8]]
+        same = "environment.observations" if other == ["history_length"] else "training.network"
+        what, change = f"has {', '.join(pairs)}", f"give the same {same}.* settings"
+    else:
+        return
+    if verb == "resume":
+        change = (
+            "a resumed run keeps its network: leave training.algorithm.method, training.network.* and "
+            "environment.observations.history_length out"
         )
+    raise CheckpointError(f"{cannot} {what}; {change}.")

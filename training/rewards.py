@@ -209,7 +209,7 @@ class RewardFunction:
         """
         own = resolve_own(
             configuration.own,
-            "rewards.own",
+            "environment.rewards.own",
             taken=REWARD_TERMS,
             gives=lambda inputs, found: found.shape == inputs.command.shape[:1],
             rule="it must be one number for each world, (N,)",

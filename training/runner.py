@@ -27,8 +27,9 @@ from .configuration import TrainingConfiguration
 from .filming import Filmer
 from .keepsake import Keepsake
 from .logger import RunLogger, make_writer
+from .networks import command_entries
 from .processes import Processes, ProcessLostError
-from .resuming import TrainingDivergedError, save_run, write_learned
+from .resuming import TrainingDivergedError, save_run, what_is_left, write_learned
 from .run_directory import read_run_json, update_run_json
 from .scoring import Scorer
 from .stopping import Progress, StopSignals, TrainingOutcome
@@ -170,9 +171,8 @@ class TrainingRunner:
             except ProcessLostError as error:
                 raise self._rescue(error, begin) from error
             except BaseException as error:
-                # of several processes, those that are left say how it ended, unless it is in what was learned, or nothing was
-                if not self.processes.several or isinstance(error, TrainingDivergedError) or self._kept.iteration < 0:
-                    self._note_failure()
+                # of several processes, those that are left may yet say better; there may be none
+                self._note("diverged" if isinstance(error, TrainingDivergedError) else "failed")
                 raise
             if reason != "signal":
                 self._submit(written)
@@ -252,17 +252,16 @@ class TrainingRunner:
         skipped, minibatches = losses.get("skipped_minibatches", 0.0), self.alg.steps
         self.logger.scalars["Physics/nonfinite_samples"] = float(broken)
         self.logger.write({"Physics/nonfinite_samples": float(broken)}, iteration)
-        survives = f" The last checkpoint in '{self.log_dir}' is intact." if self.log_dir else ""
+        limit = f"training.run.nonfinite_limit is {run.nonfinite_limit:g}"
         if broken > run.nonfinite_limit * samples:
             raise TrainingDivergedError(
-                f"Iteration {iteration}: {broken} of {samples} environment samples are not finite "
-                f"(run.nonfinite_limit is {run.nonfinite_limit:g}); the physics or a reward has diverged.{survives}"
+                f"Iteration {iteration}: {broken} of {samples} environment samples are not finite ({limit}); the physics or a "
+                f"reward has diverged.{what_is_left(self.log_dir)}"
             )
         if skipped > run.nonfinite_limit * minibatches or not all(map(math.isfinite, losses.values())):
             raise TrainingDivergedError(
-                f"Iteration {iteration}: {skipped:.0f} of {minibatches} minibatches had gradients that are not finite "
-                f"(run.nonfinite_limit is {run.nonfinite_limit:g}); lower algorithm.learning_rate or look at the "
-                f"rewards.{survives}"
+                f"Iteration {iteration}: {skipped:.0f} of {minibatches} minibatches had gradients that are not finite ({limit}); "
+                f"lower training.algorithm.learning_rate or look at the rewards.{what_is_left(self.log_dir)}"
             )
 
     def _agreed_stop(self, signals: StopSignals, begin: float, max_seconds: float | None) -> str:
@@ -333,17 +332,17 @@ class TrainingRunner:
         self.iteration = self._kept.iteration
         path = self.log_dir / f"model_{self.iteration}.pt"
         sentence = f"{error}; iteration {self.iteration} is in '{path}', go on with --resume {self.log_dir}"
-        if known not in ("running", "failed"):
+        if known not in ("running", "failed", "diverged"):
             raise SystemExit(2)  # another one has done it
-        if known == "running":
+        if known != "diverged":
             self._record_loss(path)
         if not (path.exists() and time.time() - path.stat().st_mtime < time.monotonic() - begin):
             try:
                 self._write_kept(path, learned)
             except TrainingDivergedError as diverged:
-                self._note_failure()
+                self._note("diverged")
                 sentence = f"{error}; {diverged}"
-        if known == "failed":
+        if known == "diverged":
             raise SystemExit(2)
         return ProcessLostError(sentence)
 
@@ -357,10 +356,10 @@ class TrainingRunner:
                 local["environment"] = self.env.progress_dict()
             write_learned(self, path, learned, local)
 
-    def _note_failure(self) -> None:
+    def _note(self, outcome: str) -> None:
         if self.log_dir is not None:
             with suppress(CheckpointError):  # a full disk may be what it failed of
-                update_run_json(self.log_dir, {"outcome": "failed"})
+                update_run_json(self.log_dir, {"outcome": outcome})
 
     # The gauge
 
@@ -385,7 +384,7 @@ class TrainingRunner:
             if score is None:
                 names = ", ".join(report.scores) or "nothing"
                 self.message(
-                    f"The gauge reports no {self.configuration.run.gauge_score!r} (run.gauge_score) but {names}."
+                    f"The gauge reports no {self.configuration.run.gauge_score!r} (training.run.gauge_score) but {names}."
                 )
             elif math.isfinite(score) and (self.best_score is None or score > self.best_score):
                 self.best_score, self.best_iteration = score, report.iteration
@@ -422,13 +421,3 @@ class TrainingRunner:
                 "best_iteration": self.best_iteration,
             }
             update_run_json(self.log_dir, changes)
-
-
-def command_entries(contract: PolicyContract) -> tuple[int, ...]:
-    """Entries of an observation frame that hold the command."""
-    start = 0
-    for term, width in zip(contract.observation, contract.term_widths, strict=True):
-        if term.name == "command":
-            return tuple(range(start, start + width))
-        start += width
-    return ()

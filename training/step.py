@@ -99,7 +99,11 @@ class EnvironmentStep:
         self.rewards = RewardFunction(configuration.rewards, period, device)
         self.terminations = Terminations(configuration.termination)
         make_commands = resolve_class(
-            configuration.commands.generator, "commands.generator", CommandGenerator, "draw", "held_yaw_rate"
+            configuration.commands.generator,
+            "environment.commands.generator",
+            CommandGenerator,
+            "draw",
+            "held_yaw_rate",
         )
         self.commands = make_commands(
             configuration.commands,

@@ -53,7 +53,8 @@ class StepReader:
         if not len(self._trunk_points):
             length, width = self._settings.trunk_area
             raise ConfigurationError(
-                f"rewards.trunk_area is {length:g} x {width:g} m, which holds no point of the height scan; make it larger"
+                f"environment.rewards.trunk_area is {length:g} x {width:g} m, which holds no point of the height scan; make it "
+                "larger"
             )
         self._default_pose = torch.tensor(robot.default_joint_position, device=device)
         ranges = torch.from_numpy(joint_ranges(robot)).float().to(device)
@@ -90,7 +91,7 @@ class StepReader:
             return torch.full((robot.num_joints,), math.inf, device=self._device)
         if parameters.no_load_speed is None:
             raise ConfigurationError(
-                f"rewards.joint_speed_limits is {self._settings.joint_speed_limits:g}, but this parameter set of robot "
+                f"environment.rewards.joint_speed_limits is {self._settings.joint_speed_limits:g}, but this parameter set of robot "
                 f"'{robot.name}' does not say how fast its motors turn; add full_torque_speed and no_load_speed to "
                 "robot.toml, or set it to 0"
             )

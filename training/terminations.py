@@ -107,7 +107,7 @@ class Terminations:
         used = {name: t for name, t in TERMINATIONS.items() if getattr(configuration, name, True) is not None}
         own = resolve_own(
             configuration.own,
-            "termination.own",
+            "environment.termination.own",
             taken=TERMINATIONS,
             gives=lambda inputs, found: found.shape == inputs.command.shape[:1] and found.dtype is torch.bool,
             rule="it must be true or false for each world, (N,) bool",

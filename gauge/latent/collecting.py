@@ -1,7 +1,13 @@
-"""Robots of one policy on every terrain and with every command, and what their encoder and experts said meanwhile."""
+"""Robots of one policy on every terrain and with every command, and what their encoder and experts said meanwhile.
+
+A robot's start, noise and latency follow from its terrain, its command and its seed alone. Starts lie beside each other, so that
+a robot that a probe is tried on takes another way over the same ground than those it was fitted to.
+"""
 
 from __future__ import annotations
 
+import math
+import zlib
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -16,7 +22,7 @@ from ...policy.base import Policy
 from ...policy.watching import watched_session
 from ...robots import Robot
 from ...robots.rotation import from_yaw, tilt
-from ...terrains.base import Terrain
+from ...terrains.base import Pose, Terrain
 from ..episodes import Episode
 from ..motors import joint_parameters
 from ..policies import PoliciesRequest, check_fit
@@ -32,6 +38,8 @@ COMMANDS = {
 """The paper's commands: forward, lateral [m/s] and yaw [rad/s]."""
 INTERVAL = 0.1
 """Time between two notes [s]."""
+SPREAD = 0.25
+"""Half width of what each robot's seed adds to its start along x and y [m]: a fraction of the terrains, which are 10 m wide."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +58,7 @@ class LatentRequest(PoliciesRequest):
     seconds: float = 5.0
     """How long every robot walks [s]."""
     robots: int = 4
-    """For each terrain and command, at least 2; they differ in noise and latency."""
+    """For each terrain and command, at least 2; they differ in start, noise and latency."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,11 +116,12 @@ def collect(policy: Policy, robot: Robot, asked: LatentRequest, suite: Suite, te
         episodes = _episodes(asked, terrains, places)
         walk = Walk(policy, physics, suite.noise, episodes, steps=stands + steps, session=session)
         physics.randomize(Randomization(friction=walk.tensor([asked.friction] * len(places))))
-        poses = [terrains[t].spawns["level_eval"] for t, _, _ in places]
-        stand = robot.stand_height
+        physics.reset(physics.standing())
+        feet = (physics.state.foot_position_w - physics.state.base_position_w[:, None])[0, :, :2].double().numpy()
+        starts = [start(terrains[t], episodes[i], feet) for i, (t, _, _) in enumerate(places)]
         walk.reset(
-            walk.tensor([(*p.position[:2], p.position[2] + stand) for p in poses]),
-            from_yaw(walk.tensor([p.yaw for p in poses])),
+            walk.tensor([(*p.position[:2], p.position[2] + robot.stand_height) for p in starts]),
+            from_yaw(walk.tensor([p.yaw for p in starts])),
         )
         command = walk.tensor(list(COMMANDS.values()))[torch.tensor([c for _, c, _ in places])]
         fallen = torch.zeros(len(places), dtype=torch.bool)
@@ -136,6 +145,19 @@ def collect(policy: Policy, robot: Robot, asked: LatentRequest, suite: Suite, te
         falls=int(fallen.sum()),
         walkers=len(places),
     )
+
+
+def start(terrain: Terrain, episode: Episode, feet: NDArray[np.float64]) -> Pose:
+    """Where a robot starts: beside the start of quality episodes, by up to ``SPREAD`` along x and y, with no foot in the ground.
+
+    Args:
+        feet: of the standing robot, from its base, forward and left [m], (F, 2).
+    """
+    spawn = terrain.spawns["level_eval"]
+    x, y = spawn.position[:2] + np.random.default_rng(zlib.crc32(episode.key.encode())).uniform(-SPREAD, SPREAD, 2)
+    cos, sin = math.cos(spawn.yaw), math.sin(spawn.yaw)
+    height = terrain.height(x + feet @ (cos, -sin), y + feet @ (sin, cos)).max()
+    return Pose(position=(float(x), float(y), float(height)), yaw=spawn.yaw)
 
 
 def _table(parts: Sequence[torch.Tensor]) -> NDArray[np.float64]:

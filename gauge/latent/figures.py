@@ -38,7 +38,7 @@ _COLOURS = ("#0072b2", "#e69f00", "#d55e00", "#cc79a7", "#009e73", "#56b4e9", "#
 _SIDE, _LEFT, _TOP, _GAP = 300.0, 34.0, 46.0, 26.0
 _MOST_POINTS = 1500
 """Points of a policy that are drawn; all of them are in the CSV file."""
-_ROW, _CELL, _NAMES = 22.0, 40.0, 96.0
+_ROW, _CELL, _NAMES, _LINE = 22.0, 40.0, 96.0, 18.0
 
 Points = Sequence[tuple[str, Notes, Mapping[str, NDArray[np.float64]]]]
 
@@ -48,8 +48,8 @@ def label(name: str) -> str:
     return LABELS.get(name, name.replace("_", " "))
 
 
-def render_figure(name: str, results: Mapping[str, Any], points: Points) -> str | None:
-    """A figure as an SVG file with a panel for each policy; None where no policy has what it shows."""
+def draw(name: str, results: Mapping[str, Any], points: Points) -> dict[str, Any] | None:
+    """A figure's ``name``, a panel for each policy, and a ``legend`` of classes; None where no policy has what it shows."""
     if name == "experts":
         panels = [_weights_panel(e) for e in results["policies"] if e["experts"] is not None]
         legend: list[dict[str, Any]] = []
@@ -58,35 +58,38 @@ def render_figure(name: str, results: Mapping[str, Any], points: Points) -> str 
         classes = [label(n) for n in results[name]]
         panels = [_scatter(name, entries[who], notes, places[name]) for who, notes, places in points if name in places]
         legend = [{"text": text, "colour": _COLOURS[i % len(_COLOURS)]} for i, text in enumerate(classes)]
-    if not panels:
-        return None
-    x = _LEFT
     for panel in panels:
-        panel["x"] = x
-        x += panel["width"] + _GAP + (_LEFT if name != "experts" else 0.0)
-    at, line = _LEFT, 0
-    for item in legend:
+        # the panel's template has escaped what is in it
+        panel["drawn"] = markupsafe.Markup(_template("latent_panel.svg.j2").render(name=name, p=panel))
+    return {"name": name, "panels": panels, "legend": legend} if panels else None
+
+
+def render_figure(drawing: Mapping[str, Any]) -> str:
+    """A figure as an SVG file that stands alone, its panels side by side."""
+    x, places = _LEFT, []
+    for panel in drawing["panels"]:
+        places.append((x, panel))
+        x += panel["width"] + _GAP + (_LEFT if drawing["legend"] else 0.0)
+    at, y = _LEFT, _TOP + max(p["height"] for p in drawing["panels"]) + 44.0
+    legend = []
+    for item in drawing["legend"]:
         width = 28.0 + 7.0 * len(item["text"])
         if at + width > max(x, 360.0) and at > _LEFT:
-            at, line = _LEFT, line + 1
-        item["x"], item["line"] = round(at, 1), line
+            at, y = _LEFT, y + _LINE
+        legend.append({**item, "x": round(at, 1), "y": y})
         at += width
-    height = _TOP + max(p["height"] for p in panels) + 44.0
     return _template("latent.svg.j2").render(
-        name=name,
-        panels=panels,
+        name=drawing["name"],
+        panels=places,
         legend=legend,
         top=_TOP,
-        legend_y=height,
-        size=(round(max(x, 380.0), 1), round(height + 18.0 * (line + 1) if legend else height - 30.0, 1)),
+        size=(round(max(x, 380.0), 1), round(y + _LINE if legend else y - 30.0, 1)),
     )
 
 
-def render_page(results: Mapping[str, Any], pictures: Mapping[str, str]) -> str:
+def render_page(results: Mapping[str, Any], drawings: Mapping[str, Mapping[str, Any]]) -> str:
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
-    # the figures' templates have escaped what is in them
-    figures = {name: markupsafe.Markup(text) for name, text in pictures.items()}
-    return _template("latent.html.j2").render(results=results, figures=figures, spaces=SPACES)
+    return _template("latent.html.j2").render(results=results, figures=drawings, spaces=SPACES)
 
 
 _fixed = partial(fixed, digits=2)
@@ -116,6 +119,7 @@ def _scatter(name: str, entry: Mapping[str, Any], notes: Notes, places: NDArray[
         "words": words,
         "width": _SIDE,
         "height": _SIDE,
+        "box": (-22.0, -2.0, _SIDE + 24.0, _SIDE + 26.0),
         "axes": [f"PC {i + 1} ({100 * share:.0f} %)" for i, share in enumerate(entry[name]["explained"])],
         "paths": [
             {
@@ -138,6 +142,7 @@ def _weights_panel(entry: Mapping[str, Any]) -> dict[str, Any]:
         "words": f"{experts['at_once']:.1f} of {count} at once, {experts['in_all']:.1f} in all",
         "width": _NAMES + _CELL * count,
         "height": _ROW * (len(rows) + 1),
+        "box": (0.0, 0.0, _NAMES + _CELL * count, _ROW * (len(rows) + 1) + 4.0),
         "columns": [{"x": _NAMES + _CELL * (k + 0.5), "text": str(k + 1)} for k in range(count)],
         "rows": [
             {

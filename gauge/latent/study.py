@@ -24,7 +24,7 @@ from ..pipelines import check_friction
 from ..policies import Loaded, Watch, describe, load_policies
 from ..suite import Suite, SuiteError, load_suite
 from .collecting import COMMANDS, LatentRequest, Notes, collect
-from .figures import FIGURES, render_figure, render_page
+from .figures import FIGURES, draw, render_figure, render_page
 from .separation import Separation, principal_components, separation
 
 PAIRS = {"terrains": "forward on every terrain", "commands": "every command on all terrains"}
@@ -70,6 +70,9 @@ def study_latents(
             points.append((label, notes, places))
     if not entries:
         raise LatentError("; ".join(r["reason"] for r in refused) or "there is nothing to look at; name a policy")
+    if len(terrains) == 1:
+        only = f"'{terrains[0].name}' is the only terrain, so there is nothing to tell it from"
+        refused.append({"what": "telling terrains apart", "reason": f"{only}; name more of them with --terrain"})
     results = {
         "schema": 1,
         "policies": entries,
@@ -87,12 +90,11 @@ def study_latents(
         ),
     }
     make_folder(folder, LatentError)
-    drawn = {name: render_figure(name, results, points) for name in FIGURES}
-    pictures = {name: text for name, text in drawn.items() if text}
-    for name, text in pictures.items():
-        write_atomically(folder / f"latent-{name}.svg", text, LatentError)
+    drawings = {name: drawing for name in FIGURES if (drawing := draw(name, results, points))}
+    for name, drawing in drawings.items():
+        write_atomically(folder / f"latent-{name}.svg", render_figure(drawing), LatentError)
     write_atomically(folder / "points.csv", as_csv(results, points), LatentError)
-    write_atomically(folder / "latent.html", render_page(results, pictures), LatentError)
+    write_atomically(folder / "latent.html", render_page(results, drawings), LatentError)
     write_atomically(folder / "latent.json", json_text(results), LatentError)
     return results
 
@@ -135,6 +137,10 @@ def look(
     }
     places: dict[str, NDArray[np.float64]] = {}
     for pair, rows in chosen.items():
+        found: dict[str, Any] = {}
+        entry[pair] = found
+        if len(names[pair]) < 2:
+            continue
         seen = np.bincount(classes[pair][rows], minlength=len(names[pair]))
         if not seen.all():
             raise LatentError(
@@ -147,9 +153,8 @@ def look(
                 f"with '{loaded.policy.path}' all robots but number {left[0] + 1} fell at once, and telling {pair} apart takes two, to "
                 "learn from and to be tried on; choose other terrains, a lower --level or more --robots"
             )
-        found: dict[str, Any] = {}
         for space, values in spaces.items():
-            if values is None or len(names[pair]) < 2:
+            if values is None:
                 continue
             found[space] = _plain(separation(values[rows], classes[pair][rows], notes.robot[rows]), names[pair])
             whole = blocks[rows[blocks[:, 0]]]
@@ -161,7 +166,6 @@ def look(
             found["explained"] = [float(s) for s in shares]
             places[pair] = np.full((len(rows), 2), np.nan)
             places[pair][rows] = spread
-        entry[pair] = found
     entry["experts"] = None if notes.weights is None else _experts(notes, names, chosen, classes)
     return entry, places
 

@@ -35,10 +35,12 @@ LONGEST = 3600.0
 """Of all commands together [s]."""
 MOST_PULLS = 1000
 """Of one force."""
+ON_ITS_BACK = 3.0
+"""Tilt that a robot on its back comes to [rad]: π on level ground, less the room that legs and trunk may leave."""
 
 
 class ScenarioError(ValueError):
-    """A scenario that does not exist, is malformed, or could never be decided."""
+    """A scenario that does not exist, is malformed, or could never be decided or failed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,14 +220,14 @@ def load_scenario(name: str) -> Scenario:
     """Load a scenario by name, or from a TOML file of the user's own (a path that ends in ``.toml``).
 
     Raises:
-        ScenarioError: no such scenario, a malformed file, its suite, or a scenario that could never be decided.
+        ScenarioError: no such scenario, a malformed file, its suite, or a scenario that could never be decided or failed.
     """
     own = name.endswith(".toml")
     if not own and name not in scenario_names():
         known = ", ".join(scenario_names())
         raise ScenarioError(
-            f"there is no scenario '{one_line(name, 80)}'{did_you_mean(name, scenario_names())}; choose one of {known}, or "
-            "give a .toml file"
+            f"there is no scenario '{one_line(name, 80)}'{did_you_mean(name, scenario_names()) or ';'} choose one of {known}, "
+            "or give a .toml file"
         )
     path = Path(name) if own else SCENARIO_FOLDER / f"{name}.toml"
     source = f"scenario file {one_line(path)}"
@@ -247,7 +249,7 @@ def _problems(scenario: Scenario) -> Iterator[str]:
         load_suite(scenario.suite)
     except SuiteError as error:
         yield str(error)
-    ground, start, success = scenario.ground, scenario.start, scenario.success
+    ground, success = scenario.ground, scenario.success
     seconds = scenario.seconds
     if seconds > LONGEST:
         yield f"the commands last {seconds:g} s; at most {LONGEST:g} s are possible"
@@ -276,20 +278,25 @@ def _problems(scenario: Scenario) -> Iterator[str]:
             )
     for number, found in enumerate(scenario.reported):
         successes, trials = found.successes, found.trials
+        if (successes is None) != (trials is None):
+            given, lacking = ("successes", "trials") if trials is None else ("trials", "successes")
+            yield f"reported[{number}] has {given} = {getattr(found, given)} and no {lacking}; give both, or a text alone"
+        elif successes is None and found.text is None:
+            yield f"reported[{number}] says nothing of what was found; give successes and trials, or a text"
         if successes is not None and trials is not None and (successes > trials or trials == 0):
             yield (
                 f"reported[{number}] has {successes} successes in {trials} trials; there cannot be more of them than trials, nor "
                 "no trials"
             )
-    first = scenario.commands[0].until_x
-    if first is not None and first <= start.x + start.spread[0]:
-        yield (
-            f"commands[0].until_x is x = {first:g} m, and robots start at up to {start.x + start.spread[0]:g} m, where it is over "
-            "before it begins; let it lead on, or leave it out"
-        )
     if not success.survive and success.beyond is None and success.speed is None:
         yield (
             "nothing says what success is, so it can never be decided; give beyond, speed or survive = true under [success]"
+        )
+    tilt, lying = scenario.failure.tilt, scenario.failure.lying
+    if success.beyond is None and success.speed is None and lying is False and tilt > ON_ITS_BACK:
+        yield (
+            f"success is to survive, and nothing counts as a fall: failure.lying is false, and failure.tilt is {tilt:g} rad, which a "
+            f"robot on its back need not exceed; give failure.lying a time [s], or failure.tilt at most {ON_ITS_BACK:g} rad"
         )
     fastest = max(phase.velocity[0] for phase in scenario.commands)
     if success.speed is not None and success.speed > fastest:
@@ -297,30 +304,36 @@ def _problems(scenario: Scenario) -> Iterator[str]:
             f"success.speed is {success.speed:g} m/s and no more than {fastest:g} m/s is ever commanded, so success can never be "
             "decided; command more, or ask for less"
         )
-    onward = [phase for phase in scenario.commands if _leads_on(phase, scenario)]
-    if success.beyond is not None and not onward:
+    yield from _way_problems(scenario)
+
+
+def _way_problems(scenario: Scenario) -> Iterator[str]:
+    """What is wrong with the way along x, in sentences: a walk through the commands as they are told, from the furthest start.
+
+    Once robots are told to turn their heading is unknown: every command may lead on, and no place is surely passed.
+    """
+    start, beyond = scenario.start, scenario.success.beyond
+    begin = x = furthest = start.x + start.spread[0]
+    turned = False
+    for number, phase in enumerate(scenario.commands):
+        limit = math.inf if phase.until_x is None else phase.until_x
+        if limit <= x and not turned:
+            yield (
+                f"commands[{number}].until_x is x = {limit:g} m, and robots are at up to {x:g} m by then, where it is over before it "
+                "begins; let it lead on, or leave it out"
+            )
+        forward, lateral, yaw = phase.velocity
+        turned = turned or bool(yaw and not phase.steer)
+        along = math.cos(start.yaw) * forward - math.sin(start.yaw) * lateral
+        x = min(x + phase.seconds * (math.hypot(forward, lateral) if turned else along), max(x, limit))
+        furthest = max(furthest, x)
+    if beyond is not None and furthest == begin:
         yield (
-            f"success.beyond is x = {success.beyond:g} m, but no command leads along x from a heading of {start.yaw:g} rad, so success "
+            f"success.beyond is x = {beyond:g} m, but no command leads along x from a heading of {start.yaw:g} rad, so success "
             "can never be decided; command a velocity that leads there, or ask for something else under [success]"
         )
-    way = sum(math.hypot(*phase.velocity[:2]) * phase.seconds for phase in onward)
-    if success.beyond is not None and not start.x + start.spread[0] < success.beyond <= start.x + way:
+    elif beyond is not None and not begin < beyond <= furthest:
         yield (
-            f"success.beyond is x = {success.beyond:g} m, but robots start at {start.x:g} m and the commands lead no further than "
-            f"to {start.x + way:g} m, so success can never be decided; choose a place between"
+            f"success.beyond is x = {beyond:g} m, but robots start at up to {begin:g} m and the commands lead no further than to "
+            f"{furthest:g} m, so success can never be decided; choose a place between, or lead further"
         )
-    limits = [phase.until_x for phase in onward if phase.until_x is not None]
-    if success.beyond is not None and 0 < len(limits) == len(onward) and max(limits) < success.beyond:
-        yield (
-            f"success.beyond is x = {success.beyond:g} m, but the commands that lead on end at until_x = {max(limits):g} m, so "
-            "success can never be decided; let until_x be as far"
-        )
-
-
-def _leads_on(phase: Leg, scenario: Scenario) -> bool:
-    """Whether a command may lead towards larger x: any that moves does where robots are told to turn, for want of a heading."""
-    forward, lateral, _ = phase.velocity
-    start = scenario.start
-    away = abs(math.remainder(start.yaw + math.atan2(lateral, forward), math.tau))
-    turned = any(each.velocity[2] and not each.steer for each in scenario.commands)
-    return bool(forward or lateral) and (turned or away <= 0.5 * math.pi + start.spread[2])

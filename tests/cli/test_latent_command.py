@@ -17,6 +17,12 @@ def test_tables_and_a_sentence_on_what_was_left_out(run, policy, tmp_path):
     assert found["policies"][0]["label"] == "pretrained" and found["terrains"] == ["flat", "wave"]
 
 
+def test_a_single_terrain_is_said_to_have_nothing_to_be_told_from(run):
+    result = run("latent", "pretrained", *SHORT[2:], "--out", "here")
+    assert result.exit_code == 1 and "commands told apart" in result.stdout
+    assert result.stderr.splitlines()[-1].startswith("telling terrains apart was left out: 'wave' is the only terrain")
+
+
 def test_one_sentence_for_a_policy_with_nothing_to_look_at(refused, policy):
     sentence = refused("latent", policy, *SHORT)
     assert sentence == (

@@ -43,7 +43,18 @@ def test_no_cluster(refused, tiny, monkeypatch):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
 def test_a_machine_without_a_gpu(refused, tiny):
     (tiny / "sweep.toml").write_text(sweep(one='task = "go2-cts"\nbackend = "mujoco-warp"'))
-    assert "wants a GPU and this machine has none" in refused("sweep", "sweep.toml")
+    sentence = refused("sweep", "sweep.toml")
+    assert "wants a GPU and this machine has none; write device = " in sentence and "--" not in sentence
+
+
+@pytest.mark.parametrize("field", ["suite", "training_suite"])
+def test_a_suite_that_is_not_there_leaves_no_folder(refused, tiny, field):
+    text = re.sub(rf"^{field} = .*", f'{field} = "quik"', sweep(one='task = "go2-cts"'), flags=re.MULTILINE)
+    (tiny / "sweep.toml").write_text(text)
+    told = refused("sweep", "sweep.toml", "--out", "out")
+    assert (
+        told.startswith(f"sweep file 'sweep.toml': {field}: there is no suite 'quik'") and not (tiny / "out").exists()
+    )
 
 
 def test_a_folder_to_keep_runs_in_that_cannot_be_is_told_at_once(refused, tiny):
@@ -78,7 +89,7 @@ def test_a_folder_of_other_settings_keeps_its_tables(run, tmp_path):
     result = run("sweep", "sweep.toml", "--out", "out", "--report")
     told = [line for line in result.stderr.splitlines() if line.startswith("gaitgauge: ")]
     assert result.exit_code == 1 and len(told) == 4
-    assert all("holds a training with other settings" in line for line in told)
+    assert all("whose training.run.iterations is '1530', and the sweep's file says '1531'" in line for line in told)
     assert (tmp_path / "out/sweep.html").read_text() == "of an earlier call"
 
 

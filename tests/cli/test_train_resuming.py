@@ -91,7 +91,7 @@ def test_trained_networks_go_on_where_their_schedules_stood(trained):
     entries = torch.load(trained / "model_2.pt", weights_only=True)
     entries["training"]["progress"] = 0.25
     torch.save(entries, trained / "quarter.pt")
-    quarter = plan(trained / "quarter.pt")
+    quarter = plan(trained / "quarter.pt", *SMALL)
     assert quarter.task.environment.schedule.begin == 0.25
     assert quarter.settings["environment"]["schedule"]["begin"] == 0.25
     (trained / "quarter.pt").unlink()
@@ -160,7 +160,34 @@ def test_policy_without_training_state(refused, policy):
 def test_initial_weights_of_other_networks(refused, trained):
     bigger = [s.replace("student_hidden=8", "student_hidden=16") for s in SMALL]
     message = refused("train", "go2-flat", *FAKE, "--init-from", trained / "model_2.pt", *bigger)
-    assert "training.network" in message
+    assert message == (
+        f"Cannot start from '{trained / 'model_2.pt'}': its network has encoder_hidden [8] (this run's [16]); give the same "
+        "training.network.* settings."
+    )
+
+
+def test_initial_weights_of_another_method(refused, trained, tmp_path):
+    message = refused("train", "go2-him", *FAKE, "--init-from", trained / "model_2.pt", *SMALL)
+    assert message.endswith("': its network is cts, this run's is him; begin with a file of him, or with none.")
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [
+        ("training.network.latent_width=16", "has latent_width 32 (this run's 16)"),
+        ("training.algorithm.method=him", "is cts, this run's is him"),
+        ("environment.observations.history_length=7", "has history_length 5 (this run's 7)"),
+    ],
+)
+def test_resuming_with_another_network(refused, trained, setting, named):
+    before = sorted(trained.rglob("*"))
+    message = refused("train", "go2-flat", "--resume", trained, "--device", "cpu", "--iterations", 3, setting)
+    assert (
+        f"Cannot resume from '{trained / 'model_2.pt'}': its network {named}; a resumed run keeps its network"
+        in message
+    )
+    assert sorted(trained.rglob("*")) == before
 
 
 def test_finished_run_says_what_to_give(refused, trained):
@@ -183,6 +210,7 @@ def test_a_resumed_run_has_the_settings_of_its_checkpoint_whatever_the_task_says
         TrainRequest(task=name, backend="fake", device="cpu", overrides=("training.algorithm.clip=0.9",))
     )
     monkeypatch.setattr(launch, "find_task", lambda *_, **__: elsewhere.task)
+    monkeypatch.setattr(launch, "check_network", lambda *_: None)  # the file's network is of its own task
     resumed = prepare(TrainRequest(task=name, device="cpu", resume=str(path)))
     assert resumed.task.environment == made.task.environment
     assert resumed.task.training == made.task.training

@@ -97,6 +97,8 @@ def test_what_comes_of_it_is_printed_and_written(run, policy, scenarios, tmp_pat
     ]
     page = (tmp_path / "here" / "trial.html").read_text()
     assert "Standing &lt;b&gt;still&lt;/b&gt;" in page and "<b>still" not in page and "Theirs: 5/20" in page
+    # on phones rows are cards, whose values say what they are
+    assert '<table class="trials stack">' in page and '<td data-label="came through"><strong>2/2' in page
 
 
 def test_what_cannot_be_tried_is_said_and_the_others_go_on(run, policy, scenarios, tmp_path):

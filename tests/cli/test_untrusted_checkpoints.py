@@ -137,13 +137,17 @@ def test_settings_that_reach_elsewhere_are_refused(refused, trained, tmp_path, f
 
 def test_settings_larger_than_the_machine_are_one_sentence(refused, trained, tmp_path):
     entries = torch.load(trained / "model_2.pt", weights_only=True)
-    for width, named in ((10**7, "less than or equal to 65536"), (30_000, "weights; at most")):
+    for width, named in ((10**7, "less than or equal to 65536"), (30_000, "(this run's [30000, 30000])")):
         entries["training"]["settings"]["training"]["network"]["actor_hidden"] = [width, width]
         torch.save(entries, tmp_path / "model_2.pt")
         assert named in refused("train", "go2-flat", "--resume", tmp_path / "model_2.pt", *RESUME)
+    large = "training.network.actor_hidden=30000,30000"
+    assert "weights; at most" in refused("train", "go2-flat", *FAKE, large)
 
 
 @pytest.mark.parametrize("trust", [(), ("--trust",)])
 def test_what_lies_beside_a_checkpoint_is_no_code(refused, tmp_path, policy, trust):
     assert "holds no training state" in refused("train", "go2-flat", "--backend", "fake", "--resume", policy, *trust)
-    assert "training.network" in refused("train", "go2-flat", *FAKE, "--init-from", policy, *SMALL, *trust)
+    assert "network is mlp, this run's is cts" in refused(
+        "train", "go2-flat", *FAKE, "--init-from", policy, *SMALL, *trust
+    )

@@ -2,6 +2,7 @@
 
 import math
 import re
+from typing import Any
 
 import pytest
 from gaitgauge.gauge import charts
@@ -103,6 +104,29 @@ def test_curves_have_round_ticks_and_leave_out_what_is_not_finite():
     assert charts.curves({"none": []})["lines"] == []
 
 
+def test_curves_over_little_have_ticks_that_differ():
+    data = charts.curves({"a": [([0.000384, 0.000768], [-2e-5, 1e-5])]})
+    x, y = (" ".join(t["label"] for t in data[f"{axis}_ticks"]) for axis in "xy")
+    assert x == "0 0.0001 0.0002 0.0003 0.0004 0.0005 0.0006 0.0007"
+    assert y == "−0.00002 −0.000015 −0.00001 −0.000005 0 0.000005 0.00001"
+    assert charts.curves({"a": [([2e7], [1e6])]})["x_ticks"][-1]["label"] == "20000000"
+
+
+def sweep_page(figures: dict[str, Any], names: list[str]) -> str:
+    sweep = {"title": "", "name": "", "suite": "", "entries": [], "sentences": [], "runs": [], "compared": False}
+    return page_template("sweep.html.j2").render(sweep=sweep, groups=[], names=names, figures=figures)
+
+
+def test_a_curve_of_one_point_is_a_dot_and_an_entry_without_a_curve_is_in_no_legend():
+    nothing = ([], [])
+    data = charts.curves({"none": [nothing], "dot": [([1.0], [2.0])], "line": [([0.0, 1.0], [0.0, 1.0]), nothing]})
+    page = sweep_page({"level": data}, ["none", "dot", "line"])
+    assert re.findall(r'<(polyline|circle) class="curve (c\d)', page) == [("circle", "c1"), ("polyline", "c2")]
+    assert re.findall(r'class="curve (c\d)" d="M0 5h26"/></svg>(\w+)', page) == [("c1", "dot"), ("c2", "line")]
+    assert "Learning curves" not in sweep_page({"level": charts.curves({"none": [nothing]})}, ["none"])
+    assert "Learning curves" not in sweep_page({}, ["none"])
+
+
 @pytest.mark.parametrize(
     ("seeds", "legend"),
     [
@@ -113,8 +137,7 @@ def test_curves_have_round_ticks_and_leave_out_what_is_not_finite():
 )
 def test_seeds_of_a_sweep_s_entry_share_its_colour_and_differ_in_their_dashes(seeds, legend):
     data = charts.curves({name: [([0.0, 1.0], [0.0, 1.0])] * seeds for name in ("CTS", "HIM")})
-    sweep = {"title": "", "name": "", "suite": "", "entries": [], "sentences": [], "runs": [], "compared": False}
-    page = page_template("sweep.html.j2").render(sweep=sweep, groups=[], names=["CTS", "HIM"], figures={"level": data})
+    page = sweep_page({"level": data}, ["CTS", "HIM"])
     drawn = re.findall(r'<polyline class="curve (c\d d\d)"', page)
     dashes = [f"d{place % 4}" for place in range(seeds)]
     assert drawn == [f"{colour} {dash}" for colour in ("c0", "c1") for dash in dashes]

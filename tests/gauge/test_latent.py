@@ -8,7 +8,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
-from gaitgauge.gauge.latent.collecting import Notes, collect
+from gaitgauge.gauge.episodes import Episode
+from gaitgauge.gauge.latent.collecting import SPREAD, Notes, collect, start
 from gaitgauge.gauge.latent.separation import principal_components, separation, silhouette
 from gaitgauge.gauge.latent.study import LatentError, LatentRequest, _blocks, _experts, look, study_latents
 from gaitgauge.gauge.policies import Loaded
@@ -97,6 +98,27 @@ def test_what_robots_noted_belongs_to_where_they_were(walks):
     asked, *places = walks
     again = collect(policy, robot, replace(asked, threads=1), *places)
     assert np.array_equal(notes.latent, again.latent)
+
+
+@pytest.mark.parametrize("name", ["flat", "stairs_fd", "stairs_bd", "obstacle", "wave"])
+def test_robots_start_beside_each_other_with_a_foot_on_the_ground_and_none_in_it(name):
+    terrain = make_terrain(name, None if name == "flat" else 10)
+    spawn = terrain.spawns["level_eval"]
+    feet = np.array([(0.2, 0.14), (0.2, -0.14), (-0.2, 0.14), (-0.2, -0.14)])
+    ahead = -1.0 if name == "stairs_bd" else 1.0
+    places = set()
+    for seed in range(20):
+        episode = Episode(
+            terrain=name, level=10, friction=0.8, payload=0.0, seed=seed, stage="latent forward", goals=()
+        )
+        found = start(terrain, episode, feet)
+        assert found == start(terrain, episode, feet) and found.yaw == spawn.yaw
+        x, y, z = found.position
+        assert abs(x - spawn.position[0]) <= SPREAD and abs(y - spawn.position[1]) <= SPREAD
+        ground = terrain.height(x + ahead * feet[:, 0], y + ahead * feet[:, 1])
+        assert z - ground.max() == pytest.approx(0.0, abs=1e-9)
+        places.add((x, y))
+    assert len(places) == 20
 
 
 def test_means_are_of_notes_of_one_robot_that_follow_each_other():
@@ -209,7 +231,9 @@ def test_several_policies_side_by_side_and_one_that_has_nothing_to_look_at(polic
         titles = [t.text for t in picture.iter("{http://www.w3.org/2000/svg}text")]
         assert "pretrained" in titles and ("a<b>" in titles) == (name != "experts")
     page = (tmp_path / "latent.html").read_text()
-    assert "a<b>" not in page and "plain was left out" in page and page.count("<svg") == 3
+    assert "a<b>" not in page and "plain was left out" in page
+    # two panels of terrains, two of commands and one of experts, each a picture of its own that may stand below the others
+    assert page.count("<figure>") == 5 and page.count('<svg viewBox="-22.0 -2.0 324.0 326.0"') == 4
 
 
 def test_a_latent_of_one_entry_and_parts_of_none(tmp_path):
@@ -231,9 +255,16 @@ def test_a_latent_of_one_entry_and_parts_of_none(tmp_path):
         settling=0.2,
         robots=2,
     )
-    one, none, nobody = study_latents(request, tmp_path / "out")["policies"]
+    found = study_latents(request, tmp_path / "out")
+    one, none, nobody = found["policies"]
     assert one["commands"].keys() == {"latent", "input", "explained"} and one["commands"]["explained"][1] == 0.0
     assert none["commands"].keys() == {"input"} and nobody["experts"] is None
+    # one terrain: commands are told apart on it, and nothing is drawn or listed of terrains
+    assert one["terrains"] == {} and not (tmp_path / "out" / "latent-terrains.svg").exists()
+    reason = "'flat' is the only terrain, so there is nothing to tell it from; name more of them with --terrain"
+    assert found["refused"] == [{"what": "telling terrains apart", "reason": reason}]
+    page = (tmp_path / "out" / "latent.html").read_text()
+    assert "telling terrains apart was left out" in page and "Terrains, walking forward" not in page
 
 
 def test_one_sentence_where_there_is_nothing_to_look_at(policies, tmp_path):

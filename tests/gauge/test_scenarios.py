@@ -5,6 +5,7 @@ from gaitgauge.gauge.trials.page import view
 from gaitgauge.gauge.trials.scenario import ScenarioError, load_scenario, scenario_names
 from gaitgauge.gauge.trials.trialling import profile
 
+COMMAND = "[[commands]]\n"
 OWN = """
 name = "own"
 title = "One's own"
@@ -59,8 +60,12 @@ def test_a_scenario_differs_in_its_digest_by_what_decides_about_outcomes_alone(t
 
 
 def test_unknown_names_are_refused_with_those_that_are_near():
-    with pytest.raises(ScenarioError, match="there is no scenario 'tile-stair'; did you mean 'tile-stairs'"):
-        load_scenario("tile-stair")
+    with pytest.raises(
+        ScenarioError, match=r"did you mean 'lateral-pull' or 'lateral-impulse'[?] choose one of drop-60cm, "
+    ):
+        load_scenario("lateral")
+    with pytest.raises(ScenarioError, match="there is no scenario 'moon'; choose one of drop-60cm, "):
+        load_scenario("moon")
     with pytest.raises(ScenarioError, match=r"scenario file 'nowhere\.toml' does not exist"):
         load_scenario("nowhere.toml")
 
@@ -71,7 +76,7 @@ def test_unknown_names_are_refused_with_those_that_are_near():
         ('name = "own"', 'name = "sprint"', "is called 'sprint' as a scenario that ships"),
         ("survive = true", "survive = false", "nothing says what success is, so it can never be decided"),
         ("[success]\nsurvive = true", "", "nothing says what success is"),
-        ("survive = true", "beyond = 3.0", "commands lead no further than to 2 m, so success can never be decided"),
+        ("survive = true", "beyond = 3.0", "commands lead no further than to 2.05 m, so success can never be decided"),
         ("survive = true", "beyond = 0.0", "success can never be decided; choose a place between"),
         (
             "velocity = [1.0",
@@ -84,7 +89,17 @@ def test_unknown_names_are_refused_with_those_that_are_near():
             "no command leads along x from a heading of 3 rad",
         ),
         ("survive = true", "speed = 1.5", "no more than 1 m/s is ever commanded, so success can never be decided"),
-        ("velocity = [1.0", "until_x = 1.0\nvelocity = [1.0", "commands that lead on end at until_x = 1 m"),
+        ("velocity = [1.0", "until_x = 1.0\nvelocity = [1.0", "lead no further than to 1 m, so success can never"),
+        (  # the first command would lead on, and ends at 1 m
+            "velocity = [1.0",
+            f"until_x = 1.0\nvelocity = [0.8, 0.0, 0.0]\n{COMMAND}seconds = 0.4\nvelocity = [1.0",
+            "commands lead no further than to 1.4 m, so success can never be decided",
+        ),
+        (
+            "[success]\nsurvive = true",
+            f"{COMMAND}until_x = 0.5\nseconds = 1.0\nvelocity = [2.0, 0.0, 0.0]\n[success]\nspeed = 1.9",
+            r"commands\[1\].until_x is x = 0.5 m, and robots are at up to 2.05 m by then, where it is over before it begins",
+        ),
         ("friction = 0.6", "friction = 0.0", "friction is 0.0; it must be greater than 0"),
         ("seconds = 2.0", "seconds = -1.0", r"commands\[0\].seconds is -1.0"),
         ("friction = 0.6", "frictoin = 0.6", "unknown field 'frictoin'; did you mean 'friction'"),
@@ -95,6 +110,11 @@ def test_unknown_names_are_refused_with_those_that_are_near():
         ),
         ("[success]", "[failure]\nlying = 0\n[success]", "failure.lying is 0; it must be greater than 0"),
         ("[success]", "[failure]\nlying = true\n[success]", "failure.lying is true; give the time"),
+        (
+            "[success]",
+            "[failure]\nlying = false\ntilt = 3.1416\n[success]",
+            "nothing counts as a fall: failure.lying is false, and failure.tilt is 3.1416 rad",
+        ),
         ("[success]", "[ground]\nlevel = 3\n[success]", "ground.level is 3 of no terrain"),
         (
             "velocity = [1.0",
@@ -119,6 +139,9 @@ def test_unknown_names_are_refused_with_those_that_are_near():
         ),
         ("[success]", '[[reported]]\nwho = "a"\nsuccesses = 3\ntrials = 2\n[success]', "3 successes in 2 trials"),
         ("[success]", '[[reported]]\nwho = "a"\nsuccesses = 0\ntrials = 0\n[success]', "0 successes in 0 trials"),
+        ("[success]", '[[reported]]\nwho = "a"\nsuccesses = 3\n[success]', "successes = 3 and no trials; give both"),
+        ("[success]", '[[reported]]\nwho = "a"\ntrials = 3\n[success]', "has trials = 3 and no successes; give both"),
+        ("[success]", '[[reported]]\nwho = "a"\n[success]', r"reported\[0\] says nothing of what was found"),
         ("[success]", '[ground]\nterrain = "moon"\n[success]', "unknown terrain 'moon'"),
         ("[success]", '[ground]\nterrain = "wave"\n[success]', "terrain 'wave' needs a level"),
         (
@@ -146,7 +169,7 @@ def test_unknown_names_are_refused_with_those_that_are_near():
 )
 def test_what_cannot_be_played_or_decided_is_refused_in_one_sentence(tmp_path, old, new, sentence):
     text = OWN.replace(old, new)
-    if "until_x" in new:
+    if "until_x" in new and "[success]" not in new:
         text = text.replace("survive = true", "beyond = 1.5")
     with pytest.raises(ValueError, match=sentence) as caught:
         load(tmp_path, text)
@@ -158,10 +181,22 @@ def test_what_cannot_be_played_or_decided_is_refused_in_one_sentence(tmp_path, o
     [(3.1416 - 0.0001, "-1.0, 0.0, 0.0"), (1.5, "0.0, -1.0, 0.0"), (3.0, "1.0, 0.0, 0.5"), (0.0, "-1.0, 0.0, 0.5")],
 )
 def test_a_way_along_x_may_begin_with_any_heading(tmp_path, yaw, velocity):
-    back = f"[[commands]]\nseconds = 2.0\nuntil_x = 0.5\nvelocity = [{velocity}]\n\n"
+    back = f"[[commands]]\nseconds = 2.0\nuntil_x = 2.5\nvelocity = [{velocity}]\n\n"
     text = OWN.replace("velocity = [1.0, 0.0, 0.0]", f"velocity = [{velocity}]")
     text = text.replace("[success]\nsurvive = true", f"{back}[start]\nyaw = {yaw}\n[success]\nbeyond = 1.5")
     assert load(tmp_path, text).success.beyond == 1.5
+
+
+def test_places_are_passed_again_after_a_way_back_and_after_a_turn(tmp_path):
+    for between in ("-1.0, 0.0, 0.0", "0.0, 0.0, 1.57"):
+        on = f"{COMMAND}seconds = 2.0\nvelocity = [{between}]\n{COMMAND}seconds = 2.0\nuntil_x = 1.0\nvelocity = [1.0, 0.0, 0.0]\n"
+        assert load(tmp_path, OWN.replace("[success]", on + "[success]")).commands[2].until_x == 1.0
+
+
+def test_upside_down_is_no_fall_where_something_else_can_be_missed_or_lying_is_one(tmp_path):
+    for failure, success in (("lying = false", "beyond = 1.0"), ("lying = 2.0", "survive = true")):
+        text = OWN.replace("[success]\nsurvive = true", f"[failure]\ntilt = 3.1416\n{failure}\n[success]\n{success}")
+        assert load(tmp_path, text).failure.tilt == 3.1416
 
 
 def test_the_ground_is_drawn_from_the_side_by_its_corners():

@@ -152,7 +152,7 @@ def test_ranks_of_one_policy_are_refused(tmp_path):
 def test_policies_that_one_side_lacks_are_named(tmp_path):
     real = read_measurements(write(tmp_path / "real.csv", "policy,motion,m\nours,walk,1\n"))
     sim = read_measurements(write(tmp_path / "sim.csv", "policy,motion,m\nour,walk,1\n"))
-    with pytest.raises(ValidationError, match="'sim' has no rows of policy 'ours'; did you mean 'our'"):
+    with pytest.raises(ValidationError, match=r"'sim' has no rows of policy 'ours'; did you mean 'our'\? both sides"):
         validate(real, [sim])
 
 

@@ -282,7 +282,7 @@ def test_motor_speeds_that_would_do_nothing_are_refused():
     faster = RandomizationConfiguration(motor_speed=(1.0, 2.5))
     with pytest.raises(
         ConfigurationError,
-        match=r"^randomization\.motor_speed is 1 to 2\.5 while physics\.torque_speed_limit is off, .* leave .* at 1,1$",
+        match=r"^environment\.randomization\.motor_speed is 1 to 2\.5 while environment\.physics\.torque_speed_limit is off, .* at 1,1$",
     ):
         make(randomization=faster, physics={"torque_speed_limit": False})
     make(physics={"torque_speed_limit": False})
@@ -304,7 +304,7 @@ def test_joint_speeds_of_motors_that_nobody_knows_are_not_judged(monkeypatch):
     monkeypatch.setattr("gaitgauge.training.environment.joint_parameters", lambda *_: nobody_knows)
     with pytest.raises(
         ConfigurationError,
-        match=r"^rewards\.joint_speed_limits is -0\.3, but .* 'go2' does not say .*, or set it to 0$",
+        match=r"^environment\.rewards\.joint_speed_limits is -0\.3, but .* 'go2' does not say .*, or set it to 0$",
     ):
         make(rewards=weights, physics={"torque_speed_limit": False})
 
@@ -411,7 +411,9 @@ def test_joint_constants_can_be_overridden():
     parameters = make(joints=joints).backend.scene.parameters
     assert parameters.armature == (0.02,) * 12 and parameters.friction_loss == (0.0,) * 12
     assert parameters.stiffness == (20.0,) * 12
-    with pytest.raises(ValueError, match=r"joints.parameters is 'nope', but robot 'go2' has: gauge, training"):
+    with pytest.raises(
+        ValueError, match=r"^environment.joints.parameters is 'nope', but robot 'go2' has: gauge, training"
+    ):
         make(joints=JointConfiguration(parameters="nope"))
 
 

@@ -76,14 +76,21 @@ def test_a_rescued_checkpoint_is_of_the_last_iteration(tmp_path, monkeypatch):
 def test_broken_weights_are_not_rescued(tmp_path, monkeypatch):
     error = lose(tmp_path, monkeypatch, outcome="running", broken=True)
     assert isinstance(error, ProcessLostError) and "not finite" in str(error) and "--resume" not in str(error)
-    assert not (tmp_path / "model_2.pt").exists() and noted(tmp_path) == "failed"
+    assert not (tmp_path / "model_2.pt").exists() and noted(tmp_path) == "diverged"
 
 
 @pytest.mark.parametrize("broken", [True, False])
-def test_a_run_in_which_another_process_diverged_has_failed(tmp_path, monkeypatch, broken):
+def test_a_run_in_which_another_process_diverged_has_diverged(tmp_path, monkeypatch, broken):
     """The one that diverged has said so; what is finite is kept all the same."""
-    assert isinstance(lose(tmp_path, monkeypatch, outcome="failed", broken=broken), SystemExit)
-    assert (tmp_path / "model_2.pt").exists() == (not broken) and noted(tmp_path) == "failed"
+    assert isinstance(lose(tmp_path, monkeypatch, outcome="diverged", broken=broken), SystemExit)
+    assert (tmp_path / "model_2.pt").exists() == (not broken) and noted(tmp_path) == "diverged"
+
+
+def test_a_run_in_which_another_process_failed_has_lost_it(tmp_path, monkeypatch):
+    """It noted that, since nobody might have been left to; those that are left have a checkpoint to tell of."""
+    error = lose(tmp_path, monkeypatch, outcome="failed", broken=False)
+    assert "iteration 2 is in" in str(error) and (tmp_path / "model_2.pt").exists()
+    assert noted(tmp_path) == "lost a process"
 
 
 def test_a_process_that_diverges_says_so_for_all(tmp_path):
@@ -91,7 +98,7 @@ def test_a_process_that_diverges_says_so_for_all(tmp_path):
     env.poison = 2
     with pytest.raises(TrainingDivergedError):
         make(tmp_path, env=env).learn(1)
-    assert noted(tmp_path) == "failed"
+    assert noted(tmp_path) == "diverged"
 
 
 @pytest.mark.parametrize("begun_at", [0, 3])
@@ -108,9 +115,11 @@ def test_a_run_that_loses_a_process_before_its_first_iteration_says_so(tmp_path,
     assert (said["outcome"], said["iteration"]) == ("lost a process", begun_at)
 
 
-def test_a_process_that_fails_before_its_first_iteration_says_so_for_all(tmp_path, monkeypatch):
-    """A reward that raises does so in every process: none is left to say it."""
+@pytest.mark.parametrize("complete", [0, 1])
+def test_a_process_that_fails_says_so_for_all(tmp_path, monkeypatch, complete):
+    """A reward that raises does so in every process, whether or not an iteration was complete: none is left to say it."""
     runner = make(tmp_path)
+    runner.learn(complete)
     update_run_json(tmp_path, {"outcome": "running"})
     monkeypatch.setattr(runner.env, "step", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):

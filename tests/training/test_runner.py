@@ -190,10 +190,13 @@ def test_nan_in_the_environment_is_counted_and_stops_the_run(tmp_path):
     assert runner.logger.scalars["Physics/nonfinite_samples"] == 8
     assert all(torch.isfinite(p).all() for p in runner.alg.actor.parameters())
     strict = make(tmp_path, env=env)
-    with pytest.raises(TrainingDivergedError, match=r"8 of 64 environment samples .* last checkpoint"):
+    limit = r"8 of 64 environment samples are not finite \(training\.run\.nonfinite_limit is 0\.01\); "
+    with pytest.raises(TrainingDivergedError, match=rf"{limit}.* The last checkpoint, '.*model_2\.pt', is intact\.$"):
         strict.learn(1)
     assert read_checkpoint(tmp_path / "model_2.pt")["iter"] == 2
-    assert json.loads((tmp_path / "run.json").read_text())["outcome"] == "failed"
+    assert json.loads((tmp_path / "run.json").read_text())["outcome"] == "diverged"
+    with pytest.raises(TrainingDivergedError, match=r"^Iteration 0: 8 of 64 .* a reward has diverged\.$"):
+        make(tmp_path / "new", env=env).learn(1)  # there is no checkpoint yet
 
 
 @pytest.mark.parametrize(("bare", "minibatches"), [(True, 4), (False, 8)])
@@ -210,7 +213,9 @@ def test_skipped_minibatches_are_a_share_of_those_of_the_iteration(tmp_path, mon
         runner.alg.storage.returns[0, 0] = torch.nan  # one sample, in one minibatch of each of two passes
 
     monkeypatch.setattr(runner.alg, "compute_returns", broken)
-    with pytest.raises(TrainingDivergedError, match=f"2 of {minibatches} minibatches"):
+    with pytest.raises(
+        TrainingDivergedError, match=f"2 of {minibatches} minibatches .* lower training.algorithm.learn"
+    ):
         runner.learn(1)
 
 

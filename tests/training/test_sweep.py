@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from gaitgauge.files.parsing import one_line
+from gaitgauge.gauge import charts
 from gaitgauge.training.checkpoint import CheckpointError
 from gaitgauge.training.sweep.curves import by_figure, curves_csv
 from gaitgauge.training.sweep.file import SweepEntry, SweepError, load_sweep
@@ -36,7 +38,6 @@ def write(folder: Path, text: str) -> Path:
         ("name = 'a'\ntitle = 'b'\n[[entry]]\nname = 'c'", r"entry\[0\] lacks task"),
         ("name = '../a'\ntitle = 'b'\n[[entry]]\nname = 'c'\ntask = 'd'", "letters, digits"),
         ("name = 'a'\ntitle = 'b'\nseed = [1]\n[[entry]]\nname = 'c'\ntask = 'd'", "unknown field 'seed'.*'seeds'"),
-        ("name = 'a'\ntitle = 'b'\nseeds = [1, 1]\n[[entry]]\nname = 'c'\ntask = 'd'", r"seeds \[1, 1\]; give"),
         ("name = 'a'\ntitle = 'b'\ncheckpoint = 'first'\n[[entry]]\nname = 'c'\ntask = 'd'", "'last' or 'best'"),
         (
             "name = 'a'\ntitle = 'b'\ncheckpoint = 'best'\ntraining_suite = 'none'\n[[entry]]\nname = 'c'\ntask = 'd'",
@@ -44,19 +45,24 @@ def write(folder: Path, text: str) -> Path:
         ),
         (
             "name = 'a'\ntitle = 'b'" + "\n[[entry]]\nname = 'C'\ntask = 'd'\n[[entry]]\nname = 'c'\ntask = 'd'",
-            "several",
+            "sweep.toml': has the entries 'C' and 'c' in one folder; rename one",
         ),
+        ("name = 'a'\ntitle = 'b'\n[[entry]]\nname = 'c'\ntaks = 'd'", r"unknown field 'entry\[0\].taks'.*'task'"),
         (
             f"name = 'a'\ntitle = 'b'\nseeds = {list(range(1001))}\n[[entry]]\nname = 'c'\ntask = 'd'",
             "1,001 trainings",
         ),
         (
-            "name = 'a'\ntitle = 'b'\nsettings = ['training.run.seed=1']\n[[entry]]\nname = 'c'\ntask = 'd'",
-            r"'training.run.seed=1', with which all seeds train the same run; write seeds",
+            "name = 'a'\ntitle = 'b'\nsuite = 'quik'\n[[entry]]\nname = 'c'\ntask = 'd'",
+            r"sweep.toml': suite: there is no suite 'quik'.*'quick'",
         ),
         (
-            "name = 'a'\ntitle = 'b'\n[[entry]]\nname = 'c'\ntask = 'd'\nsettings = [' environment.seed = 1']",
-            "with which all seeds",
+            "name = 'a'\ntitle = 'b'\nsuite = 'none'\n[[entry]]\nname = 'c'\ntask = 'd'",
+            "sweep.toml': suite: there is no suite 'none'",
+        ),
+        (
+            "name = 'a'\ntitle = 'b'\ntraining_suite = 'quik'\n[[entry]]\nname = 'c'\ntask = 'd'",
+            r"sweep.toml': training_suite: there is no suite 'quik'.*'quick'",
         ),
         ("name =", "not valid TOML"),
     ],
@@ -107,13 +113,41 @@ def test_entries_that_cannot_start_leave_the_others(tmp_path):
         SweepEntry(name="misspelt", task="go2-ctss"),
         SweepEntry(name="setting", task="go2-cts", settings=("training.algorithm.epoch=3",)),
         SweepEntry(name="engine", task="go2-cts", backend="physx"),
+        SweepEntry(name="seed", task="go2-cts", settings=("training.run.seed=1",)),
+        SweepEntry(name="seed of worlds", task="go2-cts", settings=(" environment.seed = 1",)),
+        SweepEntry(name="seeds", task="go2-cts", seeds=(1, 1)),
+        SweepEntry(name="no seeds", task="go2-cts", seeds=()),
+        SweepEntry(name="method", task="go2-him", init_from="pretrained"),
+        SweepEntry(
+            name="width", task="go2-moe-cts", init_from="pretrained", settings=("training.network.latent_width=16",)
+        ),
         replace(ENTRY, name="two", seeds=(7,)),
     )
     runs, refused = plan_runs(replace(SWEEP, entry=entries, seeds=(3, 4)), tmp_path)
     assert [run.label for run in runs] == ["one, seed 3", "two, seed 7", "one, seed 4"]
-    assert list(refused) == ["misspelt", "setting", "engine"]
-    for sentence, named in zip(refused.values(), ("go2-cts", "training.algorithm.epochs", "'physx'"), strict=True):
+    assert list(refused) == [entry.name for entry in entries[1:-1]]
+    for sentence, named in zip(
+        refused.values(),
+        (
+            "go2-cts",
+            "training.algorithm.epochs",
+            "'physx'",
+            "'training.run.seed=1' all seeds train the same run; write seeds",
+            "' environment.seed = 1' all seeds train the same run",
+            "seeds are [1, 1]; give at least one, and each once",
+            "seeds are []; give at least one",
+            "its network is moe_cts, this run's is him; begin with a file of him, or with none",
+            "its network has latent_width 32 (this run's 16); give the same training.network.* settings",
+        ),
+        strict=True,
+    ):
         assert named in sentence and "\n" not in sentence
+
+
+def test_a_seed_among_the_settings_of_all_entries_stops_all_of_them(tmp_path):
+    sweep = replace(SWEEP, settings=("training.run.seed=1",), entry=(ENTRY, replace(ENTRY, name="two")))
+    runs, refused = plan_runs(sweep, tmp_path)
+    assert runs == [] and list(refused) == ["one", "two"] and len(set(refused.values())) == 1
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
@@ -121,7 +155,15 @@ def test_without_a_gpu_only_engines_of_the_cpu_start(tmp_path):
     sweep = replace(SWEEP, backend="mujoco-warp", entry=(ENTRY, replace(ENTRY, name="cpu", backend="mujoco")))
     runs, refused = plan_runs(sweep, tmp_path)
     assert [run.label for run in runs] == ["cpu, seed 0"] and not runs[0].on_gpu
-    assert "this machine has none" in refused["one"]
+    assert refused["one"] == (
+        "backend 'mujoco-warp' wants a GPU and this machine has none; "
+        """write device = "cpu" (slow) or backend = "mujoco" in the sweep's file"""
+    )
+    asked = (replace(ENTRY, device="cuda"), replace(ENTRY, name="cpu", device="cuda", backend="mujoco"))
+    told = plan_runs(replace(sweep, entry=asked), tmp_path / "asked")[1]
+    assert list(told) == ["one", "cpu"]
+    for sentence in told.values():
+        assert "--" not in sentence and sentence.endswith("""; write device = "cpu" in the sweep's file""")
     assert plan_runs(replace(sweep, entry=(replace(ENTRY, device="cpu"),)), tmp_path / "other")[1] == {}
 
 
@@ -131,7 +173,9 @@ def test_a_note_that_was_edited_is_refused(tmp_path, note):
     path = run.folder / "entry.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | note))
     ((), refused) = plan_runs(SWEEP, tmp_path)
-    assert "holds a training with another" in refused["one"] and refused["one"].isprintable()
+    (name,) = note
+    its = f"whose {one_line(name)} is {note[name]}, and the sweep's file says {0 if name == 'seed' else 'none'}; give another"
+    assert its in refused["one"] and refused["one"].isprintable()
 
 
 @pytest.mark.parametrize("noted", [{"iteration": "5"}, {"iteration": None}, {"iteration": []}, {"outcome": 5}])
@@ -145,11 +189,24 @@ def test_a_run_description_that_was_edited_is_one_sentence(tmp_path, noted):
         _ = run.trained
 
 
-def test_a_folder_of_other_settings_is_refused(tmp_path):
-    plan_runs(SWEEP, tmp_path)
-    assert plan_runs(SWEEP, tmp_path)[1] == {}
-    changed = replace(SWEEP, settings=("training.algorithm.epochs=3",))
-    assert "holds a training with other settings" in plan_runs(changed, tmp_path)[1]["one"]
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        (
+            ("epochs=3",),
+            "whose training.algorithm.epochs is '2', and the sweep's file says '3'; give another folder with --out",
+        ),
+        (("clip=0.1", "epochs=2"), "whose training.algorithm.clip is none, and the sweep's file says '0.1'"),
+        ((), "whose training.algorithm.epochs is '2', and the sweep's file says none"),
+        (("epochs=3", "epochs=2"), "whose settings is ['training.algorithm.epochs=2'], and the sweep's file says ['"),
+    ],
+)
+def test_a_folder_of_other_settings_is_refused(tmp_path, changed, sentence):
+    before = replace(SWEEP, settings=("training.algorithm.epochs=2",))
+    plan_runs(before, tmp_path)
+    assert plan_runs(before, tmp_path)[1] == {}
+    settings = tuple(f"training.algorithm.{setting}" for setting in changed)
+    assert f"holds a training {sentence}" in plan_runs(replace(SWEEP, settings=settings), tmp_path)[1]["one"]
 
 
 def test_a_seed_that_is_new_is_not_noted_with_settings_that_are_refused(tmp_path):
@@ -157,7 +214,7 @@ def test_a_seed_that_is_new_is_not_noted_with_settings_that_are_refused(tmp_path
     plan_runs(SWEEP, tmp_path)
     more = replace(SWEEP, seeds=(1, 0))
     runs, refused = plan_runs(replace(more, settings=("training.algorithm.epochs=3",)), tmp_path)
-    assert runs == [] and "holds a training with other settings" in refused["one"]
+    assert runs == [] and "holds a training whose training.algorithm.epochs is none" in refused["one"]
     assert plan_runs(more, tmp_path)[1] == {}
 
 
@@ -189,7 +246,8 @@ def test_a_training_may_begin_with_a_shipped_policy_or_a_checkpoint(tmp_path):
     assert begins[begins.index("--init-from") + 1] == "pretrained"
     other = replace(going_on, entry=(replace(ENTRY, init_from="none.pt"),))
     assert "none.pt" in plan_runs(other, tmp_path / "other")[1]["one"]
-    assert "with another init_from" in plan_runs(replace(going_on, init_from=None), tmp_path)[1]["one"]
+    without = plan_runs(replace(going_on, init_from=None), tmp_path)[1]["one"]
+    assert "whose init_from is 'pretrained', and the sweep's file says none" in without
 
 
 def test_a_gauging_is_played_where_it_is_told(tmp_path):
@@ -247,9 +305,17 @@ def test_curves_keep_their_entries():
         "a,0,mean reward,2,0.75",
         "b,1,mean reward,1,0.25",
     ]
-    assert by_figure(curves, ["b", "a", "c"]) == {
-        "mean reward": {"b": [([1.0], [0.25])], "a": [([1.0, 2.0], [0.5, 0.75])], "c": []}
+    nothing = ([], [])
+    assert by_figure(curves, {"b": (0, 1), "a": (0,), "c": (0,)}) == {
+        "mean reward": {"b": [nothing, ([1.0], [0.25])], "a": [([1.0, 2.0], [0.5, 0.75])], "c": [nothing]}
     }
+
+
+def test_a_seed_is_drawn_alike_whether_or_not_earlier_ones_have_a_curve():
+    curves = {("a", 0): {}, ("a", 1): {"mean reward": ([1.0, 2.0], [0.5, 0.75])}}
+    (series,) = by_figure(curves, {"a": (0, 1)}).values()
+    (line,) = [line for line in charts.curves(series)["lines"] if line["points"]]
+    assert (line["label"], line["place"]) == ("a", 1)
 
 
 def test_entries_are_compared_over_their_seeds():

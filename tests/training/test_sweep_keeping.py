@@ -43,6 +43,7 @@ def finished(tmp_path_factory):
         for step in range(3):
             writer.add_scalar("Perf/total_steps", 1e6 * (step + 1), step)
             writer.add_scalar("Train/mean_reward", 0.5 * step, step)
+            writer.add_scalar("Loss/surrogate", -0.25 * step, step)
     shutil.copy(PRETRAINED, made / "model_3.pt")
     note = {"task": "go2-moe-cts", "host": "lab-7", "command": "gaitgauge train --log-root /home/me", "seed": 0}
     note |= {"begun_with": "/home/me/first.pt", "resumed": [{"checkpoint": "model_1.pt", "command": "train /home/me"}]}
@@ -74,7 +75,9 @@ def test_the_report_of_what_was_kept_is_that_of_the_sweep(finished, kept):
     assert [row["state"] for row in tables[0]] == ["gauged", "unfinished"]
     assert tables[0][0]["score"] == json.loads(CARD.read_text())["score"]
     assert (finished / "curves.csv").read_text() == (kept / "curves.csv").read_text()
-    assert "mean reward,2,0.5" in (kept / "curves.csv").read_text()
+    for row in ("mean reward,2,0.5", "Loss/surrogate,3,-0.5"):
+        assert f"one,0,{row}\n" in (kept / "curves.csv").read_text()
+    assert "Loss/" not in (kept / "sweep.html").read_text()
 
 
 def test_it_is_small_and_names_no_machine_and_no_folder(kept):
@@ -304,7 +307,9 @@ def test_the_shipped_folders_are_read(tmp_path):
 def test_what_cannot_be_kept_is_known_before_a_training(kept):
     runs, _ = plan_runs(SWEEP, kept, to_train=False)
     changed = [replace(run, settings=("training.run.iterations=4",)) for run in runs]
-    with pytest.raises(SweepError, match=r"one/seed-0' holds a training with other settings; give another .* --keep"):
+    with pytest.raises(
+        SweepError, match=r"one/seed-0' holds a training whose .*iterations is '3', .*'4'; give another .* --keep"
+    ):
         check_keep(changed, kept)
     check_keep(runs, kept / "new")
     assert not (kept / "new").exists()
@@ -348,8 +353,21 @@ def test_damaged_curves_are_one_sentence(tmp_path, text):
 
 def test_curves_come_back_as_they_were(tmp_path):
     curves = {"mean reward": ([1.0, 2.0], [0.5, -0.25]), "mean terrain level in training": ([1.0], [3.0])}
+    curves["Loss/value"] = ([1.0, 2.0], [0.125, 0.0625])
     (tmp_path / "curves.csv").write_text(kept_curves_csv(curves))
     assert learning_curves(tmp_path) == curves
+
+
+def test_long_curves_are_thinned_out_to_their_last_point(tmp_path):
+    with SummaryWriter(str(tmp_path)) as writer:
+        for step in range(950):
+            for tag in ("Perf/total_steps", "Train/mean_reward", "Loss/value"):
+                writer.add_scalar(tag, 1e6 * (step + 1), step)
+    found = learning_curves(tmp_path)
+    assert {title: (len(x), x[-1]) for title, (x, _) in found.items()} == {
+        "mean reward": (317, 950.0),
+        "Loss/value": (95, 950.0),
+    }
 
 
 def test_a_report_notes_nothing(tmp_path):

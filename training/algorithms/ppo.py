@@ -59,10 +59,10 @@ class PPO:
         on_gpu = torch.device(device).type == "cuda"
         if configuration.symmetry != "none" and mirror is None:
             raise ConfigurationError(
-                f"symmetry is {configuration.symmetry!r}, but the task gives no mirror maps; set it to 'none'."
+                f"training.algorithm.symmetry is {configuration.symmetry!r}, but the task gives no mirror maps; set it to 'none'."
             )
         if configuration.cuda_graphs and not on_gpu:
-            raise ConfigurationError("cuda_graphs is on; it needs a CUDA device.")
+            raise ConfigurationError("training.algorithm.cuda_graphs is on; it needs a CUDA device.")
         self.device = device
         self.actor: Any = actor.to(device)
         self.critic, self.storage = critic.to(device), storage

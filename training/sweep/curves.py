@@ -20,13 +20,16 @@ TAGS = {"Train/mean_reward": "mean reward", "Curriculum/mean_level": "mean terra
 SCORE = "score in MuJoCo while training"
 FIGURES = (SCORE, *TAGS.values())
 """Titles of the charts, in order."""
-_MOST = 400
-"""Points of a curve."""
+_LOSS = "Loss/"
+"""Keys in the log that begin so are kept under their own names, and not drawn."""
+_MOST, _MOST_OF_A_LOSS = 400, 100
+"""Largest number of points of a curve."""
 _KEPT_HEAD = ("figure", "environment_steps_millions", "value")
 
 
 def learning_curves(run: Path) -> dict[str, Curve]:
-    """Curves of a run directory by their titles, those that its log has, or of what was kept of it; long ones are thinned out.
+    """Curves of a run directory by their titles, losses by their keys in the log, those that it has, or of what was kept of it;
+    long ones are thinned out, to their last point.
 
     Raises:
         SweepError: the kept curves are damaged.
@@ -43,6 +46,7 @@ def learning_curves(run: Path) -> dict[str, Curve]:
     steps = {event.step: event.value / 1e6 for event in events.Scalars("Perf/total_steps")}
     titles = {tag: title for tag, title in TAGS.items() if tag in known}
     titles |= {tag: SCORE for tag in known if tag.startswith("Gauge/") and tag.endswith("/score")}
+    titles |= {tag: tag for tag in known if tag.startswith(_LOSS)}
     found = {}
     for tag, title in titles.items():
         # a score stands at the number of iterations that were scored, all else at the index of the iteration
@@ -50,7 +54,8 @@ def learning_curves(run: Path) -> dict[str, Curve]:
         # of an iteration that was done twice, before and after a resume, the later one counts
         values = {e.step - offset: e.value for e in events.Scalars(tag) if e.step - offset in steps}
         order = sorted(values)
-        order = order[:: max(len(order) // _MOST, 1)]
+        most = _MOST_OF_A_LOSS if title == tag else _MOST
+        order = order[:: -max(math.ceil(len(order) / most), 1)][::-1]
         found[title] = ([steps[at] for at in order], [values[at] for at in order])
     return found
 
@@ -82,26 +87,27 @@ def _read_curves(path: Path) -> dict[str, Curve]:
             raise ValueError
         for figure, *point in rows[1:]:
             steps, value = map(float, point)
-            if figure not in FIGURES or not math.isfinite(steps + value):
+            if not (figure in FIGURES or figure.startswith(_LOSS)) or not math.isfinite(steps + value):
                 raise ValueError
             for values, number in zip(found.setdefault(figure, ([], [])), (steps, value), strict=True):
                 values.append(number)
     except (ValueError, csv.Error) as error:
         raise SweepError(
-            f"the learning curves '{one_line(path)}' are damaged: each row has a figure ({', '.join(FIGURES)}) and two numbers; "
+            f"the learning curves '{one_line(path)}' are damaged: each row has a figure ({', '.join(FIGURES)}, {_LOSS}…) and two numbers; "
             "put the file back, or delete it and call again: the run is told without curves"
         ) from error
     return found
 
 
 def by_figure(
-    curves: Mapping[tuple[str, int], Mapping[str, Curve]], entries: Sequence[str]
+    curves: Mapping[tuple[str, int], Mapping[str, Curve]], seeds: Mapping[str, Sequence[int]]
 ) -> dict[str, dict[str, list[Curve]]]:
-    """For each figure that any run has, the curves of each entry's seeds."""
+    """For each figure that any run has, the curves of each entry's ``seeds``, in their order, one without points where there is
+    none: a seed is drawn alike in every figure.
+    """
     return {
         figure: {
-            entry: [own[figure] for (name, _), own in curves.items() if name == entry and figure in own]
-            for entry in entries
+            entry: [curves.get((entry, seed), {}).get(figure, ([], [])) for seed in own] for entry, own in seeds.items()
         }
         for figure in FIGURES
         if any(figure in own for own in curves.values())

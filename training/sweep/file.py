@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read_text, shown
+from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read_text
+from ...gauge.suite import SuiteError, load_suite
 from ..launch import DEFAULT_BACKEND
 
 NO_SUITE = "none"
-_SEEDS = ("training.run.seed", "environment.seed")
-"""Settings that would be the same in all runs of an entry."""
 MOST_RUNS = 1000
 """Trainings of a sweep."""
 
@@ -66,31 +65,36 @@ class Sweep:
     """What of a run is gauged: its last checkpoint, or the one that ``training_suite`` scored highest."""
 
     def __post_init__(self) -> None:
-        names = [e.name.lower() for e in self.entry]
-        if not names:
+        if not self.entry:
             raise ValueError("has no entries; add a table [[entry]] with name and task")
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"has several entries of the name {twice[0]}; their folders would be the same")
-        for seeds in (self.seeds, *(e.seeds for e in self.entry if e.seeds is not None)):
-            if not seeds or len(set(seeds)) < len(seeds):
-                raise ValueError(f"has seeds {list(seeds)}; give at least one, and each once")
-        for setting in (*self.settings, *(setting for e in self.entry for setting in e.settings)):
-            if setting.partition("=")[0].strip() in _SEEDS:
-                raise ValueError(
-                    f"has the setting {shown(setting)}, with which all seeds train the same run; write seeds = […]"
-                )
+        folders: dict[str, str] = {}
+        for entry in self.entry:
+            if other := folders.get(entry.name.lower()):
+                raise ValueError(f"has the entries '{other}' and '{entry.name}' in one folder; rename one of them")
+            folders[entry.name.lower()] = entry.name
         if self.checkpoint == "best" and self.training_suite == NO_SUITE:
             raise ValueError("has checkpoint 'best', which training_suite chooses; give a suite, or checkpoint 'last'")
-        runs = sum(len(self.seeds if e.seeds is None else e.seeds) for e in self.entry)
+        runs = sum(len(self.seeds_of(e)) for e in self.entry)
         if runs > MOST_RUNS:
             raise ValueError(f"has {runs:,} trainings; at most {MOST_RUNS:,} are possible")
+
+    def seeds_of(self, entry: SweepEntry) -> tuple[int, ...]:
+        """The entry's own seeds, or else the sweep's."""
+        return self.seeds if entry.seeds is None else entry.seeds
 
 
 def load_sweep(path: Path) -> Sweep:
     """Read a sweep's file.
 
     Raises:
-        SweepError: no such file, no valid TOML, or a field that does not fit.
+        SweepError: no such file, no valid TOML, a field that does not fit, or no such suite.
     """
     source = f"sweep file '{one_line(path)}'"
-    return build(Sweep, parse_toml(read_text(path, "sweep file", SweepError), source, SweepError), source, SweepError)
+    sweep = build(Sweep, parse_toml(read_text(path, "sweep file", SweepError), source, SweepError), source, SweepError)
+    scores = {} if sweep.training_suite == NO_SUITE else {"training_suite": sweep.training_suite}
+    for field, suite in ({"suite": sweep.suite} | scores).items():
+        try:
+            load_suite(suite)
+        except SuiteError as error:
+            raise SweepError(f"{source}: {field}: {error}") from error
+    return sweep

@@ -73,6 +73,7 @@ def fold_sweep(
         sentences.append(f"All seeds of {_listed(alike)} have the same score, which says nothing of their spread.")
     if other := [r.label for r, row in zip(runs, rows, strict=True) if row["state"] == "trained" and r.has_results]:
         sentences.append(f"Results of {_listed(other)} are of another suite or checkpoint and do not count.")
+    seeds = {e.name: sweep.seeds_of(e) for e in sweep.entry}
     data: dict[str, Any] = {
         "schema": 1,
         "name": sweep.name,
@@ -88,7 +89,7 @@ def fold_sweep(
     }
     write_atomically(folder / "sweep.json", json_text(data), SweepError)
     write_atomically(folder / "curves.csv", curves_csv(curves), SweepError)
-    write_atomically(folder / "sweep.html", _page(data, curves), SweepError)
+    write_atomically(folder / "sweep.html", _page(data, by_figure(curves, seeds)), SweepError)
     return data
 
 
@@ -158,7 +159,7 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(f"'{name}'" for name in names)
 
 
-def _page(data: Mapping[str, Any], curves: Mapping[tuple[str, int], Mapping[str, Curve]]) -> str:
+def _page(data: Mapping[str, Any], figures: Mapping[str, Mapping[str, Sequence[Curve]]]) -> str:
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
     names = [entry["entry"] for entry in data["entries"]]
     groups = list(dict.fromkeys(g for e in data["entries"] if e["best"] for g in e["best"]["groups"] or {}))
@@ -166,5 +167,5 @@ def _page(data: Mapping[str, Any], curves: Mapping[tuple[str, int], Mapping[str,
         sweep=data,
         groups=groups,
         names=names,
-        figures={figure: charts.curves(series) for figure, series in by_figure(curves, names).items()},
+        figures={figure: charts.curves(series) for figure, series in figures.items()},
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ...backends.base import BackendError
+from ...backends.base import BackendError, DeviceError
 from ...files.parsing import one_line, read_results, shown
 from ...files.writing import json_text, make_folder, write_atomically
 from ...gauge.comparison import ComparisonError, load_result
@@ -33,6 +33,8 @@ KEPT_POLICY = "policy.gauge.pt"
 RESULTS = "results.json"
 SCORES = ("score", "score_interval", "level", "groups")
 """What a table tells of results."""
+_SEEDS = ("training.run.seed", "environment.seed")
+"""Settings that would be the same in all runs of an entry."""
 RUN_ERRORS = (SweepError, CheckpointError, ComparisonError, PolicyError, ContractError, OSError)
 """What may be wrong with the files of one run; the others go on."""
 
@@ -264,11 +266,20 @@ class SweepRun:
             how = "put it back, or delete it if the training beside it is the one that the sweep's file asks for"
             raise DamagedNoteError(f"{error}; {how}, and call again") from error
         if found != mine:
-            changed = next(n for n in {**mine, **found} if n not in mine or n not in found or found[n] != mine[n])
-            what = "other settings" if changed == "settings" else f"another {one_line(changed, 80)}"
+            theirs, ours = _named(found), _named(mine)
+            names = sorted({**ours, **theirs}, key=lambda name: name == "settings")  # their order is told last
+            name = next(n for n in names if n not in ours or n not in theirs or theirs[n] != ours[n])
+            its, wanted = (shown(note[name]) if name in note else "none" for note in (theirs, ours))
             raise SweepError(
-                f"'{self.folder}' holds a training with {what}; give another folder with {option}, or take this one away"
+                f"'{self.folder}' holds a training whose {one_line(name, 80)} is {its}, and the sweep's file says {wanted}; give "
+                f"another folder with {option}, or take this one away"
             )
+
+
+def _named(note: Mapping[str, Any]) -> dict[str, Any]:
+    """What a run's note says, and each of its settings by its name."""
+    settings = note.get("settings")
+    return {**note, **(dict(str(s).partition("=")[::2] for s in settings) if isinstance(settings, list) else {})}
 
 
 def _read_policy(path: Path) -> FilePolicy:
@@ -303,6 +314,19 @@ def _is_trained(run: SweepRun) -> bool:
         return False
 
 
+def _check_seeds(seeds: Sequence[int], settings: Sequence[str]) -> None:
+    """Refuse an entry whose runs would not differ.
+
+    Raises:
+        SweepError: it is one.
+    """
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise SweepError(f"seeds are {shown(list(seeds))}; give at least one, and each once")
+    for setting in settings:
+        if setting.partition("=")[0].strip() in _SEEDS:
+            raise SweepError(f"with the setting {shown(setting)} all seeds train the same run; write seeds = […]")
+
+
 def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[list[SweepRun], dict[str, str]]:
     """The runs of a sweep, those of the first seed first, and of each entry of which a run cannot start one sentence on why.
 
@@ -313,7 +337,7 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
     Raises:
         SuiteError: no such suite.
     """
-    digests = {suite: load_suite(suite).digest for suite in {sweep.suite, sweep.training_suite} - {NO_SUITE}}
+    digest = load_suite(sweep.suite).digest
     runs: list[tuple[int, SweepRun]] = []
     refused: dict[str, str] = {}
     for entry in sweep.entry:
@@ -328,6 +352,7 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
             score_suite=None,
         )
         try:
+            _check_seeds(sweep.seeds_of(entry), settings)
             iterations = prepare(replace(request, device="cpu")).task.training.run.iterations
             own = [
                 SweepRun(
@@ -339,15 +364,16 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
                     iterations=iterations,
                     init_from=init_from,
                     folder=folder / "runs" / entry.name / f"seed-{seed}",
-                    suite_digest=digests[sweep.suite],
+                    suite_digest=digest,
                 )
-                for seed in (sweep.seeds if entry.seeds is None else entry.seeds)
+                for seed in sweep.seeds_of(entry)
             ]
             if to_train and not all(map(_is_trained, own)):
                 try:
                     on_gpu = prepare(request).device.startswith("cuda")
-                except BackendError as error:  # what was trained elsewhere can be gauged all the same
-                    refused[entry.name] = str(error)
+                except DeviceError as error:  # what was trained elsewhere can be gauged all the same
+                    change = 'device = "cpu"' if entry.device else 'device = "cpu" (slow) or backend = "mujoco"'
+                    refused[entry.name] = f"{error.reason}; write {change} in the sweep's file"
                     own = [run for run in own if _is_trained(run)]
                 else:
                     own = [replace(run, on_gpu=on_gpu) for run in own]
