@@ -4,7 +4,6 @@ import errno
 import io
 import logging
 import os
-import shutil
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -45,9 +44,11 @@ def test_control_characters_are_escaped():
 
 @pytest.mark.parametrize("name", [b"\xff", b"\x1b[31m"])
 def test_a_page_whose_name_is_no_text_is_named(run, tmp_path, name):
-    shutil.copy(Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json", tmp_path / "card.json")
+    card = (Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json").read_text()
+    (tmp_path / "card.json").write_text(card)
+    (tmp_path / "other.json").write_text(card.replace("policy.pt", "other.pt"))
     page = os.fsdecode(name) + ".html"
-    for arguments in (("board", ".", "--out", page), ("compare", "card.json", "card.json", "--out", page + "s")):
+    for arguments in (("board", ".", "--out", page), ("compare", "card.json", "other.json", "--out", page + "s")):
         result = run(*arguments)
         assert result.exit_code == 0, result.exception
         assert not set("\x1b\udcff") & set(result.output)
