@@ -19,15 +19,26 @@ _WIDTH = 80
 
 
 def run_training_or_settings(
-    *, list_settings: bool, overrides: Sequence[str], score: bool, score_suite: str, **choices: Any
+    *,
+    list_settings: bool,
+    overrides: Sequence[str],
+    time: str | None,
+    score: bool,
+    score_suite: str,
+    **choices: Any,
 ) -> None:
-    """Print the settings of a task and end, or train it, with checkpoints that are scored or not."""
+    """Print the settings of a task, as the options beside it change them, and end; or train it, with checkpoints that are scored
+    or not.
+    """
     if list_settings:
-        print_settings(choices["task"], overrides, choices["robot"])
+        from ..training.launch import TrainRequest, own_overrides
+
+        request = TrainRequest(overrides=overrides, **choices)
+        print_settings(request.task, own_overrides(request), request.robot)
         return
     from .train import run_training
 
-    run_training(overrides=overrides, score_suite=score_suite if score else None, **choices)
+    run_training(overrides=overrides, time=time, score_suite=score_suite if score else None, **choices)
 
 
 def print_settings(task: str, overrides: Sequence[str], robot: str | None = None) -> None:

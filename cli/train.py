@@ -14,6 +14,7 @@ import typer
 from ..files.parsing import one_line
 from ..training.configuration import RunConfiguration
 from ..training.launch import TrainPlan, TrainRequest, prepare, train
+from ..training.processes import Processes, told_number
 from ..training.stopping import Progress
 from .console import Terminal, shell_command
 from .errors import UserError
@@ -51,9 +52,24 @@ def run_training(*, task: str, time: str | None, **choices: Any) -> None:
         console.say(f"best by the gauge's score: {run / 'best.pt'}")
     if outcome.reason != "finished":
         again = shell_command(["train", task, "--resume", str(run)], *_again(plan))
-        console.say(f"go on with:\n  {again}")
+        start, where = _start()
+        console.say(f"go on with{where}:\n  {start}{again.removeprefix('gaitgauge')}")
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
+
+
+def _start() -> tuple[str, str]:
+    """How as many processes as those of this run are started, in place of ``gaitgauge``, and what a reader must add."""
+    count = Processes.told().count
+    if count == 1:
+        return "gaitgauge", ""
+    here = told_number("LOCAL_WORLD_SIZE", count)
+    several = 0 < here < count
+    machines = f"--nnodes {count // here} " if several else ""
+    return (
+        f"torchrun {machines}--nproc-per-node {here} -m gaitgauge.cli.main",
+        ", on every machine and with its --rdzv options" if several else "",
+    )
 
 
 def _again(plan: TrainPlan) -> list[str]:

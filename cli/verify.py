@@ -9,6 +9,7 @@ from pathlib import Path
 import typer
 
 from ..backends.registry import choose_device
+from ..files.parsing import shown
 from ..gauge.comparison import load_result
 from ..gauge.naming import distinct_names, folder_name
 from ..gauge.verify import prepare_replay, verify
@@ -66,7 +67,15 @@ def run_verification(
         if found["score"] is not None:
             band = "no interval" if found["band"] is None else "a replay within {:.4f} to {:.4f}".format(*found["band"])
             console.say(f"score on the card {found['score']:.4f} ({band}), here {found['replayed']:.4f}")
-        if found["equal"]:
+        for item in found["settings"]:
+            console.say(f"{item['name']}: {shown(item['card'])} on the card, {shown(item['here'])} here")
+        if found["unlike"]:
+            console.say(f"card and replay were not played alike: {'; '.join(found['unlike'])}")
+        if found["settings"]:
+            console.say("the card does NOT hold: it was made with another solver or other motors")
+        elif found["figures"]:
+            console.say(f"the card does NOT hold: every outcome is the same, but not its {', '.join(found['figures'])}")
+        elif found["equal"]:
             console.say("the card holds: every outcome is the same to the last digit")
         elif found["holds"] and found["band"] is not None and found["replayed"] > found["band"][1]:
             console.say("the card holds: with other seeds the score is higher still")

@@ -10,34 +10,44 @@ from typing import Any
 import jinja2
 
 from ..files.parsing import edited, one_line
-from ..files.writing import write_atomically
+from ..files.writing import make_folder, write_atomically
 from ..policy.contract import PRIVILEGED_TERMS
+from ..policy.finding import shipped_policies
 from .comparison import load_result
 from .coverage import COMPLETE, coverage_of, coverage_words
 from .naming import distinct_names
 from .pages import page_template
+from .policies import file_digest
 from .result_check import robot_digest_of
 from .suite import load_suite, suite_names
-from .verify import CardError, check_coverage
+from .verify import CardError, check_card
 
 
 def write_board(folder: Path, page: Path) -> Path:
-    """Write the board of a folder's cards, ``*.json`` or folders of evaluations, all or nothing.
+    """Write the board of a folder's cards, ``*.json`` or folders of evaluations, all or nothing, into a folder that is created.
 
     Raises:
-        CardError: there is no card, or one does not hold what it says it holds of a suite that ships.
+        CardError: there is no card, one does not hold what it says it holds of a suite that ships, or names such a one and is not
+            of it; or the page cannot be written.
         ComparisonError: a file that is none, or a damaged one; nothing is left out in silence.
     """
     files = sorted([*folder.glob("*.json"), *folder.glob("*/results.json")])
     if not files:
         raise CardError(f"'{folder}' holds no score cards; put results.json files or folders of evaluations there")
     cards = {str(file.relative_to(folder)): load_result(file) for file in files}
+    shipped = {name: load_suite(name) for name in suite_names()}
+    by_digest = {suite.digest: suite for suite in shipped.values()}
     for file, card in cards.items():
-        name, digest = card["suite"]["name"], card["suite"]["digest"]
-        if name in suite_names() and (suite := load_suite(name)).digest == digest:
-            check_coverage(card, suite, f"the card '{one_line(file)}'")
+        named, source = card["suite"], f"the card '{one_line(file)}'"
+        if named["digest"] not in by_digest and (suite := shipped.get(named["name"])):
+            raise CardError(
+                f"{source} is of {named['name']} {named['version']} with digest {named['digest'][:12]}…, but {suite.name} here is "
+                f"{suite.version} with {suite.digest[:12]}…; evaluate its policy again, or take the card away"
+            )
+        check_card(card, by_digest.get(named["digest"]), source)
     with edited(f"a card in '{one_line(folder)}'", CardError, jinja2.TemplateError):
         text = render_board(board_data(cards, folder))
+    make_folder(page.parent, CardError)
     write_atomically(page, text, CardError)
     return page
 
@@ -53,9 +63,10 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
         cards, best first, with their ``rank``) and ``others`` (parts, custom runs, levels alone and policies with privileged
         observations, which have no rank).
     """
-    tables: dict[tuple[str, str, str, str | None], dict[str, Mapping[str, Any]]] = {}
+    tables: dict[tuple[str, str, str, str, str, str | None], dict[str, Mapping[str, Any]]] = {}
     for name, card in cards.items():
-        key = (card["suite"]["digest"], card["backend"], card["robot"], robot_digest_of(card))
+        of = card["suite"]
+        key = (of["digest"], of["name"], of["version"], card["backend"], card["robot"], robot_digest_of(card))
         tables.setdefault(key, {})[name] = card
     found = []
     for key, rows in sorted(tables.items(), key=lambda item: -len(item[1])):
@@ -67,9 +78,9 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
         for entry in ranked:  # equal scores share a rank
             entry["rank"] = 1 + sum(other["score"] > entry["score"] for other in ranked)
         others = [e for e in entries if not e["ranked"]]
-        _, backend, robot, files = key
+        digest, called, version, backend, robot, files = key
         place = {
-            "suite": next(reversed(rows.values()))["suite"],
+            "suite": {"name": called, "version": version, "digest": digest},
             "backend": backend,
             "robot": robot,
             "robot_digest": files,
@@ -86,7 +97,9 @@ def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
 def _entry(name: str, card: Mapping[str, Any], folder: Path, policy: str) -> dict[str, Any]:
     """A line of the board."""
     terms: Sequence[str] | None = card["policy"].get("observations")
-    found = ((folder / name).parent / card["policy"]["path"]).is_file()
+    path = card["policy"]["path"]
+    ships = path in shipped_policies() and file_digest(path) == card["policy"]["file_sha256"]
+    found = ships or ((folder / name).parent / path).is_file()
     covered, privileged = coverage_of(card), bool(set(terms or ()) & set(PRIVILEGED_TERMS))
     return {
         "card": name,

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from ..policy.finding import find_policy
-from .comparison import ComparisonError, check_different, compare, load_result
+from ..robots.loading import robot_digest
+from .comparison import ComparisonError, check_alike, check_different, compare, load_result
 from .comparison_report import write_comparison
-from .evaluate import Request, Status, evaluate, identity, prepare
+from .coverage import coverage
+from .evaluate import Prepared, Request, Status, evaluate, identity, prepare
 from .naming import distinct_names, run_folders
 from .report import write_report
+from .results import chance_rules
 from .store import check_folder
 
 
@@ -48,21 +51,7 @@ def compare_all(
     requests = {c: replace(request, policy=c) for c in contestants if c not in found}
     prepared_requests = {c: prepare(wanted) for c, wanted in requests.items()}
     check_different([found.get(c) or find_policy(c).resolve() for c in contestants], contestants)
-    for contestant, prepared in prepared_requests.items():
-        suite = prepared.suite
-        for other, result in found.items():
-            if result["suite"]["digest"] != suite.digest:
-                named = f"{result['suite']['name']} {result['suite']['version']}"
-                raise ComparisonError(
-                    f"results of different suites do not compare: '{other}' has {named}, '{contestant}' would be "
-                    f"evaluated on {suite.name} {suite.version}; choose with --suite"
-                )
-            present = {(e["terrain"], e["friction"], e["payload"]) for e in result["environments"]}
-            if present != {(e.terrain, e.friction, e.payload) for e in prepared.environments}:
-                raise ComparisonError(
-                    f"'{other}' has other environments than '{contestant}' would be given; choose them with --terrain, "
-                    "--friction and --payload"
-                )
+    check_alike([found.get(c) or _known_before(prepared_requests[c]) for c in contestants], contestants)
     folders = run_folders(list(requests), runs, suite=request.suite, pipeline=request.pipeline)
     for prepared, target in zip(prepared_requests.values(), folders, strict=True):
         check_folder(target, identity(prepared), resume=True)
@@ -75,3 +64,22 @@ def compare_all(
     labels = distinct_names([labelled.get(c, found[c]["policy"]["path"]) for c in contestants])
     comparison = compare([found[c] for c in contestants], labels)
     return comparison.plain(), write_comparison(folder, comparison)
+
+
+def _known_before(prepared: Prepared) -> dict[str, Any]:
+    """What results will say of how they were made, in the keys that ``check_alike`` reads, before anything is played."""
+    request, suite = prepared.request, prepared.suite
+    return {
+        "suite": {"name": suite.name, "version": suite.version, "digest": suite.digest},
+        "backend": request.backend,
+        "robot": prepared.robot.name,
+        "pipeline": request.pipeline,
+        "score": 0.0 if prepared.rules.quality else None,
+        "chance": asdict(chance_rules(suite, prepared.seeds)),
+        "coverage": coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline),
+        "provenance": {"digests": {"robot": robot_digest(prepared.robot)}},
+        "environments": [
+            {"terrain": e.terrain, "friction": e.friction, "payload": e.payload, "trials": e.searched}
+            for e in prepared.environments
+        ],
+    }

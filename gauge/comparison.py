@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -19,9 +19,10 @@ import numpy as np
 from ..files.parsing import edited, one_line, read_results, shown
 from .coverage import COMPLETE, coverage_of, coverage_words
 from .episodes import QUALITY
-from .intervals import CONFIDENCE, Array, Chance, Evidence
+from .intervals import CONFIDENCE, Array, Chance, ChanceRules, Evidence
 from .naming import distinct_names
-from .result_check import chance_rules_of, check_result, robot_digest_of
+from .result_check import chance_rules_of, check_result, robot_digest_of, unlike, versions_of
+from .result_figures import BY_HAND
 from .results import ONE_SEED, SCHEMA, environment_weights
 
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
@@ -74,12 +75,16 @@ class Comparison:
     """Whether all were given the same seeds."""
     differences: tuple[Difference, ...]
     """Of all pairs, in the order of ``KINDS``."""
+    unlike: Sequence[str] = ()
+    """Versions, source and solver's settings that are not the same in all, in words."""
 
     @property
     def sentences(self) -> list[str]:
-        """What the scores say, one sentence for each pair, what the details add, and of what suite this is not the score."""
+        """What the scores say, one for each pair, what the details add, what was not alike, of what suite this is not the score."""
         scores = [d for d in self.differences if d.kind == "score"]
         found = [_score_sentence(d, len(scores)) for d in scores] + [self._details_sentence()]
+        if self.unlike:
+            found.append(f"They were not played alike, which may be part of a difference: {'; '.join(self.unlike)}.")
         return found + ([] if self.complete else [self._coverage_sentence()])
 
     @property
@@ -135,7 +140,8 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
     if len(results) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results, not {len(results)}")
     labels = list(labels) if labels else distinct_names([r["policy"]["path"] for r in results])
-    _check(results, labels)
+    check_different(results, labels)
+    check_alike(results, labels)
     rows = results[0]["environments"]
     order = {_key(row): at for at, row in enumerate(rows)}
     evidence = []
@@ -187,6 +193,9 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
         ),
         paired=paired,
         differences=tuple(sorted(differences, key=lambda d: KINDS.index(d.kind))),
+        unlike=unlike(
+            [versions_of(r) | {f"solver.{k}": v for k, v in (r.get("solver") or {}).items()} for r in results]
+        ),
     )
 
 
@@ -237,9 +246,13 @@ def check_different(contestants: Sequence[object], labels: Sequence[str]) -> Non
             )
 
 
-def _check(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
-    """Refuse results that were not given the same episodes, or are the same."""
-    check_different(results, labels)
+@edited("one of the results", ComparisonError)
+def check_alike(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
+    """Refuse results that were not given the same episodes; of what is yet to be played, what is known of them before.
+
+    Raises:
+        ComparisonError: one sentence.
+    """
     for label, found in zip(labels, results, strict=True):
         if found["score"] is None:
             raise ComparisonError(
@@ -250,7 +263,7 @@ def _check(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
         if suite != suites[0]:
             raise ComparisonError(
                 f"results of different suites do not compare: '{labels[0]}' has {suites[0]}, '{label}' has {suite}; "
-                "evaluate both on one suite"
+                "evaluate both on one suite (--suite)"
             )
         if found["suite"]["digest"] != results[0]["suite"]["digest"]:
             raise ComparisonError(
@@ -269,6 +282,17 @@ def _check(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
                 f"'{labels[0]}' and '{label}' name the robot {found['robot']}, but its files differ "
                 f"({' and '.join(str(f)[:12] for f in files)}); evaluate both on one robot (--robot)"
             )
+        rules = [
+            chance_rules_of(r, f"the results of '{n}'", ComparisonError)
+            for n, r in ((labels[0], results[0]), (label, found))
+        ]
+        for name in (f.name for f in fields(ChanceRules) if f.name not in ("seeds", "search_seeds")):
+            first, other = (getattr(r, name) for r in rules)
+            if first != other:
+                raise ComparisonError(
+                    f"the rules of chance differ, though the suite is one: chance.{name} is {first} in '{labels[0]}' and {other} in "
+                    f"'{label}'; {BY_HAND}"
+                )
         searched = [any(row.get("trials") for row in r["environments"]) for r in (results[0], found)]
         if searched[0] != searched[1]:
             given, other = (label, labels[0]) if searched[0] else (labels[0], label)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
@@ -248,9 +247,18 @@ def sources(results: Mapping[str, Any]) -> dict[str, str]:
         "physics steps": _grouped(provenance["physics_steps"]) + _rate(provenance),
     }
     for key, value in policy["provenance"].items():
-        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        text = _in_words(value)
         entries[f"policy: {key}"] = text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
     return entries
+
+
+def _in_words(value: Any) -> str:
+    """A provenance entry, which may be a table or a list, for readers."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_in_words(entry)}" for name, entry in value.items())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ", ".join(map(_in_words, value))
+    return "–" if value is None else str(value)
 
 
 def _engine(results: Mapping[str, Any]) -> str:

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field
 
 from ..files.parsing import Name, Seed, Text, one_line, shown, take
 from .intervals import ChanceRules
-from .results import environment_weights
+from .result_figures import check_figures
 from .suite import Friction, Payload
 
 MOST_ROWS = 10_000
 """Environments of one result."""
 MOST_REPLICATES = 20_000_000
 """Environments times replicates of the level searches, which are done again when results are compared."""
-_ROUNDING = 2e-6
-"""Of a score and of those that it is the mean of."""
-_BY_HAND = "it was changed by hand, so ask its maker for the results.json of the run"
 _Words = Annotated[str, Field(max_length=4096)]
 _Score = Annotated[float, Field(ge=0.0, le=1001.0)]
 """A level weighs at most 1, and there are at most 1000."""
@@ -42,6 +37,8 @@ class _Result:
     groups: Mapping[Text, _Value] = field(default_factory=dict)
     terrains: _Table = field(default_factory=dict)
     metrics: _Table = field(default_factory=dict)
+    health: Mapping[Text, _Value | None] | None = None
+    solver: Mapping[Text, _Value | Text | bool | None] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +77,14 @@ class _Row:
     score: _Score | None = None
     quality: Mapping[Text, _Value] | None = None
     metrics: Mapping[Text, Mapping[Text, _Value]] = field(default_factory=dict)
+    search: Mapping[Seed, bool] | None = None
     trials: Mapping[Seed, Mapping[Seed, bool]] = field(default_factory=dict)
     runs: Mapping[Seed, Mapping[Text, _Value | Mapping[Text, _Value]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Provenance:
+    versions: Mapping[str, Text] = field(default_factory=dict)
     digests: Mapping[str, Text] = field(default_factory=dict)
 
 
@@ -104,11 +103,32 @@ def robot_digest_of(data: Mapping[str, Any]) -> str | None:
     return found
 
 
+def versions_of(data: Mapping[str, Any]) -> dict[str, str]:
+    """Versions of gaitgauge and of the engine, and the digest of gaitgauge's source, as far as results state them."""
+    provenance = data.get("provenance", {})
+    names, versions = ("gaitgauge", str(data.get("backend")).partition(":")[0]), provenance.get("versions", {})
+    found = {name: versions[name] for name in names if name in versions}
+    source = provenance.get("digests", {}).get("source")
+    return found | ({} if source is None else {"source of gaitgauge": source[:12]})
+
+
+def unlike(tables: Sequence[Mapping[str, object]]) -> list[str]:
+    """In what some tables differ, in words, in their order: ``mujoco 3.16.0 and 3.17.0``. What one does not say is no difference."""
+    words = {}
+    for name in dict.fromkeys(name for table in tables for name in table):
+        values = list(dict.fromkeys(str(table[name]) for table in tables if table.get(name) is not None))
+        if len(values) > 1:
+            words[name] = f"{one_line(name)} {one_line(' and '.join(values))}"
+    return list(words.values())
+
+
 def check_result(data: Mapping[str, Any], source: str, error: type[Exception]) -> None:
-    """Check names, numbers and their ranges in the content of a ``results.json``; what is not named here is left as it is.
+    """Check names, numbers and their ranges in the content of a ``results.json``, and that its figures follow from its runs.
+
+    What is not named here is left as it is.
 
     Raises:
-        error: something is missing, of another type, or out of range.
+        error: something is missing, of another type, out of range, or none of these results'.
     """
     take(_Result, data, source, error)
     for key, kind in _TABLES.items():
@@ -119,29 +139,10 @@ def check_result(data: Mapping[str, Any], source: str, error: type[Exception]) -
         raise error(f"{source}: environments is {shown(rows)}; it must be a list of at most {MOST_ROWS:,}")
     for at, row in enumerate(rows):
         take(_Row, row, f"{source}: environments[{at}]", error)
-    _check_score(data, source, error)
-
-
-def _check_score(data: Mapping[str, Any], source: str, error: type[Exception]) -> None:
-    """Check that a score is that of the environments: each once, the mean of theirs."""
-    score, interval, rows = data["score"], data.get("score_interval"), data["environments"]
-    keys = [(row["terrain"], row["friction"], row["payload"]) for row in rows]
-    if twice := next((key for key, count in Counter(keys).items() if count > 1), None):
-        terrain, friction, payload = twice
-        raise error(
-            f"{source}: {one_line(terrain, 80)} at friction {friction:g} and payload {payload:g} kg is "
-            f"there twice; {_BY_HAND}"
-        )
+    interval = data.get("score_interval")
     if interval is not None and interval[0] > interval[1]:
         raise error(f"{source}: score_interval is {shown(list(interval))}; its ends must rise")
-    if score is None or not rows:
-        return
-    scores = [row.get("score") for row in rows]
-    if None in scores:
-        raise error(f"{source}: environments[{scores.index(None)}] has no score, but all of them have one; {_BY_HAND}")
-    mean = float(environment_weights([row["terrain"] for row in rows]) @ np.array(scores))
-    if abs(mean - score) > _ROUNDING:
-        raise error(f"{source}: score is {score:g}, but that of its environments is {mean:.6f}; {_BY_HAND}")
+    check_figures(data, chance_rules_of(data, source, error), source, error)
 
 
 def chance_rules_of(data: Mapping[str, Any], source: str, error: type[Exception]) -> ChanceRules:

@@ -19,8 +19,9 @@ from .evaluate import Prepared, Request, Status, evaluate, prepare
 from .intervals import Evidence
 from .pipelines import Environment
 from .policies import file_digest
-from .result_check import chance_rules_of, robot_digest_of
-from .results import environment_weights
+from .result_check import chance_rules_of, robot_digest_of, unlike, versions_of
+from .result_figures import BY_HAND, check_interval
+from .results import chance_rules, environment_weights
 from .suite import Suite, load_suite
 
 Row = Mapping[str, Any]
@@ -28,6 +29,18 @@ _APART = 1_000_000
 """Distance of fresh seeds from those of the next number."""
 _OUTCOME = ("level", "score", "quality", "metrics", "trials", "runs", "falls", "diverged", "overflowed", "restarted")
 """What of an environment's row must be the same to the last digit for a replay to be called equal."""
+_FIGURES = (
+    "score",
+    "score_interval",
+    "level",
+    "level_interval",
+    "terrains",
+    "metrics",
+    "groups",
+    "groups_interval",
+    "health",
+)
+"""What else must be, where all environments are replayed."""
 
 
 class CardError(ValueError):
@@ -81,7 +94,7 @@ def prepare_replay(
             f"the card was made on {wanted['name']} {wanted['version']} with digest {wanted['digest'][:12]}…, here it is "
             f"{rules.name} {rules.version} with {rules.digest[:12]}…; give the card's suite file with --suite"
         )
-    check_coverage(card, rules, "the card")
+    check_card(card, rules, "the card")
     rows = _sample(card["environments"], rules) if quick else card["environments"]
     prepared = prepare(
         Request(
@@ -111,24 +124,37 @@ def prepare_replay(
     return prepared if fresh is None else with_fresh_seeds(prepared, fresh)
 
 
-def check_coverage(card: Mapping[str, Any], suite: Suite, source: str) -> None:
-    """Check that a card holds what of its suite it says it holds: else a replay of what is left would confirm it.
+def check_card(card: Mapping[str, Any], suite: Suite | None, source: str) -> None:
+    """Check that a card is of the suite it names and holds what of it it says: else a replay of what is left would confirm it.
 
     Args:
-        suite: the card's, by digest.
+        suite: the one of the card's digest; None where it does not ship, and the card's interval alone is checked.
         source: what the card is called in the sentence.
 
     Raises:
-        CardError: it says something else.
+        CardError: suite, rules, coverage or interval are others.
     """
-    stated = coverage_of(card)["kind"]
-    seeds = chance_rules_of(card, source, CardError).seeds
-    held = coverage(suite, [_environment(row) for row in card["environments"]], seeds, pipeline=card["pipeline"])
-    if stated not in (held["kind"], UNKNOWN):
-        raise CardError(
-            f"{source} calls itself {one_line(stated)}, but holds {one_line(held['text'])} of {suite.name}; it was changed by hand, "
-            "so ask its maker for the results.json of the run"
-        )
+    rules, named = chance_rules_of(card, source, CardError), card["suite"]
+    if suite is not None:
+        if (named["name"], named["version"]) != (suite.name, suite.version):
+            raise CardError(
+                f"{source} names its suite {named['name']} {named['version']}, but its digest {suite.digest[:12]}… is that of "
+                f"{suite.name} {suite.version}; {BY_HAND}"
+            )
+        expected = chance_rules(suite, rules.seeds)
+        for name, value in vars(expected).items():
+            if getattr(rules, name) != value:
+                raise CardError(
+                    f"{source}: chance.{name} is {shown(getattr(rules, name))}, but that of {suite.name} is {shown(value)}; {BY_HAND}"
+                )
+        stated = coverage_of(card)["kind"]
+        environments = [_environment(row) for row in card["environments"]]
+        held = coverage(suite, environments, rules.seeds, pipeline=card["pipeline"])
+        if stated not in (held["kind"], UNKNOWN):
+            raise CardError(
+                f"{source} calls itself {one_line(stated)}, but holds {one_line(held['text'])} of {suite.name}; {BY_HAND}"
+            )
+    check_interval(card, rules, source, CardError)
 
 
 def with_fresh_seeds(prepared: Prepared, number: int) -> Prepared:
@@ -174,33 +200,45 @@ def verify(
 def judge(card: Mapping[str, Any], replay: Mapping[str, Any], *, fresh: bool = False) -> dict[str, Any]:
     """Whether a card holds, given the results of a replay of all or some of its environments.
 
-    It holds where the replay's score lies within the band of the card's (``tolerance_band``); for a sample the interval is that
-    of the card's own rows over the sampled environments. Where the card has no interval (one seed, or levels alone) only the
-    same outcome holds.
+    It holds where the replay's score lies within a band around the card's (``tolerance_band``), whose width is that of the replay's
+    interval: what the card says of its own does not count. Where the replay has none (one seed, or levels alone) only the same
+    outcome holds. Where all outcomes are the same, so must be the figures made of them; solver and motors must be in any case.
 
     Args:
         fresh: whether the replay had other seeds than the card. Then a score above the band holds as well: it owes nothing to
             the card's seeds.
 
     Returns:
-        ``holds``, ``equal`` (every outcome the same to the last digit), ``quick``, ``environments`` (played, of the card),
-        ``score``, ``interval`` and ``band`` of the card and the ``replayed`` score over what was played, and ``levels``: for each
-        environment whose level differs its terrain, friction, payload, ``card`` and ``here``.
+        ``holds``, ``equal`` (every outcome, and every figure made of them, the same to the last digit), ``quick``, ``environments``
+        (played, of the card), ``score``, ``interval`` and ``band`` of the card and the ``replayed`` score over what was played;
+        ``levels``: for each environment whose level differs its terrain, friction, payload, ``card`` and ``here``; ``figures``:
+        names of those that are off though all outcomes are the same; ``settings``: ``name``, ``card`` and ``here`` of each of the
+        solver or the motors that differs; ``unlike``: versions that differ, in words.
     """
     by_key = {_key(row): row for row in card["environments"]}
     pairs = [(by_key[_key(row)], row) for row in replay["environments"]]
-    equal = all(old.get(key) == new.get(key) for old, new in pairs for key in _OUTCOME)
+    same = all(old.get(key) == new.get(key) for old, new in pairs for key in _OUTCOME)
     quick = len(pairs) < len(by_key)
-    score, interval, here = card["score"], card["score_interval"], replay["score"]
-    if quick and score is not None:
-        olds = [old for old, _ in pairs]
-        weights = environment_weights([row["terrain"] for row in olds])
-        score = round(float(weights @ np.array([row["score"] for row in olds])), 6)
-        interval = Evidence(olds, chance_rules_of(card, "the card", CardError)).chance(weights).interval(score)
+    whole = same and not quick and not fresh
+    figures = [key for key in _FIGURES if whole and _says_other(card.get(key), replay.get(key))]
+    equal = same and not (whole and any(_says_other(card.get(key), replay.get(key), by=0.0) for key in _FIGURES))
+    score, interval, here = card["score"], None, replay["score"]
+    if score is not None:
+        weights = environment_weights([old["terrain"] for old, _ in pairs])
+        if quick:
+            score = round(float(weights @ np.array([old["score"] for old, _ in pairs])), 6)
+        rules = chance_rules_of(replay, "the replay", CardError)
+        interval = Evidence([new for _, new in pairs], rules).chance(weights).interval(score)
     band = tolerance_band(score, interval)
     within = band is not None and here is not None and band[0] <= here and (fresh or here <= band[1])
+    asked, used = _settings(card), _settings(replay)
+    settings = [
+        {"name": name, "card": value, "here": used[name]}
+        for name, value in asked.items()
+        if name in used and value != used[name]
+    ]
     return {
-        "holds": equal or within,
+        "holds": not settings and (not figures if same else within),
         "equal": equal,
         "quick": quick,
         "environments": [len(pairs), len(by_key)],
@@ -213,7 +251,28 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any], *, fresh: bool = F
             for old, new in pairs
             if old["level"] != new["level"]
         ],
+        "figures": figures,
+        "settings": settings,
+        "unlike": unlike([versions_of(card), versions_of(replay)]),
     }
+
+
+def _says_other(stated: Any, found: Any, *, by: float = 1e-4) -> bool:
+    """Whether a figure, or one in a table or list of them, is off by more than so much; one that is not stated is not."""
+    if isinstance(stated, Mapping):
+        return any(_says_other(value, (found or {}).get(key), by=by) for key, value in stated.items())
+    if isinstance(stated, list):
+        return len(stated) != len(found or ()) or any(
+            _says_other(a, b, by=by) for a, b in zip(stated, found, strict=True)
+        )
+    return stated is not None and (found is None or abs(stated - found) > by)
+
+
+def _settings(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of solver and motors, as far as results state them."""
+    solver, motors = results.get("solver") or {}, results.get("motors") or {}
+    gains = {f"motors.{name}": motors[name] for name in ("stiffness", "damping") if name in motors}
+    return {f"solver.{name}": value for name, value in solver.items()} | gains
 
 
 def tolerance_band(score: float | None, interval: Sequence[float] | None) -> list[float] | None:

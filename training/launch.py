@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -14,12 +15,14 @@ from pydantic import Field
 
 from ..files import MOST_THREADS
 from ..files.parsing import build, check_fields, shown
-from ..files.writing import lock_folder
+from ..files.writing import LOCK, lock_folder
 from ..gauge.suite import load_suite
 from ..policy.contract import PolicyContract
 from ..policy.finding import find_policy, latest_checkpoint, shipped_policies
 from ..policy.its_robot import robot_for
 from ..robots.registry import lasting
+from .algorithms.methods import METHODS
+from .algorithms.storage import check_minibatches, split_sizes
 from .algorithms.symmetry import build_mirror
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .configuration import ConfigurationError, TrainingConfiguration, to_plain
@@ -28,7 +31,7 @@ from .environment_configuration import EnvironmentConfiguration
 from .filming import Filmer
 from .logger import check_logger
 from .own_terms import foreign_functions
-from .processes import Processes, ProcessLostError, idle_gpus, own_device, told_number
+from .processes import Processes, ProcessLostError, idle_gpus, own_device
 from .resuming import begin_with, check_environments, check_network, resume_run
 from .run_directory import (
     LOG_ROOT,
@@ -144,7 +147,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         raise ConfigurationError(
             "a resumed run keeps its robot; leave --robot out, or begin a new run with --init-from"
         )
-    own = _own_overrides(request)
+    own = own_overrides(request)
     robot = None if request.robot is None else lasting(request.robot)
     known, task = find_task(request.task), find_task(request.task, own, robot=robot)
     checkpoint, run, weights, notice = None, None, None, ""
@@ -178,6 +181,10 @@ def prepare(request: TrainRequest) -> TrainPlan:
             )
         check_environments(checkpoint, kept.environment.num_envs, task.environment.num_envs)
         check_network(checkpoint, entries, task, "resume")
+        if (wanted := task.training.run.iterations) <= iteration:
+            raise ConfigurationError(
+                f"the run has done {iteration} of {wanted} iterations; to go on, give a larger --iterations"
+            )
     else:
         backend = request.backend or DEFAULT_BACKEND
         begun: list[str] = []
@@ -187,6 +194,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
             check_network(weights, entries, task, "start")
             begun = _going_on(task, entries)
         task = find_task(request.task, [*begun, *own], robot=robot)
+    _check_rollout(task)
     check_logger(task.training.run.logger)
     device = own_device(request.device, backend)
     if request.capture and not device.startswith("cuda"):
@@ -217,6 +225,22 @@ def prepare(request: TrainRequest) -> TrainPlan:
         settings=settings,
         notice=notice,
     )
+
+
+def _check_rollout(task: Task) -> None:
+    """Refuse worlds, steps and minibatches with which nothing can be learned.
+
+    Raises:
+        ConfigurationError: they do not fit together.
+    """
+    algorithm, run = task.training.algorithm, task.training.run
+    period = algorithm.student_period if METHODS[algorithm.method].has_teacher else 1
+    teachers, students = split_sizes(task.environment.num_envs, period)
+    check_minibatches(algorithm.minibatches, steps=run.steps_per_iteration, teachers=teachers, students=students)
+    if run.steps_per_iteration * task.environment.num_envs < 2:
+        raise ConfigurationError(
+            "one step of one environment is no rollout to learn from; give more --num-envs or training.run.steps_per_iteration"
+        )
 
 
 def _own_logger(task: Task, named: Task, checkpoint: Path) -> tuple[Task, str]:
@@ -296,7 +320,7 @@ def _first_weights(request: TrainRequest, task: Task) -> Path:
     )
 
 
-def _own_overrides(request: TrainRequest) -> list[str]:
+def own_overrides(request: TrainRequest) -> list[str]:
     """The request's options and settings as overrides, options first, so that a setting spelled out wins."""
     options: list[tuple[str, Any]] = [
         ("environment.num_envs", request.num_envs),
@@ -336,18 +360,18 @@ def train(
         went wrong.
     """
     request, task, device = plan.request, plan.task, plan.device
-    rank = told_number("RANK", 0)
+    rank = Processes.told().rank
     run_settings = task.training.run
     run: Path | None = None
-    if rank == 0:
-        run = plan.run or new_run_directory(request.log_root, run_settings.experiment, run_settings.run_name)
-        started(run)
-        for sentence in filter(None, (plan.notice, idle_gpus(device))):
-            message(sentence)
     seed_everything(run_settings.seed + rank)
     environment = replace(task.environment, seed=task.environment.seed + rank)
     with ExitStack() as closing:
-        if run is not None:
+        if rank == 0:
+            run = plan.run or new_run_directory(request.log_root, run_settings.experiment, run_settings.run_name)
+            closing.callback(_remove_unused, run)
+            started(run)
+            for sentence in filter(None, (plan.notice, idle_gpus(device))):
+                message(sentence)
             closing.callback(lock_folder(run, CheckpointError).release)
         worlds = f"{environment.num_envs} environments"
         with _enough_memory(f"{worlds} do not fit into the memory of {device}; use a smaller --num-envs"):
@@ -360,10 +384,8 @@ def train(
                 fuse=request.fuse,
             )
             closing.callback(env.close)
-            if run is not None:
-                if env.unfused:
-                    message(env.unfused)
-                _describe(plan, run, env)
+            if run is not None and env.unfused:
+                message(env.unfused)
             processes = Processes.join(device)
             scorer = filmer = None
             if run is not None and request.score_suite is not None and run_settings.gauge_interval > 0:
@@ -394,7 +416,14 @@ def train(
         too_much = f"learning with {worlds} does not fit into the memory of {device}"
         try:
             with _enough_memory(f"{too_much}; use a smaller --num-envs, or more training.algorithm.minibatches"):
-                outcome = _learn(plan, runner, began)
+                if plan.checkpoint is not None:
+                    resume_run(runner, plan.checkpoint)
+                elif plan.weights is not None:
+                    begin_with(runner, plan.weights)
+                if rank == 0:  # not before all that may refuse: what is refused changes no run
+                    _describe(plan, run, env)
+                seconds = None if request.seconds is None else max(request.seconds - (time.monotonic() - began), 0.0)
+                outcome = runner.learn(run_settings.iterations - runner.iteration, max_seconds=seconds)
         except ProcessLostError:
             closing.pop_all()  # closing would wait for the lost process
             raise
@@ -417,19 +446,10 @@ def _enough_memory(otherwise: str) -> Iterator[None]:
         raise
 
 
-def _learn(plan: TrainPlan, runner: TrainingRunner, began: float) -> TrainingOutcome:
-    """Continue or begin, and train."""
-    request, iterations = plan.request, plan.task.training.run.iterations
-    if plan.checkpoint is not None:
-        resume_run(runner, plan.checkpoint)
-    elif plan.weights is not None:
-        begin_with(runner, plan.weights)
-    if (left := iterations - runner.iteration) <= 0:
-        raise ConfigurationError(
-            f"the run has done {runner.iteration} of {iterations} iterations; to go on, give a larger --iterations"
-        )
-    seconds = None if request.seconds is None else max(request.seconds - (time.monotonic() - began), 0.0)
-    return runner.learn(left, max_seconds=seconds)
+def _remove_unused(run: Path) -> None:
+    """Remove a run directory in which nothing but the lock was written."""
+    if run.is_dir() and {path.name for path in run.iterdir()} <= {LOCK}:
+        shutil.rmtree(run, ignore_errors=True)
 
 
 def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment) -> None:

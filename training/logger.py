@@ -33,7 +33,9 @@ def check_logger(name: str) -> None:
     """
     if name not in _SERVICES:
         return
-    if importlib.util.find_spec(name) is None:
+    spec = importlib.util.find_spec(name)
+    # A mere folder of that name, such as the one that wandb leaves, has no origin.
+    if spec is None or spec.origin is None:
         raise ConfigurationError(
             f"--logger {name} needs the package '{name}', which is not installed: pip install {name}"
         )
@@ -46,17 +48,18 @@ def make_writer(configuration: TrainingConfiguration, log_dir: Path, environment
     """Start the configured writer in a run directory.
 
     Raises:
-        ConfigurationError: the service cannot be reached or refuses the account.
+        ConfigurationError: the service cannot be reached or refuses the account, or its package does not work.
     """
     name = configuration.run.logger
     if name not in _SERVICES:
         from torch.utils.tensorboard import SummaryWriter
 
         return SummaryWriter(log_dir=str(log_dir), flush_secs=10)  # type: ignore[no-untyped-call]
-    module = importlib.import_module(f"rsl_rl.utils.{name}_log_writer")
-    service = importlib.import_module(name)
-    refused = (OSError, RuntimeError, ValueError, getattr(getattr(service, "errors", None), "Error", OSError))
+    refused: tuple[type[Exception], ...] = (OSError, RuntimeError, ValueError, ImportError, AttributeError)
     try:
+        service = importlib.import_module(name)
+        refused += (getattr(getattr(service, "errors", None), "Error", OSError),)
+        module = importlib.import_module(f"rsl_rl.utils.{name}_log_writer")
         writer = getattr(module, _SERVICES[name][0])(
             log_dir=str(log_dir), project_name=configuration.run.logger_project
         )

@@ -55,13 +55,28 @@ class Processes:
     """Processes of the run."""
 
     @classmethod
+    def told(cls) -> Processes:
+        """What torchrun says in the environment; nobody is joined.
+
+        Raises:
+            ConfigurationError: it is nonsense.
+        """
+        here = cls(rank=told_number("RANK", 0), count=told_number("WORLD_SIZE", 1))
+        if here.rank >= here.count:
+            raise ConfigurationError(
+                f"the environment variable RANK is {here.rank} and WORLD_SIZE {here.count}; ranks count from 0 and are smaller: "
+                "unset both, or start the run with torchrun"
+            )
+        return here
+
+    @classmethod
     def join(cls, device: torch.device | str) -> Processes:
         """Join the processes that torchrun started, if it did.
 
         Raises:
             ConfigurationError: what torchrun says in the environment is nonsense, or nobody is there.
         """
-        here = cls(rank=told_number("RANK", 0), count=told_number("WORLD_SIZE", 1))
+        here = cls.told()
         if here.several:
             on_gpu = torch.device(device).type == "cuda"
             if on_gpu:

@@ -49,9 +49,39 @@ def test_what_cannot_be_compared_is_said_before_anything_is_played(run, refused,
     for other in ("first", "first/results.json", "card.json"):
         assert refused("compare", "first", policy, other, "--suite", tiny) == f"'first' and '{other}' {same}"
     sentence = refused("compare", first, policy, "--suite", "demo")
-    assert "results of different suites do not compare" in sentence and "choose with --suite" in sentence
+    assert "results of different suites do not compare: 'first' has tiny " in sentence.replace(str(first), "first")
+    assert sentence.endswith("evaluate both on one suite (--suite)")
     sentence = refused("compare", first, policy, "--suite", tiny, "--friction", 0.9)
-    assert "other environments" in sentence
+    assert "were not given the same environments: only 'first' has" in sentence.replace(str(first), "first")
+    assert not (tmp_path / "results").exists()
+
+
+def test_what_was_not_made_alike_is_refused_before_anything_is_played(run, refused, tmp_path, policy, tiny):
+    assert run("evaluate", policy, "--suite", tiny, "--threads", 1, "--out", "first").exit_code == 0
+    alike = ("compare", "first", policy, "--suite", tiny)
+    for choices, words in (
+        (
+            ("--pipeline", "multi", "--terrain", "wave", "--level", 1),
+            "different pipelines do not compare: 'first' has stress",
+        ),
+        (("--level", 1), f"'{policy}' was given its level and that of 'first' was searched for; "),
+        (("--pipeline", "level"), f"the results of '{policy}' have levels and no scores; "),
+    ):
+        assert words in refused(*alike, *choices)
+    for change, words in (
+        ({"backend": "newton"}, "different engines do not compare: 'first' has newton"),
+        ({"robot": "a1"}, "different robots do not compare: 'first' has a1"),
+        (
+            {"provenance": {"digests": {"robot": "ab" * 32}}},
+            "name the robot go2, but its files differ (abababababab and ",
+        ),
+    ):
+        card = json.loads((tmp_path / "first" / "results.json").read_text())
+        (tmp_path / "card.json").write_text(json.dumps(card | change))
+        assert words in refused("compare", "card.json", *alike[2:]).replace("card.json", "first")
+    # two policies, and nothing that was played before
+    flat = ("--terrain", "flat", "--friction", 0.6, "--payload", 0, "--pipeline", "multi")
+    assert "different robots do not compare" in refused("compare", "pretrained", "pretrained-go1", *flat)
     assert not (tmp_path / "results").exists()
 
 

@@ -8,6 +8,7 @@ import os
 import pty
 import signal
 import subprocess
+import sys
 import termios
 import threading
 from pathlib import Path
@@ -19,6 +20,7 @@ from gaitgauge.cli.train import parse_duration
 from gaitgauge.files import writing
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.launch import TrainRequest, prepare
+from gaitgauge.training.logger import make_writer
 from gaitgauge.training.overrides import override_keys
 from gaitgauge.training.processes import idle_gpus
 from gaitgauge.training.scoring import Scorer, scores_of
@@ -111,6 +113,28 @@ def test_time_limit_ends_with_success(run, tmp_path):
         (("go2-flat", "--resume", "latest", "--init-from", "x.pt"), ("--resume", "--init-from")),
         (("go2-flat", "--backend", "fake", "environment.joints.parameters=nope"), ("'nope'", "training")),
         (("go2-flat", "--backend", "fake", "training.run.experiment=a/b"), ("a/b", "folder name")),
+        (("go2-flat", *FAKE, "--num-envs", 1), ("1 environment cannot", "--num-envs (environment.num_envs) 2 or more")),
+        (
+            (
+                "go2-flat",
+                *FAKE,
+                "--num-envs",
+                3,
+                "training.algorithm.minibatches=1000",
+                "training.run.steps_per_iteration=4",
+            ),
+            (
+                "4 steps of 1 teacher and 2 student environments do not fill 1000 minibatches",
+                "training.algorithm.minibatches=4 or fewer, or more --num-envs",
+            ),
+        ),
+        (
+            (
+                *("go2-flat", *FAKE, *SMALL, "--num-envs", 1),
+                *("training.algorithm.method=him", "training.run.steps_per_iteration=1"),
+            ),
+            ("one step of one environment", "training.run.steps_per_iteration"),
+        ),
         (("go2-flat", "--backend", "fake", "--logger", "paper"), ("'paper'", "tensorboard, wandb, neptune")),
     ],
 )
@@ -194,6 +218,41 @@ def test_a_logger_that_is_not_there(refused, tmp_path, name):
     assert not (tmp_path / "logs").exists()
 
 
+@pytest.mark.parametrize("name", ["wandb", "neptune"])
+def test_a_folder_with_the_name_of_a_logger_is_no_logger(refused, tmp_path, monkeypatch, name):
+    if importlib.util.find_spec(name) is not None:
+        pytest.skip(f"{name} is installed")
+    (tmp_path / name).mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    assert f"pip install {name}" in refused("train", "go2-flat", "--backend", "fake", "--logger", name)
+
+
+def test_a_logger_whose_package_does_not_work_is_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "wandb.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    configuration = prepare(TrainRequest(task="go2-flat", backend="fake", device="cpu", logger="wandb")).task.training
+    with pytest.raises(ConfigurationError, match="--logger wandb cannot start: "):
+        make_writer(configuration, tmp_path, None)
+    sys.modules.pop("wandb", None)
+
+
+def test_a_rank_without_processes_is_refused_before_anything_is_made(refused, tmp_path, monkeypatch):
+    monkeypatch.setenv("RANK", "1")
+    message = refused("train", "go2-flat", *FAKE, *SMALL, "--iterations", 1)
+    assert "RANK is 1 and WORLD_SIZE 1" in message and "torchrun" in message
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_run_in_which_nothing_was_written_leaves_no_directory(refused, tmp_path, monkeypatch):
+    def too_large(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr("gaitgauge.training.launch.TrainingRunner", too_large)
+    assert "smaller --num-envs" in refused("train", "go2-flat", *FAKE, *SMALL)
+    assert list((tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()) == []
+
+
 def test_idle_gpus_are_named(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
     assert idle_gpus("cuda:0") == "" and idle_gpus("cpu") == ""
@@ -231,6 +290,14 @@ def test_settings_are_listed_with_default_unit_and_meaning(run):
             listed.add(f"{head}.{line.strip().partition(' = ')[0]}")
     missing = {f"environment.{key}" for key in keys} - listed
     assert not missing
+
+
+def test_settings_are_listed_as_the_options_beside_change_them(run):
+    options = ("--num-envs", 7, "--iterations", 11, "--seed", 5, "--score-every", 3, "environment.seed=6")
+    result = run("train", "go2-flat", "--list-settings", *options)
+    assert result.exit_code == 0, result.output
+    lines = result.output.splitlines()
+    assert {"  num_envs = 7", "  iterations = 11", "  seed = 5", "  seed = 6", "  gauge_interval = 3"} <= set(lines)
 
 
 def test_every_setting_says_what_it_means():

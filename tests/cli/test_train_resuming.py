@@ -8,6 +8,7 @@ import torch
 from gaitgauge.files import writing
 from gaitgauge.files.writing import lock_folder
 from gaitgauge.training.launch import TrainRequest, prepare
+from gaitgauge.training.stopping import TrainingOutcome
 from gaitgauge.training.tasks import TASKS
 from small_run import FAKE, SMALL
 
@@ -109,6 +110,30 @@ def test_what_is_told_to_go_on_with_keeps_what_checkpoints_do_not(run, monkeypat
     assert " ".join(result.output.partition("--resume")[2].split()).endswith("--device cpu --no-score")
 
 
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        ({}, "go on with: gaitgauge train"),
+        ({"WORLD_SIZE": "2"}, "go on with: torchrun --nproc-per-node 2 -m gaitgauge.cli.main train"),
+        (
+            {"WORLD_SIZE": "16", "LOCAL_WORLD_SIZE": "8"},
+            "go on with, on every machine and with its --rdzv options: "
+            "torchrun --nnodes 2 --nproc-per-node 8 -m gaitgauge.cli.main train",
+        ),
+    ],
+)
+def test_what_is_told_to_go_on_with_starts_as_many_processes(run, trained, monkeypatch, told, expected):
+    def stopped(plan, **_):
+        return TrainingOutcome(reason="time", iteration=2, checkpoint=trained / "model_2.pt", exit_code=0), trained
+
+    monkeypatch.setattr("gaitgauge.cli.train.train", stopped)
+    for name, value in told.items():
+        monkeypatch.setenv(name, value)
+    result = run("train", "go2-flat", *FAKE, *SMALL)
+    assert result.exit_code == 0, result.output
+    assert f"{expected} go2-flat --resume {trained}" in " ".join(result.output.split())
+
+
 def test_checkpoint_of_another_task(refused, trained, tmp_path):
     message = refused("train", "go2-cts", "--resume", trained, "--device", "cpu")
     assert "'go2-flat'" in message
@@ -194,6 +219,20 @@ def test_finished_run_says_what_to_give(refused, trained):
     message = refused("train", "go2-flat", "--resume", trained / "model_2.pt", "--device", "cpu", "--no-score")
     assert "2 of 2 iterations" in message
     assert "--iterations" in message
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (("--iterations", 1), "has done 2 of 1 iterations"),
+        (("--iterations", 3, "environment.observations.history_start=zeros"), "policy contract differs"),
+        (("--iterations", 3, "training.algorithm.minibatches=1000"), "do not fill 1000 minibatches"),
+    ],
+)
+def test_a_resume_that_is_refused_changes_nothing(refused, trained, change, named):
+    before = {f: f.read_bytes() for f in trained.rglob("*") if f.is_file()}
+    assert named in refused("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", *change)
+    assert {f: f.read_bytes() for f in trained.rglob("*") if f.is_file()} == before
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -50,10 +50,10 @@ def test_what_the_command_line_names_needs_no_trust(trained, tmp_path, monkeypat
     stored = torch.load(trained / "model_2.pt", weights_only=True)["training"]["settings"]["environment"]
     named = "environment.commands.generator=mine:Own"
     path = stranger(trained, tmp_path, commands=stored["commands"] | {"generator": "mine:Own"})
-    request = TrainRequest(task="go2-flat", device="cpu", resume=str(path), overrides=(named,))
+    request = TrainRequest(task="go2-flat", device="cpu", resume=str(path), overrides=(named,), iterations=3)
     plan = prepare(request)
     assert plan.task.environment.commands.generator == "mine:Own" and plan.needs_trust
-    assert not prepare(TrainRequest(task="go2-flat", device="cpu", resume=str(trained))).needs_trust
+    assert not prepare(TrainRequest(task="go2-flat", device="cpu", resume=str(trained), iterations=3)).needs_trust
 
 
 def test_a_run_directory_that_leads_elsewhere_is_refused(refused, trained, tmp_path):
@@ -109,10 +109,10 @@ def test_a_checkpoint_never_chooses_where_data_go(run, trained, tmp_path, monkey
     result = run("train", "go2-flat", "--resume", path, *RESUME)
     assert result.exit_code == 0 and started == []
     assert f"add --logger {service} to go on with that" in " ".join(result.output.split())
-    request = TrainRequest(task="go2-flat", device="cpu", resume=str(path))
+    request = TrainRequest(task="go2-flat", device="cpu", resume=str(path), iterations=3)
     plan = prepare(request)
     assert (plan.task.training.run.logger, plan.task.training.run.logger_project) == ("tensorboard", "gaitgauge")
-    asked = prepare(TrainRequest(task="go2-flat", device="cpu", resume=str(path), logger=service))
+    asked = prepare(TrainRequest(task="go2-flat", device="cpu", resume=str(path), iterations=3, logger=service))
     assert (asked.task.training.run.logger, asked.task.training.run.logger_project) == (service, "gaitgauge")
     assert checked == ["tensorboard", "tensorboard", service]
 

@@ -26,20 +26,31 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
     assert "played 2 of the card's 4 environments, one of each terrain" in words
     assert "every outcome is the same to the last digit" in words
 
-    content["score"] += 0.3
-    for row in content["environments"]:
-        row["score"] = row["score"] + 0.3
-        for played in row.get("runs", {}).values():
-            played["quality"] += 0.3
-        if row["terrain"] == "slope_fd":
-            row["level"] = 9
-    path.write_text(json.dumps(content))
+    forged = json.loads(path.read_text())
+    forged["score"] += 0.3
+    path.write_text(json.dumps(forged))
+    assert "but what it is made of gives" in refused("verify", path, *options)
+    forged = json.loads(json.dumps(content)) | {"score_interval": [0.0, 1.0]}
+    path.write_text(json.dumps(forged))
+    assert "but that of its trials and runs is" in refused("verify", path, *options)
+
+    forged = json.loads(json.dumps(content))
+    forged["solver"]["iterations"] += 1
+    forged["provenance"]["versions"]["mujoco"] = "3.0.0"
+    path.write_text(json.dumps(forged))
+    done = run("verify", path, *options, "--quick", "--out", tmp_path / "again")
+    words = " ".join(done.stdout.split())
+    assert done.exit_code == 1 and "card and replay were not played alike: mujoco 3.0.0 and" in words
+    assert "solver.iterations: 101 on the card, 100 here" in words and "does NOT hold: it was made with" in words
+
+    (at,) = (at for at, row in enumerate(content["environments"]) if (row["terrain"], row["friction"]) == ("flat", 0.6))
+    forged = json.loads(json.dumps(content))
+    forged["environments"][at]["falls"] += 1
+    forged["health"]["falls"] += 1
+    path.write_text(json.dumps(forged))
     done = run("verify", path, *options, "--quick", "--out", tmp_path / "again", "--json")
-    assert done.exit_code == 1
     found = json.loads(done.stdout)
-    assert (found["holds"], found["equal"]) == (False, False)
-    (level,) = found["levels"]
-    assert (level["terrain"], level["friction"], level["card"]) == ("slope_fd", 0.6, 9)
+    assert (found["holds"], found["equal"]) == (True, False)
 
     path.write_text((tmp_path / "run" / "results.json").read_text())
     done = run("verify", path, *options, "--quick", "--fresh", 5, "--out", tmp_path / "fresh", "--json")

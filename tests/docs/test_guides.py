@@ -8,6 +8,7 @@ the block to a file first.
 from __future__ import annotations
 
 import os
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -78,6 +79,15 @@ def test_every_command_that_is_shown_exists_with_these_options(page, words):
             break
         group = command
     command.make_context("gaitgauge", list(words))
+
+
+def test_the_page_of_the_api_names_what_exists_and_every_command():
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    names = re.findall(r"(?:`|^::: )(gaitgauge(?:\.\w+)+)", text, re.M)
+    assert len(names) > 15
+    for name in names:
+        pkgutil.resolve_name(name)  # raises
+    assert [c for c in COMMANDS.list_commands(None) if f"`{c}`" not in text] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

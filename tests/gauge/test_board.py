@@ -2,15 +2,19 @@
 
 import json
 
+import numpy as np
 import pytest
 from gaitgauge.cli.main import app
 from gaitgauge.gauge.board import board_data, render_board, write_board
 from gaitgauge.gauge.comparison import ComparisonError
+from gaitgauge.gauge.policies import file_digest
 from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.gauge.verify import CardError
 from sample_results import HOSTILE, Page, sample
 from typer.testing import CliRunner
+
+CHANCE = sample()["chance"]
 
 
 def card(
@@ -18,12 +22,12 @@ def card(
 ):
     return {
         "schema": 2,
-        "suite": {"name": "robogauge-1.1", "version": "1.1.0", "title": "", "digest": digest},
+        "suite": {"name": "mine", "version": "1.1.0", "title": "", "digest": digest},
         "coverage": {"kind": kind, "text": text},
         "score": score,
         "score_interval": None if score is None else [score - 0.01, score + 0.01],
         "level": 7.5,
-        "chance": {"note": None},
+        "chance": CHANCE,
         "policy": {"path": path, "file_sha256": "cd" * 32, "observations": list(observations)},
         "pipeline": "stress",
         "backend": "mujoco",
@@ -119,14 +123,62 @@ def test_a_card_is_not_written_over(tmp_path):
     assert (tmp_path / "one.json").read_text() == text
 
 
-def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(tmp_path):
-    whole = sample()
-    whole["suite"]["digest"] = load_suite("robogauge-1.1").digest
-    (tmp_path / "card.json").write_text(json.dumps(whole))
-    write_board(tmp_path, tmp_path / "board.html")
-    rows = [row for row in whole["environments"] if row["friction"] != 0.2]
+@pytest.fixture
+def whole(tmp_path):
+    """A complete card of robogauge-1.1, which a function writes into a folder after changes."""
+    content = sample(resamples=2000)
+    content["suite"]["digest"] = load_suite("robogauge-1.1").digest
+
+    def write(**changes):
+        (tmp_path / "card.json").write_text(json.dumps(content | changes))
+        return write_board(tmp_path, tmp_path / "boards" / "all.html")
+
+    write.content = content
+    return write
+
+
+def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(whole):
+    """The page's folder is created."""
+    assert "robogauge-1.1 1.1.0" in Page(whole().read_text()).text
+    content = whole.content
+    rows = [row for row in content["environments"] if row["friction"] != 0.2]
     weights = environment_weights([row["terrain"] for row in rows])
-    whole |= {"environments": rows, "score": float(weights @ [row["score"] for row in rows])}
-    (tmp_path / "card.json").write_text(json.dumps(whole))
+    part = {"environments": rows, "score": float(weights @ [row["score"] for row in rows])}
+    part |= {"level": float(np.mean([row["level"] for row in rows if row["terrain"] != "flat"]))}
     with pytest.raises(CardError, match=r"card\.json' calls itself complete, but holds 8 of 9 frictions"):
-        write_board(tmp_path, tmp_path / "board.html")
+        whole(**part, terrains={}, metrics={}, groups={}, health=None)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (
+            {"name": "zz", "version": "9"},
+            r"card\.json' names its suite zz 9, but its digest a43a.* is that of robogauge-1\.1",
+        ),
+        ({"version": "9"}, r"names its suite robogauge-1\.1 9, but its digest"),
+        (
+            {"digest": "ab" * 32},
+            r"is of robogauge-1\.1 1\.1\.0 with digest ab.*, but robogauge-1\.1 here is 1\.1\.0 with a43a",
+        ),
+    ],
+)
+def test_a_card_that_names_another_suite_than_its_own_is_not_put_on_the_board(whole, change, named):
+    """Renamed, it was not checked, and headed the table of a suite that it does not hold."""
+    with pytest.raises(CardError, match=named):
+        whole(suite=whole.content["suite"] | change)
+
+
+def test_suites_of_the_same_digest_and_other_names_have_tables_of_their_own():
+    cards = {name: card(0.5, suite={"name": name, "version": "1", "digest": "ab" * 32}) for name in ("one", "two")}
+    assert [table["suite"]["name"] for table in board_data(cards)] == ["one", "two"]
+
+
+def test_a_policy_that_ships_is_found_by_name_where_it_is_the_card_s():
+    policy = {"path": "pretrained", "file_sha256": file_digest("pretrained")}
+    cards = {"a": card(0.5, policy=policy), "b": card(0.4, policy=policy | {"file_sha256": "ab" * 32})}
+    (table,) = board_data(cards)
+    assert [e["command"] for e in table["ranked"]] == [
+        "gaitgauge verify a",
+        "gaitgauge verify b --policy FILE",  # of another release
+    ]

@@ -58,6 +58,27 @@ def test_the_same_results_twice_are_refused():
         compare([results(), results()])
 
 
+def test_other_rules_of_chance_are_refused_and_named():
+    """They ended in a sentence of NumPy's about shapes."""
+    first, second = both()
+    second["chance"]["resamples"] = 20
+    with pytest.raises(
+        ComparisonError, match=r"chance\.resamples is 10 in 'first' and 20 in 'second'; it was changed by hand"
+    ):
+        compare([first, second])
+
+
+def test_versions_source_and_solver_that_differ_are_said():
+    first, second = both(terrains=("flat",))
+    assert not any("played alike" in sentence for sentence in compare([first, second]).sentences)
+    for found, version, iterations in ((first, "3.16.0", 100), (second, "3.17.0", 5)):
+        found["provenance"]["versions"]["mujoco"] = version
+        found["solver"] = {"iterations": iterations}
+    assert (
+        "They were not played alike, which may be part of a difference: mujoco 3.16.0 and 3.17.0; solver.iterations 100 and 5."
+    ) in compare([first, second]).sentences
+
+
 def test_everything_that_the_issue_names_is_compared():
     kinds = {d.kind for d in compare(both()).differences}
     assert kinds == {"score", "level", "group", "terrain", "friction", "metric", "command"}

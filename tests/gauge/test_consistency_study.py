@@ -377,6 +377,8 @@ def test_page_is_self_contained_and_escapes_names(request_of, tmp_path):
     assert "standing &lt;b&gt;.gauge.pt" in html and "standing <b>" not in html
     assert not re.search(r"(?:src|href)\s*=|url\(|@import", html)
     assert html.count("<svg") > 30
+    # what is beside a swatch is not broken where there is room: a sentence would make a phone's page three screens wide
+    assert max(len(words) for words in re.findall(r'"key-line">(?:<svg.*?</svg>)?([^<]*)<', html)) < 60
     assert "nan" not in re.sub(r"<style>.*?</style>", "", html, flags=re.S).lower().replace("provenance", "")
     for words in ("Gap", "Models", "Not described by", "Open loop", "Attribution", "linear velocity tracking"):
         assert words in html

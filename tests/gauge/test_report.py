@@ -7,7 +7,7 @@ from contextlib import suppress
 import pytest
 from gaitgauge.api import ResultsError, load_results
 from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
-from gaitgauge.gauge.report import CLIP, metric_matrix, render, warnings, write_report
+from gaitgauge.gauge.report import CLIP, metric_matrix, render, sources, warnings, write_report
 from gaitgauge.gauge.store import StoreError
 from sample_results import HOSTILE, PIPELINES, Page, row, sample
 
@@ -126,6 +126,14 @@ def test_every_number_has_its_name_where_a_phone_hides_the_tables_heads(stress):
         for line in re.findall(r"<tr>(.*?)</tr>", table.split("</thead>")[1], re.S):
             _, *cells = re.findall(r"<t[dh]\b[^>]*>", line)
             assert cells and all("data-label=" in cell or 'class="strip"' in cell for cell in cells), line
+
+
+def test_where_a_policy_comes_from_is_told_in_words(stress):
+    robot = {"name": "go2", "digest": "5a51"}
+    told = {"robot": robot, "task": "go2-flat", "iteration": 1006, "seeds": [1, 2], "note": None}
+    found = sources(stress | {"policy": stress["policy"] | {"provenance": told}})
+    shown = [found[f"policy: {key}"] for key in told]
+    assert shown == ["name go2, digest 5a51", "go2-flat", "1006", "1, 2", "–"]
 
 
 def test_directions_commands_and_references_are_shown(stress):

@@ -8,7 +8,7 @@ from gaitgauge.gauge.comparison import ComparisonError, load_result
 from gaitgauge.gauge.evaluate import Request, identity, prepare
 from gaitgauge.gauge.policies import file_digest
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.gauge.verify import CardError, check_coverage, judge, prepare_replay, with_fresh_seeds
+from gaitgauge.gauge.verify import CardError, check_card, judge, prepare_replay, with_fresh_seeds
 from sample_results import sample
 
 
@@ -62,6 +62,7 @@ def test_a_sample_is_held_against_the_same_environments(card):
 
 def test_without_an_interval_only_the_same_outcome_holds(card):
     card["score_interval"] = None
+    card["chance"]["seeds"] = [0]  # one seed shows no spread
     replay = deepcopy(card)
     assert judge(card, replay)["holds"]
     replay["environments"][0]["score"] += 1e-6
@@ -122,12 +123,87 @@ def test_a_card_of_a_policy_that_ships_names_it():
 
 def test_a_card_that_holds_less_than_it_says_is_refused():
     """Bad environments left out, and the score worked out anew: a replay of what is left would hold."""
-    whole = sample()
-    check_coverage(whole, load_suite("robogauge-1.1"), "it")
+    suite, whole = load_suite("robogauge-1.1"), sample(resamples=2000)
+    check_card(whole, suite, "it")
     part = whole | {"environments": [row for row in whole["environments"] if row["terrain"] != "obstacle"]}
     with pytest.raises(
         CardError,
         match=r"it calls itself complete, but holds 6 of 7 terrains of robogauge-1\.1; it was changed by hand",
     ):
-        check_coverage(part, load_suite("robogauge-1.1"), "it")
-    check_coverage(part | {"coverage": None}, load_suite("robogauge-1.1"), "it")  # results from before say nothing
+        check_card(part, suite, "it")
+    with pytest.raises(CardError, match=r"it: score_interval is .*, but that of its trials and runs is"):
+        check_card(part | {"coverage": None}, suite, "it")  # results from before say nothing of what they hold
+
+
+def test_a_card_of_a_suite_that_names_another_or_has_other_rules_is_refused():
+    suite, card = load_suite("robogauge-1.1"), sample(resamples=2000)
+    for key, value in (("version", "9.9.9"), ("name", "zz")):
+        with pytest.raises(
+            CardError, match=r"it names its suite .*, but its digest a43a.* is that of robogauge-1\.1 1\.1\.0"
+        ):
+            check_card(card | {"suite": card["suite"] | {key: value}}, suite, "it")
+    with pytest.raises(CardError, match=r"it: chance.resamples is 1000, but that of robogauge-1.1 is 2000"):
+        check_card(card | {"chance": card["chance"] | {"resamples": 1000}}, suite, "it")
+
+
+@pytest.mark.parametrize("interval", [[0.0, 1.0], [0.9, 0.95], None])
+def test_an_interval_that_the_runs_do_not_give_is_refused(card, interval):
+    """It was taken as it is printed, and a card with a wide one held whatever its score."""
+    check_card(card, None, "it")
+    with pytest.raises(CardError, match=r"it: score_interval is .*, but that of its trials and runs is"):
+        check_card(card | {"score_interval": interval}, None, "it")
+
+
+def test_the_band_is_as_wide_as_the_replay_s_interval(card):
+    """Runs that were spread by hand widen the card's interval, and no band."""
+    true = judge(card, deepcopy(card))["band"]
+    forged = deepcopy(card) | {"score_interval": [0.0, 1.0]}
+    for row in forged["environments"]:
+        for at, run in enumerate(row["runs"].values()):
+            run["quality"] += 0.3 * (at - 1)
+    found = judge(forged, card)
+    assert found["band"] == true and not found["equal"]
+
+
+@pytest.mark.parametrize(
+    ("key", "inside"),
+    [
+        ("level", ()),
+        ("level_interval", (0,)),
+        ("terrains", ("wave", "interval", 1)),
+        ("metrics", ("lin_vel_err", "mean25")),
+        ("groups", ("safety",)),
+        ("groups_interval", ("safety", 0)),
+        ("health", ("episodes",)),
+    ],
+)
+def test_a_figure_that_is_off_where_no_outcome_is_is_named(card, key, inside):
+    """The last digits of an interval may be another machine's, and an older card may say less."""
+    for by, figures in ((1e-6, []), (0.1, [key])):
+        forged = deepcopy(card)
+        table, last = forged, key
+        for step in inside:
+            table, last = table[last], step
+        table[last] += by
+        found = judge(forged, card)
+        assert (found["holds"], found["equal"], found["figures"]) == (not figures, False, figures)
+    assert judge(card | {"health": {}, "groups_interval": None}, card)["equal"]
+
+
+def test_another_solver_or_motors_than_the_replay_s_do_not_hold_and_other_versions_are_said(card):
+    card |= {"solver": {"iterations": 100}, "motors": {"stiffness": [20.0], "damping": [0.5], "note": None}}
+    assert judge(card, deepcopy(card))["holds"]
+    for key, value in (
+        ("solver", {"iterations": 5}),
+        ("motors", {"stiffness": [40.0], "damping": [0.5], "note": None}),
+    ):
+        found = judge(card | {key: value}, card)
+        assert not found["holds"] and [item["name"].partition(".")[0] for item in found["settings"]] == [key]
+    older = deepcopy(card)
+    older["provenance"] |= {"versions": {"mujoco": "3.16.0", "numpy": "1.0"}, "digests": {"source": "ab" * 32}}
+    card["provenance"]["digests"] = {"source": "cd" * 32}
+    found = judge(older, card)
+    assert found["holds"] and found["unlike"] == [
+        "mujoco 3.16.0 and 3.17.0",
+        "source of gaitgauge abababababab and cdcdcdcdcdcd",
+    ]

@@ -69,6 +69,18 @@ def test_what_torchrun_did_not_say_is_one_sentence(monkeypatch, name, value):
     assert str(caught.value).isprintable()
 
 
+@pytest.mark.parametrize(("rank", "count"), [(1, None), (2, 2), (0, 0)])
+def test_a_rank_beyond_the_processes_is_one_sentence(monkeypatch, rank, count):
+    monkeypatch.setenv("RANK", str(rank))
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    if count is not None:
+        monkeypatch.setenv("WORLD_SIZE", str(count))
+    with pytest.raises(
+        ConfigurationError, match=f"RANK is {rank} and WORLD_SIZE {1 if count is None else count}; ranks"
+    ):
+        Processes.join("cpu")
+
+
 @pytest.mark.parametrize(
     "variables",
     [{}, {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "x"}, {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "-1"}],

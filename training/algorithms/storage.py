@@ -6,7 +6,36 @@ from dataclasses import dataclass
 
 import torch
 
+from ..configuration import ConfigurationError
 from ..networks import Widths
+
+
+def split_sizes(num_envs: int, period: int) -> tuple[int, int]:
+    """How many of ``num_envs`` environments are the teacher's and the student's, every ``period``-th one.
+
+    Raises:
+        ConfigurationError: too few environments for at least one of each.
+    """
+    if period > 1 and num_envs < 2:
+        raise ConfigurationError(
+            f"{num_envs} environment cannot be split into teacher and student; give --num-envs (environment.num_envs) 2 or more"
+        )
+    students = (num_envs + period - 1) // period
+    return num_envs - students, students
+
+
+def check_minibatches(num_minibatches: int, *, steps: int, teachers: int, students: int) -> None:
+    """Refuse to divide a rollout into more minibatches than there are samples of the teacher or the student.
+
+    Raises:
+        ConfigurationError: there are more.
+    """
+    if (most := steps * min(teachers or students, students)) < num_minibatches:
+        named = f"{teachers} teacher and {students} student" if teachers else f"{students}"
+        raise ConfigurationError(
+            f"{steps} steps of {named} environments do not fill {num_minibatches} minibatches; give "
+            f"training.algorithm.minibatches={most} or fewer, or more --num-envs or training.run.steps_per_iteration"
+        )
 
 
 @dataclass(frozen=True)
@@ -30,19 +59,15 @@ class EnvironmentSplit:
         """Split ``num_envs`` environments.
 
         Raises:
-            ValueError: too few environments for at least one of each.
+            ConfigurationError: too few environments for at least one of each.
         """
-        if period > 1 and num_envs < 2:
-            raise ValueError(
-                f"{num_envs} environment(s) cannot be split into teacher and student; use at least {period}."
-            )
+        num_teacher, num_student = split_sizes(num_envs, period)
         index = torch.arange(num_envs, device=device)
         student = index % period == 0
         order = torch.cat((index[~student], index[student]))
         inverse = torch.empty_like(order)
         inverse[order] = index
-        num_student = (num_envs + period - 1) // period
-        return cls(num_teacher=num_envs - num_student, num_student=num_student, order=order, inverse=inverse)
+        return cls(num_teacher=num_teacher, num_student=num_student, order=order, inverse=inverse)
 
 
 class RolloutStorage:
@@ -119,16 +144,10 @@ class RolloutStorage:
             storage flattened over time and block-ordered environments; what does not divide evenly is left out.
 
         Raises:
-            ValueError: there are fewer student or teacher samples than minibatches.
+            ConfigurationError: there are fewer student or teacher samples than minibatches.
         """
         steps, teachers, students = self.num_steps, self.split.num_teacher, self.split.num_student
-        groups = [(count, first) for count, first in ((teachers, 0), (students, teachers)) if count]
-        if steps * min(count for count, _ in groups) < num_minibatches:
-            named = f"{teachers} teacher and {students} student" if teachers else f"{students}"
-            raise ValueError(
-                f"{steps} steps of {named} environments do not fill {num_minibatches} minibatches; "
-                "use more environments or fewer minibatches."
-            )
+        check_minibatches(num_minibatches, steps=steps, teachers=teachers, students=students)
 
         def draw(count: int, first: int) -> torch.Tensor:
             size = steps * count // num_minibatches
@@ -136,7 +155,7 @@ class RolloutStorage:
             rows = shuffled // count * self.num_envs + shuffled % count + first
             return rows.view(num_minibatches, size)
 
-        return tuple(draw(count, first) for count, first in groups)
+        return tuple(draw(count, first) for count, first in ((teachers, 0), (students, teachers)) if count)
 
     def student_rows(self, rows: torch.Tensor) -> torch.Tensor:
         """Rows of the flattened student-only buffers that belong to student rows of the flattened storage."""
