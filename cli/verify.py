@@ -70,7 +70,7 @@ def run_verification(
         for item in found["settings"]:
             console.say(f"{item['name']}: {shown(item['card'])} on the card, {shown(item['here'])} here")
         if found["unlike"]:
-            console.say(f"card and replay were not played alike: {'; '.join(found['unlike'])}")
+            console.say(f"card and replay were made with other versions: {'; '.join(found['unlike'])}")
         if found["settings"]:
             console.say("the card does NOT hold: it was made with another solver or other motors")
         elif found["figures"]:

@@ -84,7 +84,9 @@ class Comparison:
         scores = [d for d in self.differences if d.kind == "score"]
         found = [_score_sentence(d, len(scores)) for d in scores] + [self._details_sentence()]
         if self.unlike:
-            found.append(f"They were not played alike, which may be part of a difference: {'; '.join(self.unlike)}.")
+            found.append(
+                f"They were made with other versions or settings, which may be part of a difference: {'; '.join(self.unlike)}."
+            )
         return found + ([] if self.complete else [self._coverage_sentence()])
 
     @property

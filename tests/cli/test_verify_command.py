@@ -40,7 +40,7 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
     path.write_text(json.dumps(forged))
     done = run("verify", path, *options, "--quick", "--out", tmp_path / "again")
     words = " ".join(done.stdout.split())
-    assert done.exit_code == 1 and "card and replay were not played alike: mujoco 3.0.0 and" in words
+    assert done.exit_code == 1 and "card and replay were made with other versions: mujoco 3.0.0 and" in words
     assert "solver.iterations: 101 on the card, 100 here" in words and "does NOT hold: it was made with" in words
 
     (at,) = (at for at, row in enumerate(content["environments"]) if (row["terrain"], row["friction"]) == ("flat", 0.6))

@@ -75,7 +75,8 @@ def test_versions_source_and_solver_that_differ_are_said():
         found["provenance"]["versions"]["mujoco"] = version
         found["solver"] = {"iterations": iterations}
     assert (
-        "They were not played alike, which may be part of a difference: mujoco 3.16.0 and 3.17.0; solver.iterations 100 and 5."
+        "They were made with other versions or settings, which may be part of a difference: mujoco 3.16.0 and 3.17.0; "
+        "solver.iterations 100 and 5."
     ) in compare([first, second]).sentences
 
 
