@@ -13,7 +13,8 @@ from dataclasses import dataclass, fields, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 
 from ..robots.base import JointParameters, Robot
 from ..terrains.base import Terrain
@@ -24,6 +25,14 @@ if TYPE_CHECKING:
 
 _Iterations = Annotated[int, Field(ge=1, le=10_000)]
 
+
+def _known_dimension(value: int) -> int:
+    if value not in (3, 4, 6):  # no Literal: a setting's text would not become its number
+        raise PydanticCustomError("contact_dimension", "Input should be 3, 4 or 6")
+    return value
+
+
+_ContactDimension = Annotated[int, AfterValidator(_known_dimension)]
 
 SMALLEST_BASE_MASS = 0.01
 """A base never gets lighter than this [kg]; see ``Randomization.base_mass_offset``."""
@@ -62,7 +71,7 @@ class PhysicsOptions:
     """Largest number of line-search iterations."""
     tolerance: Annotated[float, Field(ge=0.0, le=1.0)] = 1e-8
     """Solver tolerance."""
-    foot_condim: Annotated[int, Field(ge=1, le=6)] | None = None
+    foot_condim: _ContactDimension | None = None
     """Contact dimension of the feet (3 sliding, 4 with torsion, 6 with rolling too); None keeps the robot file's."""
     self_collision: bool = True
     """Whether the robot's own parts meet each other."""

@@ -12,18 +12,28 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Annotated, Any
 
 import torch
 from gaitgauge.backends.base import PhysicsState
+from gaitgauge.files.parsing import Seed, from_text
+from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.gauge.trials.running import Trial, run_scenario
 from gaitgauge.gauge.trials.scenario import Scenario, load_scenario
-from gaitgauge.policy.base import Policy
+from gaitgauge.policy.base import Policy, PolicyError
 from gaitgauge.policy.its_robot import robot_for
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import Robot
 from gaitgauge.robots.body_plan import body_plan
+from pydantic import Field
+
+_Speed = Annotated[float, Field(ge=0.1, le=100.0)]
+_Way = Annotated[float, Field(gt=0.0, le=50.0)]
+_Friction = Annotated[float, Field(ge=0.0, le=10.0)]
+_Robots = Annotated[int, Field(ge=1, le=1000)]
 
 
 def scenario(*, speed: float, reach: float, runway: float, friction: float, suite: str) -> Scenario:
@@ -84,18 +94,30 @@ def lines(trials: Sequence[Trial], joint_speeds: torch.Tensor, robot: Robot, *, 
     return rows
 
 
+def _within(hint: Any) -> Callable[[str], Any]:
+    """What argparse reads an option of a type and range with."""
+    return lambda text: from_text(hint, text, "value", argparse.ArgumentTypeError)
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("policy")
-    parser.add_argument("--speed", type=float, default=4.2, help="commanded forward speed [m/s]")
-    parser.add_argument("--reach", type=float, default=4.0, help="speed whose time is taken [m/s]")
-    parser.add_argument("--runway", type=float, default=8.0, help="way after which the robot is to stop [m]")
-    parser.add_argument("--friction", type=float, default=0.6)
-    parser.add_argument("--robots", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--speed", type=_within(_Speed), default=4.2, help="commanded forward speed [m/s]")
+    parser.add_argument("--reach", type=_within(_Speed), default=4.0, help="speed whose time is taken [m/s]")
+    parser.add_argument("--runway", type=_within(_Way), default=8.0, help="way after which the robot is to stop [m]")
+    parser.add_argument("--friction", type=_within(_Friction), default=0.6)
+    parser.add_argument("--robots", type=_within(_Robots), default=20)
+    parser.add_argument("--seed", type=_within(Seed), default=0)
     parser.add_argument("--suite", default="robogauge-1.1", help="suite whose physics and noise act")
-    given = parser.parse_args()
+    try:
+        sprint_as_told(parser.parse_args())
+    except (PolicyError, SuiteError) as error:
+        sys.exit(f"error: {error}")
+
+
+def sprint_as_told(given: argparse.Namespace) -> None:
+    """Run and print what the options ask for."""
     sprint = scenario(
         speed=given.speed, reach=given.reach, runway=given.runway, friction=given.friction, suite=given.suite
     )

@@ -107,7 +107,8 @@ def _figures(data: Mapping[str, Any], rules: ChanceRules) -> Iterator[Figure]:
             yield f"environments[{at}].{name}.mean50", found and found["mean50"], expected
         if evaluated:
             yield f"environments[{at}].score", row["score"], _at_level(quality, "mean50", row, rules)
-    yield "level", data.get("level"), _mean_level(rows)
+    if "level" in data:
+        yield "level", data["level"], _mean_level(rows)
     for terrain, item in (data.get("terrains") or {}).items():
         mine = [row for row in rows if row["terrain"] == terrain]
         yield f"terrains.{terrain}.level", item.get("level"), _mean_level(mine)

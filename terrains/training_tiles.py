@@ -22,10 +22,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
-from ..files.parsing import did_you_mean
+from ..files.parsing import NotNegative, Positive, Share, did_you_mean
 from .base import Box, FloatArray, HeightField, Pose, Terrain
 from .registry import TerrainError
 from .tile_geometry import (
@@ -50,6 +52,8 @@ _LAST_RISER = 0.2  # distance from the last riser or bar to the tile's edge, at 
 _OVERLAP = 0.2  # how far a step reaches under the next one, so that no crack opens between them [m]
 
 Range = tuple[float, float]
+_Grown = tuple[Positive, NotNegative]
+_Shares = tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,23 +62,24 @@ class TileShape:
     does not call them a range to draw from.
     """
 
-    platform_radius: float = 1.3
+    platform_radius: Positive = 1.3
     """Half the side of the level square in the middle of slopes and stairs [m]."""
-    slope_gradient: tuple[float, float] = (0.10, 0.52)
-    """Rise over run."""
-    stair_riser: tuple[float, float] = (0.05, 0.23)
-    """Mean height of a step [m]."""
+    slope_gradient: _Grown = (0.10, 0.52)
+    """Rise over run at difficulty 0, and its growth up to 1."""
+    stair_riser: _Grown = (0.05, 0.23)
+    """Mean height of a step at difficulty 0, and its growth up to 1 [m]."""
     stair_tread: Range = (0.28, 0.36)
     """Range of a flight's mean depth of a step [m]."""
-    stair_irregularity: float = 0.15
+    stair_irregularity: Share = 0.15
     """Treads and risers of one flight differ from their mean by up to a share, drawn from 0 to this."""
-    stair_count: int = 9
+    stair_count: Annotated[int, Field(ge=1, le=1000)] = 9
     """Largest number of risers between the platform and the tile's edge."""
-    obstacle_height: tuple[float, float] = (0.05, 0.25)
-    """Height of obstacles over the level of the start, and depth of pits below it [m]; bars have up to this height."""
+    obstacle_height: _Grown = (0.05, 0.25)
+    """Height of obstacles over the start, and depth of pits, at difficulty 0, and its growth up to 1 [m]; bars have up to this
+    height."""
     obstacle_free_radius: float = 1.5
     """Half the side of the level square around the start between obstacles [m]."""
-    obstacle_shares: tuple[float, float, float, float, float] = (0.15, 0.2, 0.3, 0.2, 0.15)
+    obstacle_shares: _Shares = (0.15, 0.2, 0.3, 0.2, 0.15)
     """Shares of the patches at -1, -1/2, 0, 1/2 and 1 times ``obstacle_height`` over the start."""
     bar_start: Range = (1.3, 1.7)
     """Range of half the side of the level square inside the first bar [m]."""
@@ -84,17 +89,17 @@ class TileShape:
     """Range of the distance between two bars [m]."""
     bar_height: Range = (0.8, 1.0)
     """Range of a bar's height as a share of ``obstacle_height``."""
-    wave_steepness: tuple[float, float] = (0.20, 0.60)
-    """Largest gradient of each of the two waves, 2 pi amplitude / length."""
+    wave_steepness: _Grown = (0.20, 0.60)
+    """Largest gradient of each of the two waves at difficulty 0, and its growth up to 1; 2 pi amplitude / length."""
     wave_length: Range = (1.4, 2.8)
     """Range of each wave's length [m]."""
     wave_share: Range = (0.75, 1.0)
     """Range of each wave's gradient as a share of ``wave_steepness``."""
-    roughness: float = 0.05
+    roughness: NotNegative = 0.05
     """Largest height above and below the smooth surface of rough slopes [m]; waves have a share of it, drawn from 0 to 1."""
-    taper: float = 0.8
+    taper: Positive = 0.8
     """Width of the zone in which a height field comes down to the floor at its edge [m]."""
-    extent: float = 40.0
+    extent: Annotated[float, Field(gt=_EDGE, le=1000.0)] = 40.0
     """Half the side of the rim around pits [m]; beyond it is the floor, as deep below as the pit."""
 
     def __post_init__(self) -> None:
@@ -108,6 +113,8 @@ class TileShape:
                 f"obstacle_free_radius is {self.obstacle_free_radius} m; it must be above 0 and less than the tile's "
                 f"{_EDGE:g} m, so that there is room for obstacles"
             )
+        if not sum(self.obstacle_shares) > 0:
+            raise TerrainError("obstacle_shares are all 0; at least one must be above 0")
         for name in ("stair_tread", "bar_start", "bar_width", "bar_gap", "bar_height", "wave_length", "wave_share"):
             low, high = getattr(self, name)
             if not 0 < low <= high:

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from pydantic import Field
 from pydantic_core import to_jsonable_python
 
-from ..files.parsing import Count, NotNegative, Positive, Seed
+from ..files.parsing import Count, NotNegative, Positive, Seed, Share
 from .environment_configuration import Ramp
 
 METHODS: tuple[str, ...] = ("cts", "ac_moe", "mcp", "him", "dreamwaq")
@@ -114,9 +114,9 @@ class AlgorithmConfiguration:
     """Passes over the rollout."""
     minibatches: int = 4
     """Minibatches per pass; each holds teacher and student samples in the ratio of their environments."""
-    discount: float = 0.99
+    discount: Share = 0.99
     """Discount factor gamma."""
-    gae_lambda: float = 0.95
+    gae_lambda: Share = 0.95
     """Lambda of generalized advantage estimation."""
     clip: Positive = 0.2
     """Clip range of the probability ratio and of the value update."""
@@ -128,7 +128,7 @@ class AlgorithmConfiguration:
     """Initial learning rate of teacher encoder, actor and critic."""
     learning_rate_range: tuple[_Rate, _Rate] = (1e-5, 1e-2)
     """Bounds of the adaptive learning rate."""
-    desired_kl: Ramp | float | None = 0.01
+    desired_kl: Ramp | Positive | None = 0.01
     """KL divergence that the learning rate is adapted to after every minibatch; a ramp moves with the environment's schedules, None
     keeps the rate fixed."""
     max_gradient_norm: float = 1.0
@@ -158,6 +158,10 @@ class AlgorithmConfiguration:
         _choose("precision", self.precision, PRECISIONS)
         _choose("compile_mode", self.compile_mode, COMPILE_MODES)
         _positive(self, "epochs", "minibatches", "learning_rate", "student_learning_rate", "max_gradient_norm", "clip")
+        if isinstance(self.desired_kl, Ramp) and not min(self.desired_kl.start, self.desired_kl.end) > 0:
+            raise ConfigurationError(
+                f"desired_kl goes from {self.desired_kl.start:g} to {self.desired_kl.end:g}; both must be greater than zero."
+            )
         if self.student_period < 2:
             raise ConfigurationError(
                 f"student_period is {self.student_period}; it must be at least 2, or no environment is left to the "
@@ -191,7 +195,7 @@ class RunConfiguration:
     """Updates between two gaugings of the student; 0 for none. Each writes a checkpoint."""
     gauge_score: str = "score"
     """Key of the gauge's result by which ``best.pt`` is chosen."""
-    gauge_wait: float = 900.0
+    gauge_wait: NotNegative = 900.0
     """Longest wait for pending scores, and for pending videos, at the end of a run [s]."""
     random_episode_start: bool = True
     """Whether the first episodes start at random ages, so that resets spread over time."""
@@ -204,7 +208,7 @@ class RunConfiguration:
     average_age: float = 0.1
     """How far back the averaged weights, which are played and gauged, lie in the mean: a fraction of the iterations done (see
     ``averaging``); 0 for the weights of the last iteration alone, at most 0.5."""
-    nonfinite_limit: float = 0.01
+    nonfinite_limit: Share = 0.01
     """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run
     stops."""
 

@@ -72,7 +72,7 @@ def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
     """
     if min(shares, default=-1.0) < 0 or sum(shares) <= 0:
         raise ConfigurationError(
-            f"shares of the terrain kinds are {list(shares)}; they must not be negative and not all zero"
+            "environment.terrain.tiles.<kind>.share is 0 for every kind, or negative for one; give at least one kind a share above 0"
         )
     total = sum(shares)
     bounds = torch.tensor([sum(shares[: i + 1]) / total for i in range(len(shares))], dtype=torch.float64)

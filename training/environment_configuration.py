@@ -233,12 +233,12 @@ class RewardConfiguration:
     """Commanded speed between which sigma grows to the terrain's largest [m/s]."""
     sigma_yaw_range: Range = (1.0, 2.0)
     """Commanded yaw rate between which sigma grows to the terrain's largest [rad/s]."""
-    base_height_target: float = 0.38
+    base_height_target: _Metres = 0.38
     """[m]."""
     trunk_area: tuple[_Extent, _Extent] = (0.4, 0.3)
     """Length and width of the area below the base whose mean ground the base's height is measured from [m]; points of the
     height scan count."""
-    foot_height_scale: float = 0.025
+    foot_height_scale: Positive = 0.025
     """Foot regulation fades with foot height over this share of ``base_height_target``."""
     foot_height_over: Literal["foot", "base"] = "foot"
     """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
@@ -389,7 +389,7 @@ class TerminationConfiguration:
 
     trunk_contact: NotNegative | None = None
     """Force of the ground on the trunk, head and chin apart, that ends an episode [N]. None for never."""
-    tilt: NotNegative | None = 1.4
+    tilt: Positive | None = 1.4
     """Angle between the base's z axis and the world's [rad]; None for no limit."""
     joint_velocity: Positive = 150.0
     """Joint speed beyond anything real, which counts as a diverged world [rad/s]."""
@@ -413,7 +413,7 @@ class EnvironmentConfiguration:
     seed: Seed = 0
     """Seed of every draw the environment makes."""
     episode_length: Positive = 25.0
-    """Longest episode [s]."""
+    """Longest episode [s], at least one control period."""
     physics: PhysicsOptions = TRAINING_PHYSICS
     joints: JointConfiguration = JointConfiguration()
     schedule: ScheduleConfiguration = ScheduleConfiguration()
@@ -429,3 +429,10 @@ class EnvironmentConfiguration:
     """Events of one's own."""
     log_interval: Count = 8
     """Environment steps between two logs of finished episodes; each log costs the learner's logger time."""
+
+    def __post_init__(self) -> None:
+        if self.episode_length < self.physics.control_period:
+            raise ValueError(
+                f"episode_length is {self.episode_length:g} s; it must be at least one control period, "
+                f"{self.physics.control_period:g} s"
+            )

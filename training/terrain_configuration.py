@@ -10,6 +10,9 @@ from pydantic import Field
 from ..files.parsing import NotNegative, Positive, Seed, Share
 from ..terrains.training_tiles import DEFAULT_SHAPE, NUM_TILE_LEVELS, TileShape
 
+_Distance = Annotated[float, Field(gt=0.0, le=100.0)]
+_Spread = Annotated[float, Field(ge=0.0, le=100.0)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class TileConfiguration:
@@ -54,7 +57,7 @@ class TerrainConfiguration:
     """Kinds of training tile."""
     shape: TileShape = DEFAULT_SHAPE
     """Dimensions of the tiles."""
-    levels: Annotated[int, Field(ge=1, le=1000)] = NUM_TILE_LEVELS
+    levels: Annotated[int, Field(ge=1, le=NUM_TILE_LEVELS)] = NUM_TILE_LEVELS
     """Number of levels, from the easiest."""
     variants: Annotated[int, Field(ge=1, le=1000)] = 16
     """Different tiles per kind and level, where a kind has chance in it. With four, chance makes a level harder than the next."""
@@ -62,23 +65,23 @@ class TerrainConfiguration:
     """Seed of the tiles' chance."""
     curriculum: bool = True
     """Whether levels follow success; otherwise every episode draws its level."""
-    highest_start_level: Annotated[int, Field(ge=0)] = 5
-    """Levels at the start are uniform from 0 to this."""
-    promotion_distance: float = 4.0
+    highest_start_level: Annotated[int, Field(ge=0, lt=NUM_TILE_LEVELS)] = 5
+    """Levels at the start are uniform from 0 to this, or to the last of ``levels``."""
+    promotion_distance: _Distance = 4.0
     """Distance from the tile's middle (larger of |x|, |y|) beyond which the level rises [m]; 4 is the tile's edge."""
-    demotion_share: float = 0.5
+    demotion_share: Share = 0.5
     """Share of the commanded way below which the level falls."""
     demote_falls: bool = True
     """Whether a fall before promotion lowers the level whatever the distance."""
-    leave_distance: Annotated[float, Field(gt=0.0, le=100.0)] | None = 4.75
+    leave_distance: _Distance | None = 4.75
     """Distance from the tile's middle at which an episode is cut short as a time-out [m]; None for never. Beyond the
     edge there is only level ground, on which the published robots had the next tile."""
-    spawn_jitter: float = 1.0
+    spawn_jitter: _Spread = 1.0
     """Episodes start up to this far from the tile's middle, in x and in y [m]."""
     spread_probability: Share = 0.1
     """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; they do not move
     levels."""
-    spread_distance: float = 3.0
+    spread_distance: _Spread = 3.0
     """Those episodes start up to this far from the tile's middle, in x and in y [m]."""
     level_rule: str = "gaitgauge.training.curriculum:next_level"
     """``module:function`` that says on which level the next episode is, with the arguments of this one."""

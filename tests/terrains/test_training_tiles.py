@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from gaitgauge.terrains import TerrainError
 from gaitgauge.terrains.base import Box
-from gaitgauge.terrains.gauge_terrains import STAIR_RISERS, slope_gradient, wave_heights
+from gaitgauge.terrains.gauge_terrains import STAIR_RISERS, obstacle, slope_gradient, wave_heights
 from gaitgauge.terrains.training_tiles import (
     NUM_TILE_LEVELS,
     TILE_KINDS,
@@ -68,6 +68,30 @@ def test_stairs(level, seed, points):
         far_from_edges = np.abs(radius[:, None] - at).min(axis=1) > 2e-3
         assert tile.height(x, y)[far_from_edges] == pytest.approx(line[far_from_edges], abs=1e-9)
         assert height[0 if sign > 0 else -1] == 0.0
+
+
+@pytest.mark.parametrize(("level", "mean"), [(0, 0.05), (5, 0.165), (8, 0.234), (10, 0.28), (11, 0.303)])
+def test_the_second_number_of_a_pair_is_the_growth_up_to_difficulty_1(level, mean):
+    shape = TileShape(stair_irregularity=0.0)
+    height = profile(make_tile("stairs_up", level, shape=shape))[1]
+    steps = np.diff(height)
+    assert steps[steps != 0] == pytest.approx(mean)
+
+
+def test_levels_go_on_beyond_the_gauge_s_hardest_ground():
+    """As ``docs/training-choices.md`` says: stairs from level 8 on, slopes and bars from level 10 on."""
+    shape = TileShape(stair_irregularity=0.0, bar_height=(1.0, 1.0))
+
+    def highest(kind, level):
+        steps = np.diff(profile(make_tile(kind, level, shape=shape))[1])
+        return steps.max()
+
+    assert highest("stairs_up", 7) == pytest.approx(0.211) and highest("stairs_up", 8) == pytest.approx(0.234)
+    assert STAIR_RISERS[-1] == 0.23
+    bars = 2 * obstacle(10).boxes[0].half_size[2]
+    assert (highest("bars", 9), bars, highest("bars", 10)) == pytest.approx((0.275, 0.28, 0.3))
+    gradients = [float(make_tile("slope_up", level).height(2.3, 0.0)) for level in (9, 10)]
+    assert (gradients[0], slope_gradient(10), gradients[1]) == pytest.approx((0.568, 0.57, 0.62))
 
 
 def test_some_flights_are_regular_and_some_are_not():

@@ -65,8 +65,12 @@ def test_kinds_are_blocks_in_proportion():
     shares = [tile.share for tile in ALL_TILES]
     counts = torch.bincount(assign_kinds(shares, 8192), minlength=len(shares))
     assert (counts / 8192).tolist() == pytest.approx([s / sum(shares) for s in shares], abs=2e-4)
-    with pytest.raises(ValueError, match="must not be negative and not all zero"):
-        assign_kinds([0.0, 0.0], 4)
+    for shares in ([0.0, 0.0], [], [2.0, -1.0]):
+        with pytest.raises(
+            ValueError,
+            match=r"^environment\.terrain\.tiles\.<kind>\.share is 0 for every kind, or negative for one; give",
+        ):
+            assign_kinds(shares, 4)
 
 
 def test_students_and_teachers_share_every_kind_and_level():

@@ -1,5 +1,7 @@
 """The sprint benchmark: the scenario with settings of its own, and what it prints."""
 
+import sys
+
 import pytest
 import sprint
 import torch
@@ -45,3 +47,21 @@ def test_a_robot_runs_stands_and_is_told_to_stop():
     assert done.outcome == "success" and 0.5 < done.peak_speed < 1.3
     assert 0.1 < done.speed_time < 1.0 and done.path[-1][0] == pytest.approx(0.45, abs=0.2)
     assert joint_speeds.shape[1] == 12 and 15 < len(joint_speeds) < 100
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (["pretrained", "--robots", "0"], "argument --robots: 'value' is '0'; it must be greater than or equal to 1"),
+        (["pretrained", "--speed", "0"], "argument --speed: 'value' is '0'; it must be greater than or equal to 0.1"),
+        (["pretrained", "--runway", "-1"], "argument --runway: 'value' is '-1'; it must be greater than 0"),
+        (["pretrained", "--suite", "nosuch"], "error: there is no suite 'nosuch'"),
+        (["nosuch.pt"], "error: there is no policy file 'nosuch.pt'"),
+    ],
+)
+def test_what_cannot_be_run_is_one_sentence(given, sentence, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["sprint.py", *given])
+    with pytest.raises(SystemExit) as end:
+        sprint.main()
+    said = end.value.code if isinstance(end.value.code, str) else capsys.readouterr().err
+    assert sentence in said
