@@ -179,11 +179,11 @@ def own_device(asked: str | None, backend: str) -> str:
 
 def idle_gpus(device: str) -> str:
     """A sentence on GPUs that no process of a run uses, empty if there are none."""
-    processes = told_number("LOCAL_WORLD_SIZE", 0)
+    processes = told_number("LOCAL_WORLD_SIZE", 1)
     gpus = torch.cuda.device_count() if device.startswith("cuda") else 0
-    if not 0 < processes < gpus:
+    if processes >= gpus:
         return ""
     return (
-        f"{processes} of {gpus} GPUs are used; --nproc-per-node {gpus} uses all, and CUDA_VISIBLE_DEVICES says which are "
-        "meant."
+        f"{processes} of {gpus} GPUs {'is' if processes == 1 else 'are'} used; torchrun --nproc-per-node {gpus} uses all, and "
+        "CUDA_VISIBLE_DEVICES says which are meant."
     )

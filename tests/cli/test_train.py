@@ -255,9 +255,10 @@ def test_a_run_in_which_nothing_was_written_leaves_no_directory(refused, tmp_pat
 
 def test_idle_gpus_are_named(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
-    assert idle_gpus("cuda:0") == "" and idle_gpus("cpu") == ""
+    assert idle_gpus("cuda:0").startswith("1 of 4 GPUs is used; torchrun --nproc-per-node 4 uses all")
+    assert idle_gpus("cpu") == ""
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
-    assert idle_gpus("cuda:0").startswith("3 of 4 GPUs are used; --nproc-per-node 4 uses all")
+    assert idle_gpus("cuda:0").startswith("3 of 4 GPUs are used; torchrun --nproc-per-node 4 uses all")
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
     assert idle_gpus("cuda:0") == ""
 
