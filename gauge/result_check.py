@@ -118,7 +118,7 @@ def unlike(tables: Sequence[Mapping[str, object]]) -> list[str]:
     for name in dict.fromkeys(name for table in tables for name in table):
         values = list(dict.fromkeys(str(table[name]) for table in tables if table.get(name) is not None))
         if len(values) > 1:
-            words[name] = f"{one_line(name)} {one_line(' and '.join(values))}"
+            words[name] = f"{one_line(name)} {one_line(', '.join(values[:-1]))} and {one_line(values[-1])}"
     return list(words.values())
 
 
