@@ -255,6 +255,7 @@ def check_alike(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> 
     Raises:
         ComparisonError: one sentence.
     """
+    rules: ChanceRules | None = None
     for label, found in zip(labels, results, strict=True):
         if found["score"] is None:
             raise ComparisonError(
@@ -284,12 +285,10 @@ def check_alike(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> 
                 f"'{labels[0]}' and '{label}' name the robot {found['robot']}, but its files differ "
                 f"({' and '.join(str(f)[:12] for f in files)}); evaluate both on one robot (--robot)"
             )
-        rules = [
-            chance_rules_of(r, f"the results of '{n}'", ComparisonError)
-            for n, r in ((labels[0], results[0]), (label, found))
-        ]
+        mine = chance_rules_of(found, f"the results of '{label}'", ComparisonError)
+        rules = rules or mine
         for name in (f.name for f in fields(ChanceRules) if f.name not in ("seeds", "search_seeds")):
-            first, other = (getattr(r, name) for r in rules)
+            first, other = getattr(rules, name), getattr(mine, name)
             if first != other:
                 raise ComparisonError(
                     f"the rules of chance differ, though the suite is one: chance.{name} is {first} in '{labels[0]}' and {other} in "

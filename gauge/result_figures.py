@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from .episodes import QUALITY
 from .intervals import ChanceRules, Evidence
 from .results import environment_weights
 from .scoring import STATISTICS, level_score
-from .suite import Scoring
 
 BY_HAND = "it was changed by hand, so ask its maker for the results.json of the run"
 _ROUNDING = 2e-6
@@ -135,8 +134,7 @@ def _at_level(values: Mapping[str, float] | None, statistic: str, row: Row, rule
     """A quality or metric with the weight of its level; zero where nothing was measured, for no level was passed."""
     if not values:
         return 0.0
-    weights = cast(Scoring, rules)  # which has the two that are asked for
-    return float(level_score(values[statistic], row["level"] or 0, weights, flat=row["terrain"] == "flat"))
+    return float(level_score(values[statistic], row["level"] or 0, rules, flat=row["terrain"] == "flat"))
 
 
 def _mean_level(rows: list[Row]) -> float | None:

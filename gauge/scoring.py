@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +48,19 @@ def command_statistics(record: Record, column: int) -> dict[tuple[int, int], Arr
     return found
 
 
-def level_score(value: Array | float, level: float, scoring: Scoring, *, flat: bool) -> Array | float:
+class LevelWeights(Protocol):
+    """What a score is made with: a suite's ``Scoring``, or the ``ChanceRules`` that results state."""
+
+    @property
+    def level_weight(self) -> float:
+        """Of each level above the first."""
+
+    @property
+    def quality_weight(self) -> float:
+        """Of the quality."""
+
+
+def level_score(value: Array | float, level: float, scoring: LevelWeights, *, flat: bool) -> Array | float:
     """Score of a quality (or metric) at a level: 0.09 (L - 1) + 0.19 q; the quality itself on flat ground; 0 at level 0.
 
     Between two levels it lies between their scores, below level 1 between zero and that of level 1.
