@@ -255,14 +255,17 @@ def check_alike(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> 
     Raises:
         ComparisonError: one sentence.
     """
-    rules: ChanceRules | None = None
     for label, found in zip(labels, results, strict=True):
         if found["score"] is None:
             raise ComparisonError(
                 f"the results of '{label}' have levels and no scores; use the pipeline stress or multi"
             )
     suites = [f"{r['suite']['name']} {r['suite']['version']}" for r in results]
-    for label, suite, found in zip(labels[1:], suites[1:], results[1:], strict=True):
+    rules = [
+        chance_rules_of(r, f"the results of '{label}'", ComparisonError)
+        for label, r in zip(labels, results, strict=True)
+    ]
+    for label, suite, mine, found in zip(labels[1:], suites[1:], rules[1:], results[1:], strict=True):
         if suite != suites[0]:
             raise ComparisonError(
                 f"results of different suites do not compare: '{labels[0]}' has {suites[0]}, '{label}' has {suite}; "
@@ -285,10 +288,8 @@ def check_alike(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> 
                 f"'{labels[0]}' and '{label}' name the robot {found['robot']}, but its files differ "
                 f"({' and '.join(str(f)[:12] for f in files)}); evaluate both on one robot (--robot)"
             )
-        mine = chance_rules_of(found, f"the results of '{label}'", ComparisonError)
-        rules = rules or mine
         for name in (f.name for f in fields(ChanceRules) if f.name not in ("seeds", "search_seeds")):
-            first, other = getattr(rules, name), getattr(mine, name)
+            first, other = getattr(rules[0], name), getattr(mine, name)
             if first != other:
                 raise ComparisonError(
                     f"the rules of chance differ, though the suite is one: chance.{name} is {first} in '{labels[0]}' and {other} in "
