@@ -6,7 +6,8 @@
 The training environment of ``go2-moe-cts`` on MuJoCo, with the schedules at their end; levels never move. The student acts
 without exploration noise. Prints for each level: episodes that would move it up and down, among those that count; the mean share
 of the commanded speed, along the robot's present heading and along the commanded one; how long it heads more than 45 and 90
-degrees off; and reward per second. Further arguments are settings, as for ``gaitgauge train``.
+degrees off; reward per second; and which rules ended episodes, with how many of the stuck robots walked: had more than half of
+the commanded speed of late along their own heading. Further arguments are settings, as for ``gaitgauge train``.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ from gaitgauge.training.step_inputs import StepInputs
 from gaitgauge.training.tasks import find_task
 from gaitgauge.training.terminations import Ends
 
+WALKING = "stuck, but walking"
+_OF_LATE = 4.0
+"""Time constant of the mean that tells who walks [s]."""
 LOOKED_AT = ("steps", "moving", "along base", "along command", "off 45", "off 90")
 
 
@@ -84,6 +88,8 @@ class FixedLevels:
         self.sums = {level: dict.fromkeys(LOOKED_AT, 0.0) for level in levels}
         self.rewards: dict[int, torch.Tensor] = defaultdict(lambda: torch.zeros(len(self.terms)))
         self.moves = {level: Counter[str]() for level in levels}
+        self.ends = {level: Counter[str]() for level in levels}
+        self._own_share = torch.zeros(worlds)
         parts = self.environment.parts
         self.terms = parts.rewards.names
         self._terminations, self._move, self._step_rewards = parts.terminations, parts.levels.move, parts.rewards
@@ -95,7 +101,7 @@ class FixedLevels:
         self.environment._begin(self.level)
 
     def _ends(self, inputs: StepInputs) -> Ends:
-        """The environment's own, after a look at headings."""
+        """The environment's own, after a look at headings, and counted."""
         moving = inputs.command[:, :2].norm(dim=1) >= 0.1
         base = progress_share(replace(inputs, commanded_heading_xy=inputs.heading_xy))
         cosine = (inputs.heading_xy * inputs.commanded_heading_xy).sum(dim=1)
@@ -104,7 +110,14 @@ class FixedLevels:
             here = self.level == level
             for name, value in zip(LOOKED_AT, (*values, cosine < 0.7071, cosine < 0.0), strict=True):
                 row[name] += float(value[here].float().sum())
-        return self._terminations(inputs)
+        ends = self._terminations(inputs)
+        self._own_share.lerp_((base * moving).nan_to_num(0.0), inputs.period / _OF_LATE)
+        for world, rule in ends.by_rule.nonzero().tolist():
+            name = self._terminations.names[rule]
+            walks = name == "stuck" and self._own_share[world] > 0.5
+            self.ends[int(self.level[world])][WALKING if walks else name] += 1
+        self._own_share.masked_fill_(ends.failed | ends.time_out, 0.0)
+        return ends
 
     def _earn(self, inputs: StepInputs, progress: torch.Tensor) -> torch.Tensor:
         values = self._step_rewards(inputs, progress)
@@ -147,6 +160,9 @@ class FixedLevels:
                 f"level {level:2}  up {moves['up']} down {moves['down']} same {moves['same']}  share of the speed: present "
                 f"heading {row['along base'] / moving:.3f}, commanded {row['along command'] / moving:.3f}  off by 45: "
                 f"{row['off 45'] / steps:.2f}, 90: {row['off 90'] / steps:.2f}  reward {float(per_second.sum()):.3f}/s"
+            )
+            found.append(
+                "    ends: " + (", ".join(f"{name} {n}" for name, n in sorted(self.ends[level].items())) or "none")
             )
             if terms:
                 earned = zip(self.terms, per_second.tolist(), strict=True)

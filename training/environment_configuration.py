@@ -181,10 +181,11 @@ class RewardConfiguration:
     progress: float = 0.0
     """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an
     obstacle."""
-    progress_along: Literal["command", "base"] = "command"
+    progress_along: Literal["command", "straight", "base"] = "command"
     """Heading at which ``progress``, being stuck and the commanded way to the next level count: ``command`` for the robot's own
-    when the command was drawn, turned by the yaw rate commanded since; ``base`` for whichever it has now, with which turning away
-    from a step costs nothing."""
+    when the command was drawn, turned by the yaw rate commanded since, so that who turns too slowly falls behind without seeing by
+    how much; ``straight`` for this with straight commands, which hold it, and for whichever heading the robot has now in arcs;
+    ``base`` for that always, with which turning away from a step costs nothing."""
     vertical_velocity: Ramp = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
     """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
     roll_pitch_rate: float = -0.05

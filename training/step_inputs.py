@@ -109,8 +109,8 @@ class StepInputs:
     heading_xy: torch.Tensor
     """Unit vector of the base's x axis in the world's xy plane, (N, 2)."""
     commanded_heading_xy: torch.Tensor
-    """Where the robot should be heading, as ``heading_xy``: its heading when the command was drawn, turned by the yaw rate
-    commanded since, (N, 2)."""
+    """Where the robot should be heading, as ``heading_xy``, (N, 2): ``RewardConfiguration.progress_along`` says whether its heading
+    when the command was drawn, turned by the yaw rate commanded since, or its own."""
     period: float
     """Control period [s]."""
     state: PhysicsState

@@ -109,6 +109,15 @@ class StepReader:
         speed = ((command.abs() - self._sigma_low) * self._sigma_rate).clamp(0.0, 1.0)
         return base + speed * (self._difficulty[memory.level] * self._sigma_growth)[:, None]
 
+    def _commanded_heading(self, memory: EnvironmentMemory, heading_xy: torch.Tensor) -> torch.Tensor:
+        """``StepInputs.commanded_heading_xy``, where ``heading_xy`` are the robots' own."""
+        along = self._settings.progress_along
+        if along == "base":
+            return heading_xy
+        if along == "command":
+            return memory.commanded_heading
+        return torch.where(memory.holds_heading[:, None], memory.commanded_heading, heading_xy)
+
     def __call__(
         self, state: PhysicsState, memory: EnvironmentMemory, action: torch.Tensor, progress: torch.Tensor
     ) -> StepInputs:
@@ -172,7 +181,7 @@ class StepReader:
             diverged=diverged,
             progress=progress,
             heading_xy=heading_xy,
-            commanded_heading_xy=memory.commanded_heading if settings.progress_along == "command" else heading_xy,
+            commanded_heading_xy=self._commanded_heading(memory, heading_xy),
             period=self._period,
             state=state,
             failed=diverged,

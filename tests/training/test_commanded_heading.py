@@ -2,7 +2,13 @@
 
 import pytest
 import torch
-from gaitgauge.training.environment_configuration import CommandConfiguration, CommandStage, Ramp, RewardConfiguration
+from gaitgauge.training.environment_configuration import (
+    CommandConfiguration,
+    CommandStage,
+    Ramp,
+    RewardConfiguration,
+    TerminationConfiguration,
+)
 from gaitgauge.training.height_scan import heading
 from gaitgauge_fake_engine import FakeScript
 from small_environment import gliding, idle, make
@@ -64,15 +70,36 @@ def test_an_episode_sets_out_from_the_heading_of_its_start():
     assert not torch.allclose(memory.commanded_heading[0], ahead[0], atol=1e-3)
 
 
-def test_progress_may_be_counted_along_whichever_way_the_robot_heads():
-    along = {}
-    for frame in ("command", "base"):
-        environment = make(4, script=gliding(0.0, 0.0, 4.0), rewards=RewardConfiguration(progress_along=frame))
-        memory, _ = commanded(environment, 1.0, 0.0)
-        idle(environment, 39)
-        along[frame] = float(memory.commanded_way.norm(dim=1)[0])
-    assert along["command"] == pytest.approx(0.78, abs=0.01)
-    assert along["base"] == pytest.approx(0.5, abs=0.02), "half a circle"
+@pytest.mark.parametrize(
+    ("along", "holds", "way"),
+    [
+        ("command", True, 0.78),
+        ("command", False, 0.78),
+        ("straight", True, 0.78),
+        ("straight", False, 0.5),  # half a circle
+        ("base", True, 0.5),
+    ],
+)
+def test_progress_may_be_counted_along_whichever_way_the_robot_heads(along, holds, way):
+    environment = make(4, script=gliding(0.0, 0.0, 4.0), rewards=RewardConfiguration(progress_along=along))
+    memory, _ = commanded(environment, 1.0, 0.0)
+    memory.holds_heading.fill_(holds)
+    idle(environment, 39)
+    assert float(memory.commanded_way.norm(dim=1)[0]) == pytest.approx(way, abs=0.02)
+
+
+@pytest.mark.parametrize(("along", "stuck"), [("command", True), ("straight", False)])
+def test_who_walks_an_arc_without_turning_fast_enough_is_not_stuck(along, stuck):
+    environment = make(
+        2,
+        script=gliding(1.0, 0.0, 0.6),
+        rewards=RewardConfiguration(progress_along=along),
+        termination=TerminationConfiguration(stuck=0.5, stuck_from=0.0),
+    )
+    memory, _ = commanded(environment, 1.0, 2.0)
+    memory.holds_heading.fill_(False)
+    ended = [bool(idle(environment)[2].any()) for _ in range(150)]
+    assert any(ended) == stuck
 
 
 def test_a_run_from_before_headings_were_remembered_goes_on():
