@@ -183,8 +183,8 @@ class RewardConfiguration:
     obstacle."""
     progress_along: Literal["command", "straight", "base"] = "command"
     """Heading at which ``progress``, being stuck and the commanded way to the next level count: ``command`` for the robot's own
-    when the command was drawn, turned by the yaw rate commanded since, so that who turns too slowly falls behind without seeing by
-    how much; ``straight`` for this with straight commands, which hold it, and for whichever heading the robot has now in arcs;
+    when the command was drawn, turned by the yaw rate commanded since, from which a robot that turns at another rate drifts away without
+    seeing how far; ``straight`` for this with straight commands, which hold it, and for whichever heading the robot has now in arcs;
     ``base`` for that always, with which turning away from a step costs nothing."""
     vertical_velocity: Ramp = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
     """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
