@@ -29,7 +29,7 @@ from gaitgauge.training.step_inputs import StepInputs
 from gaitgauge.training.tasks import find_task
 from gaitgauge.training.terminations import Ends
 
-WALKING = "stuck, but walking"
+WALKING = "stuck but walking"
 _OF_LATE = 4.0
 """Time constant of the mean that tells who walks [s]."""
 LOOKED_AT = ("steps", "moving", "along base", "along command", "off 45", "off 90")

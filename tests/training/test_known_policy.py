@@ -24,6 +24,7 @@ def test_levels_stay_and_commands_lead_straight_ahead():
     assert memory.command[:, 0].tolist() == pytest.approx([0.8] * 4)
     rows = played.lines(terms=True)
     assert rows[0].startswith("level  3  up 2 down 0 same 0") and any("linear_tracking" in row for row in rows)
+    assert rows[1] == "    ends: time_out 2"
 
 
 def test_steps_of_another_depth_and_height():
