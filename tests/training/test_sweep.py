@@ -165,6 +165,8 @@ def test_without_a_gpu_only_engines_of_the_cpu_start(tmp_path):
     for sentence in told.values():
         assert "--" not in sentence and sentence.endswith("""; write device = "cpu" in the sweep's file""")
     assert plan_runs(replace(sweep, entry=(replace(ENTRY, device="cpu"),)), tmp_path / "other")[1] == {}
+    everywhere = replace(sweep, device="cpu", entry=(ENTRY, replace(ENTRY, name="two", device="cuda")))
+    assert list(plan_runs(everywhere, tmp_path / "everywhere")[1]) == ["two"], "an entry's own goes first"
 
 
 @pytest.mark.parametrize("note", [{"more": 1}, {"\x1b[31m": 1}, {"seed": 9}, {"more": None}, {"init_from": None}])

@@ -34,7 +34,7 @@ class SweepEntry:
     backend: Text | None = None
     """Physics engine; None for that of the sweep."""
     device: Literal["cpu", "cuda"] | None = None
-    """Where it is trained; None for what the engine is made for."""
+    """Where it is trained; None for that of the sweep."""
     init_from: Text | None = None
     """Shipped policy or checkpoint whose networks it begins with; None for that of the sweep."""
 
@@ -55,6 +55,8 @@ class Sweep:
     """``key=value`` each, of all entries."""
     backend: Text = DEFAULT_BACKEND
     """Physics engine of the trainings."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where they are trained; None for what the engine is made for."""
     init_from: Text | None = None
     """Shipped policy or checkpoint whose networks the trainings begin with; None for nothing."""
     suite: Text = "gaitgauge-1"

@@ -342,12 +342,13 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
     refused: dict[str, str] = {}
     for entry in sweep.entry:
         settings, backend = (*sweep.settings, *entry.settings), entry.backend or sweep.backend
+        device = entry.device or sweep.device
         init_from = sweep.init_from if entry.init_from is None else entry.init_from
         request = TrainRequest(
             task=entry.task,
             overrides=settings,
             backend=backend,
-            device=entry.device,
+            device=device,
             init_from=init_from,
             score_suite=None,
         )
@@ -372,7 +373,7 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
                 try:
                     on_gpu = prepare(request).device.startswith("cuda")
                 except DeviceError as error:  # what was trained elsewhere can be gauged all the same
-                    change = 'device = "cpu"' if entry.device else 'device = "cpu" (slow) or backend = "mujoco"'
+                    change = 'device = "cpu"' if device else 'device = "cpu" (slow) or backend = "mujoco"'
                     refused[entry.name] = f"{error.reason}; write {change} in the sweep's file"
                     own = [run for run in own if _is_trained(run)]
                 else:
