@@ -181,11 +181,11 @@ class RewardConfiguration:
     progress: float = 0.0
     """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an
     obstacle."""
-    progress_along: Literal["command", "straight", "base"] = "command"
-    """Heading at which ``progress``, being stuck and the commanded way to the next level count: ``command`` for the robot's own
-    when the command was drawn, turned by the yaw rate commanded since, from which a robot that turns at another rate drifts away without
-    seeing how far; ``straight`` for this with straight commands, which hold it, and for whichever heading the robot has now in arcs;
-    ``base`` for that always, with which turning away from a step costs nothing."""
+    progress_along: Literal["command", "straight", "base"] = "straight"
+    """Heading at which ``progress``, being stuck and the commanded way to the next level count: ``straight`` for the robot's own
+    when the command was drawn, with straight commands, which hold it, and for whichever heading the robot has now in arcs;
+    ``command`` for the first always, turned by the yaw rate commanded since, from which a robot that turns at another rate drifts
+    away without seeing how far; ``base`` for the second always, with which turning away from a step costs nothing."""
     vertical_velocity: Ramp = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
     """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
     roll_pitch_rate: float = -0.05

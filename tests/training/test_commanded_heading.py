@@ -15,8 +15,9 @@ from small_environment import gliding, idle, make
 
 
 def commanded(environment, forward, yaw):
-    """Command the same to all worlds for good, and return where they head."""
+    """Command the same to all worlds for good, held where it is straight, and return where they head."""
     memory = environment.parts.memory
+    memory.holds_heading.fill_(yaw == 0.0)
     memory.command.copy_(torch.tensor([forward, 0.0, yaw]).expand(environment.num_envs, 3))
     memory.command_steps.fill_(1000)
     return memory, memory.commanded_heading.clone()
@@ -34,7 +35,7 @@ def test_who_turns_away_is_still_led_straight_ahead():
 
 @pytest.mark.parametrize("turns", [0.0, 4.0])
 def test_an_arc_leads_round_whether_the_robot_turns_or_not(turns):
-    environment = make(4, script=gliding(0.0, 0.0, turns))
+    environment = make(4, script=gliding(0.0, 0.0, turns), rewards=RewardConfiguration(progress_along="command"))
     memory, ahead = commanded(environment, 1.0, 4.0)
     idle(environment, 39)
     # Half a turn at 4 rad/s and 1 m/s: a half circle of radius 0.25 m.
@@ -88,12 +89,14 @@ def test_progress_may_be_counted_along_whichever_way_the_robot_heads(along, hold
     assert float(memory.commanded_way.norm(dim=1)[0]) == pytest.approx(way, abs=0.02)
 
 
-@pytest.mark.parametrize(("along", "stuck"), [("command", True), ("straight", False)])
-def test_who_walks_an_arc_without_turning_fast_enough_is_not_stuck(along, stuck):
+@pytest.mark.parametrize(
+    ("rewards", "stuck"), [(RewardConfiguration(progress_along="command"), True), (RewardConfiguration(), False)]
+)
+def test_who_walks_an_arc_without_turning_fast_enough_is_not_stuck(rewards, stuck):
     environment = make(
         2,
         script=gliding(1.0, 0.0, 0.6),
-        rewards=RewardConfiguration(progress_along=along),
+        rewards=rewards,
         termination=TerminationConfiguration(stuck=0.5, stuck_from=0.0),
     )
     memory, _ = commanded(environment, 1.0, 2.0)
