@@ -70,7 +70,7 @@ class Comparison:
 
     suite: Mapping[str, Any]
     policies: tuple[Mapping[str, Any], ...]
-    """Label, path, file digest, coverage (kind and text), score, interval and level of each."""
+    """Label, path, file digest, coverage (kind and text), score, interval of its runs and trials, and level of each."""
     paired: bool
     """Whether all were given the same seeds."""
     differences: tuple[Difference, ...]
@@ -146,12 +146,15 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
     check_alike(results, labels)
     rows = results[0]["environments"]
     order = {_key(row): at for at, row in enumerate(rows)}
-    evidence = []
+    weights = environment_weights([row["terrain"] for row in rows])
+    evidence: list[Evidence] = []
+    intervals: list[tuple[float, float] | None] = []
     for at, (label, found) in enumerate(zip(labels, results, strict=True)):
         source = f"the results of '{label}'"
         same_order = sorted(found["environments"], key=lambda row: order[_key(row)])
         with edited(source, ComparisonError):
             evidence.append(Evidence(same_order, chance_rules_of(found, source, ComparisonError), name=str(at)))
+            intervals.append(evidence[-1].chance(weights).interval(found["score"]))
     paired = len({(tuple(r["chance"]["seeds"]), len(r["chance"]["search_seeds"])) for r in results}) == 1
     raw: list[tuple[str, str, int, int, tuple[float, float], Chance]] = []
     for first, second in combinations(range(len(results)), 2):
@@ -187,11 +190,11 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
                 "file_sha256": found["policy"]["file_sha256"],
                 "coverage": {key: coverage_of(found)[key] for key in ("kind", "text")},
                 "score": found["score"],
-                "score_interval": found["score_interval"],
+                "score_interval": interval and [round(end, 6) for end in interval],
                 "level": found["level"],
                 "seeds": list(found["chance"]["seeds"]),
             }
-            for label, found in zip(labels, results, strict=True)
+            for label, found, interval in zip(labels, results, intervals, strict=True)
         ),
         paired=paired,
         differences=tuple(sorted(differences, key=lambda d: KINDS.index(d.kind))),

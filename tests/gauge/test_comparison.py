@@ -97,6 +97,16 @@ def test_scores_are_those_of_the_results():
     assert by_name["level", "mean level"].values[0] == pytest.approx(first["level"])
 
 
+def test_a_score_s_interval_is_that_of_its_runs_whatever_the_file_says():
+    first, second = both()
+    honest = compare([first, second]).policies
+    assert [list(p["score_interval"]) for p in honest] == [first["score_interval"], second["score_interval"]]
+    first["score_interval"] = [first["score"], first["score"]]
+    assert compare([first, second]).policies == honest
+    # a band of the file's own says nothing of the difference either
+    assert compare([first, second]).differences[0].interval == compare(both()).differences[0].interval
+
+
 def test_the_same_seeds_are_compared_seed_by_seed():
     """Runs that are all better by the same differ for certain, however far the seeds are apart."""
     first, second = (results(terrains=("flat",), frictions=(0.6,)) for _ in range(2))
