@@ -102,7 +102,7 @@ class Levels:
         forward, lateral = memory.command[:, :1], memory.command[:, 1:2]
         heading_xy = inputs.commanded_heading_xy
         left_xy = torch.stack((-heading_xy[:, 1], heading_xy[:, 0]), dim=1)
-        memory.commanded_way.add_((forward * heading_xy + lateral * left_xy) * inputs.period)
+        memory.commanded_way.add_(forward * heading_xy + lateral * left_xy, alpha=inputs.period)
         memory.commanded_farthest.copy_(torch.maximum(memory.commanded_farthest, memory.commanded_way.norm(dim=1)))
 
     def move(
