@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .gauge.comparison import Comparison
     from .policy.base import Policy
-    from .training.stopping import TrainingOutcome
+    from .studies.compare.comparison import Comparison
+    from .training.run.stopping import TrainingOutcome
 
 
 class ResultsError(ValueError):
@@ -200,8 +200,8 @@ def evaluate(
     from .files.parsing import shown
     from .gauge.evaluate import Request
     from .gauge.evaluate import evaluate as run
-    from .gauge.naming import run_folders
-    from .gauge.report import write_report
+    from .gauge.report.page import write_report
+    from .studies.naming import run_folders
 
     _need("a path", policy=policy, suite=suite)
     _need("a path or None", out=out)
@@ -243,8 +243,8 @@ def compare(*results: Results | str | Path) -> Comparison:
     Raises:
         ComparisonError: results that cannot be read, or were not made alike.
     """
-    from .gauge.comparison import compare as run
-    from .gauge.comparison import load_result
+    from .studies.compare.comparison import compare as run
+    from .studies.compare.comparison import load_result
 
     for result in results:
         _need("a path, or what evaluate returned", result=result)
@@ -258,7 +258,7 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
         task: name of the task.
         settings: ``key=value`` settings of the task, such as ``environment.push.linear=0.6``.
         seconds: wall-clock limit [s].
-        options: fields of ``gaitgauge.training.launch.TrainRequest``.
+        options: fields of ``gaitgauge.training.run.launch.TrainRequest``.
 
     Returns:
         How it ended, and the run directory.
@@ -266,8 +266,8 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
     Raises:
         ArgumentError, TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.
     """
-    from .training.launch import TrainRequest, prepare
-    from .training.launch import train as run
+    from .training.run.launch import TrainRequest, prepare
+    from .training.run.launch import train as run
 
     _need("a text", task=task)
     _need("several texts", settings=settings)

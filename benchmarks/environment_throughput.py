@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gaitgauge.training.environment import TrainingEnvironment
+from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge.training.tasks import find_task
 from torch.utils._python_dispatch import TorchDispatchMode
 

@@ -27,9 +27,9 @@ from unittest.mock import patch
 import torch
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.policy.base import PolicySession
-from gaitgauge.policy.export import export_onnx, export_torchscript
-from gaitgauge.policy.fence.child import Child, Program
-from gaitgauge.policy.fenced import FencedPolicy, FencedSession
+from gaitgauge.policy.export.files import export_onnx, export_torchscript
+from gaitgauge.policy.foreign.fence.child import Child, Program
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy, FencedSession
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 
@@ -138,7 +138,7 @@ def load_both(policy: str) -> tuple[FencedPolicy, Program, tuple[Times, Times]]:
     assert isinstance(fenced, FencedPolicy)
     behind = now(fenced._child) - began
     began = now()
-    with patch("gaitgauge.policy.fence.child.Child", Unfenced):
+    with patch("gaitgauge.policy.foreign.fence.child.Child", Unfenced):
         alone: Any = load_policy(policy)
     return fenced, alone._child.program, (behind, now() - began)
 
@@ -155,7 +155,7 @@ def run(request: Request) -> Cost:
 
     with (
         tempfile.TemporaryDirectory() as folder,
-        patch("gaitgauge.policy.fenced.FencedSession", session),
+        patch("gaitgauge.policy.foreign.fenced_policy.FencedSession", session),
         patch("gaitgauge.gauge.evaluate.load_policy", lambda *_, **__: fenced),
     ):
         began = now(fenced._child)

@@ -16,7 +16,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import warp as wp
-from gaitgauge.backends.mujoco_warp.height_fields.repair import repair_height_fields
+from gaitgauge.backends.upstream.height_fields.repair import repair_height_fields
 from gaitgauge.terrains.base import Terrain
 from gaitgauge.terrains.registry import make_terrain
 

@@ -20,14 +20,14 @@ from dataclasses import replace
 
 import torch
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.training.environment import TrainingEnvironment
-from gaitgauge.training.environment_configuration import CommandConfiguration, CommandStage, Ramp
-from gaitgauge.training.environment_memory import EnvironmentMemory
-from gaitgauge.training.randomness import UniformColumns
-from gaitgauge.training.rewards import progress_share
-from gaitgauge.training.step_inputs import StepInputs
+from gaitgauge.training.environment.configuration import CommandConfiguration, CommandStage, Ramp
+from gaitgauge.training.environment.environment import TrainingEnvironment
+from gaitgauge.training.environment.memory import EnvironmentMemory
+from gaitgauge.training.environment.randomness import UniformColumns
+from gaitgauge.training.environment.rewards import progress_share
+from gaitgauge.training.environment.step_inputs import StepInputs
+from gaitgauge.training.environment.terminations import Ends
 from gaitgauge.training.tasks import find_task
-from gaitgauge.training.terminations import Ends
 
 WALKING = "stuck but walking"
 _OF_LATE = 4.0

@@ -31,11 +31,11 @@ import numpy as np
 from gaitgauge.backends.base import PhysicsOptions
 from gaitgauge.files.writing import write_atomically
 from gaitgauge.gauge.evaluate import Request, evaluate, prepare
-from gaitgauge.gauge.policies import file_digest
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import Suite, SuiteError, load_suite
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.loading import load_policy
+from gaitgauge.studies.policies import file_digest
 from gaitgauge.training.tasks import TaskError, find_task
 
 ENGINES = ("mujoco", "mujoco-warp")

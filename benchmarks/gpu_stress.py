@@ -25,11 +25,11 @@ from typing import Any
 
 import torch
 from gaitgauge.gauge import evaluate as evaluation
-from gaitgauge.gauge import workers
 from gaitgauge.gauge.episodes import Episode
 from gaitgauge.gauge.goals import TARGET
-from gaitgauge.gauge.rollout import POLL_INTERVAL, Rollout
-from gaitgauge.gauge.workers import Job
+from gaitgauge.gauge.play import workers
+from gaitgauge.gauge.play.rollout import POLL_INTERVAL, Rollout
+from gaitgauge.gauge.play.workers import Job
 
 LINE_STEPS = 200
 

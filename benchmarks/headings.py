@@ -21,9 +21,9 @@ from gaitgauge.backends.base import TRAINING_PHYSICS, PhysicsBackend, Randomizat
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge.goals import target_command, target_offset
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.policy.its_robot import robot_for
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation import ObservationBuilder
+from gaitgauge.policy.robot_of import robot_for
 from gaitgauge.robots.rotation import yaw_of
 from gaitgauge.terrains import gauge_terrains
 from gaitgauge.terrains.base import Box, Terrain

@@ -22,14 +22,14 @@ from typing import Any
 
 import numpy as np
 from gaitgauge.files.writing import write_atomically
-from gaitgauge.gauge.comparison import ComparisonError, compare
+from gaitgauge.gauge.chance.intervals import Chance, ChanceRules, Evidence
+from gaitgauge.gauge.chance.level_chance import bisect
+from gaitgauge.gauge.chance.level_curve import expected_levels, follow
 from gaitgauge.gauge.evaluate import Request, evaluate
-from gaitgauge.gauge.intervals import Chance, ChanceRules, Evidence
-from gaitgauge.gauge.level_chance import bisect
-from gaitgauge.gauge.level_curve import expected_levels, follow
 from gaitgauge.gauge.result_check import chance_rules_of
 from gaitgauge.gauge.results import SCHEMA, environment_weights
 from gaitgauge.gauge.store import StoreError
+from gaitgauge.studies.compare.comparison import ComparisonError, compare
 from numpy.typing import NDArray
 
 DATA = Path(__file__).parents[1] / "docs" / "data" / "repeated_evaluations.json"

@@ -22,7 +22,7 @@ from gaitgauge.robots import load_robot
 from gaitgauge.training.algorithms.methods import METHODS
 from gaitgauge.training.algorithms.symmetry import build_mirror
 from gaitgauge.training.configuration import TrainingConfiguration
-from gaitgauge.training.environment_configuration import ObservationConfiguration
+from gaitgauge.training.environment.configuration import ObservationConfiguration
 from gaitgauge.training.tasks import find_task
 from tensordict import TensorDict
 

@@ -19,13 +19,13 @@ import torch
 from gaitgauge.backends.base import Randomization, Scene
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge.episodes import Episode
-from gaitgauge.gauge.self_contact import SelfContact
+from gaitgauge.gauge.play.self_contact import SelfContact
 from gaitgauge.gauge.suite import Suite, load_suite
-from gaitgauge.gauge.walking import Walk
 from gaitgauge.policy.base import Policy
-from gaitgauge.policy.its_robot import robot_for
 from gaitgauge.policy.loading import load_policy
+from gaitgauge.policy.robot_of import robot_for
 from gaitgauge.robots.rotation import tilt
+from gaitgauge.studies.walking import Walk
 from gaitgauge.terrains.gauge_terrains import flat
 
 DIRECTIONS = {

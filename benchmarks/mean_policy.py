@@ -4,7 +4,7 @@
     gaitgauge import RUN/model_1400.pt b.gauge.pt --trainable
     python benchmarks/mean_policy.py mean.gauge.pt a.gauge.pt b.gauge.pt
 
-Checkpoints of one run, or of runs that went on from each other, lie close enough for that (``training/averaging.py``). Contract,
+Checkpoints of one run, or of runs that went on from each other, lie close enough for that (``training/run/averaging.py``). Contract,
 task and progress are those of the last file; its provenance gets ``mean_of``: run and iteration of every file.
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 from gaitgauge.policy.contract import PolicyContract
-from gaitgauge.training.checkpoint import learned_networks, read_checkpoint, student_state, write_checkpoint
+from gaitgauge.training.run.checkpoint import learned_networks, read_checkpoint, student_state, write_checkpoint
 
 State = Mapping[str, torch.Tensor]
 

@@ -15,7 +15,7 @@ import warnings
 import torch
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy
-from gaitgauge.policy.networks import MoeCtsNetwork
+from gaitgauge.policy.networks.architectures import MoeCtsNetwork
 from torch import nn
 from torch.nn import functional
 

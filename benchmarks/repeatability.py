@@ -31,10 +31,10 @@ import numpy as np
 from gaitgauge.files.parsing import parse_json, read_text
 from gaitgauge.files.writing import json_text, write_atomically
 from gaitgauge.gauge.evaluate import Request, evaluate
-from gaitgauge.gauge.policies import file_digest
 from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import Suite, load_suite
+from gaitgauge.studies.policies import file_digest
 from scipy import stats
 
 BOUND = 0.005

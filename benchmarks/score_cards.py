@@ -25,16 +25,16 @@ import numpy as np
 import torch
 from gaitgauge.files.provenance import without_place
 from gaitgauge.files.writing import json_text, write_atomically
-from gaitgauge.gauge.comparison import load_result
 from gaitgauge.gauge.evaluate import Request, evaluate
-from gaitgauge.gauge.report import write_report
+from gaitgauge.gauge.report.page import write_report
 from gaitgauge.gauge.store import StoreError
-from gaitgauge.gauge.verify import tolerance_band
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.finding import shipped_policies
 from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import load_robot
+from gaitgauge.studies.cards.verify import tolerance_band
+from gaitgauge.studies.compare.comparison import load_result
 
 NAMES = ("standing", "trotting", "cts", *shipped_policies())
 SUITES = ("robogauge-1.1", "gaitgauge-1")

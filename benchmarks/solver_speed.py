@@ -23,7 +23,7 @@ import mujoco_warp
 import torch
 import warp as wp
 from gaitgauge.backends.base import PhysicsOptions
-from gaitgauge.backends.mujoco_warp.fused_solver.solve import knows, plain_solve, solve
+from gaitgauge.backends.upstream.fused_solver.solve import knows, plain_solve, solve
 from mujoco_warp._src import solver
 from warp_profile import SCENES, Case, Walkers, measure
 

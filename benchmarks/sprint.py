@@ -21,13 +21,13 @@ import torch
 from gaitgauge.backends.base import PhysicsState
 from gaitgauge.files.parsing import Seed, from_text
 from gaitgauge.gauge.suite import SuiteError
-from gaitgauge.gauge.trials.running import Trial, run_scenario
-from gaitgauge.gauge.trials.scenario import Scenario, load_scenario
 from gaitgauge.policy.base import Policy, PolicyError
-from gaitgauge.policy.its_robot import robot_for
 from gaitgauge.policy.loading import load_policy
+from gaitgauge.policy.robot_of import robot_for
 from gaitgauge.robots import Robot
 from gaitgauge.robots.body_plan import body_plan
+from gaitgauge.studies.trials.running import Trial, run_scenario
+from gaitgauge.studies.trials.scenario import Scenario, load_scenario
 from pydantic import Field
 
 _Speed = Annotated[float, Field(ge=0.1, le=100.0)]

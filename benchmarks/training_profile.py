@@ -28,9 +28,9 @@ from typing import Any
 import environment_throughput
 import torch
 import warp_profile
-from gaitgauge.training.launch import TrainRequest, prepare, train
-from gaitgauge.training.runner import TrainingRunner
-from gaitgauge.training.stopping import Progress
+from gaitgauge.training.run.launch import TrainRequest, prepare, train
+from gaitgauge.training.run.runner import TrainingRunner
+from gaitgauge.training.run.stopping import Progress
 from torch.profiler import ProfilerActivity, profile, record_function
 
 PARTS = (

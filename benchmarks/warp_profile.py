@@ -40,8 +40,8 @@ from gaitgauge.robots.rotation import from_yaw
 from gaitgauge.terrains.base import HeightField, Terrain
 from gaitgauge.terrains.registry import make_terrain
 from gaitgauge.terrains.training_tiles import NUM_TILE_LEVELS, make_tile
-from gaitgauge.training.environment_configuration import TRAINING_PHYSICS
-from gaitgauge.training.terrain_configuration import ALL_TILES
+from gaitgauge.training.environment.configuration import TRAINING_PHYSICS
+from gaitgauge.training.environment.terrain_configuration import ALL_TILES
 
 GAUGE_BOXES = ("flat", "slope_fd", "slope_bd", "stairs_fd", "stairs_bd", "obstacle")
 SCENES = ("gauge-boxes", "gauge-wave", "gauge-all", "tiles-boxes", "tiles-fields", "tiles-mix")

@@ -13,11 +13,11 @@ import viser
 
 from ..backends.base import BackendError
 from ..files.parsing import one_line
-from ..gauge.naming import distinct_names
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError
 from ..policy.finding import find_policy, shipped_policies
 from ..robots import RobotError
+from ..studies.naming import distinct_names
 from ..terrains.gauge_terrains import LEVELS
 from ..terrains.registry import TerrainError, gauge_terrain_names
 from .browser_access import check_host, is_loopback, own_requests_only

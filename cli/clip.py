@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..gauge.report import CLIP
+from ..gauge.report.page import CLIP
 
 SECONDS = 6.0
 """Length of the film [s]."""

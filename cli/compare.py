@@ -11,10 +11,10 @@ from typing import Any
 from rich.text import Text
 
 from ..backends.registry import choose_device
-from ..gauge.comparing import compare_all
-from ..gauge.comparison import format_p
 from ..gauge.evaluate import Request
-from ..gauge.naming import joined_names
+from ..studies.compare.comparison import format_p
+from ..studies.compare.contestants import compare_all
+from ..studies.naming import joined_names
 from .console import Terminal, make_table, print_json
 from .evaluate import shower
 from .studies import resumable

@@ -21,7 +21,7 @@ def suites(incomplete: str) -> list[str]:
 
 def scenarios(incomplete: str) -> list[str]:
     """Names of field trials, and files."""
-    from ..gauge.trials.scenario import scenario_names
+    from ..studies.trials.scenario import scenario_names
 
     return ["all", *scenario_names(), *_files(incomplete, (".toml",))]
 

@@ -11,10 +11,10 @@ from typing import Any
 from rich.text import Text
 
 from ..files.parsing import bare_name
-from ..gauge.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
-from ..gauge.consistency.request import StudyRequest, StudyStatus
-from ..gauge.consistency.study import prepare_study, study
-from ..gauge.naming import joined_names
+from ..studies.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
+from ..studies.consistency.request import StudyRequest, StudyStatus
+from ..studies.consistency.study import prepare_study, study
+from ..studies.naming import joined_names
 from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay
 from .studies import resumable

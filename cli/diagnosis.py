@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from ..files.writing import same_file, write_atomically
-from ..gauge.diagnosis import Diagnosis, Outcome, diagnose
-from ..policy.adapters import assumptions
-from ..policy.alternatives import toml_lines
-from ..policy.its_robot import robot_for
+from ..policy.foreign.adapters import assumptions
 from ..policy.loading import load_policy
+from ..policy.robot_of import robot_for
 from ..robots import load_robot
+from ..studies.doctor.alternatives import toml_lines
+from ..studies.doctor.diagnosis import Diagnosis, Outcome, diagnose
 from .console import Terminal, make_table, print_json
 from .errors import UserError
 from .policies import policy_file

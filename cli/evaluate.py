@@ -16,12 +16,12 @@ from rich.text import Text
 from ..backends.registry import choose_device
 from ..gauge.coverage import COMPLETE, coverage_of, coverage_words, notes, score_label, suite_label
 from ..gauge.evaluate import Request, Status, evaluate, prepare
-from ..gauge.naming import run_folders
-from ..gauge.report import write_report
+from ..gauge.report.page import write_report
 from ..gauge.results import ALL
 from ..gauge.suite import Suite
-from ..policy.adapters import AT_ONCE, doubt
 from ..policy.contract import PolicyContract
+from ..policy.foreign.adapters import AT_ONCE, doubt
+from ..studies.naming import run_folders
 from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay, duration
 from .studies import resumable

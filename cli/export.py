@@ -7,9 +7,9 @@ from pathlib import Path
 
 from ..files.parsing import did_you_mean
 from ..files.writing import make_folder
-from ..policy.export import PARTS, ExportError, export_policy, export_unitree, first_steps
-from ..policy.its_robot import robot_for
+from ..policy.export.files import PARTS, ExportError, export_policy, export_unitree, first_steps
 from ..policy.loading import load_policy
+from ..policy.robot_of import robot_for
 from ..robots import load_robot
 from .console import Terminal
 from .errors import UserError

@@ -60,7 +60,7 @@ def import_file(
 
     if trainable:
         from ..policy.loading import load_policy
-        from ..training.checkpoint import trim_checkpoint
+        from ..training.run.checkpoint import trim_checkpoint
 
         trim_checkpoint(find_policy(source), destination, raw=raw)
         policy = load_policy(str(destination))
@@ -81,7 +81,7 @@ def import_file(
 
 def contract_table(contract: PolicyContract) -> Table:
     """A policy contract for people."""
-    from ..policy.its_robot import REMEMBERED
+    from ..policy.robot_of import REMEMBERED
 
     table = Table(show_header=False)
     table.add_column("field")
@@ -201,7 +201,7 @@ def _suites() -> Table:
 
 
 def _scenarios() -> Table:
-    from ..gauge.trials.scenario import load_scenario, scenario_names
+    from ..studies.trials.scenario import load_scenario, scenario_names
 
     table = make_table("field trials (--scenario NAME, or a scenario's .toml)", "name", "title", "at most")
     for scenario in map(load_scenario, scenario_names()):

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..gauge.latent.figures import SPACES, label
-from ..gauge.latent.study import PAIRS, LatentRequest, study_latents
-from ..gauge.naming import joined_names
+from ..studies.latent.figures import SPACES, label
+from ..studies.latent.study import PAIRS, LatentRequest, study_latents
+from ..studies.naming import joined_names
 from .console import Terminal, make_table
 from .policies import policy_files
 from .studies import make_study

@@ -65,7 +65,7 @@ def run_play(**choices: Any) -> None:
     asked = PlayRequest(**choices)
     viewer = _check(asked)
     quality = choose_renderer() if viewer == "video" else None  # before MuJoCo is imported
-    from ..gauge.naming import distinct_names
+    from ..studies.naming import distinct_names
     from .play_session import beyond
     from .worlds import WorldMaker
 

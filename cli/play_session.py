@@ -16,12 +16,12 @@ from ..backends.registry import make_backend
 from ..gauge.goals import target_command, target_offset
 from ..gauge.motors import joint_parameters
 from ..gauge.suite import Suite
-from ..gauge.walking import Walk
-from ..policy.adapters import AT_ONCE, doubt
 from ..policy.base import Policy
+from ..policy.foreign.adapters import AT_ONCE, doubt
 from ..robots import Robot
 from ..robots.body_plan import model_joint_order
 from ..robots.rotation import from_yaw, in_heading, tilt
+from ..studies.walking import Walk
 from ..terrains.base import Terrain
 from .errors import UserError
 

@@ -31,7 +31,7 @@ def run_training_or_settings(
     or not.
     """
     if list_settings:
-        from ..training.launch import TrainRequest, own_overrides
+        from ..training.run.launch import TrainRequest, own_overrides
 
         request = TrainRequest(overrides=overrides, **choices)
         print_settings(request.task, own_overrides(request), request.robot)

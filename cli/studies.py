@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from ..files.writing import LOCK, lock_folder, make_folder
-from ..gauge.policies import lost_policy
+from ..studies.policies import lost_policy
 from .console import Terminal, print_json, shell_command
 from .errors import UserError
 from .progress import ProgressDisplay

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from ..gauge.cluster import check_address
+from ..gauge.play.cluster import check_address
 from ..training.sweep.call import Kept, work_through
 from ..training.sweep.file import load_sweep
 from .console import Terminal, make_table, print_json, shell_command

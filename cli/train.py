@@ -13,9 +13,9 @@ import typer
 
 from ..files.parsing import one_line
 from ..training.configuration import RunConfiguration
-from ..training.launch import TrainPlan, TrainRequest, prepare, train
-from ..training.processes import Processes, told_number
-from ..training.stopping import Progress
+from ..training.run.launch import TrainPlan, TrainRequest, prepare, train
+from ..training.run.processes import Processes, told_number
+from ..training.run.stopping import Progress
 from .console import Terminal, shell_command
 from .errors import UserError
 from .progress import ProgressDisplay, duration

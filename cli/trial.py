@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from ..backends.registry import choose_device
-from ..gauge.naming import joined_names
-from ..gauge.trials.page import measures, percent, reported
-from ..gauge.trials.trialling import ALL, TrialRequest, run_trials
+from ..studies.naming import joined_names
+from ..studies.trials.page import measures, percent, reported
+from ..studies.trials.trialling import ALL, TrialRequest, run_trials
 from .console import Terminal, make_table
 from .policies import policy_files
 from .studies import make_study

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..gauge.validation import AVERAGE, example, read_measurements, validate
+from ..studies.validate.validation import AVERAGE, example, read_measurements, validate
 from .console import Terminal, make_table, print_json
 from .errors import UserError
 

@@ -10,9 +10,9 @@ import typer
 
 from ..backends.registry import choose_device
 from ..files.parsing import shown
-from ..gauge.comparison import load_result
-from ..gauge.naming import distinct_names, folder_name
-from ..gauge.verify import prepare_replay, verify
+from ..studies.cards.verify import prepare_replay, verify
+from ..studies.compare.comparison import load_result
+from ..studies.naming import distinct_names, folder_name
 from .console import Terminal, print_json
 from .evaluate import shower
 from .studies import resumable

@@ -7,8 +7,8 @@ from typing import Any
 from ..backends.registry import choose_device
 from ..gauge.suite import load_suite
 from ..policy.base import Policy
-from ..policy.its_robot import robot_for
 from ..policy.loading import load_policy
+from ..policy.robot_of import robot_for
 from ..robots import load_robot
 from ..terrains.gauge_terrains import LEVELS
 from ..terrains.registry import gauge_terrain_names, make_terrain

@@ -24,27 +24,27 @@ from ..files.parsing import one_line, shown
 from ..files.provenance import plugins, provenance, source_digest, versions
 from ..files.writing import json_text, write_atomically
 from ..policy.contract import kind_of_observations
-from ..policy.its_robot import robot_for, without_copy
 from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
+from ..policy.robot_of import robot_for, without_copy
 from ..robots import Robot, load_robot
 from ..robots.loading import robot_digest
 from ..terrains.registry import make_terrain, terrain_names
-from .cluster import Cluster, ClusterError, ClusterWorkers, check_address
 from .coverage import coverage
-from .dispatcher import Dispatcher, Speculation, play
 from .episodes import QUALITY
+from .fit import check_fit
 from .goals import TARGET, check_terrain, count_sub_commands
 from .motors import gains_note, joint_parameters
 from .pipelines import PIPELINES, Environment, check_friction, check_payload, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
-from .policies import check_fit
-from .progress import ProgressMeter, Status
+from .play.cluster import Cluster, ClusterError, ClusterWorkers, check_address
+from .play.dispatcher import Dispatcher, Speculation, play
+from .play.progress import ProgressMeter, Status
+from .play.segments import count_segments
+from .play.workers import Job, local_workers, start_workers
 from .results import fold, health, rows_csv
-from .segments import count_segments
 from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
-from .workers import Job, local_workers, start_workers
 
 _WORLDS = 24
 """Worlds of a worker on the CPU: more share the loop's cost, fewer keep more workers busy to the end."""

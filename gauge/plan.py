@@ -17,9 +17,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
+from .chance.level_curve import CurveSearch, bracketing_levels, fitted_curve, follow, nearness
 from .episodes import Episode, Record
 from .goals import TARGET
-from .level_curve import CurveSearch, bracketing_levels, fitted_curve, follow, nearness
 from .pipelines import Environment
 from .suite import Suite
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ..files.parsing import Name, Seed, Text, one_line, shown, take
-from .intervals import ChanceRules
+from .chance.intervals import ChanceRules
 from .result_figures import check_figures
 from .suite import Friction, Payload
 

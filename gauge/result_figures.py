@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..files.parsing import edited, one_line, shown
+from .chance.intervals import ChanceRules, Evidence
 from .episodes import QUALITY
-from .intervals import ChanceRules, Evidence
 from .results import environment_weights
 from .scoring import STATISTICS, level_score
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from .chance.intervals import CONFIDENCE, ChanceRules, Evidence
+from .chance.level_curve import bracketing_levels, fitted_curve
 from .episodes import Record
 from .goals import command_name, count_sub_commands
-from .intervals import CONFIDENCE, ChanceRules, Evidence
-from .level_curve import bracketing_levels, fitted_curve
 from .plan import EnvironmentResult
 from .scoring import STATISTICS, Array, command_statistics, group_values, level_score, rounded, run_statistics
 from .suite import Suite

@@ -218,7 +218,7 @@ class Scoring:
     """Number of bootstrap resamples for the confidence intervals."""
     level: Literal["bisection", "curve"] = "bisection"
     """``bisection``: the highest level that a bisection of level tests finds passed, a whole number; ``curve``: the expected level,
-    the area under the share of successes by level (``gauge/level_curve.py``)."""
+    the area under the share of successes by level (``gauge/chance/level_curve.py``)."""
     bracket_seeds: Annotated[int, Field(ge=1, le=1000)] = 2
     """Search seeds with which a curve's crossing is looked for, before all of them are played around it."""
 

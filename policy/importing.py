@@ -7,9 +7,9 @@ from pathlib import Path
 
 from ..robots import load_robot
 from ..robots.identity import identify
-from .its_robot import REMEMBERED
 from .loading import load_policy
 from .native import FilePolicy, save_policy
+from .robot_of import REMEMBERED
 
 
 def import_policy(

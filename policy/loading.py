@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..robots import Robot, load_robot
-from .adapters import (
+from .base import PolicyError
+from .contract import ContractError, HistoryOrder, PolicyContract, check_robot, standard_contract
+from .finding import find_policy
+from .foreign.adapters import (
     LONGEST_HISTORY,
     assumptions,
     checkpoint_network,
@@ -21,15 +24,12 @@ from .adapters import (
     mjlab_contract,
     sidecar_contract,
 )
-from .base import PolicyError
-from .contract import ContractError, HistoryOrder, PolicyContract, check_robot, standard_contract
-from .fence.archive import archive_names, read_limited
-from .finding import find_policy
+from .foreign.batched_policy import rebuilt
+from .foreign.fence.archive import archive_names, read_limited
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
-from .rebuilt import rebuilt
 
 if TYPE_CHECKING:
-    from .fence.child import Child
+    from .foreign.fence.child import Child
 
 DEFAULT_ROBOT = "go2"
 
@@ -122,21 +122,21 @@ def _foreign(
 ) -> FilePolicy:
     """Load a TorchScript or ONNX file; ``contract`` is the one that was stored with it, None to look for one."""
     # Only those who load such a file wait for what it needs.
-    from .fence.child import Child
-    from .fenced import FencedPolicy
+    from .foreign.fence.child import Child
+    from .foreign.fenced_policy import FencedPolicy
 
     metadata: dict[str, str] = {}
     if file.kind == "torchscript":
-        from .fence.script import check_script
-        from .torchscript import ScriptProgram
+        from .foreign.fence.script import check_script
+        from .foreign.torchscript_session import ScriptProgram
 
         script = check_script(file.data, source=source)
         child, attributes = Child(ScriptProgram, script.data, source=source), script.attributes
         if script.contract:
             metadata["contract"] = script.contract
     else:
-        from .fence.graph import check_graph
-        from .onnx_file import GraphProgram  # with onnxruntime, which the forked child may not load any more
+        from .foreign.fence.graph import check_graph
+        from .foreign.onnx_session import GraphProgram  # with onnxruntime, which the forked child may not load any more
 
         model = check_graph(file.data, source=source, folder=path.parent)
         metadata = {entry.key: entry.value for entry in model.metadata_props}

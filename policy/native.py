@@ -38,9 +38,9 @@ from ..files.parsing import shown
 from ..files.writing import make_folder, replacing
 from .base import Policy, PolicyError, PolicySession, check_observation, checked_action
 from .contract import ContractError, PolicyContract, other_width
-from .fence.archive import packed, read_archive
-from .fence.pickles import REBUILD_TENSOR, check_tensors, read_pickle
-from .networks import ARCHITECTURES
+from .foreign.fence.archive import packed, read_archive
+from .foreign.fence.pickles import REBUILD_TENSOR, check_tensors, read_pickle
+from .networks.architectures import ARCHITECTURES
 
 FORMAT = "gaitgauge-policy"
 VERSION = 1

@@ -14,7 +14,7 @@ from pydantic import Field
 from pydantic_core import to_jsonable_python
 
 from ..files.parsing import Count, NotNegative, Positive, Seed, Share
-from .environment_configuration import Ramp
+from .environment.configuration import Ramp
 
 METHODS: tuple[str, ...] = ("cts", "ac_moe", "mcp", "him", "dreamwaq")
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")

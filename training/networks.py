@@ -16,8 +16,8 @@ from torch import nn
 from torch.nn import functional
 
 from ..policy.contract import PolicyContract
-from ..policy.layers import linear
-from ..policy.networks import ARCHITECTURES, ExpertMixture, multilayer_perceptron
+from ..policy.networks.architectures import ARCHITECTURES, ExpertMixture, multilayer_perceptron
+from ..policy.networks.layers import linear
 from .configuration import ConfigurationError, NetworkConfiguration, TrainingConfiguration
 
 

@@ -10,7 +10,7 @@ from ..policy.contract import standard_contract
 from ..robots import Robot, load_robot
 from ..robots.body_plan import body_plan
 from .configuration import TrainingConfiguration
-from .environment_configuration import CommandStage, EnvironmentConfiguration, Ramp, Range
+from .environment.configuration import CommandStage, EnvironmentConfiguration, Ramp, Range
 
 Triple = tuple[float, float, float]
 

@@ -12,7 +12,7 @@ from ..files.plugins import imported
 from ..robots import load_robot
 from ..robots.loading import robot_digest
 from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
-from .environment_configuration import (
+from .environment.configuration import (
     CommandConfiguration,
     CommandStage,
     EnvironmentConfiguration,
@@ -21,9 +21,9 @@ from .environment_configuration import (
     RewardConfiguration,
     TerminationConfiguration,
 )
+from .environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
 from .overrides import TaskError, apply_overrides
 from .scaling import scaled
-from .terrain_configuration import FLAT_TILE, TerrainConfiguration
 
 
 @dataclass(frozen=True, kw_only=True)

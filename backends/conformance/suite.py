@@ -84,8 +84,6 @@ def check(name: str, *needs: str) -> Callable[[Callable[[Bench], str]], Callable
 
 def all_checks() -> tuple[Check, ...]:
     """All checks in the order in which they run: what everything else rests on comes first."""
-    from . import kinematics, motors, stepping, health, contact, legs, ground, friction, model, disturbance, refusal  # noqa: F401, I001
-
     return tuple(_CHECKS.values())
 
 

@@ -15,6 +15,9 @@ import warp as wp
 
 from ..arguments import check_force
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Randomization, Scene, Support
+from ..upstream.fused_solver import fuse_solver
+from ..upstream.height_fields import repair_height_fields
+from ..upstream.order import CanonicalOrder
 from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
 from ..warp.state import StateArrays
@@ -22,12 +25,9 @@ from ..warp.structures import filled, to_warp
 from . import kernels, readout
 from .alarms import DROPPED
 from .arrays import Links, Palette, Roles, contact_arrays, motion_arrays
-from .fused_solver import fuse_solver
-from .height_fields import repair_height_fields
 from .masses import BATCHED_FIELDS, WorldMasses, describe_model
 from .memory import bytes_per_world
 from .model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model
-from .order import CanonicalOrder
 
 repair_height_fields()
 fuse_solver()

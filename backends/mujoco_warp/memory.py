@@ -6,7 +6,7 @@ import mujoco
 import mujoco_warp
 import warp as wp
 
-from .height_fields.repair import SEARCH_THREADS, scratch_bytes
+from ..upstream.height_fields.repair import SEARCH_THREADS, scratch_bytes
 from .model import Capacity
 
 _SCRATCH_FACTOR = 1.3

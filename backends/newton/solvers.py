@@ -19,9 +19,9 @@ import warp as wp
 
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
 from ..mujoco_warp.alarms import DROPPED
-from ..mujoco_warp.fused_solver import fuse_solver
-from ..mujoco_warp.height_fields.repair import repair_height_fields
 from ..mujoco_warp.model import SMALLEST_TOLERANCE, constraint_rows, contacts_per_world
+from ..upstream.fused_solver import fuse_solver
+from ..upstream.height_fields.repair import repair_height_fields
 from . import kernels, solver_kernels
 from .import_check import import_differences
 from .model import WorldModel, carriers

@@ -144,7 +144,7 @@ def board(
     Examples:
       gaitgauge board cards --out board.html
     """
-    from ...gauge.board import write_board
+    from ...studies.cards.board import write_board
     from ..console import Terminal
 
     if out is not None and out.suffix.lower() != ".html":

@@ -18,11 +18,11 @@ from gaitgauge.backends.base import TRAINING_PHYSICS, Randomization, ResetState,
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge.motors import joint_parameters
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.policy.adapters import deploy_contract
 from gaitgauge.policy.contract import PolicyContract
-from gaitgauge.policy.its_robot import robot_for
+from gaitgauge.policy.foreign.adapters import deploy_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation import ObservationBuilder
+from gaitgauge.policy.robot_of import robot_for
 from gaitgauge.robots import Robot
 from gaitgauge.robots.rotation import projected_gravity
 from gaitgauge.terrains.registry import make_terrain

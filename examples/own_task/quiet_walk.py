@@ -10,16 +10,16 @@ import math
 from dataclasses import replace
 
 import torch
-from gaitgauge.training.environment import TrainingEnvironment
-from gaitgauge.training.environment_configuration import (
+from gaitgauge.training.environment.configuration import (
     OwnEvent,
     OwnObservation,
     OwnReward,
     OwnTermination,
     TerminationConfiguration,
 )
-from gaitgauge.training.observations import ObservationInputs
-from gaitgauge.training.step_inputs import StepInputs
+from gaitgauge.training.environment.environment import TrainingEnvironment
+from gaitgauge.training.environment.observations import ObservationInputs
+from gaitgauge.training.environment.step_inputs import StepInputs
 from gaitgauge.training.tasks import find_task
 
 LARGEST_TILT = 0.5

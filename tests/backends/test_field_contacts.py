@@ -3,7 +3,7 @@
 import field_contacts
 import numpy as np
 import pytest
-from gaitgauge.backends.mujoco_warp.height_fields.repair import repair_height_fields
+from gaitgauge.backends.upstream.height_fields.repair import repair_height_fields
 from gaitgauge.terrains.registry import make_terrain
 
 TERRAIN = make_terrain("wave", 5)

@@ -5,7 +5,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import pytest
-from gaitgauge.backends.mujoco_warp.height_fields import repair as fields
+from gaitgauge.backends.upstream.height_fields import repair as fields
 from gaitgauge.terrains.registry import make_terrain
 from mujoco_warp._src import collision_driver
 

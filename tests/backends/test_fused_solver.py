@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from gaitgauge.backends import ResetState
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
-from gaitgauge.backends.mujoco_warp.fused_solver import solve as fused
+from gaitgauge.backends.upstream.fused_solver import solve as fused
 from mujoco_warp._src import solver
 from mujoco_warp_scenes import BOXES, FINE, FLAT, TRAINING, scene, upright
 

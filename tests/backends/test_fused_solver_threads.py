@@ -7,8 +7,8 @@ from pathlib import Path
 import mujoco_warp
 import numpy as np
 import pytest
-from gaitgauge.backends.mujoco_warp.fused_solver import solve as fused
-from gaitgauge.backends.mujoco_warp.fused_solver.kernel import program_text
+from gaitgauge.backends.upstream.fused_solver import solve as fused
+from gaitgauge.backends.upstream.fused_solver.kernel import program_text
 from mujoco_warp._src import solver
 from test_fused_solver import FEW, MANY, model_of, moving
 

@@ -10,8 +10,8 @@ import torch
 from gaitgauge.backends import BackendError, PhysicsState, Randomization, ResetState
 from gaitgauge.backends.mujoco_warp import MujocoWarpBackend
 from gaitgauge.backends.mujoco_warp.model import build_shared_model
-from gaitgauge.backends.mujoco_warp.order import ContactFields, RowFields
 from gaitgauge.backends.registry import make_backend
+from gaitgauge.backends.upstream.order import ContactFields, RowFields
 from mujoco_warp_scenes import BOXES, COARSE, FINE, FLAT, ROBOT, TRAINING, scene, upright
 
 # ---- physics against the C engine ----------------------------------------------------------------------------------

@@ -116,7 +116,7 @@ def test_names_are_those_of_a_program_that_builds_nothing(tmp_path):
 TRAINING = """
 from dataclasses import replace
 import torch
-from gaitgauge.training.environment import TrainingEnvironment
+from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge.training.tasks import find_task
 
 if __name__ == "__main__":

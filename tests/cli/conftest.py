@@ -9,7 +9,7 @@ from gaitgauge.cli.play_session import PlaySession
 from gaitgauge.cli.worlds import WorldMaker
 from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import load_robot
 from typer.testing import CliRunner, Result
 

@@ -8,7 +8,7 @@ import pytest
 from gaitgauge.cli import clip
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.picture import choose_renderer
-from gaitgauge.gauge.report import CLIP
+from gaitgauge.gauge.report.page import CLIP
 
 make_clip = clip.make_clip  # the suite's fixture puts another in its place
 

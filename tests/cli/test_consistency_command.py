@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 from gaitgauge.backends import BackendError, make_backend
-from gaitgauge.gauge.consistency import open_loop, variants
+from gaitgauge.studies.consistency import open_loop, variants
 
 SUITE = """
 extends = "robogauge-1.1"

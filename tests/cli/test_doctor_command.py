@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 from gaitgauge.cli import doctor
-from gaitgauge.gauge import diagnosis
-from gaitgauge.policy.alternatives import alternatives
 from gaitgauge.policy.contract import PolicyContract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import save_policy
+from gaitgauge.studies.doctor import diagnosis
+from gaitgauge.studies.doctor.alternatives import alternatives
 
 
 @pytest.fixture

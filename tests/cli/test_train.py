@@ -19,12 +19,12 @@ from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.train import parse_duration
 from gaitgauge.files import writing
 from gaitgauge.training.configuration import ConfigurationError
-from gaitgauge.training.launch import TrainRequest, prepare
-from gaitgauge.training.logger import make_writer
 from gaitgauge.training.overrides import override_keys
-from gaitgauge.training.processes import idle_gpus
-from gaitgauge.training.scoring import Scorer, scores_of
-from gaitgauge.training.side_process import PROGRAM
+from gaitgauge.training.run.launch import TrainRequest, prepare
+from gaitgauge.training.run.logger import make_writer
+from gaitgauge.training.run.processes import idle_gpus
+from gaitgauge.training.run.scoring import Scorer, scores_of
+from gaitgauge.training.run.side_process import PROGRAM
 from gaitgauge.training.tasks import TASKS
 from small_run import FAKE, SMALL
 
@@ -248,7 +248,7 @@ def test_a_run_in_which_nothing_was_written_leaves_no_directory(refused, tmp_pat
     def too_large(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr("gaitgauge.training.launch.TrainingRunner", too_large)
+    monkeypatch.setattr("gaitgauge.training.run.launch.TrainingRunner", too_large)
     assert "smaller --num-envs" in refused("train", "go2-flat", *FAKE, *SMALL)
     assert list((tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()) == []
 
@@ -331,7 +331,7 @@ def test_time_limit_waits_for_no_score_unless_asked():
 
 
 def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):
-    from gaitgauge.training import side_process
+    from gaitgauge.training.run import side_process
 
     started = []
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from gaitgauge.files import writing
 from gaitgauge.files.writing import lock_folder
-from gaitgauge.training.launch import TrainRequest, prepare
-from gaitgauge.training.stopping import TrainingOutcome
+from gaitgauge.training.run.launch import TrainRequest, prepare
+from gaitgauge.training.run.stopping import TrainingOutcome
 from gaitgauge.training.tasks import TASKS
 from small_run import FAKE, SMALL
 
@@ -238,7 +238,7 @@ def test_a_resume_that_is_refused_changes_nothing(refused, trained, change, name
 @pytest.mark.parametrize("name", TASKS)
 def test_a_resumed_run_has_the_settings_of_its_checkpoint_whatever_the_task_says_today(trained, name, monkeypatch):
     """All of them, also those that nobody had spelled out."""
-    from gaitgauge.training import launch
+    from gaitgauge.training.run import launch
 
     entries = torch.load(trained / "model_2.pt", weights_only=True)
     made = prepare(TrainRequest(task=name, backend="fake", device="cpu", num_envs=8, seed=3, iterations=70))

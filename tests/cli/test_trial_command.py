@@ -133,8 +133,8 @@ def test_an_output_that_cannot_be_used_is_said_before_anything_is_played(
     refused, policy, scenarios, tmp_path, monkeypatch, command, out
 ):
     monkeypatch.setattr("gaitgauge.files.writing._PATIENCE", 0.1)
-    monkeypatch.setattr("gaitgauge.gauge.trials.trialling.load_policies", lambda *_, **__: pytest.fail("played"))
-    monkeypatch.setattr("gaitgauge.gauge.latent.study.load_policies", lambda *_, **__: pytest.fail("played"))
+    monkeypatch.setattr("gaitgauge.studies.trials.trialling.load_policies", lambda *_, **__: pytest.fail("played"))
+    monkeypatch.setattr("gaitgauge.studies.latent.study.load_policies", lambda *_, **__: pytest.fail("played"))
     (tmp_path / "taken").mkdir()
     with FileLock(tmp_path / "taken" / LOCK):
         sentence = refused(*command, policy, "--out", out)

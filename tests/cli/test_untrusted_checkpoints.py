@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from gaitgauge.training import launch, logger
-from gaitgauge.training.launch import TrainRequest, prepare
-from gaitgauge.training.own_terms import foreign_functions
+from gaitgauge.training.environment.own_terms import foreign_functions
+from gaitgauge.training.run import launch, logger
+from gaitgauge.training.run.launch import TrainRequest, prepare
 from small_run import FAKE, SMALL
 
 RESUME = ("--device", "cpu", "--no-score", "--iterations", 3)
@@ -69,8 +69,8 @@ def test_a_run_directory_that_leads_elsewhere_is_refused(refused, trained, tmp_p
 @pytest.mark.parametrize(
     ("name", "foreign"),
     [
-        ("gaitgauge.training.commands:CommandGenerator", False),
-        ("gaitgauge.training.own_terms:import_module", True),
+        ("gaitgauge.training.environment.commands:CommandGenerator", False),
+        ("gaitgauge.training.environment.own_terms:import_module", True),
         ("gaitgauge.cli.main:train", True),
         ("gaitgauge.training.nothing:here", True),
         ("os:system", True),

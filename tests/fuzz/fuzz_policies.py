@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fuzzing import SEEDS, register
-from gaitgauge.policy.adapters import deploy_contract, sidecar_contract
 from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.fence.archive import packed, read_archive
+from gaitgauge.policy.foreign.adapters import deploy_contract, sidecar_contract
+from gaitgauge.policy.foreign.fence.archive import packed, read_archive
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 

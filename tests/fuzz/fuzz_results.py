@@ -12,22 +12,22 @@ import torch
 from fuzzing import SEEDS, register
 from gaitgauge.api import ResultsError, load_results
 from gaitgauge.files.parsing import edited
-from gaitgauge.gauge.board import write_board
-from gaitgauge.gauge.comparison import compare, load_result
-from gaitgauge.gauge.comparison_report import write_comparison
-from gaitgauge.gauge.consistency.page import write_page
-from gaitgauge.gauge.report import write_report
-from gaitgauge.gauge.validation import read_measurements, validate
-from gaitgauge.gauge.verify import judge
-from gaitgauge.policy.adapters import described_contract
+from gaitgauge.gauge.report.page import write_report
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.fence.archive import packed, read_archive
+from gaitgauge.policy.foreign.adapters import described_contract
+from gaitgauge.policy.foreign.fence.archive import packed, read_archive
 from gaitgauge.policy.native import StoredNetwork
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import load_robot
-from gaitgauge.training.checkpoint import checkpoint_entries, read_checkpoint, run_numbers
-from gaitgauge.training.run_directory import read_run_json
-from gaitgauge.training.scoring import scores_of
+from gaitgauge.studies.cards.board import write_board
+from gaitgauge.studies.cards.verify import judge
+from gaitgauge.studies.compare.comparison import compare, load_result
+from gaitgauge.studies.compare.report import write_comparison
+from gaitgauge.studies.consistency.page import write_page
+from gaitgauge.studies.validate.validation import read_measurements, validate
+from gaitgauge.training.run.checkpoint import checkpoint_entries, read_checkpoint, run_numbers
+from gaitgauge.training.run.run_directory import read_run_json
+from gaitgauge.training.run.scoring import scores_of
 
 CARD = (SEEDS / "results" / "results.json").read_bytes()
 ROBOT = load_robot("go2")

@@ -11,13 +11,13 @@ import numpy as np
 from fuzzing import register
 from gaitgauge.backends.base import PhysicsOptions
 from gaitgauge.files.parsing import parse_json
-from gaitgauge.gauge.consistency.variants import parse_variant
 from gaitgauge.gauge.episodes import Episode, Record, RecordError
 from gaitgauge.gauge.store import RunFolder
 from gaitgauge.gauge.suite import SUITE_FOLDER, load_suite
-from gaitgauge.gauge.trials.scenario import SCENARIO_FOLDER, load_scenario
 from gaitgauge.robots import RobotError, load_robot
 from gaitgauge.robots.identity import identify, recall
+from gaitgauge.studies.consistency.variants import parse_variant
+from gaitgauge.studies.trials.scenario import SCENARIO_FOLDER, load_scenario
 from gaitgauge.training.sweep.file import load_sweep
 from gaitgauge.training.tasks import find_task
 

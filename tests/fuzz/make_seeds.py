@@ -9,9 +9,9 @@ from pathlib import Path
 import onnx
 import torch
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.export import deploy_settings, stacked_contract
+from gaitgauge.policy.export.files import deploy_settings, stacked_contract
 from gaitgauge.policy.native import ForeignFile, StoredNetwork, save_policy
-from gaitgauge.policy.networks import CtsNetwork, MlpNetwork
+from gaitgauge.policy.networks.architectures import CtsNetwork, MlpNetwork
 from gaitgauge.robots import load_robot
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn

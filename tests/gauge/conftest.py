@@ -7,8 +7,6 @@ import pytest
 from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge.evaluate import Request
 
-# The scripted policy, engine and runs are shared by several test files.
-sys.path.insert(0, str(Path(__file__).parent))
 
 from tiny_runs import evaluate, tiny_request
 

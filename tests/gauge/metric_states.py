@@ -2,7 +2,7 @@
 
 import torch
 from gaitgauge.gauge.metrics import MetricEvaluator
-from gaitgauge.gauge.sampling import GRAVITY
+from gaitgauge.gauge.play.sampling import GRAVITY
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.robots.body_plan import total_mass
 from scipy.spatial.transform import Rotation

@@ -7,7 +7,7 @@ import torch
 from gaitgauge.backends import Scene
 from gaitgauge.backends.base import PhysicsState
 from gaitgauge.gauge.episodes import Episode, Record
-from gaitgauge.gauge.rollout import Rollout
+from gaitgauge.gauge.play.rollout import Rollout
 from gaitgauge.gauge.suite import Goal, Suite, load_suite
 from gaitgauge.policy.base import Policy, PolicySession
 from gaitgauge.policy.contract import standard_contract

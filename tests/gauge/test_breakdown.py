@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 
 import pytest
-from gaitgauge.gauge.breakdown import breakdown, command_label
-from gaitgauge.gauge.references import reference_table, references_for
+from gaitgauge.gauge.report.breakdown import breakdown, command_label
+from gaitgauge.gauge.report.references import reference_table, references_for
 from gaitgauge.gauge.suite import load_suite
 
 

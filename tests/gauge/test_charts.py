@@ -5,9 +5,8 @@ import re
 from typing import Any
 
 import pytest
-from gaitgauge.gauge import charts
-from gaitgauge.gauge.pages import page_template
-from gaitgauge.gauge.report import STATISTIC_LABELS, report_data
+from gaitgauge.gauge.report.page import STATISTIC_LABELS, charts, report_data
+from gaitgauge.gauge.report.pages import page_template
 from sample_results import PIPELINES, row, sample
 
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from gaitgauge.gauge.board import board_data
 from gaitgauge.gauge.coverage import notes, score_label
 from gaitgauge.gauge.evaluate import Request, prepare
 from gaitgauge.policy.base import PolicySession
 from gaitgauge.policy.contract import TERM_WIDTH, ObservationTerm, standard_contract
 from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.policy.native import FilePolicy, StoredNetwork, save_policy
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.networks.architectures import MlpNetwork
+from gaitgauge.studies.cards.board import board_data
 from scripted_gauge import GO2, Puppet
 from tiny_runs import evaluate
 

@@ -13,17 +13,17 @@ from types import SimpleNamespace
 import pytest
 import torch
 from gaitgauge.backends.registry import make_backend
-from gaitgauge.gauge import cluster, cluster_node
-from gaitgauge.gauge.cluster import Cluster, ClusterError, check_address
-from gaitgauge.gauge.cluster_node import Arrived, NodeWorker, fingerprint
-from gaitgauge.gauge.dispatcher import Speculation, play
 from gaitgauge.gauge.evaluate import Request, evaluate, prepare
 from gaitgauge.gauge.plan import plan_list
-from gaitgauge.gauge.workers import Failed, Finished, InProcess, Job, Play, Progress, Stop, Worker
+from gaitgauge.gauge.play import cluster, cluster_node
+from gaitgauge.gauge.play.cluster import Cluster, ClusterError, check_address
+from gaitgauge.gauge.play.cluster_node import Arrived, NodeWorker, fingerprint
+from gaitgauge.gauge.play.dispatcher import Speculation, play
+from gaitgauge.gauge.play.workers import Failed, Finished, InProcess, Job, Play, Progress, Stop, Worker
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import load_robot
 from gaitgauge.robots.identity import packed
 from scripted_gauge import GO2, MAXIMUM, Puppet, episode, short_suite
@@ -234,7 +234,7 @@ def test_the_class_of_the_actors_travels_without_this_module(monkeypatch):
     monkeypatch.setitem(
         sys.modules, "ray", type("Ray", (), {"util": type("U", (), {"get_node_ip_address": lambda: "n"})})
     )
-    monkeypatch.setitem(sys.modules, "gaitgauge.gauge.cluster_node", None)
+    monkeypatch.setitem(sys.modules, "gaitgauge.gauge.play.cluster_node", None)
     assert node.exchange([]).startswith("node n of the Ray cluster lacks this gaitgauge (")
 
 

@@ -6,13 +6,13 @@ from functools import partial
 
 import pytest
 from gaitgauge.backends.base import BackendError
-from gaitgauge.gauge.dispatcher import Speculation, play
 from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.pipelines import Environment
 from gaitgauge.gauge.plan import Plan, PlanRules, plan, plan_list
-from gaitgauge.gauge.segments import count_segments
+from gaitgauge.gauge.play.dispatcher import Speculation, play
+from gaitgauge.gauge.play.segments import count_segments
+from gaitgauge.gauge.play.workers import Drop, Failed, Finished, Lost, Play, Progress, Stop
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.gauge.workers import Drop, Failed, Finished, Lost, Play, Progress, Stop
 from scripted_gauge import DIAGONAL, MAXIMUM, TARGET, episode
 
 RULES = PlanRules(suite=load_suite("robogauge-1.1"), seeds=(0, 1, 2))

@@ -11,14 +11,14 @@ import pytest
 from gaitgauge.api import ArgumentError, ResultsError, evaluate, load_policy, load_results, train
 from gaitgauge.api import compare as compare_results
 from gaitgauge.backends.base import BackendError
-from gaitgauge.gauge.board import write_board
-from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
-from gaitgauge.gauge.comparison_report import write_comparison
 from gaitgauge.gauge.result_check import MOST_ROWS
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import SuiteError
-from gaitgauge.gauge.validation import Measurements, ValidationError, validate
 from gaitgauge.policy.base import PolicyError
+from gaitgauge.studies.cards.board import write_board
+from gaitgauge.studies.compare.comparison import ComparisonError, compare, load_result
+from gaitgauge.studies.compare.report import write_comparison
+from gaitgauge.studies.validate.validation import Measurements, ValidationError, validate
 from gaitgauge.training.configuration import ConfigurationError
 
 SEED = Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json"

@@ -17,7 +17,7 @@ from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import RobotError
 from gaitgauge.terrains.registry import TerrainError
 from scripted_gauge import GO2, Puppet

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from gaitgauge.gauge.episodes import RecordError
-from gaitgauge.gauge.report import write_report
+from gaitgauge.gauge.report.page import write_report
 from gaitgauge.gauge.store import StoreError
 from tiny_runs import evaluate, tiny_request, without_provenance
 

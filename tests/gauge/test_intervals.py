@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from gaitgauge.gauge.intervals import Chance, ChanceRules, Evidence
+from gaitgauge.gauge.chance.intervals import Chance, ChanceRules, Evidence
 from scipy import stats
 
 

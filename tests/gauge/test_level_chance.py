@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from gaitgauge.gauge.level_chance import bisect, bisected_levels, redraw_levels, shared_luck, success_curves
+from gaitgauge.gauge.chance.level_chance import bisect, bisected_levels, redraw_levels, shared_luck, success_curves
 
 
 def outcomes(reached, played, first=0):

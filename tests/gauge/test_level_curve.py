@@ -5,8 +5,8 @@ import random
 
 import numpy as np
 import pytest
+from gaitgauge.gauge.chance.level_curve import bracketing_levels, expected_levels, fitted_curve, follow
 from gaitgauge.gauge.episodes import Record
-from gaitgauge.gauge.level_curve import bracketing_levels, expected_levels, fitted_curve, follow
 from gaitgauge.gauge.pipelines import Environment
 from gaitgauge.gauge.plan import PlanRules, environment_result, plan
 from gaitgauge.gauge.suite import load_suite
@@ -95,7 +95,7 @@ def test_the_fit_falls_with_the_level():
 
 def test_expected_levels_scatter_about_half_as_much_as_tested_ones():
     """Chances as measured on waves: 6: 1, 7: .9, 8: .55, 9: .1."""
-    from gaitgauge.gauge.level_chance import bisected_levels
+    from gaitgauge.gauge.chance.level_chance import bisected_levels
 
     generator = np.random.default_rng(2)
     chance = np.array([1, 1, 1, 1, 1, 1, 0.9, 0.55, 0.1, 0.0])

@@ -16,7 +16,7 @@ from gaitgauge.gauge.metrics import (
     torque_smoothness,
     zmp_margin,
 )
-from gaitgauge.gauge.sampling import GRAVITY
+from gaitgauge.gauge.play.sampling import GRAVITY
 from gaitgauge.gauge.suite import METRIC_NAMES
 from gaitgauge.robots.body_plan import total_mass
 from gaitgauge.robots.rotation import rotate_inverse

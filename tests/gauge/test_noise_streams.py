@@ -5,8 +5,8 @@ import random
 import numpy as np
 import pytest
 import torch
-from gaitgauge.gauge import noise
-from gaitgauge.gauge.noise import CounterStream, ReferenceStream, make_stream, uniform_hash
+from gaitgauge.gauge.play import noise
+from gaitgauge.gauge.play.noise import CounterStream, ReferenceStream, make_stream, uniform_hash
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.observation import NOISE_TERMS
 from scripted_gauge import MAXIMUM, episode

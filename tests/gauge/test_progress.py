@@ -3,7 +3,7 @@
 import pytest
 from gaitgauge.gauge.episodes import Episode
 from gaitgauge.gauge.plan import Plan
-from gaitgauge.gauge.progress import ProgressMeter
+from gaitgauge.gauge.play.progress import ProgressMeter
 from gaitgauge.gauge.suite import load_suite
 
 SUITE = load_suite("robogauge-1.1")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.backends.base import BackendError, Capability, Support
-from gaitgauge.gauge.pushes import push_force, push_steps, sideways
-from gaitgauge.gauge.segments import Segment
+from gaitgauge.gauge.play.pushes import push_force, push_steps, sideways
+from gaitgauge.gauge.play.segments import Segment
 from gaitgauge.gauge.suite import Push, load_suite
 from gaitgauge.robots.rotation import from_yaw
 from scripted_gauge import DIAGONAL, MAXIMUM, PERIOD, Puppet, episode, run, scene, short_suite

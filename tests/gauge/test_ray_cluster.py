@@ -5,10 +5,10 @@ import json
 from pathlib import Path
 
 import pytest
-from gaitgauge.gauge import cluster
-from gaitgauge.gauge.cluster import Cluster, ClusterError
-from gaitgauge.gauge.cluster_node import fingerprint
 from gaitgauge.gauge.evaluate import Request, evaluate
+from gaitgauge.gauge.play import cluster
+from gaitgauge.gauge.play.cluster import Cluster, ClusterError
+from gaitgauge.gauge.play.cluster_node import fingerprint
 from gaitgauge.policy.finding import PRETRAINED
 
 pytestmark = [

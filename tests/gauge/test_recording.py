@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.gauge import control_step, recording
-from gaitgauge.gauge.recording import StepRecording
-from gaitgauge.gauge.rollout import Rollout
+from gaitgauge.gauge.play import control_step, recording
+from gaitgauge.gauge.play.recording import StepRecording
+from gaitgauge.gauge.play.rollout import Rollout
 from gaitgauge.policy.base import PolicyError
 from gaitgauge_fake_engine import FakeBackend, FakeScript
 from scripted_gauge import (

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import repeatability as bench
 import score_cards
-from gaitgauge.gauge.comparison import load_result
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.studies.compare.comparison import load_result
 
 SUITE = load_suite("gaitgauge-1")
 

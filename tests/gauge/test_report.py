@@ -6,9 +6,9 @@ from contextlib import suppress
 
 import pytest
 from gaitgauge.api import ResultsError, load_results
-from gaitgauge.gauge.comparison import ComparisonError, compare, load_result
-from gaitgauge.gauge.report import CLIP, metric_matrix, render, sources, warnings, write_report
+from gaitgauge.gauge.report.page import CLIP, metric_matrix, render, sources, warnings, write_report
 from gaitgauge.gauge.store import StoreError
+from gaitgauge.studies.compare.comparison import ComparisonError, compare, load_result
 from sample_results import HOSTILE, PIPELINES, Page, row, sample
 
 

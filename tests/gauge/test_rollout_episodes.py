@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gaitgauge.gauge import noise
+from gaitgauge.gauge.play import noise
 from gaitgauge.policy.base import PolicyError
 from gaitgauge_fake_engine import FakeScript
 from scripted_gauge import (

@@ -7,7 +7,7 @@ import pytest
 import torch
 from gaitgauge.backends import Scene, make_backend
 from gaitgauge.gauge.episodes import Episode
-from gaitgauge.gauge.rollout import Rollout
+from gaitgauge.gauge.play.rollout import Rollout
 from gaitgauge.gauge.suite import Goal, load_suite
 from gaitgauge.terrains.registry import make_terrain
 from scripted_gauge import GO2, MAXIMUM, TARGET, ScriptedPolicy, to_the_end

@@ -12,12 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from gaitgauge.gauge.play.workers import WorkerError
 from gaitgauge.gauge.store import RunFolder
-from gaitgauge.gauge.workers import WorkerError
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.networks.architectures import MlpNetwork
 from scripted_gauge import GO2
 from tiny_runs import SMALL, evaluate, without_provenance
 

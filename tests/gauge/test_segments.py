@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.gauge.goals import Schedule
-from gaitgauge.gauge.rollout import Rollout
-from gaitgauge.gauge.segments import OpenEpisode, Segment, SegmentOutcome, SegmentRules
+from gaitgauge.gauge.play.rollout import Rollout
+from gaitgauge.gauge.play.segments import OpenEpisode, Segment, SegmentOutcome, SegmentRules
 from gaitgauge.gauge.suite import load_suite
 from scripted_gauge import (
     DIAGONAL,

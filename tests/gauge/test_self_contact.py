@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gaitgauge.gauge.play.self_contact import SelfContact
 from gaitgauge.gauge.results import health, self_contact
-from gaitgauge.gauge.self_contact import SelfContact
 from gaitgauge.robots import load_robot
 
 from .test_edited_episodes import record

@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from gaitgauge.gauge.workers import Drop, Failed, Finished, Job, LocalProcesses, Play, Progress, Stop, WorkerError
+from gaitgauge.gauge.play.workers import Drop, Failed, Finished, Job, LocalProcesses, Play, Progress, Stop, WorkerError
 from gaitgauge.policy.base import PolicyError
 from scripted_gauge import DIAGONAL, GO2, MAXIMUM, Puppet, ScriptedPolicy, episode, short_suite
 

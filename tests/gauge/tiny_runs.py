@@ -10,7 +10,7 @@ from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge.evaluate import Request
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import MlpNetwork
+from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge_fake_engine import FakeScript
 from scripted_gauge import GO2, Puppet
 

@@ -7,7 +7,7 @@ import torch
 from gaitgauge.policy.base import PolicySession
 from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import CtsNetwork
+from gaitgauge.policy.networks.architectures import CtsNetwork
 from gaitgauge.robots import Robot, load_robot
 
 # The foreign programs are shared by several test files.

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from gaitgauge.policy.composed import AcMoeNetwork, CompositeActor, GatedActor, McpNetwork
-from gaitgauge.policy.estimators import VELOCITY, DreamwaqNetwork, HimNetwork
-from gaitgauge.policy.layers import aligned
+from gaitgauge.policy.networks.composed import AcMoeNetwork, CompositeActor, GatedActor, McpNetwork
+from gaitgauge.policy.networks.estimators import VELOCITY, DreamwaqNetwork, HimNetwork
+from gaitgauge.policy.networks.layers import aligned
 from torch import nn
 
 

@@ -12,7 +12,7 @@ from typing import NoReturn
 import gaitgauge
 import onnxruntime
 import pytest
-from gaitgauge.policy.export import export_unitree
+from gaitgauge.policy.export.files import export_unitree
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.policy.adapters import deploy_contract, sidecar_contract
 from gaitgauge.policy.base import LONGEST_MESSAGE, PolicyError
-from gaitgauge.policy.fence import archive, pickles
 from gaitgauge.policy.finding import find_policy
+from gaitgauge.policy.foreign.adapters import deploy_contract, sidecar_contract
+from gaitgauge.policy.foreign.fence import archive, pickles
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import checksum, save_policy
 from gaitgauge.robots import load_robot

@@ -9,11 +9,9 @@ import onnxruntime
 import pytest
 import torch
 import yaml
-from gaitgauge.policy import export
-from gaitgauge.policy.adapters import deploy_contract, mjlab_contract
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import History, PolicyContract, standard_contract
-from gaitgauge.policy.export import (
+from gaitgauge.policy.export.files import (
     ExportError,
     export_deploy,
     export_onnx,
@@ -22,11 +20,13 @@ from gaitgauge.policy.export import (
     mjlab_metadata,
     term_major_order,
 )
+from gaitgauge.policy.export import files as export
+from gaitgauge.policy.foreign.adapters import deploy_contract, mjlab_contract
+from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork
-from gaitgauge.policy.networks import ARCHITECTURES
-from gaitgauge.policy.rebuilt import RebuiltPolicy
+from gaitgauge.policy.networks.architectures import ARCHITECTURES
 from gaitgauge.robots import load_robot
 
 torch.set_num_threads(1)

@@ -7,7 +7,7 @@ import onnx
 import pytest
 import torch
 from foreign_programs import refused
-from gaitgauge.policy.fence import child as fence_child
+from gaitgauge.policy.foreign.fence import child as fence_child
 from gaitgauge.policy.loading import load_policy
 from onnx import TensorProto, helper, numpy_helper
 

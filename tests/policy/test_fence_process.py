@@ -13,10 +13,10 @@ import pytest
 import torch
 from foreign_programs import Plain, refused, script
 from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.fence import child as fence_child
-from gaitgauge.policy.fenced import FencedPolicy, FencedSession
+from gaitgauge.policy.foreign.fence import child as fence_child
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy, FencedSession
+from gaitgauge.policy.foreign.torchscript_session import BatchSession, ScriptProgram
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.policy.torchscript import BatchSession, ScriptProgram
 from torch import nn
 
 

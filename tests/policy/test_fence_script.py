@@ -8,8 +8,8 @@ import pytest
 import torch
 from foreign_programs import Plain, refused, script
 from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.fence.archive import packed, read_archive
-from gaitgauge.policy.fence.script import check_script
+from gaitgauge.policy.foreign.fence.archive import packed, read_archive
+from gaitgauge.policy.foreign.fence.script import check_script
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import ForeignFile, save_policy
 from torch import nn

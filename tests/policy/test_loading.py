@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.policy import finding
-from gaitgauge.policy.adapters import described_contract
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import ContractError, PolicyContract
 from gaitgauge.policy.finding import find_policy
+from gaitgauge.policy.foreign.adapters import described_contract
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import save_policy
-from gaitgauge.policy.networks import CtsNetwork, multilayer_perceptron
+from gaitgauge.policy.networks.architectures import CtsNetwork, multilayer_perceptron
 from gaitgauge.robots import load_robot
 from torch import nn
 

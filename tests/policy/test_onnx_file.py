@@ -10,11 +10,11 @@ import torch
 import yaml
 from gaitgauge.policy.base import PolicyError, RowwiseSession
 from gaitgauge.policy.contract import History, PolicyContract
+from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.onnx_session import GraphProgram, OnnxSession
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import first_line
-from gaitgauge.policy.onnx_file import GraphProgram, OnnxSession
-from gaitgauge.policy.rebuilt import RebuiltPolicy
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 

@@ -9,10 +9,10 @@ import onnxruntime
 import pytest
 import torch
 from gaitgauge.policy.contract import History, standard_contract
+from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.batched_program import NotUnderstoodError, ProgramSession
+from gaitgauge.policy.foreign.onnx_program import onnx_program
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.policy.onnx_program import onnx_program
-from gaitgauge.policy.program import NotUnderstoodError, ProgramSession
-from gaitgauge.policy.rebuilt import RebuiltPolicy
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
@@ -75,7 +75,7 @@ def test_acts_as_onnxruntime_does(dynamo, stacked):
 
 
 def test_an_exported_policy_is_rebuilt_and_acts_alike(tmp_path):
-    from gaitgauge.policy.export import export_onnx
+    from gaitgauge.policy.export.files import export_onnx
 
     own = load_policy("pretrained")
     export_onnx(own, tmp_path / "policy.onnx")

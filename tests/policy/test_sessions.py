@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.contract import PolicyContract
+from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
-from gaitgauge.policy.networks import ARCHITECTURES, unit
-from gaitgauge.policy.rebuilt import RebuiltPolicy
+from gaitgauge.policy.networks.architectures import ARCHITECTURES, unit
 from torch import nn
 from torch.nn import functional
 

@@ -3,13 +3,13 @@
 import pytest
 import torch
 from gaitgauge.policy.base import Policy, PolicySession, RowwiseSession
+from gaitgauge.policy.batch_invariance import steady_session
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.export import export_onnx, export_torchscript
+from gaitgauge.policy.export.files import export_onnx, export_torchscript
+from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork, save_policy
-from gaitgauge.policy.networks import ARCHITECTURES, MlpNetwork
-from gaitgauge.policy.rebuilt import RebuiltPolicy
-from gaitgauge.policy.steady import steady_session
+from gaitgauge.policy.networks.architectures import ARCHITECTURES, MlpNetwork
 from gaitgauge.robots import load_robot
 
 ROBOT = load_robot("go2")

@@ -10,11 +10,11 @@ import pytest
 import torch
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import History
-from gaitgauge.policy.fence.script import check_script
+from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.fence.script import check_script
+from gaitgauge.policy.foreign.torchscript_session import BatchSession, CopiesSession, ScriptProgram
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.policy.rebuilt import RebuiltPolicy
-from gaitgauge.policy.torchscript import BatchSession, CopiesSession, ScriptProgram
 from torch import nn
 
 EPISODES, RESET_STEP, RESET_ROW = 4, 6, 2
@@ -370,7 +370,7 @@ def test_import_keeps_actions_and_needs_no_sidecar(tmp_path, contract, cts_netwo
 )
 def test_published_policy_acts_as_published(tmp_path, contract):
     from gaitgauge.policy.native import StoredNetwork, save_policy
-    from gaitgauge.policy.networks import CtsNetwork
+    from gaitgauge.policy.networks.architectures import CtsNetwork
 
     with np.load(os.environ["GAITGAUGE_PUBLIC_CTS"]) as archive:
         state = {k.replace("student_encoder", "encoder"): torch.from_numpy(archive[k]) for k in archive if "/" not in k}

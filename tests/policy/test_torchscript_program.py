@@ -7,8 +7,8 @@ from itertools import pairwise
 import pytest
 import torch
 from foreign_programs import script
-from gaitgauge.policy.program import NotUnderstoodError, ProgramSession
-from gaitgauge.policy.torchscript_program import torchscript_program
+from gaitgauge.policy.foreign.batched_program import NotUnderstoodError, ProgramSession
+from gaitgauge.policy.foreign.torchscript_program import torchscript_program
 from torch import nn
 
 EPISODES = 5
@@ -247,7 +247,9 @@ class Huge(Published):
 )
 def test_what_is_not_understood_is_named_and_not_run(make, reason, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("gaitgauge.policy.program.MOST_OPERATORS", 500)  # of those here, one alone calls as many
+    monkeypatch.setattr(
+        "gaitgauge.policy.foreign.batched_program.MOST_OPERATORS", 500
+    )  # of those here, one alone calls as many
     with pytest.raises(NotUnderstoodError, match=reason):
         torchscript_program(script(make()), 45, source="file")
     assert not any(tmp_path.iterdir())

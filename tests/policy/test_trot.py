@@ -7,8 +7,8 @@ from gaitgauge.backends import Scene, make_backend
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import NativePolicy, save_policy
+from gaitgauge.policy.networks.trot import TrotController
 from gaitgauge.policy.observation import ObservationBuilder
-from gaitgauge.policy.trot import TrotController
 from gaitgauge.robots.rotation import rotate_inverse
 from gaitgauge.terrains.registry import make_terrain
 

@@ -2,10 +2,10 @@ import pytest
 import torch
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
+from gaitgauge.policy.latent_probe import watched_session
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork
-from gaitgauge.policy.networks import ARCHITECTURES
-from gaitgauge.policy.watching import watched_session
+from gaitgauge.policy.networks.architectures import ARCHITECTURES
 from gaitgauge.robots import load_robot
 
 

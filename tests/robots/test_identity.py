@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.its_robot import REMEMBERED, robot_for, without_copy
+from gaitgauge.policy.robot_of import REMEMBERED, robot_for, without_copy
 from gaitgauge.robots import RobotError, load_robot
 from gaitgauge.robots.identity import identify, recall
 from gaitgauge.robots.loading import robot_digest

@@ -4,8 +4,8 @@ import json
 import sys
 from pathlib import Path
 
-from gaitgauge.gauge.policies import file_digest
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.studies.policies import file_digest
 from gaitgauge.training.sweep.file import Sweep, SweepEntry
 from gaitgauge.training.sweep.jobs import Jobs
 from gaitgauge.training.sweep.runs import SweepRun

@@ -7,9 +7,9 @@ from gaitgauge.training.algorithms.cts import CTS
 from gaitgauge.training.algorithms.optimization import FlatGradients
 from gaitgauge.training.algorithms.symmetry import passes
 from gaitgauge.training.configuration import ConfigurationError, NetworkConfiguration
-from gaitgauge.training.environment_configuration import Ramp
+from gaitgauge.training.environment.configuration import Ramp
 from gaitgauge.training.networks import CtsActor, CtsCritic, Widths, command_entries, student_architecture
-from gaitgauge.training.runner import TrainingRunner
+from gaitgauge.training.run.runner import TrainingRunner
 from rsl_rl.modules.distribution import GaussianDistribution
 from toy_training import ACTIONS, FRAME, PRIVILEGED, ToyEnv, toy_configuration, toy_contract, toy_mirror
 

@@ -8,12 +8,12 @@ from gaitgauge.policy.loading import load_policy
 from gaitgauge.training.algorithms.him import sinkhorn, swapped_prediction
 from gaitgauge.training.algorithms.methods import METHODS
 from gaitgauge.training.algorithms.ppo import PPO
-from gaitgauge.training.checkpoint import checkpoint_entries, read_checkpoint, trim_checkpoint, write_checkpoint
 from gaitgauge.training.configuration import METHODS as NAMES
 from gaitgauge.training.configuration import ConfigurationError, HimConfiguration, TrainingConfiguration
-from gaitgauge.training.resuming import begin_with, resume_run, stored_network
-from gaitgauge.training.runner import TrainingRunner
-from gaitgauge.training.seeding import seed_everything
+from gaitgauge.training.run.checkpoint import checkpoint_entries, read_checkpoint, trim_checkpoint, write_checkpoint
+from gaitgauge.training.run.resuming import begin_with, resume_run, stored_network
+from gaitgauge.training.run.runner import TrainingRunner
+from gaitgauge.training.run.seeding import seed_everything
 from toy_training import ACTIONS, FRAME, ToyEnv, toy_configuration, toy_contract, toy_mirror
 
 NEW = ("ac_moe", "mcp", "him", "dreamwaq")

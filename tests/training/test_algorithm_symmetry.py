@@ -6,7 +6,7 @@ from gaitgauge.training.algorithms.symmetry import (
     SymmetryError,
     mirror_points,
 )
-from gaitgauge.training.height_scan import scan_pattern
+from gaitgauge.training.environment.height_scan import scan_pattern
 from toy_training import toy_mirror
 
 

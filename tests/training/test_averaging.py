@@ -3,12 +3,12 @@
 import pytest
 import torch
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.training.averaging import WeightAverage
-from gaitgauge.training.checkpoint import learned_networks, read_checkpoint, trim_checkpoint
 from gaitgauge.training.configuration import ConfigurationError
-from gaitgauge.training.resuming import begin_with, resume_run, stored_network
-from gaitgauge.training.runner import TrainingRunner
-from gaitgauge.training.seeding import seed_everything
+from gaitgauge.training.run.averaging import WeightAverage
+from gaitgauge.training.run.checkpoint import learned_networks, read_checkpoint, trim_checkpoint
+from gaitgauge.training.run.resuming import begin_with, resume_run, stored_network
+from gaitgauge.training.run.runner import TrainingRunner
+from gaitgauge.training.run.seeding import seed_everything
 from torch import nn
 from toy_training import ToyEnv, toy_configuration, toy_contract
 

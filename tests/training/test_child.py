@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from gaitgauge.training.side_process import CHILD_PROGRAM, PROGRAM
+from gaitgauge.training.run.side_process import CHILD_PROGRAM, PROGRAM
 
 SLEEPER = """
 import signal, sys, time
@@ -27,7 +27,7 @@ time.sleep(60)
 SIDE = f"""
 import time
 from pathlib import Path
-from gaitgauge.training.side_process import Job, SideProcess
+from gaitgauge.training.run.side_process import Job, SideProcess
 command = [*{CHILD_PROGRAM[:-1]}, "sleeper", "--of", "two"]
 SideProcess().submit(Job(command=command, checkpoint=Path("model_1.pt"), iteration=1, output=Path("side/1.txt")))
 time.sleep(60)
@@ -36,7 +36,7 @@ SCORER = """
 import sys, time
 from pathlib import Path
 from gaitgauge.policy.finding import PRETRAINED
-from gaitgauge.training.scoring import Scorer
+from gaitgauge.training.run.scoring import Scorer
 scorer = Scorer(Path("run"), suite="quick", threads=2)
 scorer.submit(PRETRAINED, 1)
 Path("group").write_text(str(scorer._side._running[1].pid))

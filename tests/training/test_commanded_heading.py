@@ -2,14 +2,14 @@
 
 import pytest
 import torch
-from gaitgauge.training.environment_configuration import (
+from gaitgauge.training.environment.configuration import (
     CommandConfiguration,
     CommandStage,
     Ramp,
     RewardConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge.training.height_scan import heading
+from gaitgauge.training.environment.height_scan import heading
 from gaitgauge_fake_engine import FakeScript
 from small_environment import gliding, idle, make
 

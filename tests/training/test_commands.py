@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.training.commands import COMMAND_COLUMNS, CommandGenerator, largest_commands
-from gaitgauge.training.environment_configuration import CommandConfiguration, CommandStage, Ramp
+from gaitgauge.training.environment.commands import COMMAND_COLUMNS, CommandGenerator, largest_commands
+from gaitgauge.training.environment.configuration import CommandConfiguration, CommandStage, Ramp
 
 COUNT = 40_000
 torch.set_num_threads(1)  # small tensors: threads only get in each other's way

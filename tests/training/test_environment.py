@@ -8,9 +8,7 @@ import torch
 from gaitgauge.robots.body_plan import joint_ranges
 from gaitgauge.robots.registry import load_robot
 from gaitgauge.training.configuration import ConfigurationError
-from gaitgauge.training.domain_randomization import MotorParameters
-from gaitgauge.training.environment import TrainingEnvironment
-from gaitgauge.training.environment_configuration import (
+from gaitgauge.training.environment.configuration import (
     CommandConfiguration,
     CommandStage,
     EnvironmentConfiguration,
@@ -21,6 +19,8 @@ from gaitgauge.training.environment_configuration import (
     RewardConfiguration,
     TerminationConfiguration,
 )
+from gaitgauge.training.environment.domain_randomization import MotorParameters
+from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge_fake_engine import FakeBackend, FakeScript
 from small_environment import FLAT, STAIRS, gliding, idle, make
 
@@ -301,7 +301,7 @@ def test_soft_limits_of_joint_speeds_are_a_share_of_the_motors_own():
 def test_joint_speeds_of_motors_that_nobody_knows_are_not_judged(monkeypatch):
     weights = RewardConfiguration(joint_speed_limits=-0.3)
     nobody_knows = replace(load_robot("go2").parameters["training"], no_load_speed=None, full_torque_speed=None)
-    monkeypatch.setattr("gaitgauge.training.environment.joint_parameters", lambda *_: nobody_knows)
+    monkeypatch.setattr("gaitgauge.training.environment.environment.joint_parameters", lambda *_: nobody_knows)
     with pytest.raises(
         ConfigurationError,
         match=r"^environment\.rewards\.joint_speed_limits is -0\.3, but .* 'go2' does not say .*, or set it to 0$",

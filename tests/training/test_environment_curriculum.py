@@ -5,15 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 from gaitgauge.terrains import TerrainError
-from gaitgauge.training.curriculum import assign_kinds, build_palette, next_level
-from gaitgauge.training.environment_configuration import (
+from gaitgauge.training.environment.configuration import (
     CommandConfiguration,
     CommandStage,
     Ramp,
     ScheduleConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge.training.terrain_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration, TileConfiguration
+from gaitgauge.training.environment.curriculum import assign_kinds, build_palette, next_level
+from gaitgauge.training.environment.terrain_configuration import (
+    ALL_TILES,
+    FLAT_TILE,
+    TerrainConfiguration,
+    TileConfiguration,
+)
 from gaitgauge_fake_engine import FakeScript
 from small_environment import STAIRS, gliding, idle, make
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from gaitgauge.training.configuration import ConfigurationError
-from gaitgauge.training.environment_configuration import (
+from gaitgauge.training.environment.configuration import (
     CommandConfiguration,
     CommandStage,
     PushConfiguration,

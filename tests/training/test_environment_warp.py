@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.training.environment import TrainingEnvironment
-from gaitgauge.training.environment_configuration import EnvironmentConfiguration
-from gaitgauge.training.step_inputs import AFTER_RESET, AFTER_STEP
+from gaitgauge.training.environment.configuration import EnvironmentConfiguration
+from gaitgauge.training.environment.environment import TrainingEnvironment
+from gaitgauge.training.environment.step_inputs import AFTER_RESET, AFTER_STEP
+from gaitgauge.training.environment.terrain_configuration import ALL_TILES, TerrainConfiguration
 from gaitgauge.training.tasks import find_task
-from gaitgauge.training.terrain_configuration import ALL_TILES, TerrainConfiguration
 
 torch.set_num_threads(1)
 

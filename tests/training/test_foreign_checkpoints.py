@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.native import ForeignFile, save_policy
-from gaitgauge.training.checkpoint import CheckpointError, rank_file, read_checkpoint, trim_checkpoint
-from gaitgauge.training.processes import Processes
-from gaitgauge.training.resuming import begin_with, resume_run
-from gaitgauge.training.runner import TrainingRunner
-from gaitgauge.training.seeding import random_state, restore_random_state
+from gaitgauge.training.run.checkpoint import CheckpointError, rank_file, read_checkpoint, trim_checkpoint
+from gaitgauge.training.run.processes import Processes
+from gaitgauge.training.run.resuming import begin_with, resume_run
+from gaitgauge.training.run.runner import TrainingRunner
+from gaitgauge.training.run.seeding import random_state, restore_random_state
 from small_environment import make
 from toy_training import ToyEnv, toy_configuration, toy_contract
 

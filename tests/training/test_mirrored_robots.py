@@ -11,7 +11,7 @@ from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.robots import load_robot, robot_names
 from gaitgauge.terrains.registry import make_terrain
 from gaitgauge.training.algorithms.symmetry import build_mirror
-from gaitgauge.training.environment_configuration import ObservationConfiguration
+from gaitgauge.training.environment.configuration import ObservationConfiguration
 
 ROBOTS = sorted(robot_names())
 LEFT_TO_RIGHT = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 from gaitgauge.robots import load_robot
-from gaitgauge.training.environment import training_contract
+from gaitgauge.training.environment.environment import training_contract
 from gaitgauge.training.overrides import TaskError, apply_overrides, override_keys
 from gaitgauge.training.tasks import TASKS, find_task
 

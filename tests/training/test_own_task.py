@@ -11,9 +11,7 @@ from gaitgauge.robots import load_robot
 from gaitgauge.terrains import training_tiles
 from gaitgauge.training.algorithms.symmetry import SymmetryError, build_mirror
 from gaitgauge.training.configuration import ConfigurationError
-from gaitgauge.training.curriculum import build_palette
-from gaitgauge.training.environment import training_contract
-from gaitgauge.training.environment_configuration import (
+from gaitgauge.training.environment.configuration import (
     EnvironmentConfiguration,
     OwnEvent,
     OwnObservation,
@@ -22,9 +20,11 @@ from gaitgauge.training.environment_configuration import (
     RewardConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge.training.own_terms import resolve
+from gaitgauge.training.environment.curriculum import build_palette
+from gaitgauge.training.environment.environment import training_contract
+from gaitgauge.training.environment.own_terms import resolve
+from gaitgauge.training.environment.terrain_configuration import TerrainConfiguration, TileConfiguration
 from gaitgauge.training.tasks import TaskError, find_task
-from gaitgauge.training.terrain_configuration import TerrainConfiguration, TileConfiguration
 from gaitgauge_fake_engine import FakeScript
 from small_environment import FLAT, idle, make, scripted_environment
 
@@ -92,7 +92,7 @@ def number(*_, **__): return 1.0
 def wide(*_, **__): return torch.zeros(2, 7)
 def long(*_, **__): return torch.zeros(99)
 class Plain: pass
-from gaitgauge.training.commands import CommandGenerator
+from gaitgauge.training.environment.commands import CommandGenerator
 class Late(CommandGenerator):
     def draw(self, *_, **__): raise OSError("\\x1b[31mno\\nline")
 class Strict(CommandGenerator):

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from gaitgauge.training.checkpoint import copy_checkpoint, rank_file
-from gaitgauge.training.environment_configuration import ScheduleConfiguration
-from gaitgauge.training.processes import Processes
-from gaitgauge.training.resuming import resume_run
-from gaitgauge.training.runner import TrainingRunner
-from gaitgauge.training.seeding import seed_everything
+from gaitgauge.training.environment.configuration import ScheduleConfiguration
+from gaitgauge.training.run.checkpoint import copy_checkpoint, rank_file
+from gaitgauge.training.run.processes import Processes
+from gaitgauge.training.run.resuming import resume_run
+from gaitgauge.training.run.runner import TrainingRunner
+from gaitgauge.training.run.seeding import seed_everything
 from small_environment import STAIRS, make
 from toy_training import toy_configuration
 

@@ -5,9 +5,9 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from gaitgauge.training.environment_configuration import Ramp, RewardConfiguration
-from gaitgauge.training.rewards import REWARD_TERMS, RewardFunction
-from gaitgauge.training.step_inputs import StepInputs
+from gaitgauge.training.environment.configuration import Ramp, RewardConfiguration
+from gaitgauge.training.environment.rewards import REWARD_TERMS, RewardFunction
+from gaitgauge.training.environment.step_inputs import StepInputs
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ import pytest
 import torch
 import yaml
 from gaitgauge.policy.native import StoredNetwork
-from gaitgauge.training.checkpoint import (
+from gaitgauge.training.run.checkpoint import (
     CheckpointError,
     checkpoint_entries,
     read_checkpoint,
     write_checkpoint,
 )
-from gaitgauge.training.run_directory import (
+from gaitgauge.training.run.run_directory import (
     describe_run,
     find_checkpoint,
     latest_checkpoint,
@@ -24,7 +24,7 @@ from gaitgauge.training.run_directory import (
     update_run_json,
     write_parameters,
 )
-from gaitgauge.training.seeding import random_state, restore_random_state, seed_everything
+from gaitgauge.training.run.seeding import random_state, restore_random_state, seed_everything
 from toy_training import toy_configuration, toy_contract
 
 

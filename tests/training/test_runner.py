@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.training.checkpoint import (
+from gaitgauge.training.run.checkpoint import (
     CheckpointError,
     checkpoint_entries,
     read_checkpoint,
     trim_checkpoint,
     write_checkpoint,
 )
-from gaitgauge.training.resuming import TrainingDivergedError, begin_with, resume_run, save_run, stored_network
-from gaitgauge.training.runner import TrainingRunner
-from gaitgauge.training.scoring import ScoreReport
-from gaitgauge.training.seeding import seed_everything
+from gaitgauge.training.run.resuming import TrainingDivergedError, begin_with, resume_run, save_run, stored_network
+from gaitgauge.training.run.runner import TrainingRunner
+from gaitgauge.training.run.scoring import ScoreReport
+from gaitgauge.training.run.seeding import seed_everything
 from toy_training import ToyEnv, toy_configuration, toy_contract, toy_mirror
 
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.training.algorithms.symmetry import build_mirror
-from gaitgauge.training.checkpoint import reached, read_checkpoint
-from gaitgauge.training.environment_configuration import ObservationConfiguration, Ramp
-from gaitgauge.training.resuming import resume_run
-from gaitgauge.training.runner import TrainingRunner
-from gaitgauge.training.seeding import seed_everything
+from gaitgauge.training.environment.configuration import ObservationConfiguration, Ramp
+from gaitgauge.training.run.checkpoint import reached, read_checkpoint
+from gaitgauge.training.run.resuming import resume_run
+from gaitgauge.training.run.runner import TrainingRunner
+from gaitgauge.training.run.seeding import seed_everything
 from small_environment import STAIRS, make
 from toy_training import toy_configuration
 

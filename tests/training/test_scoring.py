@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from gaitgauge.policy.finding import PRETRAINED
-from gaitgauge.training.filming import Filmer
-from gaitgauge.training.scoring import Scorer
-from gaitgauge.training.side_process import Job, SideProcess
+from gaitgauge.training.run.filming import Filmer
+from gaitgauge.training.run.scoring import Scorer
+from gaitgauge.training.run.side_process import Job, SideProcess
 
 
 def job(folder: Path, number: int, *command: str) -> Job:

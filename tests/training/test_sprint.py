@@ -5,9 +5,9 @@ import sys
 import pytest
 import sprint
 import torch
-from gaitgauge.gauge.trials.running import Trial
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
+from gaitgauge.studies.trials.running import Trial
 
 
 def trial(**known: object) -> Trial:

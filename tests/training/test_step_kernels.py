@@ -3,7 +3,7 @@
 import environment_throughput
 import pytest
 import torch
-from gaitgauge.training.environment_configuration import PushConfiguration
+from gaitgauge.training.environment.configuration import PushConfiguration
 from small_environment import STAIRS, idle, make
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.files.parsing import one_line
-from gaitgauge.gauge import charts
-from gaitgauge.training.checkpoint import CheckpointError
+from gaitgauge.gauge.report.page import charts
+from gaitgauge.training.run.checkpoint import CheckpointError
 from gaitgauge.training.sweep.curves import by_figure, curves_csv
 from gaitgauge.training.sweep.file import SweepEntry, SweepError, load_sweep
 from gaitgauge.training.sweep.folding import _entry, across_seeds, fold_sweep

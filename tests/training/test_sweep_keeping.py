@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from gaitgauge.gauge.policies import file_digest
 from gaitgauge.policy.finding import PRETRAINED, SHIPPED
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
+from gaitgauge.studies.policies import file_digest
 from gaitgauge.training.sweep.curves import kept_curves_csv, learning_curves
 from gaitgauge.training.sweep.file import Sweep, SweepEntry, SweepError, load_sweep
 from gaitgauge.training.sweep.folding import fold_sweep

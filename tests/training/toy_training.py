@@ -12,7 +12,7 @@ from gaitgauge.training.configuration import (
     RunConfiguration,
     TrainingConfiguration,
 )
-from gaitgauge.training.environment_configuration import ObservationConfiguration
+from gaitgauge.training.environment.configuration import ObservationConfiguration
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 

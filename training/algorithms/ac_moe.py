@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 
-from ...policy.layers import Experts, mixed
+from ...policy.networks.layers import Experts, mixed
 from ..configuration import NetworkConfiguration, TrainingConfiguration
 from ..networks import ComposedActor, StudentActor, ValueNetwork, Widths, composed_arguments
 from .cts import CTS, CtsLosses

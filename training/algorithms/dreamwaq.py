@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from ...policy.estimators import VELOCITY
-from ...policy.networks import multilayer_perceptron
+from ...policy.networks.architectures import multilayer_perceptron
+from ...policy.networks.estimators import VELOCITY
 from ..configuration import TrainingConfiguration
 from ..networks import Widths
 from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments

@@ -15,8 +15,8 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from ...policy.estimators import VELOCITY
-from ...policy.networks import multilayer_perceptron
+from ...policy.networks.architectures import multilayer_perceptron
+from ...policy.networks.estimators import VELOCITY
 from ..configuration import ConfigurationError, NetworkConfiguration, TrainingConfiguration
 from ..networks import StudentActor, ValueNetwork, Widths, last_in_float32, plain_arguments
 from .bootstrap import Bootstrap

@@ -17,8 +17,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from ...policy.estimators import VELOCITY
-from ...policy.networks import multilayer_perceptron
+from ...policy.networks.architectures import multilayer_perceptron
+from ...policy.networks.estimators import VELOCITY
 from ..configuration import HimConfiguration, TrainingConfiguration
 from ..networks import Widths
 from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments

@@ -13,11 +13,11 @@ import torch
 from tensordict import TensorDict
 
 from ...backends.graphs import RecordedFunction
-from ...policy.fence.archive import LARGEST_FILE
+from ...policy.foreign.fence.archive import LARGEST_FILE
 from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
+from ..environment.schedules import RampTable
 from ..networks import StudentActor, ValueNetwork, Widths
-from ..processes import Processes
-from ..schedules import RampTable
+from ..run.processes import Processes
 from .bootstrap import Bootstrap
 from .losses import Losses
 from .optimization import FlatGradients, load_moments, take_step

@@ -16,8 +16,8 @@ import torch
 from ...policy.contract import PolicyContract
 from ...robots.base import Robot
 from ...robots.body_plan import mirror_image
-from ..environment_configuration import ObservationConfiguration
-from ..height_scan import scan_pattern
+from ..environment.configuration import ObservationConfiguration
+from ..environment.height_scan import scan_pattern
 
 
 class SymmetryError(ValueError):

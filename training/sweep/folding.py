@@ -11,11 +11,11 @@ from typing import Any
 from scipy.stats import ttest_ind
 
 from ...files.writing import json_text, write_atomically
-from ...gauge import charts
-from ...gauge.comparison import ComparisonError, compare, format_p, holm, load_result
-from ...gauge.comparison_report import write_comparison
-from ...gauge.intervals import CONFIDENCE
-from ...gauge.pages import page_template
+from ...gauge.chance.intervals import CONFIDENCE
+from ...gauge.report import charts
+from ...gauge.report.pages import page_template
+from ...studies.compare.comparison import ComparisonError, compare, format_p, holm, load_result
+from ...studies.compare.report import write_comparison
 from .curves import Curve, by_figure, curves_csv, learning_curves
 from .file import Sweep, SweepError
 from .runs import RUN_ERRORS, SCORES, SweepRun, read_card, what_failed
@@ -163,7 +163,7 @@ def _page(data: Mapping[str, Any], figures: Mapping[str, Mapping[str, Sequence[C
     """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
     names = [entry["entry"] for entry in data["entries"]]
     groups = list(dict.fromkeys(g for e in data["entries"] if e["best"] for g in e["best"]["groups"] or {}))
-    return page_template("sweep.html.j2").render(
+    return page_template(__file__, "sweep.html.j2").render(
         sweep=data,
         groups=groups,
         names=names,

@@ -18,8 +18,8 @@ from typing import BinaryIO
 import torch
 
 from ...files.parsing import one_line
-from ..side_process import ENVIRONMENT, await_end, parent_pipe
-from ..stopping import STOP_SIGNALS, StopSignals
+from ..run.side_process import ENVIRONMENT, await_end, parent_pipe
+from ..run.stopping import STOP_SIGNALS, StopSignals
 from .file import Sweep, SweepError
 from .runs import RUN_ERRORS, SweepRun, what_failed
 

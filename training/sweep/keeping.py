@@ -15,10 +15,10 @@ from typing import Any
 from ...files.parsing import one_line
 from ...files.provenance import without_place
 from ...files.writing import json_text, make_folder, write_atomically
-from ...gauge.policies import file_digest
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...policy.importing import import_policy
+from ...studies.policies import file_digest
 from .curves import kept_curves_csv, learning_curves
 from .file import Sweep, SweepError
 from .runs import KEPT, KEPT_CURVES, KEPT_POLICY, RESULTS, RUN_ERRORS, SweepRun, read_card, what_failed

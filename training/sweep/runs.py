@@ -10,20 +10,20 @@ from typing import Any
 from ...backends.base import BackendError, DeviceError
 from ...files.parsing import one_line, read_results, shown
 from ...files.writing import json_text, make_folder, write_atomically
-from ...gauge.comparison import ComparisonError, load_result
-from ...gauge.policies import file_digest
 from ...gauge.suite import SuiteError, load_suite
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...policy.finding import latest_checkpoint
 from ...policy.loading import load_policy
 from ...policy.native import FilePolicy
-from ..checkpoint import CheckpointError
+from ...studies.compare.comparison import ComparisonError, load_result
+from ...studies.policies import file_digest
 from ..configuration import ConfigurationError
-from ..launch import TrainRequest, prepare
 from ..overrides import TaskError
-from ..run_directory import read_run_json
-from ..side_process import CHILD_PROGRAM
+from ..run.checkpoint import CheckpointError
+from ..run.launch import TrainRequest, prepare
+from ..run.run_directory import read_run_json
+from ..run.side_process import CHILD_PROGRAM
 from .file import NO_SUITE, Sweep, SweepEntry, SweepError
 
 KEPT = "kept"

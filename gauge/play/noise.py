@@ -1,0 +1,262 @@
+"""Random numbers of the episodes: observation noise and action latency, independent of batch order, device and threads."""
+
+from __future__ import annotations
+
+import random
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..episodes import Episode
+from ..suite import Noise
+
+TABLE_STEPS = 2000
+"""Control steps of a seed that are drawn in advance at a time."""
+BLOCK_STEPS = 32
+"""Control steps that are looked up for all worlds at a time."""
+
+
+class NoiseStream(ABC):
+    """Draws for K worlds: half widths times uniform numbers in [-1, 1), and delays. Every episode has a stream of its own."""
+
+    tables: tuple[torch.Tensor, ...] = ()
+    """Memory that ``draw`` reads, and that ``assign`` may replace by other memory."""
+
+    @abstractmethod
+    def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
+        """Read an episode's stream in a world, up to ``steps`` control steps from its start."""
+
+    @abstractmethod
+    def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Noise by observation term and delay [substeps] of every world.
+
+        Args:
+            step: place in each world's stream, in control steps, (…, K) int64.
+
+        Returns:
+            ``{term: (…, K, width)}`` in physical units, and (…, K) int64.
+        """
+
+
+class ReferenceStream(NoiseStream):
+    """Python's generator seeded with the episode's seed, drawn in the published order (gauge protocol §4).
+
+    A control step draws uniform numbers for joint positions, joint velocities, base and imu linear velocity and base and
+    imu angular velocity (all in that order), then one whole number for the delay, whatever the episode does. Episodes of
+    one seed therefore share one table. What no observation contains is drawn and forgotten.
+    """
+
+    def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
+        self._noise, self._joints, self._device = noise, joints, device
+        self._seeds: dict[int, int] = {}
+        self._generators: list[_PythonGenerator] = []
+        self._length = 0
+        self._uniform = torch.zeros(0, 0, 2 * joints + 3, device=device)
+        self._delays = torch.zeros(0, 0, dtype=torch.int64, device=device)
+        self._row = torch.zeros(worlds, dtype=torch.int64, device=device)
+        half = [noise.joint_position] * joints + [noise.joint_velocity] * joints + [0.05] * 3
+        half += [noise.base_angular_velocity] * 3 + [0.05] * 3 + [noise.base_angular_velocity] * 3
+        self._half = half
+        self._observed = [*range(2 * joints), *range(len(half) - 3, len(half))]
+
+    def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
+        """See ``NoiseStream.assign``."""
+        if steps > self._length:
+            more = -(-(steps - self._length) // TABLE_STEPS) * TABLE_STEPS
+            uniform, delays = self._tables(self._generators, more)
+            self._uniform = torch.cat((self._uniform, uniform), dim=1)
+            self._delays = torch.cat((self._delays, delays), dim=1)
+            self._length += more
+        if episode.seed not in self._seeds:
+            generator = _PythonGenerator(episode.seed)
+            uniform, delays = self._tables([generator], self._length)
+            self._seeds[episode.seed] = len(self._seeds)
+            self._generators.append(generator)
+            self._uniform = torch.cat((self._uniform, uniform))
+            self._delays = torch.cat((self._delays, delays))
+        self._row[world] = self._seeds[episode.seed]
+
+    @property
+    def tables(self) -> tuple[torch.Tensor, ...]:  # type: ignore[override]
+        """See ``NoiseStream.tables``."""
+        return self._uniform, self._delays
+
+    def _tables(self, generators: Sequence[_PythonGenerator], count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """The next ``count`` control steps of some generators: (G, count, W) in physical units, and delays (G, count)."""
+        uniform = np.zeros((len(generators), count, len(self._observed)), dtype=np.float32)
+        delays = np.zeros((len(generators), count), dtype=np.int64)
+        half = [self._half[column] for column in self._observed]
+        for row, generator in enumerate(generators):
+            unit, delays[row] = generator.draw(count, len(self._half), self._noise.latency, self._observed)
+            uniform[row] = low_to_high(unit, half)
+        return torch.tensor(uniform, device=self._device), torch.tensor(delays, device=self._device)
+
+    def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """See ``NoiseStream.draw``. A place beyond what was asked for with ``assign`` gives some other numbers."""
+        at = torch.clamp(self._row * self._length + step, max=len(self._seeds) * self._length - 1)
+        values = self._uniform.flatten(0, 1).index_select(0, at.flatten()).view(*step.shape, -1)
+        j = self._joints
+        terms = {
+            "joint_position": values[..., :j],
+            "joint_velocity": values[..., j : 2 * j],
+            "base_angular_velocity_b": values[..., -3:],
+        }
+        return terms, self._delays.flatten()[at]
+
+
+class _PythonGenerator:
+    """Many draws of ``random.Random(seed)`` at once: the same Mersenne twister, read as whole words through NumPy."""
+
+    def __init__(self, seed: int) -> None:
+        state = random.Random(seed).getstate()[1]
+        self._twister = np.random.MT19937()
+        self._twister.state = {
+            "bit_generator": "MT19937",
+            "state": {"key": np.array(state[:-1], dtype=np.uint32), "pos": state[-1]},
+        }
+        self._words = np.zeros(0, dtype=np.uint64)
+
+    def draw(
+        self, count: int, width: int, most: int, wanted: Sequence[int] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """``count`` times ``width`` calls of ``random()`` followed by one of ``randint(0, most)``.
+
+        Args:
+            width: calls of ``random()`` in a row.
+            most: largest whole number.
+            wanted: columns of the ``width`` to return, None for all.
+
+        Returns:
+            (count, columns) in [0, 1), and (count,).
+        """
+        bits = (most + 1).bit_length()
+        begins: list[int] = []
+        ends: list[int] = []
+        at = 0
+        # ``randint`` draws again until the number is small enough, so a row's length shows when its last word is read
+        self._need(count * (2 * width + 4))
+        numbers = self._words >> np.uint64(32 - bits)
+        while len(begins) < count:
+            last = at + 2 * width
+            while True:
+                if last >= len(numbers):
+                    self._need(len(self._words) + 1)
+                    numbers = self._words >> np.uint64(32 - bits)
+                if numbers[last] <= most:
+                    break
+                last += 1
+            begins.append(at)
+            ends.append(last)
+            at = last + 1
+        columns = np.arange(width) if wanted is None else np.asarray(wanted)
+        first = np.asarray(begins, dtype=np.int64)[:, None] + 2 * columns
+        high, low = self._words[first] >> np.uint64(5), self._words[first + 1] >> np.uint64(6)
+        whole = numbers[np.asarray(ends, dtype=np.int64)].astype(np.int64)
+        self._words = self._words[at:]
+        return (high * 67108864.0 + low) / 9007199254740992.0, whole
+
+    def _need(self, words: int) -> None:
+        """Have at least so many words at hand."""
+        if len(self._words) < words:
+            more = self._twister.random_raw(max(words - len(self._words), 1 << 12))
+            self._words = np.concatenate((self._words, more))
+
+
+def low_to_high(unit: NDArray[np.float64], half: Sequence[float]) -> NDArray[np.float64]:
+    """Numbers in [0, 1) as ``random.uniform(-half, half)`` maps them; ``unit`` (…, W), ``half`` (W,)."""
+    low = -np.asarray(half)
+    return low + (np.asarray(half) - low) * unit
+
+
+class CounterStream(NoiseStream):
+    """A hash of (episode, control step, index): every episode has a stream of its own, with no state to carry."""
+
+    def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
+        self._noise = noise
+        self._key = torch.zeros(worlds, dtype=torch.int64, device=device)
+        terms = {
+            "joint_position": (joints, noise.joint_position),
+            "joint_velocity": (joints, noise.joint_velocity),
+            "base_angular_velocity_b": (3, noise.base_angular_velocity),
+            "projected_gravity_b": (3, noise.projected_gravity),
+            "base_linear_velocity_b": (3, noise.base_linear_velocity),
+        }
+        self._widths = {name: width for name, (width, _) in terms.items()}
+        half = [value for width, value in terms.values() for _ in range(width)]
+        self._half = torch.tensor(half, device=device)
+        self._index = torch.arange(len(half) + 1, dtype=torch.int64, device=device)
+
+    def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
+        """See ``NoiseStream.assign``."""
+        low, high = zlib.crc32(episode.key.encode()), zlib.crc32(episode.key[::-1].encode())
+        self._key[world] = (high << 31) ^ low
+
+    def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """See ``NoiseStream.draw``."""
+        unit = uniform_hash(self._key[:, None], step[..., None], self._index)
+        delay = (unit[..., -1] * (self._noise.latency + 1)).to(torch.int64)
+        values = (2.0 * unit[..., :-1] - 1.0) * self._half
+        return dict(zip(self._widths, values.split(list(self._widths.values()), dim=-1), strict=True)), delay
+
+
+def uniform_hash(key: torch.Tensor, step: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """Uniform numbers in [0, 1) from integers, the same on every device (the SplitMix64 finalizer over a Weyl sequence).
+
+    Arguments are int64 and broadcast against each other; returns float32 with 24 random bits.
+    """
+    state = key + step * 0x5851F42D4C957F2D + index * -0x61C8864680B583EB
+    state = (state ^ _shift(state, 30)) * -0x40A7B892E31B1A47
+    state = (state ^ _shift(state, 27)) * -0x6B2FB644ECCEEE15
+    state = state ^ _shift(state, 31)
+    return _shift(state, 40).to(torch.float32) / float(1 << 24)
+
+
+def _shift(value: torch.Tensor, bits: int) -> torch.Tensor:
+    """Logical right shift of int64."""
+    return (value >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def make_stream(noise: Noise, joints: int, worlds: int, device: torch.device) -> ReferenceStream | CounterStream:
+    """The stream that a suite asks for."""
+    return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, worlds, device)
+
+
+class NoiseReader:
+    """Reads K streams step by step, many steps at a time."""
+
+    def __init__(self, stream: NoiseStream, worlds: int, device: torch.device) -> None:
+        self._stream = stream
+        self._device = device
+        self._offset = torch.zeros(worlds, dtype=torch.int64, device=device)
+        self._ahead = torch.arange(BLOCK_STEPS, device=device)[:, None]
+        self._block: list[tuple[dict[str, torch.Tensor], torch.Tensor]] = []
+        self._now = 0
+
+    def begin(self, worlds: Sequence[int], episodes: Sequence[Episode], starts: Sequence[int], steps: int) -> None:
+        """Let some worlds read other streams from the next step on.
+
+        Args:
+            starts: the places in them at which to begin, in control steps.
+            steps: none of them reads more than this number of control steps.
+        """
+        for world, episode, start in zip(worlds, episodes, starts, strict=True):
+            self._stream.assign(world, episode, start + steps)
+        at = torch.tensor(worlds, device=self._device)
+        self._offset[at] = torch.tensor(starts, device=self._device) - self._now
+        self._block = []
+
+    def next(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Noise by observation term, (K, width), and delays, (K,), of the next control step."""
+        if not self._block:
+            terms, delays = self._stream.draw(self._now + self._ahead + self._offset)
+            columns = [value.unbind(0) for value in terms.values()]
+            self._block = [
+                (dict(zip(terms, values, strict=True)), delay)
+                for *values, delay in reversed(list(zip(*columns, delays.unbind(0), strict=True)))
+            ]
+        self._now += 1
+        return self._block.pop()

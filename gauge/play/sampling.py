@@ -1,0 +1,154 @@
+"""What the metrics need to know of each sample, kept while a segment runs; the metrics themselves are worked out at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...backends.base import PhysicsState
+from ...robots.base import Robot
+from ..metrics import MetricEvaluator, SampledState
+from ..suite import Suite
+from .self_contact import SelfContact
+
+GRAVITY = 9.81
+"""[m/s²]; turns the robot's mass into its weight."""
+_MOTION = ("base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity_b")
+_JOINTS = ("joint_position", "joint_velocity", "joint_torque")
+_CONTACTS = ("ground_moment_w", "ground_force_w", "foot_normal_force", "foot_tangential_force")
+
+Samples = tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]
+"""Metrics and quality of T samples, (T, columns), NaN where a metric is not defined; which of them count, and in which parts of the
+robot touch each other, (T,)."""
+
+
+class SampleTable:
+    """Samples of K worlds. A world's rows depend on its own segment alone, and so do the metrics worked out from them."""
+
+    def __init__(
+        self,
+        suite: Suite,
+        robot: Robot,
+        weight: float,
+        worlds: int,
+        device: torch.device,
+        dtype: torch.dtype,
+        *,
+        one_by_one: bool,
+    ) -> None:
+        """Prepare the table; ``reserve`` gives it rows.
+
+        Args:
+            weight: its weight [N].
+            one_by_one: evaluate metrics segment by segment. In a CPU's vector units the last bit may depend on who else is in a
+                batch, while a GPU evaluates all segments at once.
+        """
+        self._metrics = MetricEvaluator(suite.metrics, robot, weight, device, dtype)
+        self.names = self._metrics.names
+        self._self_contact = SelfContact(robot)
+        self._between_samples = suite.metrics.smoothness == "samples"
+        joints, feet = robot.num_joints, len(robot.foot_names)
+        self._fields: tuple[str, ...] = _MOTION + _JOINTS
+        self._widths = [4, 3, 3, joints, joints, joints]
+        if self._metrics.needs_contacts:
+            self._fields += _CONTACTS
+            self._widths += [3, 3, feet, feet]
+        # then the command, the torque before, whether that is known, and whether the sample counts
+        self._split = [*self._widths, 3, joints, 1, 1]
+        self._worlds, self._device, self._dtype, self._one_by_one = worlds, device, dtype, one_by_one
+        self.rows = torch.zeros(0, 0, device=device, dtype=dtype)
+        """All rows, one world's after the other's; other memory after ``reserve``."""
+        self._begin = torch.zeros(worlds, dtype=torch.int64, device=device)
+        self.capacity = 0
+        """Rows of each world."""
+        self.count = torch.zeros(worlds, dtype=torch.int64, device=device)
+        """Rows that each world has filled, (K,)."""
+        self._torque = torch.zeros(worlds, joints, device=device, dtype=dtype)
+        self._torque_known = torch.zeros(worlds, dtype=torch.bool, device=device)
+
+    def reserve(self, rows: int) -> None:
+        """Have room for segments of so many samples."""
+        if rows <= self.capacity:
+            return
+        # one row more, for worlds that have no sample to write
+        table = torch.zeros(self._worlds, rows + 1, sum(self._split), device=self._device, dtype=self._dtype)
+        if self.capacity:
+            table[:, : self.capacity] = self.rows.view(self._worlds, self.capacity + 1, -1)[:, :-1]
+        self.rows, self.capacity = table.flatten(0, 1), rows
+        self._begin = torch.arange(self._worlds, device=self._device) * (rows + 1)
+
+    def clear(self, mask: torch.Tensor) -> None:
+        """Forget the samples of some worlds, (K,) bool."""
+        self.count.masked_fill_(mask, 0)
+
+    def forget_torque(self, mask: torch.Tensor) -> None:
+        """Some robots, (K,) bool, were reset: there is no torque to compare their next one with."""
+        self._torque_known &= ~mask
+
+    def write(self, sample: PhysicsState, due: torch.Tensor, keep: torch.Tensor, command: torch.Tensor) -> None:
+        """Write a row for every world whose sample is due.
+
+        Args:
+            sample: the state at which it is taken; the other worlds' rows do not matter.
+            due: (K,) bool; none may be before ``reserve``.
+            keep: whether it counts, (K,) bool.
+            command: commanded velocities, (K, 3).
+        """
+        if not self.capacity:
+            return
+        values = [getattr(sample, name) for name in self._fields]
+        flags = torch.stack((self._torque_known, keep), dim=1)
+        row = torch.cat((*values, command, self._torque, flags), dim=1)
+        at = torch.clamp(self.count, max=self.capacity - 1).masked_fill_(~due, self.capacity)
+        self.rows.index_copy_(0, self._begin + at, row)
+        self.count += due
+        if self._between_samples:
+            self._torque.copy_(torch.where(due[:, None], sample.joint_torque, self._torque))
+            self._torque_known |= due
+
+    def end_step(self, state: PhysicsState, active: torch.Tensor) -> None:
+        """A control step has ended: its torque is the one to compare with, where the suite says so."""
+        if not self._between_samples:
+            self._torque.copy_(state.joint_torque)
+            self._torque_known |= active
+
+    def read(
+        self, worlds: Sequence[int], counts: Sequence[int], limits: torch.Tensor, friction: torch.Tensor
+    ) -> list[Samples]:
+        """What the metrics say of some worlds' first samples.
+
+        Args:
+            counts: number of samples T of each, at least 1.
+            limits: command limits of all worlds' segments, (K, 3).
+            friction: their friction coefficients, (K,).
+        """
+        owner = np.repeat(worlds, counts)
+        first = np.repeat(np.asarray(worlds) * (self.capacity + 1) - np.cumsum(counts) + counts, counts)
+        at, world = torch.tensor(np.stack((first + np.arange(len(owner)), owner)), device=self._device)
+        batches = [[count] for count in counts] if self._one_by_one else [list(counts)]
+        mine = self.rows[at]
+        rows = [x.split([sum(batch) for batch in batches]) for x in (mine, limits[world], friction[world])]
+        values = torch.cat([self._evaluate(*batch) for batch in zip(*rows, batches, strict=True)])
+        poses = mine.split(self._split, dim=1)[self._fields.index("joint_position")].cpu().numpy()
+        ends = np.cumsum(counts)[:-1]
+        pieces = zip(
+            np.split(values.cpu().numpy(), ends), np.split(self._self_contact.touching(poses), ends), strict=True
+        )
+        return [(piece[:, :-1], piece[:, -1] > 0, touching) for piece, touching in pieces]
+
+    def _evaluate(
+        self, rows: torch.Tensor, limits: torch.Tensor, friction: torch.Tensor, counts: Sequence[int]
+    ) -> torch.Tensor:
+        """Metrics and quality of rows of the table, then whether they count, (N, columns + 1) float32.
+
+        The rows are those of some segments, one after the other, with so many samples each.
+        """
+        *values, command, before, known, keep = rows.split(self._split, dim=1)
+        if not self._metrics.needs_contacts:
+            values += [values[0][:, :0]] * len(_CONTACTS)
+        state = SampledState(**dict(zip(_MOTION + _JOINTS + _CONTACTS, values, strict=True)))
+        metrics = self._metrics.evaluate(state, command, limits, friction, before, known[:, 0] > 0)
+        return torch.cat((self._metrics.with_quality(metrics, keep[:, 0] > 0, counts), keep), dim=1).to(torch.float32)

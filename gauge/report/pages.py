@@ -1,0 +1,63 @@
+"""Render pages from templates. Every value is shown as text and never becomes markup."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from ...files.parsing import edited, read_results
+from ...files.writing import write_atomically
+from ..store import StoreError
+
+
+@cache
+def page_template(module: str, name: str, **filters: Callable[..., object]) -> jinja2.Template:
+    """Return a template, compiled once.
+
+    Args:
+        module: ``__file__`` of the caller; its folder ``templates/`` is searched first, then the one beside this module, which
+            holds the style sheet and the charts of all pages.
+        name: file in one of these folders.
+        filters: functions of a module that the template calls by these names, beside ``fixed``.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader([Path(file).parent / "templates" for file in (module, __file__)]),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"fixed": fixed} | filters
+    return environment.get_template(name)
+
+
+def page_of(source: Path, name: str, render: Callable[[dict[str, Any]], str], *, command: str) -> Path:
+    """Write the page of a finished run beside the file that it shows, all or nothing.
+
+    Args:
+        source: what the run found, JSON.
+        command: of ``gaitgauge`` that writes ``source``, for who lacks it.
+
+    Raises:
+        StoreError: the folder holds no such file, or a damaged one, or one of another version.
+    """
+    folder = source.parent
+    if not source.exists():
+        raise StoreError(f"{folder} holds no {source.name}; run gaitgauge {command} with --out {folder} first")
+    try:
+        results = read_results(source, "results", StoreError)
+        with edited(str(source), StoreError, jinja2.TemplateError):
+            text = render(results)
+    except StoreError as error:
+        raise StoreError(f"{error}; run gaitgauge {command} again with --resume") from error
+    write_atomically(folder / name, text, StoreError)
+    return folder / name
+
+
+def fixed(value: float | None, digits: int = 4) -> str:
+    """A number with fixed decimals; a dash for what does not exist."""
+    return "–" if value is None else f"{value:.{digits}f}".replace("-", "−")

@@ -1,0 +1,67 @@
+"""Scores of known policies, to be shown beside a score of the same suite."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from ...files.parsing import Name, Share, Text, build, parse_toml, read_text
+from ..coverage import COMPLETE, coverage_of
+
+_FILE = Path(__file__).parent / "references.toml"
+
+
+class ReferenceScoreError(ValueError):
+    """The table of reference scores is malformed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceScore:
+    """One policy on one suite."""
+
+    suite: Name
+    """The suite's name."""
+    version: Name
+    """The suite's version: others do not compare."""
+    policy: Text
+    """Which policy, in words."""
+    score: Share
+    """Of the whole suite."""
+    source: Text
+    """Who says so."""
+    interval: tuple[Share, Share] | None = None
+    """95 % interval of the score, where it is known."""
+    file_sha256: Name | None = None
+    """The policy's file, where it is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceTable:
+    """All of them."""
+
+    reference: tuple[ReferenceScore, ...]
+    """In the order of the file."""
+
+
+@cache
+def reference_table() -> ReferenceTable:
+    """The scores that ship with the project.
+
+    Raises:
+        ReferenceScoreError: the file is malformed.
+    """
+    data = parse_toml(read_text(_FILE, "reference file", ReferenceScoreError), _FILE.name, ReferenceScoreError)
+    return build(ReferenceTable, data, _FILE.name, ReferenceScoreError)
+
+
+def references_for(results: Mapping[str, Any]) -> Sequence[ReferenceScore]:
+    """Scores that compare with some results, the best first: of the same suite, where they hold all of it; not of the same file."""
+    if results["score"] is None or coverage_of(results)["kind"] != COMPLETE:
+        return ()
+    suite = (results["suite"]["name"], results["suite"]["version"])
+    own = results["policy"]["file_sha256"]
+    found = [r for r in reference_table().reference if (r.suite, r.version) == suite and r.file_sha256 != own]
+    return sorted(found, key=lambda r: -r.score)

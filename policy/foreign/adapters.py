@@ -1,0 +1,418 @@
+"""Contracts for policies that come without one: what their files, sidecars and widths tell.
+
+Every adapter notes in the contract's provenance where it took the facts from and what it had to assume.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ...files.parsing import parse_toml, parse_yaml, read_text
+from ...robots.base import Robot
+from ..base import PolicyError
+from ..contract import (
+    ContractError,
+    History,
+    HistoryOrder,
+    ObservationTerm,
+    PolicyContract,
+    reordered,
+    standard_contract,
+)
+from ..native import StoredNetwork
+
+AT_ONCE = 1.0
+"""Time after standing within which a fall says that the policy is run wrongly [s]."""
+# Observation terms as Isaac Lab and mjlab name them.
+FOREIGN_TERMS: Mapping[str, str] = {
+    "base_lin_vel": "base_linear_velocity_b",
+    "base_ang_vel": "base_angular_velocity_b",
+    "projected_gravity": "projected_gravity_b",
+    "velocity_commands": "command",
+    "command": "command",
+    "joint_pos_rel": "joint_position",
+    "joint_pos": "joint_position",
+    "joint_vel_rel": "joint_velocity",
+    "joint_vel": "joint_velocity",
+    "last_action": "last_action",
+    "actions": "last_action",
+}
+
+LONGEST_HISTORY = 20
+
+
+def sidecar_contract(path: Path) -> PolicyContract | None:
+    """The contract in ``<stem>.contract.json`` or ``contract.json`` beside a policy file, None if there is neither.
+
+    Raises:
+        PolicyError: the sidecar is malformed.
+    """
+    for sidecar in (path.with_name(f"{path.stem}.contract.json"), path.with_name("contract.json")):
+        if sidecar.is_file():
+            try:
+                return PolicyContract.from_json(read_text(sidecar, "contract", PolicyError))
+            except ContractError as error:
+                raise PolicyError(f"'{sidecar}' is not a policy contract: {error}") from error
+    return None
+
+
+def described_contract(path: Path, robot: Robot) -> PolicyContract:
+    """Read a ``contract.toml``: fields of ``PolicyContract``, of which those left out are the robot's standard ones. Where
+    it lists the joints in an order of its own, standard values per joint go with their joints.
+
+    Raises:
+        PolicyError: no such file, or a field is unknown or malformed.
+    """
+    source = f"contract file '{path}'"
+    data = parse_toml(read_text(path, "contract file", PolicyError), source, PolicyError)
+    provenance = {"adapter": "contract.toml", "file": path.name}
+    standard = standard_contract(robot, provenance=provenance)
+    names = data.get("joint_names")
+    if isinstance(names, list) and len(names) == robot.num_joints and all(n in names for n in robot.joint_names):
+        standard = reordered(standard, names)
+    try:
+        return PolicyContract.from_dict({**standard.to_dict(), **data})
+    except ContractError as error:
+        raise PolicyError(f"{source} is wrong: {error}") from error
+
+
+def contract_for_width(
+    width: int, robot: Robot, *, order: HistoryOrder, provenance: Mapping[str, Any], source: str
+) -> PolicyContract:
+    """The standard contract with as many frames as an input of this width holds.
+
+    Raises:
+        PolicyError: the width is not that of 1 to ``LONGEST_HISTORY`` frames.
+    """
+    frame = standard_contract(robot).frame_width
+    frames, rest = divmod(width, frame)
+    if rest or not 1 <= frames <= LONGEST_HISTORY:
+        raise PolicyError(
+            f"'{source}' takes {width} values, which is no multiple of the standard observation's {frame}; "
+            "put a contract.json beside it that describes its observation"
+        )
+    history = History(length=frames, order=order if frames > 1 else "frame-major")
+    assumed = f"{frames} frame(s) of the standard observation of {frame} entries, {history.order}; gains of the robot"
+    return standard_contract(robot, history=history, provenance={**provenance, "assumed": assumed})
+
+
+def assumptions(contract: PolicyContract) -> str | None:
+    """What had to be taken for granted of a policy that does not say it, as one sentence; None where nothing was."""
+    if "assumed" not in contract.provenance:
+        return None
+    scales = ", ".join(f"{t.name} × {', '.join(f'{s:g}' for s in t.scale)}" for t in contract.observation)
+    joints = ", ".join(name.removesuffix("_joint") for name in contract.joint_names)
+    gains = " and ".join(
+        f"{letter} {min(v):g}" + (f" to {max(v):g}" if min(v) != max(v) else "")
+        for letter, v in (("kp", contract.stiffness), ("kd", contract.damping))
+    )
+    history = contract.history
+    frames = (
+        "the current frame alone"
+        if history.length == 1
+        else f"{history.length} frames, {history.order}, starting with {history.start}"
+    )
+    return (
+        f"taken for granted ({contract.provenance['assumed']}): history {frames}; joints {joints}; observation {scales}; "
+        f"action scale {min(contract.action_scale):g} rad, gains {gains}; where this is wrong the robot falls: put a "
+        "contract.json or deploy.yaml beside the file that says it"
+    )
+
+
+def doubt(contract: PolicyContract) -> str:
+    """What to do where the robot falls within ``AT_ONCE`` of standing, and what was taken for granted of its policy."""
+    taken = assumptions(contract)
+    return "'gaitgauge doctor POLICY' tries what may be wrong" + (f"; {taken}" if taken else "")
+
+
+def find_deploy_file(path: Path) -> Path | None:
+    """The ``deploy.yaml`` that belongs to an ONNX file: beside it, or in ``params/`` next to the folder of exports."""
+    candidates = (
+        path.with_name(f"{path.stem}.deploy.yaml"),
+        path.with_name("deploy.yaml"),
+        path.parent / "params" / "deploy.yaml",
+        path.parent.parent / "params" / "deploy.yaml",
+    )
+    return next((c for c in candidates if c.is_file()), None)
+
+
+def deploy_contract(path: Path, robot: Robot) -> PolicyContract:
+    """Read a ``deploy.yaml`` as Unitree's and Isaac Lab's exporters write it.
+
+    In it ``stiffness`` and ``damping`` are in the order of the robot's SDK, everything else is in the policy's; entry i
+    of ``joint_ids_map`` is the SDK's number of the policy's joint i. Histories are term-major unless
+    ``use_gym_history`` is set, and start with copies of the first observation. Clipping comes before scaling unless
+    ``scale_first`` is set; a clip of the action limits the joint target.
+
+    Raises:
+        PolicyError: the file is malformed, or asks for something that a contract cannot express.
+    """
+    data = parse_yaml(read_text(path, "deploy file", PolicyError), f"'{path}'", PolicyError)
+    try:
+        return _deploy_contract(data, path, robot)
+    except ContractError as error:
+        raise PolicyError(f"'{path}' does not give a valid policy contract: {error}") from error
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        if isinstance(error, PolicyError):
+            raise
+        raise PolicyError(f"'{path}' lacks or garbles an entry of a deploy.yaml: {error!r}") from error
+
+
+def _deploy_contract(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
+    names = _deploy_joints(data, path, robot)
+    sdk = [int(i) for i in data["joint_ids_map"]]
+    default = [float(v) for v in data["default_joint_pos"]]
+    action = data["actions"]["JointPositionAction"]
+    offset = action.get("offset") or default
+    if max((abs(o - d) for o, d in zip(offset, default, strict=True)), default=0.0) > 1e-6:
+        raise PolicyError(
+            f"'{path}' has an action offset other than default_joint_pos, which a policy contract cannot express"
+        )
+    clip = action.get("clip")
+    ranges = ((data.get("commands") or {}).get("base_velocity") or {}).get("ranges") or {}
+    limits = [
+        max(abs(float(v)) for v in ranges[axis]) if ranges.get(axis) else robot.command_limits[i]
+        for i, axis in enumerate(("lin_vel_x", "lin_vel_y", "ang_vel_z"))
+    ]
+    settings = dict(data["observations"])
+    frame_major = bool(settings.pop("use_gym_history", False))
+    scale_first = bool(settings.pop("scale_first", False))
+    terms, lengths = [], set()
+    for name, term in settings.items():
+        own, scale = _own_term(name, path), tuple(float(s) for s in _listed(term.get("scale"), 1.0))
+        clip_of_term = None
+        if (given := term.get("clip")) is not None:
+            limit = _limit(float(given[0]), float(given[1]), name, path)
+            clip_of_term = (limit,) if scale_first else tuple(limit * abs(s) for s in scale)
+        terms.append(ObservationTerm(name=own, scale=scale, clip=clip_of_term))
+        lengths.add(int(term.get("history_length") or 1))
+    length = _one_length(lengths, path)
+    order: HistoryOrder = "frame-major" if frame_major or length == 1 else "term-major"
+    return PolicyContract(
+        robot=robot.name,
+        joint_names=names,
+        default_joint_position=tuple(default),
+        action_scale=tuple(float(v) for v in _listed(action.get("scale"), 1.0, len(names))),
+        target_range=tuple((float(low), float(high)) for low, high in clip) if clip else None,
+        stiffness=tuple(float(data["stiffness"][i]) for i in sdk),
+        damping=tuple(float(data["damping"][i]) for i in sdk),
+        control_period=float(data["step_dt"]),
+        observation=tuple(terms),
+        history=History(length=length, order=order, start="repeat"),
+        command_limits=(limits[0], limits[1], limits[2]),
+        provenance={"adapter": "deploy.yaml", "file": path.name},
+    )
+
+
+def _deploy_joints(data: Any, path: Path, robot: Robot) -> tuple[str, ...]:
+    if not isinstance(data, Mapping):
+        raise PolicyError(f"'{path}' holds no table of settings")
+    numbered = robot.sdk_joint_names
+    if numbered is None:
+        raise PolicyError(
+            f"'{path}' numbers joints as the maker's SDK does, which the description of robot '{robot.name}' does not say; "
+            "add sdk_joint_names to its robot.toml"
+        )
+    order = list(data["joint_ids_map"])
+    if sorted(order) != list(range(len(numbered))):
+        raise PolicyError(
+            f"'{path}' has joint_ids_map {order}; every number from 0 to {len(numbered) - 1} is needed once"
+        )
+    return tuple(numbered[i] for i in order)
+
+
+def matching_joint(name: str, robot: Robot) -> str:
+    """The robot's joint of this name, with or without the ending ``_joint``; the name itself if the robot has none
+    such.
+    """
+    bare = name.removesuffix("_joint")
+    return next((j for j in robot.joint_names if j.removesuffix("_joint") == bare), name)
+
+
+def _listed(value: Any, missing: float, count: int = 1) -> list[float]:
+    if value is None:
+        return [missing] * count
+    return list(value) if isinstance(value, (list, tuple)) else [value] * count
+
+
+def _own_term(name: str, source: object) -> str:
+    """The project's name of an observation."""
+    if name not in FOREIGN_TERMS:
+        raise PolicyError(f"'{source}' asks for the observation '{name}'; supported are: {', '.join(FOREIGN_TERMS)}")
+    return FOREIGN_TERMS[name]
+
+
+def _limit(low: float, high: float, name: str, source: object) -> float:
+    """The magnitude that an observation is clipped to."""
+    if low != -high:
+        raise PolicyError(
+            f"'{source}' clips the observation '{name}' to [{low}, {high}]; only symmetric limits are supported"
+        )
+    return high
+
+
+def _one_length(lengths: set[int], source: object) -> int:
+    """The length that the histories of all observations have."""
+    if len(lengths) > 1:
+        raise PolicyError(
+            f"'{source}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
+        )
+    return lengths.pop() if lengths else 1
+
+
+def mjlab_contract(metadata: Mapping[str, str], robot: Robot, *, source: str) -> PolicyContract | None:
+    """Read the metadata that mjlab's exporter writes into an ONNX file; None if they are not there.
+
+    Histories are term-major and start with copies of the first observation. The command limits are the robot's and the
+    control period is 0.02 s, mjlab's, because the metadata name neither.
+
+    Raises:
+        PolicyError: the metadata are incomplete or malformed.
+    """
+    if "observation_names" not in metadata or "joint_names" not in metadata:
+        return None
+    try:
+        return _mjlab_contract(metadata, robot, source)
+    except ContractError as error:
+        raise PolicyError(f"the metadata of '{source}' do not give a valid policy contract: {error}") from error
+    except (KeyError, IndexError, ValueError, OverflowError) as error:
+        if isinstance(error, PolicyError):
+            raise
+        raise PolicyError(f"the metadata of '{source}' lack or garble an entry: {error!r}") from error
+
+
+def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> PolicyContract:
+    def words(key: str, default: str = "") -> list[str]:
+        return [w.strip() for w in metadata.get(key, default).split(",") if w.strip()]
+
+    names = tuple(matching_joint(n, robot) for n in words("joint_names"))
+    observations = words("observation_names")
+    own = [_own_term(name, source) for name in observations]
+    count = len(observations)
+    scales = words("observation_terms_scale") or ["1.0"] * count
+    clips = words("observation_terms_clip") or ["-inf;inf"] * count
+    length = _one_length({max(1, int(float(n))) for n in words("observation_terms_history_length")}, source)
+    terms = []
+    for name, term, listed, pair in zip(observations, own, scales, clips, strict=True):
+        scale = tuple(float(s) for s in listed.split(";"))
+        low, high = (float(v) for v in pair.split(";"))
+        limit = _limit(low, high, name, source)
+        clip = tuple(limit * (abs(s) or 1.0) for s in scale)  # what is scaled by zero is zero, clipped or not
+        terms.append(
+            ObservationTerm(
+                name=term, scale=scale, clip=None if limit == math.inf else clip if len(clip) > 1 else clip[0]
+            )
+        )
+    action_scale = [float(v) for v in words("action_scale")]
+    return PolicyContract(
+        robot=robot.name,
+        joint_names=names,
+        default_joint_position=tuple(float(v) for v in words("default_joint_pos")),
+        action_scale=tuple(action_scale * len(names) if len(action_scale) == 1 else action_scale),
+        stiffness=tuple(float(v) for v in words("joint_stiffness")),
+        damping=tuple(float(v) for v in words("joint_damping")),
+        control_period=0.02,
+        observation=tuple(terms),
+        history=History(length=length, order="frame-major" if length == 1 else "term-major", start="repeat"),
+        command_limits=robot.command_limits,
+        provenance={"adapter": "mjlab metadata", "assumed": "control period 0.02 s, command limits of the robot"},
+    )
+
+
+def checkpoint_network(
+    entries: Mapping[str, Any], robot: Robot, *, path: Path
+) -> tuple[PolicyContract, StoredNetwork] | None:
+    """Network and contract of a bare rsl_rl checkpoint, None if it is not one.
+
+    Understood are a plain perceptron as the actor, with or without input normalisation, and a student of concurrent
+    teacher-student training (``student_encoder``). The activation is the one in ``params/agent.yaml`` beside it, else
+    ELU.
+
+    Raises:
+        PolicyError: it is one, but of another kind, of a width that the standard contract does not have, or with missing or
+            malformed entries.
+    """
+    try:
+        return _checkpoint_network(entries, robot, path)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError) as error:
+        if isinstance(error, (PolicyError, ContractError)):
+            raise
+        raise PolicyError(
+            f"'{path}' is an rsl_rl checkpoint with a missing or malformed entry ({type(error).__name__}: {error})"
+        ) from error
+
+
+def _checkpoint_network(
+    entries: Mapping[str, Any], robot: Robot, path: Path
+) -> tuple[PolicyContract, StoredNetwork] | None:
+    weights = next(
+        (w for k in ("actor_state_dict", "model_state_dict") if isinstance(w := entries.get(k), Mapping) and w), None
+    )
+    if not isinstance(weights, Mapping) or not all(isinstance(v, torch.Tensor) for v in weights.values()):
+        return None
+    actor, encoder = _layers(weights, "actor|mlp", "network"), _layers(weights, "student_encoder", "encoder")
+    strange = [k for k in weights if k.startswith(("memory", "rnn", "cnn", "student.", "estimator"))]
+    if not actor or strange:
+        raise PolicyError(
+            f"'{path}' is an rsl_rl checkpoint without a plain perceptron as its actor "
+            f"(it has '{(strange or list(weights) or ['nothing'])[0]}')"
+        )
+    activation = _activation(path)
+    contract = standard_contract(
+        robot, provenance={"adapter": "rsl_rl checkpoint", "assumed": f"standard observation, {activation}"}
+    )
+    frame = contract.frame_width
+    arguments: dict[str, Any] = {"frame_width": frame, "num_actions": contract.num_joints, "activation": activation}
+    actor_widths = _widths(actor)
+    if encoder:
+        encoder_widths = _widths(encoder)
+        arguments.update(
+            history_length=encoder_widths[0] // frame,
+            latent_width=encoder_widths[-1],
+            encoder_hidden=encoder_widths[1:-1],
+            actor_hidden=actor_widths[1:-1],
+        )
+        state = encoder | _layers(weights, "actor|mlp", "actor")
+        return contract, StoredNetwork(architecture="cts", arguments=arguments, state_dict=state)
+    if actor_widths[0] != frame or actor_widths[-1] != contract.num_joints:
+        raise PolicyError(
+            f"'{path}' has an actor of {actor_widths[0]} inputs and {actor_widths[-1]} outputs; "
+            f"without a contract only {frame} and {contract.num_joints} are understood"
+        )
+    arguments.update(hidden=actor_widths[1:-1])
+    normalizer = next((p for p in ("obs_normalizer.", "actor_obs_normalizer.") if p + "_mean" in weights), None)
+    if normalizer:
+        arguments.update(normalize=True)
+        # rsl_rl divides by the standard deviation plus this constant.
+        actor["mean"], actor["deviation"] = weights[normalizer + "_mean"], weights[normalizer + "_std"] + 0.01
+    return contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=actor)
+
+
+def _layers(weights: Mapping[str, torch.Tensor], names: str, ours: str) -> dict[str, torch.Tensor]:
+    """The layers of the perceptron that is called one of ``names``, called ``ours``."""
+    found = {k: v for k, v in weights.items() if re.match(rf"({names})\.\d+\.(weight|bias)$", k)}
+    return {f"{ours}.{k.split('.', 1)[1]}": v for k, v in found.items()}
+
+
+def _widths(layers: Mapping[str, torch.Tensor]) -> list[int]:
+    """Widths of a perceptron from its weights, input first."""
+    weights = sorted(
+        ((int(k.split(".")[1]), v) for k, v in layers.items() if k.endswith("weight")), key=lambda pair: pair[0]
+    )
+    return [weights[0][1].shape[1], *(w.shape[0] for _, w in weights)]
+
+
+def _activation(path: Path) -> str:
+    """Activation that the training configuration beside a checkpoint names, ELU if there is none."""
+    settings = path.parent / "params" / "agent.yaml"
+    if not settings.is_file():
+        return "elu"
+    text = read_text(settings, "training configuration", PolicyError)
+    found = re.search(r"^\s*activation:\s*['\"]?(\w+)", text, re.MULTILINE)
+    return found.group(1).lower() if found else "elu"

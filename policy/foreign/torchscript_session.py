@@ -1,0 +1,334 @@
+"""TorchScript programs where they run: batched over episodes even where the file was exported for a batch of one.
+
+An export with a history inside keeps it in tensors that ``forward`` changes, with an axis of length one for the batch.
+Such tensors are found by watching a run, and given one row per episode. Whether the file can be run that way is proved
+at load time: a batch is compared with as many copies of the module, over several steps and through a reset of some
+rows. Where that fails, every episode gets a copy of its own, which is always right but slower.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import warnings
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from ..base import (
+    PROBE_EPISODES,
+    PolicyError,
+    PolicySession,
+    RowwiseSession,
+    act_alike,
+    check_observation,
+    checked_action,
+)
+from ..contract import PolicyContract
+from ..native import LOAD_ERRORS, said_lines
+from .fence.operators import OPERATORS
+from .fence.script import CONTRACT_FILE, RESET_METHODS
+
+
+@contextmanager
+def _plain_execution() -> Iterator[None]:
+    """Without gradients, and without the JIT's specialization to the shapes it has seen.
+
+    That would make the first calls slow, and calls before and after it may round differently.
+    """
+    with torch.no_grad(), torch.jit.optimized_execution(False):
+        yield
+
+
+@dataclass(frozen=True, kw_only=True)
+class Memory:
+    """A tensor that ``forward`` changes."""
+
+    module: str
+    """Dotted path of the submodule that holds it, empty for the module itself."""
+    name: str
+    axis: int
+    """Batch axis."""
+
+
+def load_module(data: bytes, *, source: str) -> Any:
+    """Load a TorchScript module on the CPU, in evaluation mode and freshly reset.
+
+    Args:
+        data: the archive, after ``fence.script.check_script``: loading it may run code of its own.
+
+    Raises:
+        PolicyError: the archive is damaged, or its methods use an operator that is not on the list.
+    """
+    try:
+        with warnings.catch_warnings():
+            # torch announces TorchScript's retirement at every load; users of old exports can do nothing about it.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            module = torch.jit.load(io.BytesIO(data), map_location="cpu")
+    except LOAD_ERRORS as error:
+        raise PolicyError(f"'{source}' is a damaged TorchScript file: {last_line(error)}") from error
+    _check_operators(module, source=source)
+    module.eval()
+    for parameter in module.parameters():
+        parameter.requires_grad_(False)
+    try:
+        _reset(module)
+    except LOAD_ERRORS as error:
+        raise PolicyError(f"'{source}' fails in its own reset(): {last_line(error)}") from error
+    return module
+
+
+def _check_operators(module: Any, *, source: str) -> None:
+    """Check all operators once more, as torch has read them: nothing then hangs on how Python reads the code."""
+    graphs, pending = [], []
+    for part in module.modules():
+        for name in part._c._method_names():
+            graph = part._c._get_method(name).graph.copy()
+            torch._C._jit_pass_inline(graph)
+            graphs.append(graph)  # its nodes live as long as it does
+            pending.append(graph)
+    while pending:
+        for node in pending.pop().nodes():
+            space, _, name = node.kind().partition("::")
+            if name not in OPERATORS.get(space, frozenset()):
+                raise PolicyError(
+                    f"'{source}' was not loaded: its code uses {node.kind()}, which is not on the list of tensor operators"
+                )
+            pending.extend(node.blocks())
+
+
+def input_width(module: Any, candidates: Sequence[int], *, source: str) -> int:
+    """The first of the candidate widths that the module accepts as (1, width).
+
+    Raises:
+        PolicyError: none of them.
+    """
+    reason = "it has no forward()"
+    for width in candidates:
+        try:
+            with _plain_execution():
+                first_tensor(copy.deepcopy(module)(torch.zeros(1, width)))
+        except PolicyError as error:
+            raise PolicyError(f"'{source}' {error}") from error
+        except LOAD_ERRORS as error:
+            reason = last_line(error)
+        else:
+            return width
+    widths = ", ".join(str(w) for w in candidates[:3])
+    raise PolicyError(
+        f"'{source}' takes none of the standard observation widths ({widths} …): {reason}; "
+        f"put a {CONTRACT_FILE} beside it that describes its observation"
+    )
+
+
+def first_tensor(output: Any) -> torch.Tensor:
+    """The action in a module's output: the output itself, or the first entry of a tuple or list of any depth behind it.
+
+    Raises:
+        PolicyError: there is no tensor in that place.
+    """
+    if isinstance(output, (tuple, list)) and output:
+        output = output[0]
+    if not isinstance(output, torch.Tensor):
+        raise PolicyError(
+            f"returns a {type(output).__name__}; a tensor of actions, alone or first in a tuple, is needed"
+        )
+    strange = [
+        word
+        for word, holds in (
+            ("quantized", output.is_quantized),
+            ("complex", output.is_complex()),
+            ("sparse", output.layout != torch.strided),
+            ("meta", output.is_meta),
+            ("nested", output.is_nested),
+        )
+        if holds
+    ]
+    if strange:
+        raise PolicyError(f"returns a {strange[0]} tensor; a plain tensor of actions is needed")
+    return output
+
+
+class ScriptProgram:
+    """A TorchScript module at work for a policy."""
+
+    def __init__(self, data: bytes, source: str) -> None:
+        """Load the module; ``data`` has been looked through (``fence.script.check_script``).
+
+        Raises:
+            PolicyError: it cannot be loaded.
+        """
+        self.source = source
+        self._module = load_module(data, source=source)
+        self.contract: PolicyContract
+        self.memories: tuple[Memory, ...] | None = None
+
+    def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """``width``: the first of ``candidates`` that the module takes. ``prepare``: find out how to run it in batches."""
+        if request["do"] == "width":
+            return {"width": input_width(self._module, request["candidates"], source=self.source)}
+        self.prepare(PolicyContract.from_json(request["contract"]), request["attributes"])
+        return {}
+
+    def prepare(self, contract: PolicyContract, attributes: Collection[str]) -> None:
+        """Find out how to run the module in batches.
+
+        Args:
+            attributes: names of all attributes that the archive's classes declare; torch itself lists only parameters and
+                buffers.
+
+        Raises:
+            PolicyError: the module fails on zeros, or its input or output has the wrong width.
+        """
+        self.contract, self._attributes = contract, frozenset(attributes)
+        check = CopiesSession(self._module, 1, contract, self.source)
+        check.act(torch.zeros(1, contract.observation_width))
+        self.memories = self._find_memories()
+
+    def session(self, rows: int, *, rowwise: bool = False) -> PolicySession:
+        """Start work on so many episodes with a copy of the module, all at once or each alone."""
+        if rowwise:
+            return RowwiseSession(self.session, rows)
+        if self.memories is None:
+            return CopiesSession(self._module, rows, self.contract, self.source)
+        return BatchSession(self._module, rows, self.contract, self.source, self.memories)
+
+    def _find_memories(self) -> tuple[Memory, ...] | None:
+        """The module's memories, such that a batch proves equal to single runs; None if there is no such way."""
+        changed = self._changed_tensors()
+        if changed is None:
+            return None
+        if not changed:
+            return () if self._proved(()) else None
+        # All memories of a file have their batch on one axis: the first for histories, the second for recurrent states.
+        for axis in range(max(value.dim() for _, _, value in changed)):
+            if all(axis < value.dim() and value.shape[axis] == 1 for _, _, value in changed):
+                memories = tuple(Memory(module=m, name=n, axis=axis) for m, n, _ in changed)
+                if self._proved(memories):
+                    return memories
+        return None
+
+    def _changed_tensors(self) -> list[tuple[str, str, torch.Tensor]] | None:
+        """Tensors that a run changes, with their initial values; None if it changes anything else."""
+        module = copy.deepcopy(self._module)
+        before = self._snapshot(module)
+        generator = torch.Generator().manual_seed(0)
+        with _plain_execution():
+            for _ in range(2):
+                module(torch.randn(1, self.contract.observation_width, generator=generator))
+        changed = []
+        for key, value in self._snapshot(module).items():
+            old = before[key]
+            if isinstance(value, torch.Tensor) and isinstance(old, torch.Tensor):
+                if value.shape != old.shape or not torch.equal(value, old):
+                    changed.append((*key, old))
+            elif value != old:
+                return None
+        return changed
+
+    def _snapshot(self, module: Any) -> dict[tuple[str, str], Any]:
+        """Copies of all tensors, and the values of all plain attributes, of a module and its submodules."""
+        found: dict[tuple[str, str], Any] = {}
+        for path, part in module.named_modules():
+            for name in self._attributes:
+                if not part._c.hasattr(name):
+                    continue
+                value = part._c.getattr(name)
+                if isinstance(value, torch.Tensor):
+                    found[path, name] = value.detach().clone()
+                elif isinstance(value, (int, float, bool, str, list, tuple, dict)) or value is None:
+                    found[path, name] = repr(value)
+        return found
+
+    def _proved(self, memories: tuple[Memory, ...]) -> bool:
+        """Whether a batch acts as single copies do."""
+        batch = BatchSession(self._module, PROBE_EPISODES, self.contract, self.source, memories)
+        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, self.source)
+        return act_alike(copies, batch, self.contract.observation_width)
+
+
+class BatchSession(PolicySession):
+    """One module for all episodes; its memories have a row per episode."""
+
+    def __init__(
+        self, module: Any, num_episodes: int, contract: PolicyContract, source: str, memories: Sequence[Memory]
+    ) -> None:
+        self._module = copy.deepcopy(module)
+        self._contract = contract
+        self._num_episodes = num_episodes
+        self._source = source
+        parts = dict(self._module.named_modules())
+        self._memories: list[tuple[Any, Memory, torch.Tensor]] = []
+        for memory in memories:
+            part = parts[memory.module]
+            value = part._c.getattr(memory.name).detach()
+            shape = list(value.shape)
+            shape[memory.axis] = num_episodes
+            self._memories.append((part, memory, value.expand(shape).clone()))
+        self.reset()
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """See ``PolicySession``."""
+        for part, memory, initial in self._memories:
+            if episodes is None:
+                value = initial.clone()
+            else:
+                mask = episodes.reshape([-1 if axis == memory.axis else 1 for axis in range(initial.dim())])
+                value = torch.where(mask, initial, part._c.getattr(memory.name))
+            part._c.setattr(memory.name, value)
+
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
+        """See ``PolicySession``."""
+        return _run(self._module, observation, self._num_episodes, self._contract, self._source)
+
+
+class CopiesSession(PolicySession):
+    """One copy of the module for each episode, run one after another."""
+
+    def __init__(self, module: Any, num_episodes: int, contract: PolicyContract, source: str) -> None:
+        """Copy the module, which must be freshly reset."""
+        self._fresh = copy.deepcopy(module)
+        self._contract = contract
+        self._source = source
+        self._modules = [copy.deepcopy(self._fresh) for _ in range(num_episodes)]
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """See ``PolicySession``."""
+        rows = range(len(self._modules)) if episodes is None else episodes.nonzero().flatten().tolist()
+        for row in rows:
+            self._modules[row] = copy.deepcopy(self._fresh)
+
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
+        """See ``PolicySession``."""
+        check_observation(observation, len(self._modules), self._contract, self._source)
+        pairs = zip(self._modules, observation.split(1), strict=True)
+        return torch.cat([_run(module, row, 1, self._contract, self._source) for module, row in pairs])
+
+
+def _run(module: Any, observation: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> torch.Tensor:
+    check_observation(observation, rows, contract, source)
+    try:
+        with _plain_execution():
+            action = first_tensor(module(observation))
+    except PolicyError as error:
+        raise PolicyError(f"'{source}' {error}") from error
+    except LOAD_ERRORS as error:
+        raise PolicyError(
+            f"'{source}' fails on observations of shape {tuple(observation.shape)}: {last_line(error)}"
+        ) from error
+    return checked_action(action, rows, contract, source)
+
+
+def last_line(error: BaseException) -> str:
+    """TorchScript puts its message behind the traceback."""
+    return said_lines(error)[-1].rstrip(".")[:200]
+
+
+def _reset(module: Any) -> None:
+    for name in RESET_METHODS:
+        if module._c._has_method(name):
+            with _plain_execution():
+                getattr(module, name)()

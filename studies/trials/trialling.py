@@ -1,0 +1,192 @@
+"""Policies through scenarios: ``trials.json``, ``trials.csv`` and ``trial.html``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import compress
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from ...backends.base import BackendError
+from ...backends.registry import find_backend
+from ...files.provenance import provenance
+from ...files.writing import csv_text, json_text, make_folder, write_atomically
+from ...gauge.chance.intervals import wilson_interval
+from ...gauge.suite import SuiteError
+from ...policy.base import PolicyError
+from ...policy.contract import ContractError, PolicyContract
+from ...robots import RobotError
+from ..policies import PoliciesRequest, Watch, describe, load_policies
+from .page import render_page
+from .running import Trial, run_scenario
+from .scenario import Scenario, ScenarioError, load_scenario, scenario_names
+
+ALL = "all"
+"""Stands for every scenario that ships with the project."""
+MEASURES = ("reached", "progress", "mean_speed", "peak_speed", "speed_time", "tracking_error")
+"""Numbers of a trial whose median is shown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialRequest(PoliciesRequest):
+    """Who goes through what."""
+
+    scenarios: tuple[str, ...] = (ALL,)
+    """Names, ``.toml`` files, or ``all``."""
+    repeats: int | None = None
+    """Robots of each policy in each scenario; None for the scenario's own number."""
+    device: str = "cpu"
+
+
+def run_trials(
+    request: TrialRequest,
+    folder: Path,
+    *,
+    command: Sequence[str] = (),
+    watch: Watch = lambda *_: None,
+) -> dict[str, Any]:
+    """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
+
+    Returns the content of ``trials.json`` (docs/trials.md).
+
+    Raises:
+        BackendError, RobotError, ScenarioError: nothing of it can be done; or no such engine, device or robot.
+    """
+    began = time.perf_counter()
+    find_backend(request.backend, request.device)
+    policies, refused = load_policies(request.policies, request.robot, trust=request.trust)
+    scenarios: dict[str, Scenario] = {}
+    names = [n for name in request.scenarios for n in (scenario_names() if name == ALL else [name])]
+    for name in dict.fromkeys(names):
+        try:
+            scenario = load_scenario(name)
+            if scenario.name in scenarios:
+                raise ScenarioError(
+                    f"'{name}' is called '{scenario.name}' as another one of these scenarios; rename it"
+                )
+            scenarios[scenario.name] = scenario
+        except ScenarioError as error:
+            refused.append({"what": name, "reason": str(error)})
+    entries = [_about(scenario) for scenario in scenarios.values()]
+    turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]
+    for number, (scenario, entry, label) in enumerate(turns, 1):
+        watch(number, len(turns), f"{label} in {scenario.name}")
+        seeds = range(request.seed, request.seed + (request.repeats or scenario.repeats))
+        try:
+            trials = run_scenario(
+                policies[label].policy,
+                policies[label].robot,
+                scenario,
+                seeds,
+                backend=request.backend,
+                device=request.device,
+                threads=request.threads,
+            )
+        except (BackendError, ContractError, PolicyError, RobotError, SuiteError) as error:
+            refused.append({"what": f"{label} in {scenario.name}", "reason": str(error)})
+        else:
+            entry["results"].append(summary(label, policies[label].policy.contract, scenario, trials))
+    if not any(entry["results"] for entry in entries):
+        raise ScenarioError("; ".join(r["reason"] for r in refused) or "there is nothing to try; name a scenario")
+    results = {
+        "schema": 1,
+        "policies": [describe(label, loaded) for label, loaded in policies.items()],
+        "scenarios": entries,
+        "refused": refused,
+        "backend": request.backend,
+        "provenance": provenance(
+            command=command,
+            device=request.device,
+            threads=request.threads,
+            seconds=round(time.perf_counter() - began, 2),
+        ),
+    }
+    make_folder(folder, ScenarioError)
+    write_atomically(folder / "trials.csv", as_csv(results), ScenarioError)
+    write_atomically(folder / "trial.html", render_page(results), ScenarioError)
+    write_atomically(folder / "trials.json", json_text(results), ScenarioError)
+    return results
+
+
+def _about(scenario: Scenario) -> dict[str, Any]:
+    """What a result says of a scenario."""
+    terrain, start = scenario.terrain(), scenario.start
+    return {
+        "name": scenario.name,
+        "title": scenario.title,
+        "about": " ".join(scenario.about.split()),
+        "digest": scenario.digest,
+        "suite": scenario.suite,
+        "friction": scenario.friction,
+        "seconds": scenario.seconds,
+        "success": asdict(scenario.success),
+        "reported": [asdict(r) for r in scenario.reported],
+        "start": [start.x, start.y],
+        "profile": profile(terrain, start.x, start.y, scenario.success.beyond),
+        "results": [],
+    }
+
+
+def profile(terrain: Any, x: float, y: float, beyond: float | None) -> list[tuple[float, float]]:
+    """Height of the ground along x through the start, as corners of a line [m]; empty where all of it is level."""
+    step = 0.02
+    count = round((max(beyond or 0.0, x + 2.0) - x + 4.0) / step)
+    places = [x - 2.0 + step * i for i in range(count)]
+    heights = [float(z) for z in terrain.height(places, [y] * count)]
+    if max(heights) - min(heights) < 1e-6:
+        return []
+    line = [(round(a, 3), round(b, 3)) for a, b in zip(places, heights, strict=True)]
+    bends = [abs((b[1] - a[1]) - (c[1] - b[1])) >= 2e-3 for a, b, c in zip(line, line[1:], line[2:], strict=False)]
+    return [line[0], *compress(line[1:], bends), line[-1]]
+
+
+def summary(label: str, contract: PolicyContract, scenario: Scenario, trials: Sequence[Trial]) -> dict[str, Any]:
+    """Counts, Wilson's interval and medians of a policy's trials, and each of these."""
+    outcomes = [t.outcome for t in trials]
+    successes, count = outcomes.count("success"), len(trials)
+    asked = [max(abs(p.velocity[i]) for p in scenario.commands) for i in range(3)]
+    limits = contract.command_limits
+    above = [
+        f"{a:g} {unit}"
+        for a, limit, unit in zip(asked, limits, ("m/s forward", "m/s sideways", "rad/s"), strict=True)
+        if a > limit
+    ]
+    note = (
+        f"told up to {', '.join(above)}; made for up to {limits[0]:g} m/s forward, {limits[1]:g} m/s sideways and "
+        f"{limits[2]:g} rad/s"
+    )
+    medians: dict[str, float | None] = {}
+    for name in MEASURES:
+        values = [v for t in trials if (v := getattr(t, name)) is not None]
+        medians[name] = median(values) if values else None
+    return {
+        "policy": label,
+        "trials": count,
+        "successes": successes,
+        "fell": outcomes.count("fell"),
+        "missed": outcomes.count("missed"),
+        "diverged": sum(t.diverged for t in trials),
+        "share": successes / count,
+        "interval": list(wilson_interval(successes / count, count)),
+        "medians": medians,
+        "note": note if above else "",
+        "rows": [asdict(t) for t in trials],
+    }
+
+
+def as_csv(results: Mapping[str, Any]) -> str:
+    """One row for each trial."""
+    names = ("seed", "outcome", "diverged", "seconds", *MEASURES)
+    rows: list[Sequence[object]] = [("scenario", "policy", *names, "pulls")]
+    for entry in results["scenarios"]:
+        for result in entry["results"]:
+            for row in result["rows"]:
+                pulls = "; ".join(
+                    f"{p['newtons']:.1f} N at {p['begin']:.2f} s for {p['seconds']:.2f} s" for p in row["pulls"]
+                )
+                values = ["" if row[n] is None else row[n] for n in names]
+                rows.append((entry["name"], result["policy"], *values, pulls))
+    return csv_text(rows)

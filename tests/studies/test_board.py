@@ -1,0 +1,184 @@
+"""The leaderboard: what is ranked, what is only listed, and that hostile text stays text."""
+
+import json
+
+import numpy as np
+import pytest
+from gaitgauge.cli.main import app
+from gaitgauge.gauge.results import environment_weights
+from gaitgauge.gauge.suite import load_suite
+from gaitgauge.studies.cards.board import board_data, render_board, write_board
+from gaitgauge.studies.cards.verify import CardError
+from gaitgauge.studies.compare.comparison import ComparisonError
+from gaitgauge.studies.policies import file_digest
+from sample_results import HOSTILE, Page, sample
+from typer.testing import CliRunner
+
+CHANCE = sample()["chance"]
+
+
+def card(
+    score, *, kind="complete", text="complete", path="a/walk.pt", digest="ab" * 32, observations=("command",), **other
+):
+    return {
+        "schema": 2,
+        "suite": {"name": "mine", "version": "1.1.0", "title": "", "digest": digest},
+        "coverage": {"kind": kind, "text": text},
+        "score": score,
+        "score_interval": None if score is None else [score - 0.01, score + 0.01],
+        "level": 7.5,
+        "chance": CHANCE,
+        "policy": {"path": path, "file_sha256": "cd" * 32, "observations": list(observations)},
+        "pipeline": "stress",
+        "backend": "mujoco",
+        "robot": "go2",
+        "provenance": {},
+        "environments": [],
+    } | other
+
+
+def test_complete_cards_are_ranked_by_score_and_others_only_listed():
+    part = card(0.9, kind="part", text="1 of 7 terrains")
+    (table,) = board_data({"low.json": card(0.5), "part.json": part, "high.json": card(0.6), "same.json": card(0.5)})
+    assert [(e["rank"], e["card"]) for e in table["ranked"]] == [(1, "high.json"), (2, "low.json"), (2, "same.json")]
+    assert [(e["rank"], e["coverage"]) for e in table["others"]] == [(None, "part: 1 of 7 terrains")]
+    assert table["ranked"][0]["command"] == "gaitgauge verify high.json --policy FILE"
+
+
+def test_policies_whose_files_are_called_alike_are_told_apart():
+    kept = "runs/HIM/seed-1/kept/policy.gauge.pt"
+    cards = {"one.json": card(0.9, path=kept), "CTS-seed-1/results.json": card(0.8, path="policy.gauge.pt")}
+    cards |= {
+        "b.json": card(0.7, path="b\\walk.pt"),
+        "c.json": card(0.6, path="c/walk.pt"),
+        "d.json": card(0.5, path="d/trot.pt"),
+    }
+    (table, other) = board_data(cards | {"e.json": card(0.9, path="b/walk.pt", robot="a1")})
+    assert [e["policy"] for e in table["ranked"]] == ["HIM seed-1", "CTS-seed-1", "b walk", "c walk", "trot"]
+    assert [e["policy"] for e in other["ranked"]] == ["walk"]
+
+
+def test_results_that_do_not_state_their_coverage_or_have_no_score_are_not_ranked():
+    old, levels = card(0.7), card(None)
+    del old["coverage"]
+    (table,) = board_data({"old.json": old, "levels.json": levels})
+    assert not table["ranked"]
+    assert [e["card"] for e in table["others"]] == ["old.json", "levels.json"]
+
+
+def test_other_rules_engines_and_robots_have_tables_of_their_own():
+    cards = {"a": card(0.5), "b": card(0.5, digest="00"), "c": card(0.5, backend="newton"), "d": card(0.5, robot="a1")}
+    assert len(board_data(cards)) == 4
+
+
+def test_a_robot_of_the_same_name_with_other_files_has_a_table_of_its_own():
+    """A policy may carry its robot: a lighter one that is called go2 is none."""
+    files = {"a": "ab" * 32, "b": "ab" * 32, "c": "cd" * 32}
+    cards = {name: card(0.5, provenance={"digests": {"robot": digest}}) for name, digest in files.items()}
+    tables = board_data(cards)
+    assert [len(table["ranked"]) for table in tables] == [2, 1]
+    assert [table["robot_digest"] for table in tables] == ["ab" * 32, "cd" * 32]
+    assert "cdcdcdcdcdcd" in render_board(tables)
+    assert board_data({"old": card(0.5)})[0]["robot_digest"] is None
+
+
+def test_privileged_observations_are_marked_and_have_no_rank():
+    cards = {
+        "1": card(0.9, observations=("command", "base_linear_velocity_b")),
+        "2": card(0.8, observations=("command", "joint_position")),
+        "3": card(0.7),
+    }
+    del cards["3"]["policy"]["observations"]
+    (table,) = board_data(cards)
+    assert [(e["rank"], e["observations"]) for e in table["ranked"]] == [(1, "measurable"), (2, "not stated")]
+    assert [(e["rank"], e["observations"]) for e in table["others"]] == [(None, "privileged")]
+
+
+def test_the_page_is_well_formed_and_hostile_text_stays_text():
+    page = Page(render_board(board_data({"x.json": card(0.5, path=HOSTILE), "y.json": card(0.4)})))
+    assert not page.open
+    assert page.count("img") == page.count("script") == 0
+    assert "0.5000" in page.text and "0.4900 – 0.5100" in page.text
+    assert "gaitgauge verify y.json --policy FILE" in page.text
+
+
+def test_a_folder_becomes_a_page_and_what_is_no_card_is_named(tmp_path):
+    with pytest.raises(CardError, match="holds no score cards"):
+        write_board(tmp_path, tmp_path / "board.html")
+    (tmp_path / "one.json").write_text(json.dumps(card(0.5)))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "results.json").write_text(json.dumps(card(0.6)))
+    text = write_board(tmp_path, tmp_path / "board.html").read_text()
+    assert f"gaitgauge verify {tmp_path / 'run' / 'results.json'}" in text
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(ComparisonError, match=r"other.json"):
+        write_board(tmp_path, tmp_path / "second.html")
+    assert not (tmp_path / "second.html").exists()
+
+
+def test_a_card_is_not_written_over(tmp_path):
+    (tmp_path / "one.json").write_text(text := json.dumps(card(0.5)))
+    done = CliRunner().invoke(app, ["board", str(tmp_path), "--out", str(tmp_path / "one.json")])
+    assert done.exit_code == 2 and "ends in .html" in done.stderr
+    assert (tmp_path / "one.json").read_text() == text
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """A complete card of robogauge-1.1, which a function writes into a folder after changes."""
+    content = sample(resamples=2000)
+    content["suite"]["digest"] = load_suite("robogauge-1.1").digest
+
+    def write(**changes):
+        (tmp_path / "card.json").write_text(json.dumps(content | changes))
+        return write_board(tmp_path, tmp_path / "boards" / "all.html")
+
+    write.content = content
+    return write
+
+
+def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(whole):
+    """The page's folder is created."""
+    assert "robogauge-1.1 1.1.0" in Page(whole().read_text()).text
+    content = whole.content
+    rows = [row for row in content["environments"] if row["friction"] != 0.2]
+    weights = environment_weights([row["terrain"] for row in rows])
+    part = {"environments": rows, "score": float(weights @ [row["score"] for row in rows])}
+    part |= {"level": float(np.mean([row["level"] for row in rows if row["terrain"] != "flat"]))}
+    with pytest.raises(CardError, match=r"card\.json' calls itself complete, but holds 8 of 9 frictions"):
+        whole(**part, terrains={}, metrics={}, groups={}, health=None)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (
+            {"name": "zz", "version": "9"},
+            r"card\.json' names its suite zz 9, but its digest a43a.* is that of robogauge-1\.1",
+        ),
+        ({"version": "9"}, r"names its suite robogauge-1\.1 9, but its digest"),
+        (
+            {"digest": "ab" * 32},
+            r"is of robogauge-1\.1 1\.1\.0 with digest ab.*, but robogauge-1\.1 here is 1\.1\.0 with a43a",
+        ),
+    ],
+)
+def test_a_card_that_names_another_suite_than_its_own_is_not_put_on_the_board(whole, change, named):
+    """Renamed, it was not checked, and headed the table of a suite that it does not hold."""
+    with pytest.raises(CardError, match=named):
+        whole(suite=whole.content["suite"] | change)
+
+
+def test_suites_of_the_same_digest_and_other_names_have_tables_of_their_own():
+    cards = {name: card(0.5, suite={"name": name, "version": "1", "digest": "ab" * 32}) for name in ("one", "two")}
+    assert [table["suite"]["name"] for table in board_data(cards)] == ["one", "two"]
+
+
+def test_a_policy_that_ships_is_found_by_name_where_it_is_the_card_s():
+    policy = {"path": "pretrained", "file_sha256": file_digest("pretrained")}
+    cards = {"a": card(0.5, policy=policy), "b": card(0.4, policy=policy | {"file_sha256": "ab" * 32})}
+    (table,) = board_data(cards)
+    assert [e["command"] for e in table["ranked"]] == [
+        "gaitgauge verify a",
+        "gaitgauge verify b --policy FILE",  # of another release
+    ]

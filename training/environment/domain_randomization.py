@@ -1,0 +1,77 @@
+"""What differs between worlds, and from episode to episode in one world (paper, domain randomization table)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+
+from ...backends.base import PhysicsBackend, Randomization
+from .configuration import RandomizationConfiguration, Range
+
+MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_speed", "motor_offset")
+"""Names of the uniform numbers that a reset takes, one column per joint each."""
+
+
+def draw_bodies(
+    ranges: RandomizationConfiguration, num_envs: int, num_bodies: int, generator: torch.Generator
+) -> dict[str, torch.Tensor]:
+    """What is drawn once per world, on the generator's device, by the names of ``Randomization``: effective sliding friction (N,),
+    what is added to the base's mass [kg] (N,), factors on the other bodies' masses (N, bodies), and the shift of the base's centre
+    of mass [m] (N, 3).
+    """
+
+    def between(bounds: Range, *shape: int) -> torch.Tensor:
+        values = torch.empty(num_envs, *shape, device=generator.device)
+        return values.uniform_(bounds[0], bounds[1], generator=generator)
+
+    return {
+        "friction": between(ranges.friction),
+        "base_mass_offset": between(ranges.base_mass),
+        "link_mass_scale": between(ranges.link_mass, num_bodies),
+        "base_com_offset": between(ranges.base_com, 3),
+    }
+
+
+class MotorParameters:
+    """Drawn anew at every reset of a world."""
+
+    NEUTRAL: ClassVar[dict[str, float]] = {
+        "stiffness_scale": 1.0,
+        "damping_scale": 1.0,
+        "motor_strength": 1.0,
+        "motor_speed": 1.0,
+        "motor_offset": 0.0,
+    }
+    """Fields of ``Randomization`` in the order of ``MOTOR_COLUMNS``, as motors are that nobody varies; offsets in rad."""
+
+    def __init__(
+        self, ranges: RandomizationConfiguration, num_envs: int, num_joints: int, device: torch.device | str
+    ) -> None:
+        """Motors as the robot's parameter set says."""
+        bounds = [getattr(ranges, name) for name in MOTOR_COLUMNS]
+        self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
+        self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]
+        neutral = torch.tensor(list(self.NEUTRAL.values()), device=device)[:, None]
+        self._varied = [
+            name for name, bound in zip(self.NEUTRAL, bounds, strict=True) if set(bound) != {self.NEUTRAL[name]}
+        ]
+        self.values = neutral.repeat(num_envs, 1, num_joints)
+        """All of them, (N, 5, J)."""
+
+    def redraw(self, uniform: torch.Tensor, worlds: torch.Tensor) -> None:
+        """New values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
+        drawn = uniform.view(self.values.shape) * self._span + self._low
+        torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
+
+    def apply(self, backend: PhysicsBackend) -> None:
+        """Write all worlds' values into the physics, of what varies: an engine need not be able to do the rest.
+
+        All rows are written every time: selecting the rows of a mask would wait for the device to count them.
+        """
+        values = self.by_name()
+        backend.randomize(Randomization(**{name: values[name] for name in self._varied}))
+
+    def by_name(self) -> dict[str, torch.Tensor]:
+        """The values by the names of ``Randomization``, (N, J) each."""
+        return dict(zip(self.NEUTRAL, self.values.unbind(1), strict=True))

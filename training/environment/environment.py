@@ -1,0 +1,452 @@
+"""The training environment: rsl_rl's ``VecEnv`` on any physics backend.
+
+One step, in order: the action becomes joint targets with a drawn latency; the physics advances one control period;
+rewards, ends, curriculum and commands are judged on the new state; worlds whose episode is over are reset and others
+pushed; observations are made of the state after that, so that the first observation of an episode is fresh. Nothing
+in a step waits for the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from ...backends.base import Randomization, ResetState, Scene
+from ...backends.graphs import WARM_UP, RecordedFunction
+from ...backends.registry import make_backend
+from ...files.parsing import shown
+from ...policy.contract import History, PolicyContract, standard_contract
+from ...policy.robot_of import REMEMBERED
+from ...robots.base import JointParameters, Robot
+from ...robots.identity import identify
+from ...robots.registry import load_robot
+from ..configuration import ConfigurationError
+from .commands import largest_commands
+from .configuration import EnvironmentConfiguration
+from .curriculum import assign_kinds, build_palette
+from .domain_randomization import draw_bodies
+from .events import EpisodeStart
+from .height_scan import heading
+from .memory import copied, fitting, restore
+from .observations import Observations
+from .own_terms import resolve_own
+from .step import EnvironmentStep, StepResult
+from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
+
+STATE_VERSION = 1
+
+
+class TrainingEnvironment(VecEnv):
+    """Vectorized locomotion environment. Observation groups: ``policy``, ``history`` and ``privileged``.
+
+    Attributes:
+        contract: the interface of the policies trained here, one frame of observation.
+        backend: the physics.
+        common_step_counter: environment steps taken in the run.
+        unfused: why the torch parts are not compiled though they should have been, a sentence; empty otherwise.
+    """
+
+    def __init__(
+        self,
+        configuration: EnvironmentConfiguration,
+        *,
+        backend: str = "mujoco-warp",
+        device: str = "cuda:0",
+        threads: int = 1,
+        capture: bool = False,
+        fuse: bool | None = None,
+    ) -> None:
+        """Build the worlds and begin their first episodes.
+
+        Args:
+            backend: an engine's registry name.
+            device: torch device of the physics and of everything else.
+            threads: CPU threads for engines that use them.
+            capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
+            fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels
+                into a few; numbers differ in the last digits. None: on a GPU, unless a function of one's own cannot be
+                compiled, which ``unfused`` then says.
+
+        Raises:
+            ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device, or ``fuse`` for a
+                function that cannot be compiled.
+            BackendError: the engine cannot do what is asked.
+        """
+        if capture and torch.device(device).type != "cuda":
+            raise ConfigurationError(
+                f"capture=True needs a CUDA device, but the environment is on '{device}'; use capture=False there"
+            )
+        if configuration.num_envs < 1:
+            raise ConfigurationError(
+                f"environment.num_envs is {configuration.num_envs}; an environment needs at least 1 world"
+            )
+        slow, fast = configuration.randomization.motor_speed
+        if (slow, fast) != (1.0, 1.0) and not configuration.physics.torque_speed_limit:
+            raise ConfigurationError(
+                f"environment.randomization.motor_speed is {slow:g} to {fast:g} while environment.physics.torque_speed_limit is "
+                "off, without which it does nothing; turn the limit on, or leave motor_speed at 1,1"
+            )
+        self.cfg = configuration
+        self.configuration = configuration
+        self.robot = load_robot(configuration.robot)
+        parameters = joint_parameters(self.robot, configuration)
+        self.palette = build_palette(configuration.terrain)
+        kind = assign_kinds([tile.share for tile in self.palette.tiles], configuration.num_envs)
+        level = self._start_levels(configuration)
+        scene = Scene(
+            robot=self.robot,
+            parameters=parameters,
+            terrains=self.palette.terrains,
+            terrain_index=tuple(self.palette.index[kind, level, 0].tolist()),
+            physics=configuration.physics,
+        )
+        self.backend = make_backend(backend, scene, device=device, threads=threads)
+        self.device = self.backend.device
+        self.num_envs = configuration.num_envs
+        self.num_actions = self.robot.num_joints
+        self.contract = training_contract(self.robot, parameters, configuration)
+        self._generator = torch.Generator(device=self.device)
+        self._generator.manual_seed(configuration.seed)
+        state = self.backend.state
+        self._inputs = state if self.backend.state_stays else static_inputs(state)
+        self.parts = EnvironmentStep(
+            configuration,
+            robot=self.robot,
+            parameters=parameters,
+            contract=self.contract,
+            palette=self.palette,
+            kind=kind.to(self.device),
+            inputs=self._inputs,
+            generator=self._generator,
+        )
+        self.max_episode_length = self.parts.max_episode_length
+        self.kind = self.parts.kind
+        self.common_step_counter = 0
+        self._events = resolve_own(configuration.events, "environment.events").values()
+        self._bodies = draw_bodies(
+            configuration.randomization, self.num_envs, len(self.robot.collision_bodies), self._generator
+        )
+        self.backend.randomize(Randomization(**self._bodies))
+        schedule = configuration.schedule
+        if not 0.0 <= schedule.begin <= 1.0:
+            raise ConfigurationError(
+                f"environment.schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1"
+            )
+        self.parts.memory.step.fill_(round(schedule.begin * schedule.horizon_steps))
+        self._begin(level.to(self.device))
+        self._after_physics: Callable[[], StepResult] = self.parts.after_physics
+        self._observe: Callable[[], Observations] = self.parts.observe
+        self.unfused = ""
+        if fuse or (fuse is None and self.device.type == "cuda"):
+            self._fuse(required=fuse is not None)
+        if capture:
+            self._capture()
+
+    @property
+    def progress(self) -> torch.Tensor:
+        """Fraction of the run that schedules are at, a scalar tensor."""
+        return self.parts.progress()
+
+    @staticmethod
+    def _start_levels(configuration: EnvironmentConfiguration) -> torch.Tensor:
+        """Levels at the start: random, since a pattern over the worlds would give the student's only every second
+        level.
+        """
+        terrain = configuration.terrain
+        highest = min(terrain.highest_start_level, terrain.levels - 1) if terrain.curriculum else terrain.levels - 1
+        random = torch.Generator().manual_seed(configuration.seed)
+        return torch.randint(highest + 1, (configuration.num_envs,), generator=random)
+
+    def _begin(self, level: torch.Tensor) -> None:
+        """Begin an episode in every world, on the given levels, (N,)."""
+        memory = self.parts.memory
+        memory.level.copy_(level)
+        memory.moves_level.zero_()  # what an earlier episode came to moves nothing
+        if self.parts.pushes.steps > 0:
+            memory.push_phase.random_(self.parts.pushes.steps, generator=self._generator)
+        everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        self.parts.uniform.draw()
+        nobody, headings = torch.zeros_like(everyone), memory.commanded_heading
+        start = self.parts.begin_episodes(everyone, nobody, self.parts.progress(), headings)
+        self._reset(start)
+        self._read(AFTER_STEP)
+        self._observations = self.parts.observe().clone()
+
+    @contextmanager
+    def _trial(self) -> Iterator[None]:
+        """Inside, both torch parts may run: what that changes is put back."""
+        memory, motors = self.parts.memory.by_name(), self.parts.motors.by_name()
+        before = copied(memory), copied(motors)
+        try:
+            with torch.no_grad():
+                yield
+        finally:
+            restore(before[0], memory)
+            restore(before[1], motors)
+
+    def _fuse(self, *, required: bool) -> None:
+        """Compile both torch parts; where that is impossible, refuse if it is ``required``, or say so in ``unfused``."""
+        from torch._dynamo.exc import TorchDynamoException  # loading it takes more than a second
+
+        after_physics = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
+        observe = torch.compile(self._observe, fullgraph=True, dynamic=False)
+        try:
+            with self._trial():
+                after_physics()
+                observe()
+        except TorchDynamoException as error:
+            reason = next(line.strip() for line in str(error).splitlines() if line.strip())
+            sentence = f"the environment's torch parts cannot be compiled ({shown(reason)})"
+            if required:
+                raise ConfigurationError(f"{sentence}; use fuse=False, on the command line --no-fuse") from error
+            self.unfused = (
+                f"{sentence} and run as they are, which is slower; a function of your own in the task may be the cause"
+            )
+            return
+        self._after_physics, self._observe = after_physics, observe
+
+    def _capture(self) -> None:
+        """Record both torch parts."""
+        with self._trial():
+            self._after_physics = RecordedFunction(self._after_physics, self.device)
+            self._observe = RecordedFunction(self._observe, self.device)
+            for _ in range(WARM_UP + 1):
+                self._after_physics()
+                self._observe()
+
+    # --- rsl_rl's interface -----------------------------------------------------------------------------------------
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps of every world's present episode, (N,) int64. Assigning copies into the same tensor."""
+        return self.parts.memory.episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        self.parts.memory.episode_length.copy_(value)
+
+    def get_observations(self) -> TensorDict:
+        """Present observations, copies."""
+        return self._pack(self._observations.clone())
+
+    @torch.no_grad()
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance all worlds by one control period.
+
+        Args:
+            actions: raw network outputs, (N, J).
+
+        Returns:
+            Observations; rewards (N,); dones (N,) int64; extras with ``time_outs`` (N,) float and, every
+            ``log_interval`` steps, ``log``. All are new tensors that no later step touches.
+        """
+        parts = self.parts
+        parts.action.copy_(actions)
+        parts.uniform.draw()
+        self.backend.step(parts.targets(), delay=parts.delay())
+        self._read(AFTER_STEP)
+        result = self._after_physics()
+        self.common_step_counter += 1
+        extras: dict[str, Any] = {"time_outs": result.time_out.float()}
+        if self.common_step_counter % self.configuration.log_interval == 0:
+            extras["log"] = self._log()
+        self._reset(result.start)
+        if (push := result.push) is not None:
+            self.backend.push(
+                push.worlds, linear_velocity_w=push.linear_velocity, angular_velocity_b=push.angular_velocity
+            )
+        for event in self._events:
+            event(self, result.done)
+        self._read(AFTER_RESET)
+        self._observations = self._observe().clone()
+        return self._pack(self._observations), result.reward.clone(), result.done.long(), extras
+
+    def close(self) -> None:
+        """Free the physics."""
+        self.backend.close()
+
+    # --- parts of a step --------------------------------------------------------------------------------------------
+
+    def _read(self, names: tuple[str, ...]) -> None:
+        if self.backend.state_stays:
+            return
+        state = self.backend.state
+        for name in names:
+            getattr(self._inputs, name).copy_(getattr(state, name))
+
+    def _reset(self, start: EpisodeStart) -> None:
+        self.parts.motors.apply(self.backend)
+        self.backend.reset(
+            ResetState(
+                base_position=start.base_position,
+                base_quaternion=start.base_quaternion,
+                joint_position=start.joint_position,
+                base_linear_velocity=start.base_linear_velocity,
+                base_angular_velocity=start.base_angular_velocity,
+                held_target=self.parts.default_pose.expand(self.num_envs, -1),
+                terrain_index=self.parts.memory.terrain_index,
+            ),
+            start.worlds,
+        )
+
+    def _pack(self, observations: Observations) -> TensorDict:
+        return TensorDict(dict(vars(observations)), batch_size=[self.num_envs], device=self.device)
+
+    def _log(self) -> dict[str, torch.Tensor]:
+        """What happened since the last log, as tensors on the device."""
+        log = self.parts.log.read(self.parts.memory, self.parts.progress())
+        return log | {"Physics/overflow_worlds": self.backend.state.overflowed.sum().float()}
+
+    # --- resuming ---------------------------------------------------------------------------------------------------
+
+    def progress_dict(self) -> dict[str, Any]:
+        """What a run has reached, without its running episodes: step counter, levels, and the bodies that were drawn,
+        for which the levels were found.
+        """
+        return {
+            "version": STATE_VERSION,
+            "step": self.parts.memory.step.clone(),
+            "level": self.parts.memory.level.to(torch.int16),
+            "bodies": copied(self._bodies),
+            "common_step_counter": self.common_step_counter,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that continuing needs: memory, random state, randomization, observations, and poses and
+        velocities of the physics.
+
+        The physics itself is put back by a reset: what an engine carries from step to step beside positions,
+        velocities and targets (a solver's warm start, contact caches) is lost. On an engine without such memory,
+        continuing equals never having stopped.
+        """
+        state = self.backend.state
+        return {
+            "version": STATE_VERSION,
+            "memory": copied(self.parts.memory.by_name()),
+            "motors": copied(self.parts.motors.by_name()),
+            "bodies": copied(self._bodies),
+            "observations": copied(vars(self._observations)),
+            "generator": self._generator.get_state(),
+            "common_step_counter": self.common_step_counter,
+            "physics": {name: getattr(state, name).clone() for name in AFTER_RESET},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``, or begin new episodes from ``progress_dict``. The environment must have been
+        built with the same configuration.
+
+        Raises:
+            ValueError: the state is of another version or of another environment.
+        """
+        if state.get("version") != STATE_VERSION:
+            raise ValueError(
+                f"the saved environment has version {state.get('version')}, this program reads {STATE_VERSION}"
+            )
+        if "memory" not in state:
+            self._begin_from(state)
+            return
+        parts, now = self.parts, self.backend.state
+        # A run from before headings were remembered goes on with the robots' own, one from before motor speeds with 1, one from
+        # before the steps of the rewards with the episodes' length.
+        headings = heading(state["physics"]["base_quaternion_w"])
+        older = {"commanded_heading": headings, "holds_heading": torch.zeros_like(parts.memory.holds_heading)}
+        older["episode_steps"] = state["memory"]["episode_length"]
+        restore({**older, **state["memory"]}, parts.memory.by_name())
+        self._require_below(parts.memory.level, self.palette.num_levels, "level")
+        self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")
+        motors = parts.motors.by_name()
+        restore({"motor_speed": torch.ones_like(motors["motor_speed"]), **state["motors"]}, motors)
+        self._take_bodies(state["bodies"])
+        parts.motors.apply(self.backend)
+        self._observations = Observations(**fitting(state["observations"], vars(self._observations))).clone()
+        self._generator.set_state(state["generator"].cpu())
+        self.common_step_counter = int(state["common_step_counter"])
+        physics = fitting(state["physics"], {name: getattr(now, name) for name in AFTER_RESET})
+        parts.action.copy_(parts.memory.action)
+        self.backend.reset(
+            ResetState(
+                base_position=physics["base_position_w"],
+                base_quaternion=physics["base_quaternion_w"],
+                joint_position=physics["joint_position"],
+                base_linear_velocity=physics["base_linear_velocity_w"],
+                base_angular_velocity=physics["base_angular_velocity_b"],
+                joint_velocity=physics["joint_velocity"],
+                held_target=parts.targets(),
+                terrain_index=parts.memory.terrain_index,
+            )
+        )
+        self._read(AFTER_RESET)
+
+    def _begin_from(self, progress: dict[str, Any]) -> None:
+        """Begin new episodes where ``progress_dict`` says that the run is."""
+        if len(progress["level"]) != self.num_envs:
+            raise ValueError(
+                f"the saved environment does not fit: it has {len(progress['level'])} worlds, this environment "
+                f"{self.num_envs}"
+            )
+        memory = self.parts.memory
+        found = fitting(progress, {"level": memory.level, "step": memory.step})
+        self._require_below(found["level"], self.palette.num_levels, "level")
+        memory.step.copy_(found["step"])
+        self.common_step_counter = int(progress["common_step_counter"])
+        self._take_bodies(progress["bodies"])
+        self._begin(found["level"])
+
+    def _take_bodies(self, saved: dict[str, Any]) -> None:
+        self._bodies = fitting(saved, self._bodies)
+        self.backend.randomize(Randomization(**self._bodies))
+
+    @staticmethod
+    def _require_below(numbers: torch.Tensor, count: int, name: str) -> None:
+        """Refuse saved numbers of things that are not there: engines read memory by them, unchecked.
+
+        Raises:
+            ValueError: one is negative or not below ``count``.
+        """
+        if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < count:
+            raise ValueError(f"the saved environment does not fit: '{name}' is not between 0 and {count - 1}")
+
+
+def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
+    """The joint constants of the training physics.
+
+    Raises:
+        ConfigurationError: the robot has no such parameter set.
+    """
+    settings = configuration.joints
+    if settings.parameters not in robot.parameters:
+        known = ", ".join(robot.parameters)
+        raise ConfigurationError(
+            f"environment.joints.parameters is '{settings.parameters}', but robot '{robot.name}' has: {known}"
+        )
+    changed = {
+        name: (value,) * robot.num_joints
+        for name in ("armature", "joint_damping", "friction_loss")
+        if (value := getattr(settings, name)) is not None
+    }
+    return replace(robot.parameters[settings.parameters], **changed)
+
+
+def training_contract(
+    robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
+) -> PolicyContract:
+    """The interface of a policy trained here: one frame of observation, the gains, the control period and the largest
+    commands of the training.
+    """
+    tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
+    provenance = {REMEMBERED: identify(robot, configuration.robot)}
+    return replace(
+        standard_contract(
+            robot, history=History(start=configuration.observations.history_start), provenance=provenance
+        ),
+        command_limits=largest_commands(configuration.commands, [tile.command_limits for tile in tiles]),
+        stiffness=parameters.stiffness,
+        damping=parameters.damping,
+        control_period=configuration.physics.control_period,
+    )

@@ -1,0 +1,188 @@
+"""Terms of one's own: functions that settings name, so that a task adds rewards, terminations, observations and events
+without touching the environment's loop.
+
+A function is named ``module:function``; the module must be importable where the run is started and resumed. ``docs/``
+has a worked example. Names that come out of a checkpoint, perhaps a stranger's, are imported only where they are trusted
+(``foreign_functions``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from importlib import import_module
+from typing import Any, Protocol, TypeVar
+
+import torch
+
+from ...files.parsing import one_line, shown
+from ...files.plugins import imported, raised
+from ..configuration import ConfigurationError, to_plain
+
+Kind = TypeVar("Kind")
+_PACKAGE = __name__.partition(".")[0]
+_MOVED = {
+    "training.commands": "training.environment.commands",
+    "training.curriculum": "training.environment.curriculum",
+}
+"""Modules of this package that checkpoints of version 0.1 name by their former place."""
+
+
+def _present(path: str) -> str:
+    """Return ``module:name`` with the module's present place in this package."""
+    module, colon, name = path.partition(":")
+    inner = module.removeprefix(f"{_PACKAGE}.")
+    return f"{_PACKAGE}.{_MOVED[inner]}{colon}{name}" if inner != module and inner in _MOVED else path
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def function(self) -> str: ...
+
+
+def resolve(path: str, setting: str) -> Callable[..., Any]:
+    """The function or class at ``module:name``. What it raises when it is called, and is not of this package, is one sentence.
+
+    Raises:
+        ConfigurationError: there is no such module or function, or importing it fails.
+    """
+    path = _present(path)
+    found = _found(path, setting)
+    return found if _own(path) else guarded(found, f"{setting} is {shown(path)}")
+
+
+def _found(path: str, setting: str) -> Callable[..., Any]:
+    where = f"{setting} is {shown(path)}"
+    module, colon, name = path.partition(":")
+    if not colon or not module or not name:
+        raise ConfigurationError(f"{where}; write module:function, for example my_robot.rewards:airtime")
+    found = imported(path, f"{where}, but", ConfigurationError)
+    if not callable(found):
+        raise ConfigurationError(f"{where}, but module {shown(module)} has no function {shown(name)}")
+    return found  # type: ignore[no-any-return]
+
+
+def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> Callable[..., Kind]:
+    """The class at ``module:name``.
+
+    Args:
+        base: what it must be derived from.
+        methods: what is called of its instances.
+
+    Raises:
+        ConfigurationError: as ``resolve``, or it is no such class.
+    """
+    path = _present(path)
+    found, where = _found(path, setting), f"{setting} is {shown(path)}"
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise ConfigurationError(f"{where}; it must be a class derived from {base.__module__}:{base.__name__}")
+    if _own(path):
+        return found
+
+    def make(*arguments: Any, **named: Any) -> Kind:
+        made = guarded(found, where)(*arguments, **named)
+        for method in methods:
+            setattr(made, method, guarded(getattr(made, method), where))
+        return made
+
+    return make
+
+
+def resolve_own(
+    terms: Iterable[_Named],
+    setting: str,
+    taken: Iterable[str] = (),
+    *,
+    gives: Callable[[Any, Any], bool] | None = None,
+    rule: str = "",
+) -> dict[str, Callable[..., Any]]:
+    """The functions of all terms by name.
+
+    Args:
+        taken: names that they cannot have.
+        gives: whether a function's result is what it must be, from its first argument and the result; None where nothing is
+            looked at.
+        rule: how a sentence says that.
+
+    Raises:
+        ConfigurationError: a name is used twice, or a function is not there.
+    """
+    functions: dict[str, Callable[..., Any]] = {}
+    for term in terms:
+        if term.name in functions or term.name in taken:
+            raise ConfigurationError(f"{setting} has {shown(term.name)}, a name that is taken; choose another")
+        where = f"{setting}.{one_line(term.name, 80)}.function"
+        functions[term.name] = _checked(
+            resolve(term.function, where), f"{where} is {shown(term.function)}", gives, rule
+        )
+    return functions
+
+
+def _checked(
+    function: Callable[..., Any], where: str, gives: Callable[[Any, Any], bool] | None, rule: str
+) -> Callable[..., Any]:
+    """A function whose results are looked at."""
+    if gives is None:
+        return function
+
+    def checked(first: Any, *others: Any) -> Any:
+        found = function(first, *others)
+        if not isinstance(found, torch.Tensor) or not gives(first, found):
+            shape = (
+                f"a tensor of {tuple(found.shape)}, {found.dtype}" if isinstance(found, torch.Tensor) else shown(found)
+            )
+            raise ConfigurationError(f"{where}, which gave {shape}; {rule}")
+        return found
+
+    return checked
+
+
+def guarded(call: Callable[..., Any], where: str) -> Callable[..., Any]:
+    """Somebody's code, of which whatever it raises, its wish to end the program included, is one sentence.
+
+    Args:
+        where: the beginning of the sentence.
+    """
+
+    def called(*arguments: Any, **named: Any) -> Any:
+        try:
+            return call(*arguments, **named)
+        except ConfigurationError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise ConfigurationError(f"{where}, which {raised(error)}; mend it") from error
+
+    return called
+
+
+def foreign_functions(settings: Any, known: Any) -> list[str]:
+    """What settings would import: every ``module:function`` in them that is neither the package's own nor named in ``known``.
+
+    Args:
+        settings: frozen dataclasses, of any depth, or plain data.
+        known: settings that are trusted.
+    """
+    trusted = set(_names(to_plain(known)))
+    return sorted({name for name in _names(to_plain(settings)) if name not in trusted and not _own(name)})
+
+
+def _names(value: Any) -> Iterator[str]:
+    """All texts with a colon, so that a field that is added some day is not forgotten here."""
+    if isinstance(value, dict | list | tuple):
+        for entry in value.values() if isinstance(value, dict) else value:
+            yield from _names(entry)
+    elif isinstance(value, str) and ":" in value:
+        yield value
+
+
+def _own(path: str) -> bool:
+    """Whether a module of this package defines the function; what it imported from elsewhere is not its own."""
+    module, _, name = _present(path).partition(":")
+    if not module.startswith(f"{_PACKAGE}.training."):
+        return False
+    try:
+        found = getattr(import_module(module), name, None)
+    except (ImportError, ValueError, TypeError):
+        return False
+    return getattr(found, "__module__", None) == module

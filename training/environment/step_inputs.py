@@ -1,0 +1,123 @@
+"""What functions of rewards and terminations look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+
+from ...backends.base import PhysicsState
+
+AFTER_STEP = (
+    "base_position_w",
+    "base_quaternion_w",
+    "base_linear_velocity_w",
+    "base_angular_velocity_b",
+    "joint_position",
+    "joint_velocity",
+    "joint_torque",
+    "foot_position_w",
+    "foot_velocity_w",
+    "foot_contact_force_w",
+    "body_contact_force_w",
+    "trunk_contact_force_w",
+    "diverged",
+)
+"""Physics state that a step is judged by."""
+AFTER_RESET = AFTER_STEP[:6]
+"""Physics state that is observed."""
+
+
+def static_inputs(state: PhysicsState) -> PhysicsState:
+    """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32."""
+    values = {f.name: getattr(state, f.name).clone() for f in fields(PhysicsState)}
+    return PhysicsState(**{name: v.float() if v.is_floating_point() else v for name, v in values.items()})
+
+
+@dataclass(kw_only=True)
+class StepInputs:
+    """What a control step led to, before any reset. N worlds, J joints, F feet."""
+
+    base_linear_velocity_b: torch.Tensor
+    """[m/s], (N, 3)."""
+    base_angular_velocity_b: torch.Tensor
+    """[rad/s], (N, 3)."""
+    base_quaternion_w: torch.Tensor
+    """wxyz, (N, 4)."""
+    base_height: torch.Tensor
+    """Height of the base over the mean ground below the trunk [m], (N,)."""
+    command: torch.Tensor
+    """Forward, lateral [m/s] and yaw [rad/s] speed, (N, 3)."""
+    sigma: torch.Tensor
+    """Tracking width of each command axis, (N, 3)."""
+    joint_position: torch.Tensor
+    """[rad], (N, J)."""
+    joint_velocity: torch.Tensor
+    """[rad/s], (N, J)."""
+    joint_acceleration: torch.Tensor
+    """Change of velocity over the control step [rad/s²], (N, J)."""
+    joint_torque: torch.Tensor
+    """Of the last substep [N·m], (N, J)."""
+    previous_joint_torque: torch.Tensor
+    """The same, one control step earlier."""
+    default_joint_position: torch.Tensor
+    """Standing pose [rad], (J,)."""
+    soft_lower: torch.Tensor
+    """Lower soft joint limit [rad], (J,)."""
+    soft_upper: torch.Tensor
+    """Upper soft joint limit [rad], (J,)."""
+    soft_speed: torch.Tensor
+    """Soft limit of the joint speeds [rad/s], (J,); infinity where the reward ``joint_speed_limits`` has no weight."""
+    hip_joints: torch.Tensor
+    """Indices of the hip joints, which swing legs sideways, (H,) int64."""
+    hip_pairs: torch.Tensor
+    """Hip joints and their mirror images, (P, 2) int64; empty where the reward ``hip_symmetry`` has no weight."""
+    hip_signs: torch.Tensor
+    """−1 for pairs that turn opposite ways when they mirror each other, else 1, (P,)."""
+    action: torch.Tensor
+    """Raw action of this step, (N, J)."""
+    previous_action: torch.Tensor
+    """Raw action one step earlier; zeros after a reset."""
+    second_previous_action: torch.Tensor
+    """Raw action two steps earlier; zeros after a reset."""
+    foot_height: torch.Tensor
+    """Height of the foot centres over the ground [m], (N, F)."""
+    foot_velocity_w: torch.Tensor
+    """[m/s], (N, F, 3)."""
+    touching_bodies: torch.Tensor
+    """Number of thighs, calves and what hangs on them in contact, (N,)."""
+    base_touching: torch.Tensor
+    """1 where the base touches something, (N,)."""
+    upright: torch.Tensor
+    """Cosine of the angle between the base's z axis and the world's, (N,)."""
+    trunk_contact_force_w: torch.Tensor
+    """Force of the ground on the trunk's shapes [N], (N, 3)."""
+    distance: torch.Tensor
+    """Distance from the tile's middle, larger of |x| and |y| [m], (N,)."""
+    leave_distance: torch.Tensor
+    """``distance`` at which an episode is cut short [m], infinite for never, (N,)."""
+    episode_length: torch.Tensor
+    """Control steps of the present episode, (N,) int64."""
+    max_episode_length: int
+    """Control steps of the longest episode."""
+    shortfall: torch.Tensor
+    """Share of the commanded speed that is missing of late, an exponential average, (N,)."""
+    diverged: torch.Tensor
+    """Worlds whose physics is not sound any more, (N,) bool."""
+    progress: torch.Tensor
+    """Fraction of the run, scalar."""
+    heading_xy: torch.Tensor
+    """Unit vector of the base's x axis in the world's xy plane, (N, 2)."""
+    commanded_heading_xy: torch.Tensor
+    """Where the robot should be heading, as ``heading_xy``, (N, 2): ``RewardConfiguration.progress_along`` says whether its heading
+    when the command was drawn, turned by the yaw rate commanded since, or its own."""
+    period: float
+    """Control period [s]."""
+    state: PhysicsState
+    """The physics, for whatever else a function needs."""
+    failed: torch.Tensor
+    """Worlds whose episode ends as a failure, (N,) bool; the terminations put it here, so that rewards know it."""
+    base_height_target: float
+    """[m]."""
+    foot_height_length: float
+    """Height over which foot regulation fades by a factor e [m]."""

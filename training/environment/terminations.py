@@ -1,0 +1,127 @@
+"""Ends of episodes. Each rule is a function of ``StepInputs`` and the settings that says which worlds' episode is over;
+``TERMINATIONS`` names them.
+
+An end is a failure, or a time-out, whose missing future the learner bootstraps. A failure lowers the level, unless the
+physics failed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from .configuration import TerminationConfiguration
+from .own_terms import resolve_own
+from .rewards import commanded_to_move, progress_share
+from .step_inputs import StepInputs
+
+STUCK_SHORTFALL = 0.9
+"""Share of the commanded speed that is missing of late from which a robot counts as stuck."""
+
+Rule = Callable[[StepInputs, TerminationConfiguration], torch.Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Termination:
+    """A rule, and what its end means."""
+
+    rule: Rule
+    """Which worlds' episode is over, (N,) bool."""
+    time_out: bool = False
+    """Whether the end is no failure."""
+
+
+def time_out(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
+    """The longest episode is over."""
+    return inputs.episode_length >= inputs.max_episode_length
+
+
+def left_tile(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
+    """The robot has left its tile behind."""
+    return inputs.distance > inputs.leave_distance
+
+
+def trunk_contact(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
+    """The ground presses on the trunk, head and chin apart, harder than ``trunk_contact`` newtons."""
+    assert settings.trunk_contact is not None
+    return inputs.trunk_contact_force_w.norm(dim=-1) > settings.trunk_contact
+
+
+def tilt(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
+    """The base leans by more than ``tilt`` radians."""
+    assert settings.tilt is not None
+    return inputs.upright < math.cos(settings.tilt)
+
+
+def stuck(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
+    """Nearly all of the commanded speed has been missing for about ``stuck`` seconds: an average that began at 0 has come
+    to ``STUCK_SHORTFALL`` after this much time at a standstill.
+    """
+    assert settings.stuck is not None
+    missing = torch.where(commanded_to_move(inputs.command), 1.0 - progress_share(inputs), 0.0).nan_to_num(0.0)
+    inputs.shortfall.lerp_(missing, 1.0 - (1.0 - STUCK_SHORTFALL) ** (inputs.period / settings.stuck))
+    return (inputs.shortfall > STUCK_SHORTFALL) & (inputs.progress >= settings.stuck_from)
+
+
+def diverged(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
+    """The physics is not sound any more: no fault of the policy."""
+    return inputs.diverged
+
+
+TERMINATIONS: dict[str, Termination] = {
+    "time_out": Termination(rule=time_out, time_out=True),
+    "left_tile": Termination(rule=left_tile, time_out=True),
+    "trunk_contact": Termination(rule=trunk_contact),
+    "tilt": Termination(rule=tilt),
+    "stuck": Termination(rule=stuck),
+    "diverged": Termination(rule=diverged),
+}
+"""All rules by name. A rule whose setting of the same name is None is left out; ``own`` adds more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ends:
+    """Which episodes are over, and why."""
+
+    failed: torch.Tensor
+    """(N,) bool."""
+    time_out: torch.Tensor
+    """Ends that are no failure, (N,) bool."""
+    by_rule: torch.Tensor
+    """Worlds that each rule ends, (N, rules) bool; no time-outs beside a failure."""
+
+
+class Terminations:
+    """The rules in use."""
+
+    def __init__(self, configuration: TerminationConfiguration) -> None:
+        """Choose the rules.
+
+        Raises:
+            ConfigurationError: a rule of one's own is not there.
+        """
+        self._settings = configuration
+        used = {name: t for name, t in TERMINATIONS.items() if getattr(configuration, name, True) is not None}
+        own = resolve_own(
+            configuration.own,
+            "environment.termination.own",
+            taken=TERMINATIONS,
+            gives=lambda inputs, found: found.shape == inputs.command.shape[:1] and found.dtype is torch.bool,
+            rule="it must be true or false for each world, (N,) bool",
+        )
+        used |= {t.name: Termination(rule=own[t.name], time_out=t.time_out) for t in configuration.own}
+        # Time-outs first, so that each sort is neighbouring columns.
+        self.names: tuple[str, ...] = tuple(sorted(used, key=lambda name: not used[name].time_out))
+        self._rules = [used[name].rule for name in self.names]
+        self._time_outs = sum(t.time_out for t in used.values())
+
+    def __call__(self, inputs: StepInputs) -> Ends:
+        """Ends of every world's episode; ``inputs.failed`` is set."""
+        flags = torch.stack([rule(inputs, self._settings) for rule in self._rules], dim=1)
+        time_outs, failures = flags[:, : self._time_outs], flags[:, self._time_outs :]
+        inputs.failed = failed = failures.any(dim=1)
+        alone = time_outs & ~failed[:, None]
+        return Ends(failed=failed, time_out=alone.any(dim=1), by_rule=torch.cat((alone, failures), dim=1))

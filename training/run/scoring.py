@@ -1,0 +1,106 @@
+"""Gauging the student while it is being trained: the gauge's command line in a side process on the CPU."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...files.parsing import edited, read_results
+from ...gauge.suite import load_suite
+from .side_process import CHILD_PROGRAM, Finished, Job, SideProcess
+
+GAUGE_FOLDER = "gauge"
+"""Folder of a run directory that holds what the gauge left behind, by suite and checkpoint."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreReport:
+    """What became of one submitted checkpoint."""
+
+    path: Path
+    iteration: int
+    scores: Mapping[str, float]
+    """Scores by name; empty if the gauging failed."""
+    failure: str = ""
+    """Why there are no scores, in one sentence."""
+
+
+class Scorer:
+    """Takes checkpoints, gives scores back later."""
+
+    def __init__(self, run: Path, *, suite: str, threads: int | None = None) -> None:
+        """Prepare.
+
+        Args:
+            run: run directory; results go to ``gauge/<suite>/<checkpoint>/`` in it.
+            suite: name or ``.toml`` file of the suite.
+            threads: CPU threads of the side process, None for half of the machine, since training needs the others.
+
+        Raises:
+            SuiteError: no such suite.
+        """
+        self.suite = load_suite(suite).name
+        """Name in the log keys ``Gauge/<suite>/<score>``."""
+        self._asked = suite
+        self._threads = threads or max(1, (os.cpu_count() or 2) // 2)
+        self._folder = run / GAUGE_FOLDER / self.suite
+        self._side = SideProcess()
+
+    def submit(self, path: Path, iteration: int) -> None:
+        """Ask for the scores of a checkpoint, which stays where it is until they are back."""
+        out = self._folder / path.stem
+        # A resumed run may come by the same iteration again, with other weights.
+        shutil.rmtree(out, ignore_errors=True)
+        options = ["--suite", self._asked, "--json", "--no-clip", "--threads", str(self._threads), "--out", str(out)]
+        command, output = [*CHILD_PROGRAM, "evaluate", str(path), *options], self._folder / f"{path.stem}.json"
+        self._side.submit(Job(command=command, checkpoint=path, iteration=iteration, output=output))
+
+    @property
+    def pending(self) -> int:
+        """How many submitted checkpoints have not been reported."""
+        return self._side.pending
+
+    def drain(self, seconds: float, stop: Callable[[], bool] = lambda: False) -> list[ScoreReport]:
+        """Reports that arrived since the last call, after waiting for all that is pending, at most ``seconds`` [s], until ``stop``
+        says so.
+        """
+        return [_report(finished) for finished in self._side.drain(seconds, stop)]
+
+    def close(self) -> None:
+        """Give up what is pending."""
+        self._side.close()
+
+
+def _report(finished: Finished) -> ScoreReport:
+    job, failure = finished.job, finished.failure
+    scores: Mapping[str, float] = {}
+    if failure == "skipped":
+        failure = "skipped: gauging is slower than training; raise gauge_interval"
+    elif not failure:
+        try:
+            with edited("it", ValueError):
+                scores = scores_of(read_results(job.output, "results", ValueError))
+        except ValueError as error:
+            failure = f"the gauge's output {job.output} cannot be read: {error}"
+    return ScoreReport(path=job.checkpoint, iteration=job.iteration, scores=scores, failure=failure)
+
+
+def scores_of(results: Any) -> Mapping[str, float]:
+    """What is worth a curve in a ``results.json``: the score, each terrain's level and score, the groups of metrics.
+
+    Raises:
+        ValueError: the results hold no score.
+    """
+    if results.get("score") is None:
+        raise ValueError("there is no score in it")
+    scores = {"score": float(results["score"])}
+    for terrain, row in results["terrains"].items():
+        if row.get("level") is not None:
+            scores[f"level/{terrain}"] = float(row["level"])
+        if "mean" in row:
+            scores[f"terrain/{terrain}"] = float(row["mean"])
+    return scores | {f"group/{name}": float(value) for name, value in results["groups"].items()}
