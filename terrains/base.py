@@ -9,38 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Box:
-    """A solid box."""
-
-    center: tuple[float, float, float]
-    """Centre [m]."""
-    half_size: tuple[float, float, float]
-    """Half extents along the box's own axes [m]."""
-    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Orientation, wxyz."""
-    wall: bool = False
-    """True for the boundary walls: they stop the robot but are no ground to walk on (``height`` ignores them)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class HeightField:
-    """A rectangular grid of heights, axis-aligned, linear between nodes as MuJoCo triangulates it."""
-
-    center: tuple[float, float]
-    """Middle of the grid [m]."""
-    half_size: tuple[float, float]
-    """Half extents in x and y [m]; the outermost nodes lie on the edge."""
-    heights: FloatArray
-    """Node heights [m], shape (rows, columns): rows run along +y, columns along +x; the lowest must be 0,
-    because MuJoCo shifts every field so that it is."""
-    base: float = 0.1
-    """Thickness of the solid below height 0 [m]."""
+from .height import ground_height
+from .shapes import Box, FloatArray, HeightField
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +45,7 @@ class Terrain:
     """True where the robot is to cross the terrain walking backwards."""
 
     def height(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
-        """Height of the ground at (x, y) [m], any shape: the highest of floor, boxes and height field; no walls."""
-        from .height import ground_height
-
-        return ground_height(self, np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        """Return the height of the ground at (x, y) [m], any shape: the highest of floor, boxes and height field; no walls."""
+        return ground_height(
+            self.boxes, self.height_field, np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        )

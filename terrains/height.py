@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Box, FloatArray, HeightField, Terrain
+from .shapes import Box, FloatArray, HeightField
 
 # A point on the very edge of a solid counts as above it, whichever way the edge's coordinate was rounded [m].
 EDGE_TOLERANCE = 1e-9
 
 
-def ground_height(terrain: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height of the highest solid on the vertical line through (x, y); the floor plane z = 0 is everywhere.
+def ground_height(boxes: Sequence[Box], height_field: HeightField | None, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the height of the highest solid on the vertical line through (x, y); the floor plane z = 0 is everywhere.
 
     Args:
-        terrain: the ground; its walls do not count.
+        boxes: the terrain's boxes; walls do not count.
+        height_field: the terrain's height field, where it has one.
         x: forward coordinate, world frame [m], any shape.
         y: leftward coordinate, world frame [m], a shape that broadcasts with ``x``.
 
@@ -24,11 +27,11 @@ def ground_height(terrain: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
     """
     x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
     height: FloatArray = np.where(np.isnan(x) | np.isnan(y), np.nan, 0.0)
-    for box in terrain.boxes:
+    for box in boxes:
         if not box.wall:
             height = np.maximum(height, box_top(box, x, y))
-    if terrain.height_field is not None:
-        height = np.maximum(height, height_field_top(terrain.height_field, x, y))
+    if height_field is not None:
+        height = np.maximum(height, height_field_top(height_field, x, y))
     return height
 
 

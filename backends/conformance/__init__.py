@@ -6,7 +6,8 @@ this package.
 """
 
 from .bench import Bench, ConformanceError
-from .suite import Check, CheckResult, Outcome, all_checks, make_bench, run_check, run_conformance
+from .check import Check
+from .suite import CheckResult, Outcome, all_checks, make_bench, run_check, run_conformance
 
 __all__ = [
     "Bench",

@@ -13,8 +13,8 @@ from ...robots.body_plan import body_plan
 from ...terrains.base import Box, Terrain
 from ..base import TRAINING_PHYSICS, BackendError, PhysicsOptions
 from .bench import FLAT, WORLDS, Bench, Worlds, expect, expect_close
+from .check import check
 from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, level_stance, rotated
-from .suite import check
 
 
 def stand_still(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from .bench import Bench, expect, expect_close
+from .check import check
 from .kinematics import follow_reference, posed
 from .reference import GRAVITY, Reference
-from .suite import check
 
 
 @check("disturbance/push", "push")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from .bench import Bench, expect, expect_close
+from .check import check
 from .contact import lay_on_back, stand_still
 from .ground import incline
 from .reference import GRAVITY, Reference, axis_angle, level_stance
-from .suite import check
 
 HEADING_X = np.tile([1.0, 0.0, 0.0, 0.0], (4, 1))
 

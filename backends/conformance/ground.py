@@ -6,9 +6,9 @@ import numpy as np
 
 from ...terrains.base import Box, HeightField, Terrain
 from .bench import Bench, expect, expect_close
+from .check import check
 from .contact import stand_still
 from .reference import GRAVITY, Reference, axis_angle, level_stance
-from .suite import check
 
 PITCH = 0.2
 """Slope of the inclined box [rad]."""

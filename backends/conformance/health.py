@@ -6,11 +6,11 @@ import numpy as np
 
 from ...terrains.base import Box, Terrain
 from .bench import Bench, expect
+from .check import check
 from .contact import lay_on_back
 from .kinematics import base_up
 from .reference import Reference, level_stance
 from .stepping import expect_same_motion, stand, wave
-from .suite import check
 
 BLOCK = Terrain(
     name="conformance_block", family="block", boxes=(Box(center=(0.0, 0.0, 0.1), half_size=(0.6, 0.6, 0.1)),)

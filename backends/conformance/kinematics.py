@@ -10,8 +10,8 @@ import torch
 
 from ..base import PhysicsState
 from .bench import Bench, Worlds, expect, expect_close
+from .check import check
 from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, rotated
-from .suite import check
 
 FORCE_FIELDS = (
     "joint_torque",

@@ -6,8 +6,8 @@ import numpy as np
 
 from ...robots.body_plan import body_plan, joint_ranges
 from .bench import Bench, Worlds, expect
+from .check import check
 from .reference import Reference
-from .suite import check
 
 
 @check("contact/legs", "self_collision")

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from .bench import Bench, Worlds, expect_close
+from .check import check
 from .contact import centers_of_mass, pressure_point, stand_still
 from .kinematics import follow_reference, posed
 from .reference import GRAVITY, Reference
-from .suite import check
 
 
 def _weights(bench: Bench, changes: list[dict[str, Any]]) -> np.ndarray:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from .bench import Bench, Worlds, expect, expect_close
+from .check import check
 from .kinematics import follow_reference, posed
-from .suite import check
 
 
 def law(bench: Bench, target: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:

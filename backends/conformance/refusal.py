@@ -14,7 +14,7 @@ import torch
 from ...terrains.base import Box, HeightField, Terrain
 from ..base import BackendError, Randomization
 from .bench import FLAT, Bench, ConformanceError, Worlds, expect
-from .suite import ENGINE_ERRORS, check
+from .check import ENGINE_ERRORS, check
 
 _BOX = Terrain(name="conformance_box", family="box", boxes=(Box(center=(0.0, 0.0, 0.1), half_size=(1.0, 1.0, 0.1)),))
 _FIELD = Terrain(

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..base import PhysicsState, Support
 from .bench import Bench, Worlds, expect, expect_close
+from .check import check
 from .reference import Reference, level_stance
-from .suite import check
 
 MOTION_FIELDS = (
     "base_position_w",

@@ -1,4 +1,4 @@
-"""Collects the checks, runs them against an engine and says what came of each."""
+"""Run the checks against an engine and return the outcome of each."""
 
 from __future__ import annotations
 
@@ -7,25 +7,14 @@ from dataclasses import dataclass
 from enum import Enum
 from time import perf_counter
 
-import mujoco
-
 from ...robots import Robot, load_robot
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsBackend, Scene, Support, unsupported
 from ..registry import engine_class, make_backend
+from . import contact, disturbance, friction, ground, health, kinematics, legs, model, motors, refusal, stepping
 from .bench import Bench
+from .check import ENGINE_ERRORS, Check, registered
 
-# Whatever an engine under test may raise is a failed check, not the end of the run.
-ENGINE_ERRORS = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    mujoco.FatalError,
-)
+ROOMS = (kinematics, motors, stepping, health, contact, legs, ground, friction, model, disturbance, refusal)
 
 
 class Outcome(Enum):
@@ -35,22 +24,6 @@ class Outcome(Enum):
     FAILED = "failed"
     NOT_SUPPORTED = "not supported"
     """The engine declares that it cannot do this; that it refuses to is checked under ``refusal/…``."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """One check.
-
-    Its ``run`` raises ``ConformanceError`` where the engine breaks the contract and returns what it measured.
-    """
-
-    name: str
-    """Room and subject, for example ``motors/latency``."""
-    needs: tuple[str, ...]
-    """Capabilities without which the check makes no sense."""
-    run: Callable[[Bench], str]
-    about: str
-    """One sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,26 +38,9 @@ class CheckResult:
     """Wall-clock time [s]."""
 
 
-_CHECKS: dict[str, Check] = {}
-
-
-def check(name: str, *needs: str) -> Callable[[Callable[[Bench], str]], Callable[[Bench], str]]:
-    """Register a function as a check; the first line of its docstring says what it is about."""
-
-    def register(function: Callable[[Bench], str]) -> Callable[[Bench], str]:
-        unknown = set(needs) - set(CAPABILITY_NAMES)
-        if name in _CHECKS or unknown:
-            raise ValueError(f"check '{name}' is registered twice or needs unknown capabilities {sorted(unknown)}")
-        about = (function.__doc__ or "").strip().partition("\n")[0]
-        _CHECKS[name] = Check(name=name, needs=needs, run=function, about=about)
-        return function
-
-    return register
-
-
 def all_checks() -> tuple[Check, ...]:
-    """All checks in the order in which they run: what everything else rests on comes first."""
-    return tuple(_CHECKS.values())
+    """Return all checks in the order in which they run: what everything else rests on comes first."""
+    return tuple(check for room in ROOMS for check in registered(room.__name__))
 
 
 def run_check(check: Check, bench: Bench) -> CheckResult:

@@ -1,13 +1,10 @@
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge.evaluate import Request
-
-
 from tiny_runs import evaluate, tiny_request
 
 

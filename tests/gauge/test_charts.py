@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from gaitgauge.gauge.report.page import STATISTIC_LABELS, charts, report_data
 from gaitgauge.gauge.report.pages import page_template
+from gaitgauge.training.sweep import folding
 from sample_results import PIPELINES, row, sample
 
 
@@ -113,7 +114,7 @@ def test_curves_over_little_have_ticks_that_differ():
 
 def sweep_page(figures: dict[str, Any], names: list[str]) -> str:
     sweep = {"title": "", "name": "", "suite": "", "entries": [], "sentences": [], "runs": [], "compared": False}
-    return page_template("sweep.html.j2").render(sweep=sweep, groups=[], names=names, figures=figures)
+    return page_template(folding.__file__, "sweep.html.j2").render(sweep=sweep, groups=[], names=names, figures=figures)
 
 
 def test_a_curve_of_one_point_is_a_dot_and_an_entry_without_a_curve_is_in_no_legend():

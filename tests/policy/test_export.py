@@ -11,6 +11,7 @@ import torch
 import yaml
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import History, PolicyContract, standard_contract
+from gaitgauge.policy.export import files as export
 from gaitgauge.policy.export.files import (
     ExportError,
     export_deploy,
@@ -20,7 +21,6 @@ from gaitgauge.policy.export.files import (
     mjlab_metadata,
     term_major_order,
 )
-from gaitgauge.policy.export import files as export
 from gaitgauge.policy.foreign.adapters import deploy_contract, mjlab_contract
 from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
 from gaitgauge.policy.importing import import_policy

@@ -171,7 +171,7 @@ def test_ctrl_c_ends_a_program_without_an_end(tmp_path):
     path.write_bytes(script(Endless()))
     # a shell that runs the tests in the background has the signal ignored, and so would Python
     heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    ready = "from gaitgauge.policy import fenced, loading; print('ready', flush=True)"
+    ready = "from gaitgauge.policy import loading; from gaitgauge.policy.foreign import fenced_policy; print('ready', flush=True)"
     code = f"{heard}; {ready}; loading.load_policy({str(path)!r})"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None

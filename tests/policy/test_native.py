@@ -7,8 +7,8 @@ from gaitgauge.policy import native
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import ForeignFile, FrozenNetwork, StoredNetwork, frozen, save_policy
-from gaitgauge.policy.networks.architectures import CtsNetwork, ExpertMixture, MlpNetwork, MoeCtsNetwork
 from gaitgauge.policy.networks import architectures as networks
+from gaitgauge.policy.networks.architectures import CtsNetwork, ExpertMixture, MlpNetwork, MoeCtsNetwork
 from torch import nn
 
 EPISODES, RESET_STEP, RESET_ROW = 4, 6, 2
