@@ -4,13 +4,14 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import torch
+from gaitgauge.training.environment import environment
 from gaitgauge.training.environment.configuration import (
     EnvironmentConfiguration,
     PushConfiguration,
     ResetConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge.training.environment.environment import TrainingEnvironment, environment
+from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge.training.environment.terrain_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration
 from gaitgauge_fake_engine import FakeBackend, FakeScript
 
