@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from .gauge.request import EvaluationOptions, Request
 
 if TYPE_CHECKING:
     from .policy.base import Policy
@@ -94,11 +96,40 @@ _KINDS: Mapping[str, tuple[type, ...]] = {
     "a path or None": (str, os.PathLike, type(None)),
     "a text": (str,),
     "a text or None": (str, type(None)),
-    "a whole number or None": (Integral, type(None)),
     "several texts": (str,),
-    "several numbers": (Real,),
     "a path, or what evaluate returned": (str, os.PathLike, Results),
+    "a path, or a request": (str, os.PathLike, EvaluationOptions),
 }
+
+
+def _request(**options: Any) -> Request:
+    """Return a request with these options: paths as texts, sequences as tuples, NumPy's numbers as Python's.
+
+    Raises:
+        ArgumentError: there is no such option, or a value is of another type or out of range.
+    """
+    from .files.choices import choices
+    from .files.parsing import check_fields
+
+    known = choices(Request)
+    if unknown := sorted(set(options) - set(known)):
+        raise ArgumentError(f"there is no option {unknown[0]}; choose from {', '.join(known)}")
+    request = Request(**{name: _plain(value) for name, value in options.items()})
+    check_fields(request, "evaluate", ArgumentError)
+    return request
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as a request has it: a path as text, a sequence as a tuple, a NumPy number as Python's."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        return int(value)
+    if isinstance(value, Real) and not isinstance(value, bool | Integral):
+        return float(value)
+    if isinstance(value, Iterable) and not isinstance(value, str | bytes):
+        return tuple(map(_plain, value))
+    return value
 
 
 def load_results(path: str | Path) -> Results:
@@ -154,81 +185,34 @@ def load_policy(policy: str | Path, *, robot: str | None = None, trust: bool = F
 
 
 def evaluate(
-    policy: str | Path,
+    policy: str | Path | Request,
     *,
-    suite: str | Path = "gaitgauge-1",
-    pipeline: str = "stress",
-    backend: str = "mujoco",
-    device: str | None = None,
-    robot: str | None = None,
-    terrains: Sequence[str] = (),
-    level: int | None = None,
-    frictions: Sequence[float] = (),
-    payloads: Sequence[float] = (),
-    seeds: Sequence[int] = (),
-    threads: int | None = None,
     out: str | Path | None = None,
     resume: bool = False,
-    trust: bool = False,
     watch: Callable[[Any], None] | None = None,
+    **options: Any,
 ) -> Results:
     """Judge a policy, as ``gaitgauge evaluate`` does; writes results, episodes and the report.
 
     Args:
-        policy: a file, or ``latest``, ``best`` or ``pretrained``.
-        suite: a suite's name, or the path of its file.
-        pipeline: ``base``, ``multi``, ``level`` or ``stress``.
-        backend: the physics engine.
-        device: ``cpu`` or ``cuda``; None for what the engine is made for.
-        robot: name of the robot, or the path of its ``robot.toml``; None for the one that the policy is for.
-        terrains: names; empty for the suite's own.
-        level: to play at; None to search for the highest.
-        frictions: coefficients; empty for the suite's own.
-        payloads: masses on the base [kg]; empty for the suite's own.
-        seeds: of the quality episodes; empty for the suite's own.
-        threads: CPU threads, None for all cores; they change the time, never the results.
+        policy: a file, or ``latest``, ``best`` or ``pretrained``; or a whole request in place of all options.
         out: output folder; None for ``results/<policy>-<suite>-<pipeline>``.
         resume: go on with what the folder holds.
-        trust: run the program that a policy file of the project's own format carries inside.
         watch: called a few times a second with a ``Status``.
+        options: fields of ``gaitgauge.gauge.request.Request``: ``suite``, ``terrains``, ``frictions``, ``threads`` …
 
     Raises:
         ArgumentError, SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, StoreError: one sentence.
     """
-    from .backends.registry import choose_device
-    from .files import MOST_THREADS
-    from .files.parsing import shown
-    from .gauge.evaluate import Request
     from .gauge.evaluate import evaluate as run
     from .gauge.report.page import write_report
     from .studies.naming import run_folders
 
-    _need("a path", policy=policy, suite=suite)
     _need("a path or None", out=out)
-    _need("a text", pipeline=pipeline, backend=backend)
-    _need("a text or None", device=device, robot=robot)
-    _need("several texts", terrains=terrains)
-    _need("several numbers", frictions=frictions, payloads=payloads, seeds=seeds)
-    _need("a whole number or None", level=level, threads=threads)
-    if threads is not None and not 1 <= threads <= MOST_THREADS:
-        raise ArgumentError(f"threads is {shown(threads)}; it must be 1 to {MOST_THREADS}")
-    usual = run_folders([str(policy)], Path("results"), suite=str(suite), pipeline=pipeline)[0]
+    _need("a path, or a request", policy=policy)
+    request = policy if isinstance(policy, Request) else _request(policy=policy, **options)
+    usual = run_folders([request.policy], Path("results"), suite=request.suite, pipeline=request.pipeline)[0]
     folder = usual if out is None else Path(out)
-    request = Request(
-        policy=str(policy),
-        suite=str(suite),
-        pipeline=pipeline,
-        backend=backend,
-        device=choose_device(backend, device),
-        robot=robot,
-        terrains=tuple(terrains),
-        level=None if level is None else int(level),  # numpy's numbers, too, have to be written into results
-        frictions=tuple(map(float, frictions)),
-        payloads=tuple(map(float, payloads)),
-        seeds=tuple(int(s) if isinstance(s, Integral) else s for s in seeds),
-        threads=os.cpu_count() or 1 if threads is None else int(threads),
-        trust=trust,
-    )
     run(request, folder, resume=resume, watch=watch)
     write_report(folder)
     return load_results(folder)
@@ -258,7 +242,7 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
         task: name of the task.
         settings: ``key=value`` settings of the task, such as ``environment.push.linear=0.6``.
         seconds: wall-clock limit [s].
-        options: fields of ``gaitgauge.training.run.launch.TrainRequest``.
+        options: fields of ``gaitgauge.training.run.request.TrainRequest``.
 
     Returns:
         How it ended, and the run directory.
@@ -266,8 +250,9 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
     Raises:
         ArgumentError, TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.
     """
-    from .training.run.launch import TrainRequest, prepare
+    from .training.run.launch import prepare
     from .training.run.launch import train as run
+    from .training.run.request import TrainRequest
 
     _need("a text", task=task)
     _need("several texts", settings=settings)

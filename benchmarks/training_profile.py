@@ -28,7 +28,8 @@ from typing import Any
 import environment_throughput
 import torch
 import warp_profile
-from gaitgauge.training.run.launch import TrainRequest, prepare, train
+from gaitgauge.training.run.launch import prepare, train
+from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.stopping import Progress
 from torch.profiler import ProfilerActivity, profile, record_function

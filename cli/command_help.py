@@ -1,4 +1,4 @@
-"""The help of all commands: text as it is written, options in groups, examples at the end.
+"""Prepare the help of all commands: text as it is written, options in groups, examples at the end.
 
 In a command's docstring, what follows ``Examples:`` are command lines that its help ends with.
 """
@@ -11,20 +11,6 @@ from typing import Any
 from rich.markup import escape
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
-GROUPS: Mapping[str, tuple[str, ...]] = {
-    "What is played": (
-        "pipeline", "suite", "scenarios", "terrain", "terrains", "level", "levels", "friction", "frictions", "payloads", "seed",
-        "seeds", "repeats", "robots", "robot", "command", "seconds", "quick", "factors", "attribution", "margin",
-    ),
-    "Where it runs": ("backend", "backends", "reference", "device", "threads", "per_gpu", "num_envs", "capture", "fuse", "cluster"),
-    "How it is watched": ("viewer", "port", "host", "gamepad"),
-    "Beginning and end of a run": ("iterations", "time", "init_from"),
-    "Scores while it learns": ("score", "score_every", "score_suite", "score_threads"),
-    "What is written": (
-        "out", "gif", "video_every", "resume", "json_output", "run_name", "log_root", "logger", "form", "layout", "force",
-    ),
-}  # fmt: skip
-"""Groups of options, by the names of their parameters: a name means the same in every command."""
 COMMAND_GROUPS: Mapping[str, tuple[str, ...]] = {
     "Judge": ("evaluate", "compare", "verify", "board"),
     "Study": ("consistency", "validate", "trial", "latent", "sweep"),
@@ -46,7 +32,7 @@ class Program(TyperGroup):
         self.help = escape(self.help or "")
         for command in self.commands.values():
             _prepare(command)
-            command.rich_help_panel = _group_of(command.name or "", COMMAND_GROUPS)  # type: ignore[attr-defined]
+            command.rich_help_panel = next((g for g, names in COMMAND_GROUPS.items() if command.name in names), None)  # type: ignore[attr-defined]
 
 
 def _prepare(command: Any) -> None:
@@ -60,13 +46,9 @@ def _prepare(command: Any) -> None:
     for parameter in command.params:
         if isinstance(parameter, TyperOption | TyperArgument) and parameter.help:
             parameter.help = escape(parameter.help)
-    if len(options) > _FEW:
+    if len(options) <= _FEW:
         for option in options:
-            option.rich_help_panel = _group_of(option.name or "", GROUPS)
+            option.rich_help_panel = None
     if isinstance(command, TyperGroup):
         for each in command.commands.values():
             _prepare(each)
-
-
-def _group_of(name: str, groups: Mapping[str, tuple[str, ...]]) -> str | None:
-    return next((group for group, names in groups.items() if name in names), None)

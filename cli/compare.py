@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,8 +9,7 @@ from typing import Any
 
 from rich.text import Text
 
-from ..backends.registry import choose_device
-from ..gauge.evaluate import Request
+from ..gauge.request import EvaluationOptions, Request
 from ..studies.compare.comparison import format_p
 from ..studies.compare.contestants import compare_all
 from ..studies.naming import joined_names
@@ -21,25 +19,10 @@ from .studies import resumable
 
 
 def run_comparison(
-    *,
-    contestants: Sequence[str],
-    suite: str,
-    backend: str,
-    device: str | None,
-    threads: int | None,
-    out: Path | None,
-    json_output: bool,
-    **choices: Any,
+    contestants: Sequence[str], choices: EvaluationOptions, *, out: Path | None, json_output: bool
 ) -> None:
-    """Compare, show progress, print what is real and where the files are."""
-    request = Request(
-        policy=contestants[0],
-        suite=suite,
-        backend=backend,
-        device=choose_device(backend, device),
-        threads=threads or os.cpu_count() or 1,
-        **choices,
-    )
+    """Compare, show progress, print which differences are real and where the files are."""
+    request = Request(policy=contestants[0], **vars(choices))
     with resumable(Terminal(stderr=True), "gauging") as display:
         found, paths = compare_all(
             contestants,

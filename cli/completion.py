@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 Completer = Callable[[str], list[str]]
@@ -87,3 +87,16 @@ def _files(incomplete: str, endings: tuple[str, ...]) -> list[str]:
     chosen = [p for p in found if p.is_dir() or p.suffix in endings]
     hidden = "." if not name.startswith(".") else "\0"
     return [f"{folder}{slash}{p.name}{'/' if p.is_dir() else ''}" for p in chosen if not p.name.startswith(hidden)]
+
+
+KINDS: Mapping[str, Completer] = {
+    "suites": suites,
+    "scenarios": scenarios,
+    "terrains": terrains,
+    "backends": backends,
+    "robots": robots,
+    "tasks": tasks,
+    "policies": policies,
+    "checkpoints": checkpoints,
+}
+"""Completion by what a ``Choice`` names."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,27 +20,13 @@ from .progress import ProgressDisplay
 from .studies import resumable
 
 
-def run_consistency(
-    *,
-    policies: Sequence[str],
-    backends: str,
-    threads: int | None,
-    out: Path | None,
-    resume: bool,
-    json_output: bool,
-    **choices: Any,
-) -> None:
+def run_consistency(request: StudyRequest, backends: str, *, out: Path | None, resume: bool, json_output: bool) -> None:
     """Make the study, show progress, print the tables and where the files are."""
-    request = StudyRequest(
-        policies=tuple(policies),
-        backends=tuple(b.strip() for b in backends.split(",") if b.strip()),
-        threads=threads or os.cpu_count() or 1,
-        **choices,
-    )
+    request = replace(request, backends=tuple(b.strip() for b in backends.split(",") if b.strip()))
     console = Terminal(stderr=True)
     prepared = prepare_study(request)  # all that can be wrong with the request is said before anything is written
     _print_skipped(console, prepared.skipped)
-    folder = out or Path("results") / f"{joined_names(policies)}-{bare_name(request.suite)}-consistency"
+    folder = out or Path("results") / f"{joined_names(request.policies)}-{bare_name(request.suite)}-consistency"
     with resumable(console, "comparing", folder, "--resume") as display:
         command = ["gaitgauge", *sys.argv[1:]]
         results = study(prepared, folder, resume=resume, command=command, watch=_shower(display))

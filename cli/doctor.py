@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import typer
 from packaging.requirements import Requirement
@@ -48,15 +47,26 @@ class Finding:
     """What to do, where it is not ok."""
 
 
-def run_doctor(*, policy: str | None, json_output: bool, **choices: Any) -> None:
+def run_doctor(
+    policy: str | None,
+    *,
+    contract: Path | None,
+    robot: str | None,
+    seconds: float | None,
+    threads: int | None,
+    out: Path | None,
+    json_output: bool,
+    trust: bool,
+) -> None:
     """Examine this machine, or a policy as ``diagnosis.examine_policy`` does; exit code 1 where something is wrong.
 
     Raises:
         UserError: an option is for a policy, and none is named.
     """
     if policy is None:
-        for name in ("contract", "robot", "out", "seconds", "trust"):
-            if choices[name]:
+        for_policies = {"contract": contract, "robot": robot, "out": out, "seconds": seconds, "trust": trust}
+        for name, value in for_policies.items():
+            if value:
                 raise UserError(
                     f"--{name} is for the examination of a policy; name one: gaitgauge doctor POLICY --{name} …"
                 )
@@ -64,7 +74,16 @@ def run_doctor(*, policy: str | None, json_output: bool, **choices: Any) -> None
     else:
         from .diagnosis import examine_policy
 
-        well = examine_policy(policy, json_output=json_output, **choices)
+        well = examine_policy(
+            policy,
+            contract=contract,
+            robot=robot,
+            seconds=seconds,
+            threads=threads,
+            out=out,
+            json_output=json_output,
+            trust=trust,
+        )
     if not well:
         raise typer.Exit(1)
 

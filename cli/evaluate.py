@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
@@ -13,10 +12,10 @@ from typing import Any
 
 from rich.text import Text
 
-from ..backends.registry import choose_device
 from ..gauge.coverage import COMPLETE, coverage_of, coverage_words, notes, score_label, suite_label
-from ..gauge.evaluate import Request, Status, evaluate, prepare
+from ..gauge.evaluate import Status, evaluate, prepare
 from ..gauge.report.page import write_report
+from ..gauge.request import Request
 from ..gauge.results import ALL
 from ..gauge.suite import Suite
 from ..policy.contract import PolicyContract
@@ -27,37 +26,13 @@ from .progress import ProgressDisplay, duration
 from .studies import resumable
 
 
-def run_evaluation(
-    *,
-    policy: str,
-    pipeline: str,
-    suite: str,
-    backend: str,
-    device: str | None,
-    threads: int | None,
-    cluster: str | None,
-    out: Path | None,
-    resume: bool,
-    json_output: bool,
-    clip: bool = True,
-    **choices: Any,
-) -> None:
+def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bool, json_output: bool) -> None:
     """Evaluate, show progress, film the robot, print the tables and where the files are."""
-    request = Request(
-        policy=policy,
-        pipeline=pipeline,
-        suite=suite,
-        backend=backend,
-        device=choose_device(backend, device),
-        threads=threads or (None if cluster else os.cpu_count() or 1),
-        cluster=cluster,
-        **choices,
-    )
     prepared = prepare(request)  # all that can be wrong with the request is said before anything is written
-    folder = out or run_folders([policy], Path("results"), suite=suite, pipeline=pipeline)[0]
+    folder = out or run_folders([request.policy], Path("results"), suite=request.suite, pipeline=request.pipeline)[0]
     console = Terminal(stderr=True)
     # Ray prints its nodes' logs to standard output; that a worker was lost is one of the notices
-    quiet = redirect_stdout(io.StringIO() if cluster else sys.stdout)
+    quiet = redirect_stdout(io.StringIO() if request.cluster else sys.stdout)
     with resumable(console, "gauging", folder, "--resume") as display, quiet:
         command = ["gaitgauge", *sys.argv[1:]]
         results = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display))
@@ -65,7 +40,7 @@ def run_evaluation(
     if clip:
         from .clip import make_clip
 
-        options = [policy, "--suite", suite] + ["--trust"] * request.trust
+        options = [request.policy, "--suite", request.suite] + ["--trust"] * request.trust
         options += ["--robot", request.robot] if request.robot else []
         if sentence := make_clip(folder, results, options):
             console.say(sentence)

@@ -26,7 +26,7 @@ _ABOUT = {
 LAYOUTS = ("plain", "unitree")
 
 
-def run_export(*, policy: str, out: Path | None, form: str, layout: str, trust: bool, robot: str | None) -> None:
+def run_export(policy: str, *, out: Path | None, form: str, layout: str, trust: bool, robot: str | None) -> None:
     """Export, and print each file with its check against the policy.
 
     Raises:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..studies.latent.figures import SPACES, label
-from ..studies.latent.study import PAIRS, LatentRequest, study_latents
+from ..studies.latent.request import LatentRequest
+from ..studies.latent.study import PAIRS, study_latents
 from ..studies.naming import joined_names
 from .console import Terminal, make_table
 from .policies import policy_files
 from .studies import make_study
 
 
-def run_latent(
-    *, policies: Sequence[str], threads: int | None, out: Path | None, json_output: bool, **choices: Any
-) -> None:
+def run_latent(request: LatentRequest, *, out: Path | None, json_output: bool) -> None:
     """Walk, look, print tables and where the files are; exit code 1 where something was left out."""
-    request = LatentRequest(policies=policy_files(policies), threads=threads or os.cpu_count() or 1, **choices)
-    folder = out or Path("results") / f"latent-{joined_names(policies)}"
+    folder = out or Path("results") / f"latent-{joined_names(request.policies)}"
+    request = replace(request, policies=policy_files(request.policies))
     files = ("latent.json", "latent.html")
     make_study(
         study_latents, request, folder, title="looking", show=print_latents, files=files, json_output=json_output

@@ -6,18 +6,18 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .console import Terminal
 from .errors import UserError
 from .picture import choose_renderer
+from .play_request import PlayRequest
 from .progress import ProgressDisplay
 from .video import CLIP_ENDINGS, VIDEO_ENDINGS, check_film_path
 
 if TYPE_CHECKING:
-    from .play_session import Command, PlaySession
+    from .play_session import PlaySession
 
 VIEWERS = ("native", "viser", "video")
 MOST = 4
@@ -31,38 +31,13 @@ _VIDEO_SECONDS = 10.0
 """Length of a video where none is asked for [s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlayRequest:
-    """What the user asked for."""
-
-    policies: tuple[str, ...]
-    terrain: str
-    level: int | None
-    backend: str
-    device: str | None
-    viewer: str | None
-    out: Path | None
-    gif: Path | None
-    seconds: float | None
-    command: Command | None
-    friction: float
-    seed: int
-    port: int
-    host: str
-    gamepad: bool
-    trust: bool
-    robot: str | None
-    suite: str
-
-
-def run_play(**choices: Any) -> None:
-    """Load, build, and hand over to the viewer; ``choices`` are the fields of ``PlayRequest``.
+def run_play(asked: PlayRequest) -> None:
+    """Load, build, and hand over to the viewer.
 
     Raises:
         UserError: an option that makes no sense, or a viewer that this machine has no display for.
         PolicyError, ContractError, TerrainError, BackendError: one sentence on what is wrong.
     """
-    asked = PlayRequest(**choices)
     viewer = _check(asked)
     quality = choose_renderer() if viewer == "video" else None  # before MuJoCo is imported
     from ..studies.naming import distinct_names

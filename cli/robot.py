@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _EVERYTHING = "everything"
 
 
-def new_robot(*, model: Path, out: Path | None, name: str | None, force: bool) -> None:
+def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -> None:
     """Write a first description, and print what was guessed. What cannot be described leaves everything as it was.
 
     Raises:

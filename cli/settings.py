@@ -12,33 +12,18 @@ from typing import Any
 
 from rich.text import Text
 
+from ..training.run.request import TrainRequest
 from ..training.tasks import find_task
 from .console import Terminal
 
 _WIDTH = 80
 
 
-def run_training_or_settings(
-    *,
-    list_settings: bool,
-    overrides: Sequence[str],
-    time: str | None,
-    score: bool,
-    score_suite: str,
-    **choices: Any,
-) -> None:
-    """Print the settings of a task, as the options beside it change them, and end; or train it, with checkpoints that are scored
-    or not.
-    """
-    if list_settings:
-        from ..training.run.launch import TrainRequest, own_overrides
+def print_settings_of(request: TrainRequest) -> None:
+    """Print the settings of a task as the options beside it change them."""
+    from ..training.run.launch import own_overrides
 
-        request = TrainRequest(overrides=overrides, **choices)
-        print_settings(request.task, own_overrides(request), request.robot)
-        return
-    from .train import run_training
-
-    run_training(overrides=overrides, time=time, score_suite=score_suite if score else None, **choices)
+    print_settings(request.task, own_overrides(request), request.robot)
 
 
 def print_settings(task: str, overrides: Sequence[str], robot: str | None = None) -> None:

@@ -18,8 +18,8 @@ from .train import parse_duration
 
 
 def run_sweep(
-    *,
     file: Path,
+    *,
     out: Path | None,
     threads: int | None,
     per_gpu: int,

@@ -6,15 +6,16 @@ import os
 import re
 import time as clock
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import typer
 
 from ..files.parsing import one_line
 from ..training.configuration import RunConfiguration
-from ..training.run.launch import TrainPlan, TrainRequest, prepare, train
+from ..training.run.launch import TrainPlan, prepare, train
 from ..training.run.processes import Processes, told_number
+from ..training.run.request import TrainRequest
 from ..training.run.stopping import Progress
 from .console import Terminal, shell_command
 from .errors import UserError
@@ -27,11 +28,12 @@ _LONGEST = 10_000 * 3600.0
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
 
-def run_training(*, task: str, time: str | None, **choices: Any) -> None:
-    """Train, show progress, say where the checkpoints are and how to go on; exits with the run's exit code."""
+def run_training(request: TrainRequest, time: str | None) -> None:
+    """Train for at most ``time``, show progress, say how to go on; exits with the run's exit code."""
     began = clock.monotonic()
     seconds = None if time is None else parse_duration(time)
-    plan = prepare(TrainRequest(task=task, seconds=seconds, **choices))
+    plan = prepare(replace(request, seconds=seconds))
+    task = request.task
     # Of several processes, one for each GPU, the first speaks.
     console = Terminal(quiet=os.environ.get("RANK", "0") != "0", may_lose=True)
     steps = plan.task.training.run.steps_per_iteration * plan.task.environment.num_envs

@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..backends.registry import choose_device
 from ..studies.naming import joined_names
 from ..studies.trials.page import measures, percent, reported
-from ..studies.trials.trialling import ALL, TrialRequest, run_trials
+from ..studies.trials.request import TrialRequest
+from ..studies.trials.trialling import run_trials
 from .console import Terminal, make_table
 from .policies import policy_files
 from .studies import make_study
 
 
-def run_trial(
-    *,
-    policies: Sequence[str],
-    scenarios: Sequence[str],
-    backend: str,
-    device: str | None,
-    threads: int | None,
-    out: Path | None,
-    json_output: bool,
-    **choices: Any,
-) -> None:
+def run_trial(request: TrialRequest, *, out: Path | None, json_output: bool) -> None:
     """Run the trials, show progress, print the table and where the files are; exit code 1 where something was left out."""
-    request = TrialRequest(
-        policies=policy_files(policies),
-        scenarios=tuple(scenarios) or (ALL,),
-        backend=backend,
-        device=choose_device(backend, device),
-        threads=threads or os.cpu_count() or 1,
-        **choices,
-    )
-    folder = out or Path("results") / f"trial-{joined_names(policies)}"
+    folder = out or Path("results") / f"trial-{joined_names(request.policies)}"
+    request = replace(request, policies=policy_files(request.policies))
     files = ("trials.json", "trial.html")
     make_study(run_trials, request, folder, title="trying", show=print_trials, files=files, json_output=json_output)
 

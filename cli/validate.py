@@ -11,7 +11,7 @@ from .console import Terminal, make_table, print_json
 from .errors import UserError
 
 
-def run_validation(*, tables: Sequence[Path], example_name: str | None, ranks_only: bool, json_output: bool) -> None:
+def run_validation(tables: Sequence[Path], *, example_name: str | None, ranks_only: bool, json_output: bool) -> None:
     """Validate and print."""
     if example_name is not None:
         if tables:

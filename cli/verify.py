@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
@@ -19,8 +18,8 @@ from .studies import resumable
 
 
 def run_verification(
-    *,
     card: Path,
+    *,
     policy: str | None,
     suite: str | None,
     device: str | None,
@@ -40,7 +39,7 @@ def run_verification(
         beside=place if place.is_dir() else place.parent,
         suite=suite,
         device=choose_device(content["backend"], device),
-        threads=threads or os.cpu_count() or 1,
+        threads=threads,
         quick=quick,
         fresh=fresh,
         trust=trust,

@@ -22,7 +22,7 @@ _SUITE = "gaitgauge-1"
 
 
 def run_warmup(
-    *, architectures: Sequence[str], backends: Sequence[str], robot: str, cache: Path | None, threads: int | None
+    architectures: Sequence[str], backends: Sequence[str], *, robot: str, cache: Path | None, threads: int | None
 ) -> None:
     """Compile what training and evaluating need.
 

@@ -40,6 +40,7 @@ Text = Annotated[str, StringConstraints(min_length=1, max_length=1000, pattern=_
 """One line for people, or a name inside another file."""
 _WORDS = {
     "a valid array": "a list",
+    "a valid tuple": "a list",
     "an object": "a table",
     "a valid integer": "a whole number",
     "a valid number": "a number",

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from typing import Any
 import torch
 
 from ..backends.mujoco import MujocoBackend
-from ..backends.registry import find_backend, make_backend
+from ..backends.registry import choose_device, find_backend, make_backend
+from ..files.choices import cpu_threads
 from ..files.parsing import one_line, shown
 from ..files.provenance import plugins, provenance, source_digest, versions
 from ..files.writing import json_text, write_atomically
@@ -42,6 +43,7 @@ from .play.dispatcher import Dispatcher, Speculation, play
 from .play.progress import ProgressMeter, Status
 from .play.segments import count_segments
 from .play.workers import Job, local_workers, start_workers
+from .request import Request
 from .results import fold, health, rows_csv
 from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
@@ -57,30 +59,6 @@ _EARLY = 16
 """Episodes of a worker on the CPU up to which it plays others speculatively: more of them slow those that are required."""
 _WATCH_INTERVAL = 0.2
 """Shortest time between two calls of ``watch`` [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """What is to be evaluated, and how. Empty tuples and None stand for the suite's own choice."""
-
-    policy: str
-    suite: str = "gaitgauge-1"
-    pipeline: str = "stress"
-    backend: str = "mujoco"
-    device: str = "cpu"
-    robot: str | None = None
-    """Name of a robot or path of its description; None for the one that the policy is for."""
-    terrains: tuple[str, ...] = ()
-    level: int | None = None
-    frictions: tuple[float, ...] = ()
-    payloads: tuple[float, ...] = ()
-    seeds: tuple[int, ...] = ()
-    threads: int | None = 1
-    """CPU threads; they change the time, never the results. None with ``cluster`` for all that are free there."""
-    trust: bool = False
-    """Run the program that a policy file of the project's own format carries inside."""
-    cluster: str | None = None
-    """Address of a Ray cluster that plays, in as many workers as ``threads``; None for this machine. It changes the time alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +86,11 @@ def prepare(request: Request) -> Prepared:
         SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, ClusterError: one sentence on what is wrong.
     """
     suite = load_suite(request.suite)
-    find_backend(request.backend, request.device)
+    device = choose_device(request.backend, request.device)
+    # None with a cluster stands for all of its processors
+    threads = request.threads if request.cluster is not None else cpu_threads(request.threads)
+    request = replace(request, device=device, threads=threads)
+    find_backend(request.backend, device)
     if request.cluster is not None:
         check_address(request.cluster)
         if request.backend != MujocoBackend.name:

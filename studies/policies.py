@@ -33,22 +33,6 @@ class Loaded:
     robot: Robot
 
 
-@dataclass(frozen=True, kw_only=True)
-class PoliciesRequest:
-    """What every study of several policies is asked for."""
-
-    policies: tuple[str, ...]
-    seed: int = 0
-    """The first robot's seed; the others' follow it."""
-    backend: str = "mujoco"
-    robot: str | None = None
-    """Name of a robot, or its ``robot.toml``; None for the one that each policy is for."""
-    threads: int = 1
-    """CPU threads; they change the time, never the results."""
-    trust: bool = False
-    """Run the program that a policy file of the project's own format carries inside."""
-
-
 def load_policies(
     names: Sequence[str], robot: str | None = None, *, trust: bool = False
 ) -> tuple[dict[str, Loaded], list[Refused]]:

@@ -7,44 +7,23 @@ from typing import Annotated
 
 import typer
 
-from .. import completion, options
-from ..errors import UserError, report_errors
-from ..running import runs
+from ...files.choices import PLACE, PLAYED, WRITTEN, Choice, ThreadCount, Trust
+from ...gauge.request import EvaluationOptions, Request
+from ...studies.consistency.request import StudyRequest
+from .. import options
+from ..errors import UserError
+from ..running import command
 
 app = typer.Typer()
 
 
-@app.command()
-@runs("evaluate:run_evaluation")
+@command(app)
 def evaluate(
-    policy: options.Policy,
-    pipeline: Annotated[
-        str,
-        typer.Option(
-            help="base: one environment and seed; multi: one level, all frictions and seeds; level: find the highest level; stress: all.",
-            autocompletion=completion.of("base", "multi", "level", "stress"),
-        ),
-    ] = "stress",
-    suite: options.Suite = "gaitgauge-1",
-    backend: options.Backend = "mujoco",
-    device: options.Device = None,
-    robot: options.Robot = None,
-    terrains: options.Terrains = None,
-    level: options.Level = None,
-    frictions: options.Frictions = None,
-    payloads: options.Payloads = None,
-    seeds: options.Seeds = None,
-    threads: options.Threads = None,
-    cluster: options.Cluster = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-<pipeline>.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in the output folder.")] = False,
-    clip: Annotated[
-        bool, typer.Option("--clip/--no-clip", help="Film the robot for the report, where this machine can draw.")
-    ] = True,
-    json_output: Annotated[bool, typer.Option("--json", help="Print results.json instead of tables.")] = False,
-    trust: options.Trust = False,
+    request: Request,
+    out: Annotated[Path | None, options.output("results/<policy>-<suite>-<pipeline>")] = None,
+    resume: Annotated[bool, options.resume("run")] = False,
+    clip: Annotated[bool, Choice("Film the robot for the report, where this machine can draw.")] = True,
+    json_output: options.Tables = False,
 ) -> None:
     """Gauge a policy: terrains, levels, frictions, payloads, noise and latency, down to one score with its interval.
 
@@ -53,44 +32,30 @@ def evaluate(
       gaitgauge evaluate latest --terrain stairs_fd --terrain stairs_bd --threads 8
       gaitgauge evaluate walk.onnx --pipeline multi --level 5 --friction 0.6
     """
+    from ..evaluate import run_evaluation
+
+    run_evaluation(request, out=out, resume=resume, clip=clip, json_output=json_output)
 
 
-@app.command()
-@runs("compare:run_comparison")
+@command(app)
 def compare(
     contestants: Annotated[
-        list[str],
-        typer.Argument(
-            help="Two or more of: policies, as for evaluate; results folders; results.json files and score cards.",
+        tuple[str, ...],
+        Choice(
+            "Two or more of: policies, as for evaluate; results folders; results.json files and score cards.",
+            argument=True,
             metavar="A B...",
-            autocompletion=completion.policies,
+            values="policies",
         ),
     ],
-    pipeline: Annotated[
-        str,
-        typer.Option(
-            help="How policies are evaluated: stress, or multi at one --level.",
-            autocompletion=completion.of("stress", "multi"),
-        ),
-    ] = "stress",
-    suite: options.Suite = "gaitgauge-1",
-    backend: options.Backend = "mujoco",
-    device: options.Device = None,
-    robot: options.Robot = None,
-    terrains: options.Terrains = None,
-    level: options.Level = None,
-    frictions: options.Frictions = None,
-    payloads: options.Payloads = None,
-    seeds: options.Seeds = None,
-    threads: options.Threads = None,
+    choices: EvaluationOptions,
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
+        Choice(
+            "Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/.", WRITTEN
         ),
     ] = None,
-    trust: options.Trust = False,
-    json_output: Annotated[bool, typer.Option("--json", help="Print comparison.json instead of tables.")] = False,
+    json_output: options.Tables = False,
 ) -> None:
     """Say which differences between policies are real. Policies are evaluated first; what has been played is not played again.
 
@@ -99,30 +64,29 @@ def compare(
       gaitgauge compare old.gauge.pt new.gauge.pt --pipeline multi --level 3
       gaitgauge compare results/a results/b
     """
+    from ..compare import run_comparison
+
+    run_comparison(contestants, choices, out=out, json_output=json_output)
 
 
-@app.command()
-@runs("verify:run_verification")
+@command(app)
 def verify(
     card: Annotated[
-        Path, typer.Argument(help="A score card: results.json, a copy of it, or its folder.", metavar="CARD")
+        Path, Choice("A score card: results.json, a copy of it, or its folder.", argument=True, metavar="CARD")
     ],
-    policy: Annotated[str | None, typer.Option(help="The policy's file, where it is not at the card's path.")] = None,
-    suite: Annotated[str | None, typer.Option(help="The card's suite file, where its suite does not ship.")] = None,
-    device: Annotated[
-        str | None, typer.Option(help="cpu or cuda. Default: what the card's engine is made for.")
-    ] = None,
-    threads: options.Threads = None,
+    policy: Annotated[str | None, Choice("The policy's file, where it is not at the card's path.")] = None,
+    suite: Annotated[str | None, Choice("The card's suite file, where its suite does not ship.", PLAYED)] = None,
+    device: Annotated[str | None, Choice("cpu or cuda. Default: what the card's engine is made for.", PLACE)] = None,
+    threads: ThreadCount = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="One environment of each terrain, at nominal friction and payload.")
+        bool, Choice("One environment of each terrain, at nominal friction and payload.", PLAYED, flags=("--quick",))
     ] = False,
     fresh: Annotated[
-        int | None,
-        typer.Option(help="Play with other seeds, made from this number, instead of those that everybody knows."),
+        int | None, Choice("Play with other seeds, made from this number, instead of those that everybody knows.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the replay. Default: results/verify-<card>.")] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of sentences.")] = False,
-    trust: options.Trust = False,
+    out: Annotated[Path | None, Choice("Folder of the replay. Default: results/verify-<card>.", WRITTEN)] = None,
+    json_output: Annotated[bool, Choice("Print JSON instead of sentences.", WRITTEN, flags=("--json",))] = False,
+    trust: Trust = False,
 ) -> None:
     """Play a score card again and say whether it holds on this machine; exit code 1 where it does not.
 
@@ -131,13 +95,28 @@ def verify(
       gaitgauge verify card.json --policy walk.gauge.pt
       gaitgauge verify card.json --quick --fresh 4711
     """
+    from ..verify import run_verification
+
+    run_verification(
+        card,
+        policy=policy,
+        suite=suite,
+        device=device,
+        threads=threads,
+        quick=quick,
+        fresh=fresh,
+        out=out,
+        json_output=json_output,
+        trust=trust,
+    )
 
 
-@app.command()
-@report_errors
+@command(app)
 def board(
-    folder: Annotated[Path, typer.Argument(help="Folder of score cards (*.json) or of evaluations.", metavar="FOLDER")],
-    out: Annotated[Path | None, typer.Option(help="The page. Default: board.html in the folder.")] = None,
+    folder: Annotated[
+        Path, Choice("Folder of score cards (*.json) or of evaluations.", argument=True, metavar="FOLDER")
+    ],
+    out: Annotated[Path | None, Choice("The page. Default: board.html in the folder.")] = None,
 ) -> None:
     """Make a leaderboard page of a folder of score cards.
 
@@ -152,25 +131,24 @@ def board(
     Terminal().say(str(write_board(folder, out or folder / "board.html")))
 
 
-@app.command()
-@runs("validate:run_validation")
+@command(app)
 def validate(
     tables: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="The measured table, then one for each simulator (CSV; docs/validate.md).", metavar="REAL SIM..."
+        tuple[Path, ...],
+        Choice(
+            "The measured table, then one for each simulator (CSV; docs/guides/validate.md).",
+            argument=True,
+            metavar="REAL SIM...",
         ),
-    ] = None,
+    ] = (),
     example_name: Annotated[
         str | None,
-        typer.Option(
-            "--example", help="Tables that ship with the project: paper.", autocompletion=completion.of("paper")
-        ),
+        Choice("Tables that ship with the project: paper.", flags=("--example",), values=("paper",)),
     ] = None,
     ranks_only: Annotated[
-        bool, typer.Option("--ranks-only", help="Values are on different scales: compare the order of policies alone.")
+        bool, Choice("Values are on different scales: compare the order of policies alone.", flags=("--ranks-only",))
     ] = False,
-    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    json_output: options.Tables = False,
 ) -> None:
     """Hold predictions of simulators against measurements of a robot: errors by motion and metric, and ranks of policies.
 
@@ -178,60 +156,25 @@ def validate(
       gaitgauge validate --example paper
       gaitgauge validate real.csv mujoco.csv newton.csv
     """
+    from ..validate import run_validation
+
+    run_validation(tables, example_name=example_name, ranks_only=ranks_only, json_output=json_output)
 
 
-@app.command()
-@runs("consistency:run_consistency")
+@command(app)
 def consistency(
-    policies: options.Policies,
+    request: StudyRequest,
     backends: Annotated[
         str,
-        typer.Option(
-            help="Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005).",
-            autocompletion=completion.backends,
+        Choice(
+            "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005).",
+            PLACE,
+            values="backends",
         ),
     ] = "mujoco,mujoco-warp,newton",
-    reference: Annotated[
-        str | None,
-        typer.Option(
-            help="Engine that the others are compared with. Default: the first.", autocompletion=completion.backends
-        ),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option(help="cpu or cuda, for the engines that can use a GPU. Default: a GPU.")
-    ] = None,
-    suite: options.Suite = "robogauge-1.1",
-    robot: options.Robot = None,
-    terrains: options.Terrains = None,
-    frictions: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--friction", help="Friction coefficient; repeatable. Default: the nominal one; on a GPU the suite's."
-        ),
-    ] = None,
-    levels: Annotated[
-        list[int] | None,
-        typer.Option("--level", help="Level (1-10) of the terrains that have levels; repeatable. Default: 3."),
-    ] = None,
-    seeds: Annotated[int | None, typer.Option(help="Number of seeds, at least 2. Default: 3; on a GPU 10.")] = None,
-    factors: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--factor", help="Factor that the attribution switches; repeatable. Default: all (docs/consistency.md)."
-        ),
-    ] = None,
-    margin: Annotated[
-        float,
-        typer.Option(min=0.0, help="Difference of quality that does not matter: below it engines are equivalent."),
-    ] = 0.02,
-    attribution: Annotated[bool, typer.Option(help="Switch one factor at a time and see what it does.")] = True,
-    threads: options.Threads = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Output folder. Default: results/<policy>-<suite>-consistency.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the output folder.")] = False,
-    json_output: Annotated[bool, typer.Option("--json", help="Print consistency.json instead of tables.")] = False,
-    trust: options.Trust = False,
+    out: Annotated[Path | None, options.output("results/<policy>-<suite>-consistency")] = None,
+    resume: Annotated[bool, options.resume("study")] = False,
+    json_output: options.Tables = False,
 ) -> None:
     """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why.
 
@@ -239,3 +182,6 @@ def consistency(
       gaitgauge consistency pretrained --backends mujoco,mujoco-warp --device cpu --seeds 2
       gaitgauge consistency latest --terrain flat --backends mujoco,mujoco@timestep=0.005
     """
+    from ..consistency import run_consistency
+
+    run_consistency(request, backends, out=out, resume=resume, json_output=json_output)

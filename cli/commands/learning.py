@@ -2,123 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from annotated_types import Ge, Le
 
 from ...files import MOST_THREADS
-from .. import completion, options
-from ..running import runs
+from ...files.choices import PLACE, SCORES, SPAN, WRITTEN, Choice, ClusterAddress
+from ...training.run.request import QUICK_SUITE, TrainRequest
+from ..running import command
 
 app = typer.Typer()
 
 
-@app.command()
-@runs("settings:run_training_or_settings")
+@command(app)
 def train(
-    task: Annotated[
-        str,
-        typer.Argument(
-            help="What to learn, see 'gaitgauge list tasks'.", metavar="TASK", autocompletion=completion.tasks
-        ),
-    ],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Settings of the task, such as environment.push.linear=0.6 or training.network.expert_count=4.",
-            metavar="key=value",
-        ),
-    ] = None,
-    backend: Annotated[
-        str | None,
-        typer.Option(
-            help="Physics engine, see 'gaitgauge list backends'. Default: mujoco-warp.",
-            autocompletion=completion.backends,
-        ),
-    ] = None,
-    device: Annotated[
-        str | None, typer.Option(help="cpu, cuda or cuda:N; the default is what the engine is made for.")
-    ] = None,
-    num_envs: Annotated[
-        int | None, typer.Option(min=1, help="Parallel worlds, for each GPU. Default: the task's.")
-    ] = None,
-    robot: Annotated[
-        str | None,
-        typer.Option(
-            help="Robot name, or a robot.toml; the task is scaled by its size. Default: the task's.",
-            autocompletion=completion.robots,
-        ),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of everything random. Default: the task's.")] = None,
-    iterations: Annotated[
-        int | None, typer.Option(min=1, help="Updates of the whole run, resumed ones included. Default: the task's.")
-    ] = None,
+    request: TrainRequest,
     time: Annotated[
-        str | None, typer.Option(help="Stop after this wall-clock time, building included: seconds, 9m, 2h or 1h30m.")
-    ] = None,
-    resume: Annotated[
         str | None,
-        typer.Option(
-            help="Continue: latest, a run directory or a model_*.pt.",
-            metavar="latest|PATH",
-            autocompletion=completion.checkpoints,
-        ),
-    ] = None,
-    trust: Annotated[
-        bool,
-        typer.Option(
-            "--trust",
-            help="Import functions that the settings of a resumed checkpoint name; --init-from runs nothing either way.",
-        ),
-    ] = False,
-    init_from: Annotated[
-        str | None,
-        typer.Option(
-            help="Begin a new run with these networks: a checkpoint or a policy file.",
-            metavar="PATH|pretrained",
-            autocompletion=completion.policies,
-        ),
-    ] = None,
-    run_name: Annotated[str | None, typer.Option(help="Appended to the date in the run directory's name.")] = None,
-    log_root: Annotated[Path, typer.Option(help="Folder of all runs.")] = Path("logs/rsl_rl"),
-    capture: Annotated[
-        bool | None, typer.Option("--capture/--no-capture", help="CUDA graphs in the environment. Default: on a GPU.")
-    ] = None,
-    fuse: Annotated[
-        bool | None, typer.Option("--fuse/--no-fuse", help="Compile the environment's torch parts. Default: on a GPU.")
-    ] = None,
-    threads: Annotated[
-        int, typer.Option(min=1, max=MOST_THREADS, help="CPU threads of an engine that runs on the CPU.")
-    ] = 1,
-    logger: Annotated[
-        str | None,
-        typer.Option(
-            help="tensorboard, or wandb or neptune beside it. Default: the task's.",
-            metavar="NAME",
-            autocompletion=completion.of("tensorboard", "wandb", "neptune"),
-        ),
-    ] = None,
-    video_every: Annotated[
-        int | None, typer.Option(min=1, help="Iterations between two videos, made in a side process. Default: none.")
+        Choice("Stop after this wall-clock time, building included: seconds, 9m, 2h or 1h30m.", SPAN),
     ] = None,
     list_settings: Annotated[
-        bool, typer.Option("--list-settings", help="Print every setting of the task with its default, and end.")
+        bool, Choice("Print every setting of the task with its default, and end.", flags=("--list-settings",))
     ] = False,
-    score: Annotated[
-        bool,
-        typer.Option("--score/--no-score", help="Gauge checkpoints in a side process; best.pt is the best of them."),
-    ] = True,
-    score_every: Annotated[
-        int | None, typer.Option(min=1, help="Iterations between two scores. Default: the task's.")
-    ] = None,
+    score: Annotated[bool, Choice("Gauge checkpoints in a side process; best.pt is the best of them.", SCORES)] = True,
     score_suite: Annotated[
-        str, typer.Option(help="Suite of the scores, or a suite's .toml file.", autocompletion=completion.suites)
-    ] = "quick",
-    score_threads: Annotated[
-        int | None,
-        typer.Option(min=1, max=MOST_THREADS, help="CPU threads of the side process. Default: half of the machine."),
-    ] = None,
+        str, Choice("Suite of the scores, or a suite's .toml file.", SCORES, values="suites")
+    ] = QUICK_SUITE,
 ) -> None:
     """Train a policy; Ctrl-C or SIGTERM writes a checkpoint and says how to go on.
 
@@ -128,32 +40,42 @@ def train(
       gaitgauge train go2-moe-cts --init-from pretrained environment.push.linear=0.6
       gaitgauge train go2-moe-cts --resume latest
     """
+    if list_settings:
+        from ..settings import print_settings_of
+
+        print_settings_of(request)
+    else:
+        from ..train import run_training
+
+        run_training(replace(request, score_suite=score_suite if score else None), time)
 
 
-@app.command()
-@runs("sweep:run_sweep")
+@command(app)
 def sweep(
     file: Annotated[
-        Path, typer.Argument(help="A list of trainings (.toml), such as benchmarks/sweeps/*.toml.", metavar="FILE")
+        Path,
+        Choice("A list of trainings (.toml), such as benchmarks/sweeps/*.toml.", argument=True, metavar="FILE"),
     ],
-    out: Annotated[Path | None, typer.Option(help="Output folder. Default: results/sweep-<name>.")] = None,
+    out: Annotated[Path | None, Choice("Output folder. Default: results/sweep-<name>.", WRITTEN)] = None,
     threads: Annotated[
-        int | None, typer.Option(min=1, max=MOST_THREADS, help="CPU threads of the gauge. Default: half of the cores.")
+        int | None, Ge(1), Le(MOST_THREADS), Choice("CPU threads of the gauge. Default: half of the cores.", PLACE)
     ] = None,
     per_gpu: Annotated[
         int,
-        typer.Option(min=1, max=16, help="Trainings side by side on each GPU, through NVIDIA's MPS where it is there."),
+        Ge(1),
+        Le(16),
+        Choice("Trainings side by side on each GPU, through NVIDIA's MPS where it is there.", PLACE),
     ] = 1,
-    cluster: options.Cluster = None,
-    time: Annotated[str | None, typer.Option(help="Stop after this wall-clock time: seconds, 9m, 2h or 1h30m.")] = None,
+    cluster: ClusterAddress = None,
+    time: Annotated[str | None, Choice("Stop after this wall-clock time: seconds, 9m, 2h or 1h30m.", SPAN)] = None,
     report: Annotated[
-        bool, typer.Option("--report", help="Train and gauge nothing: tables and curves of what there is.")
+        bool, Choice("Train and gauge nothing: tables and curves of what there is.", flags=("--report",))
     ] = False,
     keep: Annotated[
         Path | None,
-        typer.Option(help="Keep what is trained in this folder too, small: policies, curves, results; no checkpoints."),
+        Choice("Keep what is trained in this folder too, small: policies, curves, results; no checkpoints."),
     ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print sweep.json instead of a table.")] = False,
+    json_output: Annotated[bool, Choice("Print sweep.json instead of a table.", WRITTEN, flags=("--json",))] = False,
 ) -> None:
     """Train a list of tasks, settings and seeds on the GPUs there are, gauge each, and compare; goes on where it stopped.
 
@@ -162,3 +84,16 @@ def sweep(
       gaitgauge sweep trainings.toml --report
       gaitgauge sweep trainings.toml --time 25m --keep finished
     """
+    from ..sweep import run_sweep
+
+    run_sweep(
+        file,
+        out=out,
+        threads=threads,
+        per_gpu=per_gpu,
+        cluster=cluster,
+        time=time,
+        report=report,
+        keep=keep,
+        json_output=json_output,
+    )

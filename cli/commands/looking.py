@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from annotated_types import Ge, Le
 
-from .. import completion, options
-from ..running import runs
+from ...files.choices import PLAYED, WRITTEN, Choice, RobotName, ThreadCount, Trust
+from .. import options
+from ..running import command
 
 app = typer.Typer()
 
@@ -16,15 +18,11 @@ LISTS = ("robots", "terrains", "backends", "suites", "scenarios", "policies", "t
 """What can be listed."""
 
 
-@app.command("list")
-@runs("inspect:list_things")
+@command(app, "list")
 def list_command(
     what: Annotated[
         str,
-        typer.Argument(
-            help="robots, terrains, backends, suites, scenarios, policies or tasks.",
-            autocompletion=completion.of(*LISTS),
-        ),
+        Choice("robots, terrains, backends, suites, scenarios, policies or tasks.", argument=True, values=LISTS),
     ],
 ) -> None:
     """List what can be named on the command line.
@@ -33,30 +31,31 @@ def list_command(
       gaitgauge list suites
       gaitgauge list policies
     """
+    from ..inspect import list_things
+
+    list_things(what)
 
 
-@app.command()
-@runs("doctor:run_doctor")
+@command(app)
 def doctor(
     policy: Annotated[
         str | None,
-        typer.Argument(
-            help="A policy to examine, as for play. Default: this machine is examined.",
+        Choice(
+            "A policy to examine, as for play. Default: this machine is examined.",
+            argument=True,
             metavar="POLICY",
-            autocompletion=completion.policies,
+            values="policies",
         ),
     ] = None,
-    contract: Annotated[
-        Path | None, typer.Option(help="A contract.toml that says how the policy is to be run.", metavar="PATH")
-    ] = None,
-    robot: options.Robot = None,
+    contract: options.Contract = None,
+    robot: RobotName = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.5, max=20.0, help="How long each description is played [s]. Default: 2.")
+        float | None, Ge(0.5), Le(20.0), Choice("How long each description is played [s]. Default: 2.", PLAYED)
     ] = None,
-    threads: options.Threads = None,
-    out: Annotated[Path | None, typer.Option(help="Write the contract.toml that fits best.")] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-    trust: options.Trust = False,
+    threads: ThreadCount = None,
+    out: Annotated[Path | None, Choice("Write the contract.toml that fits best.", WRITTEN)] = None,
+    json_output: Annotated[bool, Choice("Print JSON instead of a table.", WRITTEN, flags=("--json",))] = False,
+    trust: Trust = False,
 ) -> None:
     """Say what is wrong: with this machine, or with how a policy is run; exit code 1 where something is.
 
@@ -67,30 +66,39 @@ def doctor(
       gaitgauge doctor policy.onnx
       gaitgauge doctor policy.onnx --contract contract.toml --out mended.toml
     """
+    from ..doctor import run_doctor
+
+    run_doctor(
+        policy,
+        contract=contract,
+        robot=robot,
+        seconds=seconds,
+        threads=threads,
+        out=out,
+        json_output=json_output,
+        trust=trust,
+    )
 
 
-@app.command()
-@runs("warmup:run_warmup")
+@command(app)
 def warmup(
     architectures: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--arch", help="GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU."
+        tuple[str, ...],
+        Choice(
+            "GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU.", flags=("--arch",)
         ),
-    ] = None,
+    ] = (),
     backends: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--backend",
-            help="mujoco-warp or newton; repeatable. Default: mujoco-warp.",
-            autocompletion=completion.of("mujoco-warp", "newton"),
+        tuple[str, ...],
+        Choice(
+            "mujoco-warp or newton; repeatable. Default: mujoco-warp.",
+            flags=("--backend",),
+            values=("mujoco-warp", "newton"),
         ),
-    ] = None,
-    robot: Annotated[str, typer.Option(help="Robot name, or a robot.toml.", autocompletion=completion.robots)] = "go2",
-    cache: Annotated[
-        Path | None, typer.Option(help="Folder of the kernels. Default: Warp's own, or WARP_CACHE_PATH.")
-    ] = None,
-    threads: options.Threads = None,
+    ] = (),
+    robot: Annotated[str, Choice("Robot name, or a robot.toml.", values="robots")] = "go2",
+    cache: Annotated[Path | None, Choice("Folder of the kernels. Default: Warp's own, or WARP_CACHE_PATH.")] = None,
+    threads: ThreadCount = None,
 ) -> None:
     """Compile the GPU kernels of training and evaluating before they are needed, also for a GPU that is not here.
 
@@ -98,3 +106,6 @@ def warmup(
       gaitgauge warmup
       gaitgauge warmup --arch sm_90 --cache kernels
     """
+    from ..warmup import run_warmup
+
+    run_warmup(architectures, backends, robot=robot, cache=cache, threads=threads)

@@ -7,43 +7,40 @@ from typing import Annotated
 
 import typer
 
-from .. import completion, options
-from ..running import runs
+from ...files.choices import Choice, RobotName, Trust
+from ..play_request import PlayRequest
+from ..running import command
 
 app = typer.Typer()
 
 
-@app.command()
-@runs("export:run_export")
+@command(app)
 def export(
     policy: Annotated[
         str,
-        typer.Argument(
-            help="A checkpoint of the project's own, a run directory, or latest, best, pretrained.",
+        Choice(
+            "A checkpoint of the project's own, a run directory, or latest, best, pretrained.",
+            argument=True,
             metavar="POLICY",
-            autocompletion=completion.policies,
+            values="policies",
         ),
     ],
-    out: Annotated[
-        Path | None, typer.Option(help="Output folder. Default: 'exported' in the run directory, or here.")
-    ] = None,
+    out: Annotated[Path | None, Choice("Output folder. Default: 'exported' in the run directory, or here.")] = None,
     form: Annotated[
         str,
-        typer.Option(
-            "--format",
-            help="torchscript, onnx, deploy or all.",
-            autocompletion=completion.of("torchscript", "onnx", "deploy", "all"),
+        Choice(
+            "torchscript, onnx, deploy or all.", flags=("--format",), values=("torchscript", "onnx", "deploy", "all")
         ),
     ] = "all",
     layout: Annotated[
         str,
-        typer.Option(
-            help="plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'.",
-            autocompletion=completion.of("plain", "unitree"),
+        Choice(
+            "plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'.",
+            values=("plain", "unitree"),
         ),
     ] = "plain",
-    trust: options.Trust = False,
-    robot: options.Robot = None,
+    trust: Trust = False,
+    robot: RobotName = None,
 ) -> None:
     """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it.
 
@@ -51,65 +48,13 @@ def export(
       gaitgauge export latest --out exported
       gaitgauge export pretrained --layout unitree --out unitree
     """
+    from ..export import run_export
+
+    run_export(policy, out=out, form=form, layout=layout, trust=trust, robot=robot)
 
 
-@app.command()
-@runs("play:run_play")
-def play(
-    policies: Annotated[
-        list[str],
-        typer.Argument(
-            help="Policy files, run directories, or latest, best, pretrained; up to four, side by side.",
-            metavar="POLICY...",
-            autocompletion=completion.policies,
-        ),
-    ],
-    terrain: Annotated[
-        str, typer.Option(help="Terrain, see 'gaitgauge list terrains'.", autocompletion=completion.terrains)
-    ] = "flat",
-    level: Annotated[int | None, typer.Option(help="Level of the terrain, 1 to 10. Default: 5.")] = None,
-    viewer: Annotated[
-        str | None,
-        typer.Option(
-            help="native: a window; viser: in a browser; video. Default: a window where there is a display.",
-            autocompletion=completion.of("native", "viser", "video"),
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "--video", help="Write a video (.mp4); needs no display.")
-    ] = None,
-    gif: Annotated[
-        Path | None, typer.Option(help="Write a small clip that plays by itself in a page (.gif, .webp).")
-    ] = None,
-    seconds: Annotated[float | None, typer.Option(help="How long [s]. Default: 10 for a video, else no end.")] = None,
-    command: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(
-            help="Forward, sideways [m/s] and turning [rad/s] speed. Default: to the target, or a tour.",
-            metavar="VX VY YAW",
-        ),
-    ] = None,
-    friction: Annotated[float, typer.Option(help="Friction coefficient of the ground.")] = 0.6,
-    seed: Annotated[
-        int, typer.Option(min=0, max=options.LARGEST_SEED, help="Seed of the robot's heading at each start.")
-    ] = 0,
-    backend: options.Backend = "mujoco",
-    device: options.Device = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the browser's viewer.")] = 8080,
-    host: Annotated[
-        str, typer.Option(help="Interface of the browser's viewer; 0.0.0.0 lets other machines in.")
-    ] = "127.0.0.1",
-    gamepad: Annotated[bool, typer.Option("--gamepad", help="Steer the window with a gamepad.")] = False,
-    trust: options.Trust = False,
-    robot: options.Robot = None,
-    suite: Annotated[
-        str,
-        typer.Option(
-            help="Suite whose physics, gains and speeds are played with: a name or a .toml file.",
-            autocompletion=completion.suites,
-        ),
-    ] = "gaitgauge-1",
-) -> None:
+@command(app)
+def play(request: PlayRequest) -> None:
     """Watch policies walk: in MuJoCo's viewer, in a browser, or in a video file without a display.
 
     Examples:
@@ -117,37 +62,36 @@ def play(
       gaitgauge play latest --viewer viser --command 1 0 0
       gaitgauge play old.gauge.pt new.gauge.pt --out walk.mp4
     """
+    from ..play import run_play
+
+    run_play(request)
 
 
-@app.command("import")
-@runs("inspect:import_file")
+@command(app, "import")
 def import_command(
     source: Annotated[
         str,
-        typer.Argument(
-            help="TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint.",
-            autocompletion=completion.policies,
+        Choice(
+            "TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint.", argument=True, values="policies"
         ),
     ],
-    destination: Annotated[Path, typer.Argument(help="File to write, by custom NAME.gauge.pt.")],
-    force: Annotated[bool, typer.Option("--force", help="Replace the destination if it exists.")] = False,
+    destination: Annotated[Path, Choice("File to write, by custom NAME.gauge.pt.", argument=True)],
+    force: Annotated[bool, Choice("Replace the destination if it exists.", flags=("--force",))] = False,
     trainable: Annotated[
         bool,
-        typer.Option("--trainable", help="Keep teacher and critic of a training checkpoint, for train --init-from."),
+        Choice("Keep teacher and critic of a training checkpoint, for train --init-from.", flags=("--trainable",)),
     ] = False,
     raw: Annotated[
-        bool, typer.Option("--raw", help="The same with the weights after the last update, not their average.")
+        bool, Choice("The same with the weights after the last update, not their average.", flags=("--raw",))
     ] = False,
-    trust: options.Trust = False,
+    trust: Trust = False,
     contract: Annotated[
         Path | None,
-        typer.Option(
-            help="A contract.toml that says how a TorchScript or ONNX file is to be run, in place of what the file says."
+        Choice(
+            "A contract.toml that says how a TorchScript or ONNX file is to be run, in place of what the file says."
         ),
     ] = None,
-    robot: Annotated[
-        str | None, typer.Option(help="Robot name, or a robot.toml. Default: go2.", autocompletion=completion.robots)
-    ] = None,
+    robot: Annotated[str | None, Choice("Robot name, or a robot.toml. Default: go2.", values="robots")] = None,
 ) -> None:
     """Turn a foreign policy into the project's own file, with its contract.
 
@@ -155,3 +99,15 @@ def import_command(
       gaitgauge import policy.onnx walk.gauge.pt
       gaitgauge import policy.pt walk.gauge.pt --contract contract.toml
     """
+    from ..inspect import import_file
+
+    import_file(
+        source,
+        destination,
+        force=force,
+        trainable=trainable,
+        raw=raw,
+        trust=trust,
+        contract=contract,
+        robot=robot,
+    )

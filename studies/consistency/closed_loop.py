@@ -26,7 +26,8 @@ from ...gauge.scoring import run_statistics
 from ...gauge.suite import Suite
 from ...policy.base import Policy
 from ...robots import Robot
-from .statistics import MARGIN, Array, Estimate, effect_size, outcome_agreement, paired_mean
+from .request import MARGIN
+from .statistics import Array, Estimate, effect_size, outcome_agreement, paired_mean
 from .variants import Variant
 
 _WORLDS = 24

@@ -1,10 +1,26 @@
-"""What a consistency study is asked for, and how far it is."""
+"""Say which engines are compared on what, and how far a study is."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from .statistics import MARGIN
+from annotated_types import Ge
+
+from ...files.choices import (
+    PLACE,
+    PLAYED,
+    Choice,
+    PolicyNames,
+    RobotName,
+    SuiteName,
+    TerrainNames,
+    ThreadCount,
+    Trust,
+)
+
+MARGIN = 0.02
+"""Difference of quality that does not matter: it moves the score of a levelled terrain by 0.004, less than its repeatability."""
 
 
 class ConsistencyError(ValueError):
@@ -13,34 +29,50 @@ class ConsistencyError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class StudyRequest:
-    """What is to be compared. Empty tuples and None stand for a choice that suits the machine."""
+    """Policies, engines and episodes. Empty tuples and None stand for a choice that suits the machine."""
 
-    policies: tuple[str, ...]
+    policies: PolicyNames
     backends: tuple[str, ...] = ("mujoco", "mujoco-warp", "newton")
     """Engines, each as ``parse_variant`` reads it."""
-    reference: str | None = None
-    """The one that the others are compared with; None for the first."""
-    device: str | None = None
-    """Device of the engines that can use a GPU; None: a GPU, and engines made for one are left out where there is none."""
-    suite: str = "robogauge-1.1"
-    robot: str | None = None
-    """Name or path; None for the one that the policies are for."""
-    terrains: tuple[str, ...] = ()
-    """Empty: all of the suite's."""
-    levels: tuple[int, ...] = ()
-    """Empty: level 3."""
-    frictions: tuple[float, ...] = ()
-    """Empty: the nominal one on a CPU, all of the suite's where every engine but the reference runs on a GPU."""
-    seeds: int | None = None
-    """Number of seeds, at least 2; None: 3 on a CPU, 10 on a GPU."""
-    margin: float = MARGIN
-    """Difference of quality that does not matter: engines whose difference surely lies within it are equivalent."""
-    attribution: bool = True
-    factors: tuple[str, ...] = ()
-    """Factors to switch; empty: all."""
-    threads: int = 1
-    trust: bool = False
-    """Run the programs that policy files of the project's own format carry inside."""
+    reference: Annotated[
+        str | None,
+        Choice("Engine that the others are compared with. Default: the first.", PLACE, values="backends"),
+    ] = None
+    device: Annotated[str | None, Choice("cpu or cuda, for the engines that can use a GPU. Default: a GPU.", PLACE)] = (
+        None
+    )
+    suite: SuiteName = "robogauge-1.1"
+    robot: RobotName = None
+    terrains: TerrainNames = ()
+    levels: Annotated[
+        tuple[int, ...],
+        Choice("Level (1-10) of the terrains that have levels; repeatable. Default: 3.", PLAYED, flags=("--level",)),
+    ] = ()
+    frictions: Annotated[
+        tuple[float, ...],
+        Choice(
+            "Friction coefficient; repeatable. Default: the nominal one; on a GPU the suite's.",
+            PLAYED,
+            flags=("--friction",),
+        ),
+    ] = ()
+    seeds: Annotated[int | None, Choice("Number of seeds, at least 2. Default: 3; on a GPU 10.", PLAYED)] = None
+    margin: Annotated[
+        float,
+        Ge(0.0),
+        Choice("Difference of quality that does not matter: below it engines are equivalent.", PLAYED),
+    ] = MARGIN
+    attribution: Annotated[bool, Choice("Switch one factor at a time and see what it does.", PLAYED)] = True
+    factors: Annotated[
+        tuple[str, ...],
+        Choice(
+            "Factor that the attribution switches; repeatable. Default: all (docs/guides/consistency.md).",
+            PLAYED,
+            flags=("--factor",),
+        ),
+    ] = ()
+    threads: ThreadCount = None
+    trust: Trust = False
 
 
 @dataclass

@@ -21,8 +21,6 @@ from ...gauge.results import environment_weights
 Array = NDArray[np.float64]
 
 EQUIVALENT, DIFFERENT, UNDECIDED = "equivalent", "different", "undecided"
-MARGIN = 0.02
-"""Difference of quality that does not matter: it moves the score of a levelled terrain by 0.004, less than its repeatability."""
 _TINY = 1e-12
 """Spread below which differences count as all the same."""
 

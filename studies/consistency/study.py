@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from ...backends.base import BackendError
+from ...files.choices import cpu_threads
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_atomically
 from ...gauge.evaluate import Request, common_identity, prepare
@@ -222,7 +223,7 @@ def study(
         "draws": FLOOR_DRAWS,
         "policies": blocks,
         "provenance": provenance(
-            command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)
+            command=command, threads=cpu_threads(request.threads), seconds=round(time.perf_counter() - began, 2)
         ),
     }
     write_atomically(folder / "consistency.json", json_text(results), StoreError)
@@ -315,7 +316,7 @@ class _Policy:
                 policy=self._policy,
                 records=store.records,
                 keep=store.put,
-                threads=prepared.request.threads,
+                threads=cpu_threads(prepared.request.threads),
                 watch=on_progress,
             )
         self._records[variant.label] = store.records
@@ -376,7 +377,7 @@ class _Policy:
             "suite": prepared.suite,
             "robot": prepared.robot,
             "friction": prepared.cells[0].friction,
-            "threads": prepared.request.threads,
+            "threads": cpu_threads(prepared.request.threads),
         }
         targets = record_targets(prepared.reference, policy=self._policy, **settings)
         runs: dict[str, Trajectory] = {}

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...backends.base import Randomization, Scene
 from ...backends.registry import make_backend
+from ...files.choices import cpu_threads
 from ...gauge.episodes import Episode
 from ...gauge.fit import check_fit
 from ...gauge.motors import joint_parameters
@@ -27,8 +28,8 @@ from ...policy.latent_probe import watched_session
 from ...robots import Robot
 from ...robots.rotation import from_yaw, tilt
 from ...terrains.base import Pose, Terrain
-from ..policies import PoliciesRequest
 from ..walking import Walk
+from .request import LatentRequest
 
 COMMANDS = {
     "forward": (0.8, 0.0, 0.0),
@@ -41,25 +42,6 @@ INTERVAL = 0.1
 """Time between two notes [s]."""
 SPREAD = 0.25
 """Half width of what each robot's seed adds to its start along x and y [m]: a fraction of the terrains, which are 10 m wide."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LatentRequest(PoliciesRequest):
-    """Whose latent is looked at, and where."""
-
-    terrains: tuple[str, ...] = ()
-    """Names; none for the gauge's seven."""
-    level: int = 5
-    """Of the terrains that have levels."""
-    friction: float = 0.8
-    suite: str = "gaitgauge-1"
-    """Gives physics, sensor noise and latency."""
-    settling: float = 1.0
-    """How long every robot stands before it is told to walk [s]."""
-    seconds: float = 5.0
-    """How long every robot walks [s]."""
-    robots: int = 4
-    """For each terrain and command, at least 2; they differ in start, noise and latency."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +93,7 @@ def collect(policy: Policy, robot: Robot, asked: LatentRequest, suite: Suite, te
     up: list[torch.Tensor] = []
     seen: list[tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor]] = []
     with (
-        closing(make_backend(asked.backend, scene, device="cpu", threads=asked.threads)) as physics,
+        closing(make_backend(asked.backend, scene, device="cpu", threads=cpu_threads(asked.threads))) as physics,
         torch.inference_mode(),
     ):
         episodes = _episodes(asked, terrains, places)

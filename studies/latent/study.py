@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...backends.base import BackendError
 from ...backends.registry import find_backend
+from ...files.choices import cpu_threads
 from ...files.provenance import provenance
 from ...files.writing import csv_text, json_text, make_folder, write_atomically
 from ...gauge.pipelines import check_friction
@@ -23,8 +24,9 @@ from ...robots import RobotError
 from ...terrains.base import Terrain
 from ...terrains.registry import gauge_terrain_names, make_terrain
 from ..policies import Loaded, Watch, describe, load_policies
-from .collecting import COMMANDS, LatentRequest, Notes, collect
+from .collecting import COMMANDS, Notes, collect
 from .figures import FIGURES, draw, render_figure, render_page
+from .request import LatentRequest
 from .separation import Separation, principal_components, separation
 
 PAIRS = {"terrains": "forward on every terrain", "commands": "every command on all terrains"}
@@ -86,7 +88,7 @@ def study_latents(
         "refused": refused,
         "backend": request.backend,
         "provenance": provenance(
-            command=command, threads=request.threads, seconds=round(time.perf_counter() - began, 2)
+            command=command, threads=cpu_threads(request.threads), seconds=round(time.perf_counter() - began, 2)
         ),
     }
     make_folder(folder, LatentError)

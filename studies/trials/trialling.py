@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import compress
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from ...backends.base import BackendError
-from ...backends.registry import find_backend
+from ...backends.registry import choose_device, find_backend
+from ...files.choices import cpu_threads
 from ...files.provenance import provenance
 from ...files.writing import csv_text, json_text, make_folder, write_atomically
 from ...gauge.chance.intervals import wilson_interval
@@ -19,26 +20,14 @@ from ...gauge.suite import SuiteError
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
-from ..policies import PoliciesRequest, Watch, describe, load_policies
+from ..policies import Watch, describe, load_policies
 from .page import render_page
+from .request import ALL, TrialRequest
 from .running import Trial, run_scenario
 from .scenario import Scenario, ScenarioError, load_scenario, scenario_names
 
-ALL = "all"
-"""Stands for every scenario that ships with the project."""
 MEASURES = ("reached", "progress", "mean_speed", "peak_speed", "speed_time", "tracking_error")
 """Numbers of a trial whose median is shown."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrialRequest(PoliciesRequest):
-    """Who goes through what."""
-
-    scenarios: tuple[str, ...] = (ALL,)
-    """Names, ``.toml`` files, or ``all``."""
-    repeats: int | None = None
-    """Robots of each policy in each scenario; None for the scenario's own number."""
-    device: str = "cpu"
 
 
 def run_trials(
@@ -56,10 +45,11 @@ def run_trials(
         BackendError, RobotError, ScenarioError: nothing of it can be done; or no such engine, device or robot.
     """
     began = time.perf_counter()
-    find_backend(request.backend, request.device)
+    device = choose_device(request.backend, request.device)
+    find_backend(request.backend, device)
     policies, refused = load_policies(request.policies, request.robot, trust=request.trust)
     scenarios: dict[str, Scenario] = {}
-    names = [n for name in request.scenarios for n in (scenario_names() if name == ALL else [name])]
+    names = [n for name in request.scenarios or (ALL,) for n in (scenario_names() if name == ALL else [name])]
     for name in dict.fromkeys(names):
         try:
             scenario = load_scenario(name)
@@ -82,8 +72,8 @@ def run_trials(
                 scenario,
                 seeds,
                 backend=request.backend,
-                device=request.device,
-                threads=request.threads,
+                device=device,
+                threads=cpu_threads(request.threads),
             )
         except (BackendError, ContractError, PolicyError, RobotError, SuiteError) as error:
             refused.append({"what": f"{label} in {scenario.name}", "reason": str(error)})
@@ -99,8 +89,8 @@ def run_trials(
         "backend": request.backend,
         "provenance": provenance(
             command=command,
-            device=request.device,
-            threads=request.threads,
+            device=device,
+            threads=cpu_threads(request.threads),
             seconds=round(time.perf_counter() - began, 2),
         ),
     }

@@ -7,7 +7,8 @@ import pytest
 import torch
 from gaitgauge.files import writing
 from gaitgauge.files.writing import lock_folder
-from gaitgauge.training.run.launch import TrainRequest, prepare
+from gaitgauge.training.run.launch import prepare
+from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.stopping import TrainingOutcome
 from gaitgauge.training.tasks import TASKS
 from small_run import FAKE, SMALL

@@ -8,7 +8,8 @@ import pytest
 import torch
 from gaitgauge.training.environment.own_terms import foreign_functions
 from gaitgauge.training.run import launch, logger
-from gaitgauge.training.run.launch import TrainRequest, prepare
+from gaitgauge.training.run.launch import prepare
+from gaitgauge.training.run.request import TrainRequest
 from small_run import FAKE, SMALL
 
 RESUME = ("--device", "cpu", "--no-score", "--iterations", 3)

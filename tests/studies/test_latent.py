@@ -16,8 +16,9 @@ from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import ARCHITECTURES
 from gaitgauge.robots import load_robot
 from gaitgauge.studies.latent.collecting import SPREAD, Notes, collect, start
+from gaitgauge.studies.latent.request import LatentRequest
 from gaitgauge.studies.latent.separation import principal_components, separation, silhouette
-from gaitgauge.studies.latent.study import LatentError, LatentRequest, _blocks, _experts, look, study_latents
+from gaitgauge.studies.latent.study import LatentError, _blocks, _experts, look, study_latents
 from gaitgauge.studies.policies import Loaded
 from gaitgauge.terrains.registry import make_terrain
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from pydantic import Field
 
-from ...files import MOST_THREADS
-from ...files.parsing import build, check_fields, shown
+from ...files.parsing import build, shown
 from ...files.writing import LOCK, lock_folder
 from ...gauge.suite import load_suite
 from ...policy.contract import PolicyContract
@@ -34,9 +32,9 @@ from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .filming import Filmer
 from .logger import check_logger
 from .processes import Processes, ProcessLostError, idle_gpus, own_device
+from .request import TrainRequest
 from .resuming import begin_with, check_environments, check_network, resume_run
 from .run_directory import (
-    LOG_ROOT,
     describe_run,
     find_checkpoint,
     new_run_directory,
@@ -51,7 +49,6 @@ from .seeding import seed_everything
 from .stopping import Progress, TrainingOutcome
 
 DEFAULT_BACKEND = "mujoco-warp"
-QUICK_SUITE = "quick"
 _WAIT = "training.run.gauge_wait"
 _GOING_ON = {
     "training.algorithm.learning_rate": 3e-4,
@@ -60,55 +57,6 @@ _GOING_ON = {
     "training.network.initial_std": 0.3,
 }
 """Settings of a run that begins with trained networks: small steps, of the policy and of the student's encoder, and little noise."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainRequest:
-    """What is to be trained. None stands for the resumed run's choice, or else for the task's."""
-
-    task: str
-    overrides: Sequence[str] = ()
-    """``environment.…=value`` and ``training.…=value``."""
-    backend: str | None = None
-    """Physics engine; None for mujoco-warp."""
-    device: str | None = None
-    """None for the GPU if the engine is made for one, else the CPU."""
-    threads: Annotated[int, Field(ge=1, le=MOST_THREADS)] = 1
-    """CPU threads of engines that use them."""
-    num_envs: int | None = None
-    """Worlds, in each process of a run on several GPUs."""
-    robot: str | None = None
-    """Name of a robot or path of its description, for which the task is scaled; None for the task's own."""
-    seed: int | None = None
-    iterations: int | None = None
-    """Of the whole run, what a resumed run has done before included."""
-    seconds: Annotated[float, Field(ge=0.0)] | None = None
-    """Wall-clock limit [s] since ``began``."""
-    resume: str | None = None
-    """``latest``, a run directory or a checkpoint to continue."""
-    trust: bool = False
-    """Import what the settings of a resumed checkpoint name, ``module:function``, though neither task nor overrides do."""
-    init_from: str | None = None
-    """Checkpoint or policy whose networks a new run begins with."""
-    run_name: str | None = None
-    log_root: Path = LOG_ROOT
-    capture: bool | None = None
-    """CUDA graphs in the environment; None: on a GPU."""
-    fuse: bool | None = None
-    """Compile the environment's torch parts; None: on a GPU, if they can be."""
-    logger: str | None = None
-    """``tensorboard``, ``wandb`` or ``neptune``."""
-    video_every: int | None = None
-    """Iterations between two videos."""
-    score_suite: str | None = QUICK_SUITE
-    """Suite that scores checkpoints in a side process, None for no scores."""
-    score_every: int | None = None
-    """Iterations between two scores."""
-    score_threads: Annotated[int, Field(ge=1, le=MOST_THREADS)] | None = None
-    """CPU threads of the side process, None for half of the machine."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "what is to be trained", ConfigurationError)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,25 @@
+"""Say what every study of several policies is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from ..files.choices import PLACE, Choice, FirstSeed, PolicyNames, RobotName, ThreadCount, Trust
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoliciesRequest:
+    """Policies, and how they are played."""
+
+    policies: PolicyNames
+    seed: FirstSeed = 0
+    backend: Annotated[
+        str,
+        Choice(
+            "Physics engine, see 'gaitgauge list backends'.", PLACE, flags=("--backend", "--engine"), values="backends"
+        ),
+    ] = "mujoco"
+    robot: RobotName = None
+    threads: ThreadCount = None
+    trust: Trust = False

@@ -1,0 +1,124 @@
+"""Say what is to be trained. The command line and the Python API are made of these fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from annotated_types import Ge, Le
+
+from ...files import MOST_THREADS
+from ...files.choices import PLACE, PLAYED, SCORES, SPAN, WRITTEN, Choice
+
+LOG_ROOT = Path("logs/rsl_rl")
+"""Where training runs lie: ``<LOG_ROOT>/<experiment>/<run>/``."""
+QUICK_SUITE = "quick"
+"""Suite of the scores of checkpoints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainRequest:
+    """A training. None stands for the resumed run's choice, or else for the task's."""
+
+    task: Annotated[
+        str,
+        Choice("What to learn, see 'gaitgauge list tasks'.", argument=True, metavar="TASK", values="tasks"),
+    ]
+    overrides: Annotated[
+        tuple[str, ...],
+        Choice(
+            "Settings of the task, such as environment.push.linear=0.6 or training.network.expert_count=4.",
+            argument=True,
+            metavar="key=value",
+        ),
+    ] = ()
+    backend: Annotated[
+        str | None,
+        Choice("Physics engine, see 'gaitgauge list backends'. Default: mujoco-warp.", PLACE, values="backends"),
+    ] = None
+    device: Annotated[str | None, Choice("cpu, cuda or cuda:N; the default is what the engine is made for.", PLACE)] = (
+        None
+    )
+    num_envs: Annotated[int | None, Ge(1), Choice("Parallel worlds, for each GPU. Default: the task's.", PLACE)] = None
+    robot: Annotated[
+        str | None,
+        Choice(
+            "Robot name, or a robot.toml; the task is scaled by its size. Default: the task's.",
+            PLAYED,
+            values="robots",
+        ),
+    ] = None
+    seed: Annotated[int | None, Choice("Seed of everything random. Default: the task's.", PLAYED)] = None
+    iterations: Annotated[
+        int | None, Ge(1), Choice("Updates of the whole run, resumed ones included. Default: the task's.", SPAN)
+    ] = None
+    seconds: Annotated[float, Ge(0.0)] | None = None
+    """Wall-clock limit [s], building included."""
+    resume: Annotated[
+        str | None,
+        Choice(
+            "Continue: latest, a run directory or a model_*.pt.", WRITTEN, metavar="latest|PATH", values="checkpoints"
+        ),
+    ] = None
+    trust: Annotated[
+        bool,
+        Choice(
+            "Import functions that the settings of a resumed checkpoint name; --init-from runs nothing either way.",
+            flags=("--trust",),
+        ),
+    ] = False
+    init_from: Annotated[
+        str | None,
+        Choice(
+            "Begin a new run with these networks: a checkpoint or a policy file.",
+            SPAN,
+            metavar="PATH|pretrained",
+            values="policies",
+        ),
+    ] = None
+    run_name: Annotated[str | None, Choice("Appended to the date in the run directory's name.", WRITTEN)] = None
+    log_root: Annotated[Path, Choice("Folder of all runs.", WRITTEN)] = LOG_ROOT
+    capture: Annotated[
+        bool | None,
+        Choice("CUDA graphs in the environment. Default: on a GPU.", PLACE, flags=("--capture/--no-capture",)),
+    ] = None
+    fuse: Annotated[
+        bool | None,
+        Choice("Compile the environment's torch parts. Default: on a GPU.", PLACE, flags=("--fuse/--no-fuse",)),
+    ] = None
+    threads: Annotated[
+        int, Ge(1), Le(MOST_THREADS), Choice("CPU threads of an engine that runs on the CPU.", PLACE)
+    ] = 1
+    logger: Annotated[
+        str | None,
+        Choice(
+            "tensorboard, or wandb or neptune beside it. Default: the task's.",
+            WRITTEN,
+            metavar="NAME",
+            values=("tensorboard", "wandb", "neptune"),
+        ),
+    ] = None
+    video_every: Annotated[
+        int | None,
+        Ge(1),
+        Choice("Iterations between two videos, made in a side process. Default: none.", WRITTEN),
+    ] = None
+    score_every: Annotated[int | None, Ge(1), Choice("Iterations between two scores. Default: the task's.", SCORES)] = (
+        None
+    )
+    score_suite: str | None = QUICK_SUITE
+    """Suite that scores checkpoints in a side process; None for no scores."""
+    score_threads: Annotated[
+        int | None,
+        Ge(1),
+        Le(MOST_THREADS),
+        Choice("CPU threads of the side process. Default: half of the machine.", SCORES),
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Check the types and ranges of all fields."""
+        from ...files.parsing import check_fields
+        from ..configuration import ConfigurationError
+
+        check_fields(self, "what is to be trained", ConfigurationError)
