@@ -16,7 +16,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import warp as wp
-from gaitgauge.backends.upstream.height_fields.repair import repair_height_fields
+from gaitgauge.backends.upstream.height_fields.repair import HEIGHT_FIELDS
 from gaitgauge.terrains.base import Terrain
 from gaitgauge.terrains.registry import make_terrain
 
@@ -131,7 +131,7 @@ def main() -> None:
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     if not arguments.plain:
-        repair_height_fields()
+        HEIGHT_FIELDS.apply()
     terrain = make_terrain("wave", arguments.level)
     print("        touching   in one    depth difference [mm]     normals apart by     contacts a pose   into the")
     print("shape    in both     only   median    95 %     most   > 10 deg  > 90 deg    mujoco      warp     ground")

@@ -15,8 +15,8 @@ import warp as wp
 
 from ..arguments import check_force
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Randomization, Scene, Support
-from ..upstream.fused_solver import fuse_solver
-from ..upstream.height_fields import repair_height_fields
+from ..upstream.fused_solver import FUSED_SOLVER
+from ..upstream.height_fields import HEIGHT_FIELDS
 from ..upstream.order import CanonicalOrder
 from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
@@ -28,9 +28,6 @@ from .arrays import Links, Palette, Roles, contact_arrays, motion_arrays
 from .masses import BATCHED_FIELDS, WorldMasses, describe_model
 from .memory import bytes_per_world
 from .model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model
-
-repair_height_fields()
-fuse_solver()
 
 PARKED_HEIGHT = 100.0
 """Height at which a robot waits, away from every contact, that has diverged or must not step [m]."""
@@ -63,6 +60,8 @@ class MujocoWarpBackend(WarpBackend):
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         self._open(scene, device)
+        HEIGHT_FIELDS.apply()
+        FUSED_SOLVER.apply()
         self._shared = build_shared_model(scene)
         capacity = buffer_capacity(scene, self._shared)
         free = self._scope.free_bytes()

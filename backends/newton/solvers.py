@@ -20,14 +20,11 @@ import warp as wp
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
 from ..mujoco_warp.alarms import DROPPED
 from ..mujoco_warp.model import SMALLEST_TOLERANCE, constraint_rows, contacts_per_world
-from ..upstream.fused_solver import fuse_solver
-from ..upstream.height_fields.repair import repair_height_fields
+from ..upstream.fused_solver import FUSED_SOLVER
+from ..upstream.height_fields import HEIGHT_FIELDS
 from . import kernels, solver_kernels
 from .import_check import import_differences
 from .model import WorldModel, carriers
-
-repair_height_fields()
-fuse_solver()
 
 _EXACT = Capability(support=Support.EXACT)
 
@@ -139,6 +136,8 @@ class MujocoAdapter(SolverAdapter):
         return {**asked, "tolerance": max(physics.tolerance, SMALLEST_TOLERANCE)}
 
     def __init__(self, world: WorldModel, scene: Scene) -> None:
+        HEIGHT_FIELDS.apply()
+        FUSED_SOLVER.apply()
         physics, model = scene.physics, world.model
         contacts, reference = _contacts_per_world(scene, world), world.reference
         feet = [reference.geom(name).id for name in scene.robot.foot_geoms]

@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # ruff: noqa: UP018, RUF046 - a variable that changes in a kernel's loop must be made by int()
-"""Brings contacts and constraint rows into one order, so that the same start gives the same bits on a GPU.
+"""Sort contacts and constraint rows, so that the same start gives the same bits on a GPU.
 
 mujoco_warp 3.17 numbers contacts and rows in the order in which threads come by. Sums over them then differ in their
 last bits from run to run, and legged motion lets them grow. The engine's own deterministic mode fixes the order of each
@@ -11,8 +11,8 @@ rows by kind and contact before the solver.
 # Warp reads the annotations of structs and kernels: no ``from __future__ import annotations`` here.
 import mujoco_warp
 import warp as wp
+from mujoco_warp._src.types import vec5
 
-from ..mujoco_warp.arrays import vec5
 from ..warp.structures import filled
 
 wp.set_module_options({"enable_backward": False})

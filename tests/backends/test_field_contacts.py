@@ -3,7 +3,7 @@
 import field_contacts
 import numpy as np
 import pytest
-from gaitgauge.backends.upstream.height_fields.repair import repair_height_fields
+from gaitgauge.backends.upstream.height_fields.repair import HEIGHT_FIELDS
 from gaitgauge.terrains.registry import make_terrain
 
 TERRAIN = make_terrain("wave", 5)
@@ -15,7 +15,7 @@ COUNT = 200
 @pytest.mark.parametrize("terrain", [TERRAIN, STEEP], ids=["level 5", "level 10"])
 @pytest.mark.parametrize("name", field_contacts.SHAPES)
 def test_the_deepest_contact_with_a_wave_is_mujocos(name, terrain):
-    repair_height_fields()
+    HEIGHT_FIELDS.apply()
     model, qpos = field_contacts.model_of(name, terrain), field_contacts.poses(name, terrain, COUNT)
     seen = field_contacts.compare(
         field_contacts.contacts_of_mujoco(model, qpos), field_contacts.contacts_of_mujoco_warp(model, qpos)
@@ -33,7 +33,7 @@ def test_the_deepest_contact_with_a_wave_is_mujocos(name, terrain):
 
 @pytest.mark.slow
 def test_a_spheres_contacts_lie_between_it_and_the_ground():
-    repair_height_fields()
+    HEIGHT_FIELDS.apply()
     model, qpos = field_contacts.model_of("foot", TERRAIN), field_contacts.poses("foot", TERRAIN, COUNT)
     radius = float(field_contacts.SHAPES["foot"][1])
     for row, found in zip(qpos, field_contacts.contacts_of_mujoco_warp(model, qpos), strict=True):

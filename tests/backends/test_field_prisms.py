@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def _repaired():
-    fields.repair_height_fields()
+    fields.HEIGHT_FIELDS.apply()
 
 
 def _together() -> mujoco.MjModel:
@@ -71,7 +71,7 @@ def _rows(data: mujoco_warp.Data) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def whole() -> np.ndarray:
-    fields.repair_height_fields()
+    fields.HEIGHT_FIELDS.apply()
     data = field_contacts.collided(_together(), _poses())
     assert not data.overflow.numpy().any()
     return _rows(data)

@@ -1,5 +1,5 @@
 """Newton's method of mujoco_warp in one kernel, for every engine that steps it."""
 
-from .solve import fuse_solver
+from .solve import FUSED_SOLVER
 
-__all__ = ["fuse_solver"]
+__all__ = ["FUSED_SOLVER"]

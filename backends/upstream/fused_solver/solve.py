@@ -16,6 +16,7 @@ from mujoco_warp._src.solver import solve as plain_solve
 from mujoco_warp._src.types import ConeType, DisableBit, EnableBit, IntegratorType, SolverType
 
 from ...warp.structures import filled
+from ..repair import Repair
 from .kernel import LANES, Problem, Sizes, Solution, solve_kernel
 
 
@@ -105,6 +106,13 @@ def solve(model: Model, data: Data) -> None:
     )
 
 
-def fuse_solver() -> None:
-    """Let mujoco_warp solve with the function above. Idempotent."""
+def _install() -> None:
     solver.solve = solve
+
+
+FUSED_SOLVER = Repair(
+    project="mujoco-warp",
+    versions=">=3.17,<3.18",
+    fault="the speed of its solver",
+    install=_install,
+)

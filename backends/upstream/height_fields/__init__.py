@@ -1,5 +1,5 @@
 """Contacts with height fields, for every engine that steps mujoco_warp."""
 
-from .repair import repair_height_fields
+from .repair import HEIGHT_FIELDS
 
-__all__ = ["repair_height_fields"]
+__all__ = ["HEIGHT_FIELDS"]

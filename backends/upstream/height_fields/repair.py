@@ -32,6 +32,7 @@ from mujoco_warp._src.math import upper_trid_index
 from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType, OverflowType
 
 from ...warp.structures import filled
+from ..repair import Repair
 from . import kernels
 from .contacts import Contacts, Materials, write_contacts
 from .prisms import support
@@ -135,7 +136,14 @@ def convex_narrowphase(
     plain_narrowphase(model, data, context, [pair for pair in table if pair[0] != GeomType.HFIELD])
 
 
-def repair_height_fields() -> None:
-    """Let mujoco_warp use the functions above. To be called before its first collision kernel is built; idempotent."""
+def _install() -> None:
     collision_gjk.support = collision_convex.support = support
     collision_driver.convex_narrowphase = convex_narrowphase
+
+
+HEIGHT_FIELDS = Repair(
+    project="mujoco-warp",
+    versions=">=3.17,<3.18",
+    fault="its contact with height fields",
+    install=_install,
+)
