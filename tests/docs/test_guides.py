@@ -108,8 +108,12 @@ def test_marked_blocks_run(page, tmp_path):
     folder = tmp_path / "work"
     folder.mkdir()
     paths = [str(site), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "GAITGAUGE": str(ROOT)}
-    shell = f'gaitgauge() {{ "{sys.executable}" -m gaitgauge.cli.main "$@"; }}\nset -euo pipefail\n'
+    # ``pip install`` of a plug-in writes to ``site``; pip reads PIP_NO_BUILD_ISOLATION=0 as ``--no-build-isolation``.
+    pip = {"PIP_TARGET": str(site), "PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0"}
+    environment = os.environ | pip | {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "GAITGAUGE": str(ROOT)}
+    programs = {"gaitgauge": "gaitgauge.cli.main", "pip": "pip"}
+    shell = "".join(f'{name}() {{ "{sys.executable}" -m {module} "$@"; }}\n' for name, module in programs.items())
+    shell += "set -euo pipefail\n"
 
     def run(command: list[str]) -> None:
         ended = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=900)

@@ -203,15 +203,25 @@ def test_rules_that_settings_name_are_there():
     assert resolve(settings.terrain.level_rule, "").__name__ == "next_level"
 
 
-def test_the_guide_shows_the_example_and_its_tile_can_be_built(monkeypatch):
-    guide = (FOLDER.parents[1] / "docs" / "your-task.md").read_text()
+def test_the_guide_s_task_is_built_at_every_level(monkeypatch, tmp_path):
+    """The module that ``docs/guides/your-task.md`` shows: its tile at difficulty 0 too, its task, its reward as in the example."""
+    guide = (FOLDER.parents[1] / "docs" / "guides" / "your-task.md").read_text()
     shown = guide.split("```python\n")[1].partition("```")[0]
-    example = (FOLDER / "quiet_walk.py").read_text()
-    assert all(part.strip() in example for part in shown.split("\n\n\n"))
+    (tmp_path / "kerb_walk.py").write_text(shown)
+    monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setitem(training_tiles.TILE_KINDS, "kerb", None)  # taken out again at the end
-    exec(compile(guide.split("```python\n")[3].partition("```")[0], "your-task.md", "exec"), {})
-    tile = training_tiles.make_tile("kerb", 10)
-    assert [float(tile.height(x, 0.0)) for x in (0.0, 2.5, 3.5)] == [0.0, pytest.approx(0.2), 0.0]
+    example = (FOLDER / "quiet_walk.py").read_text()
+    reward = shown.partition("def soft_landing")[2].partition("\n\n\n")[0].splitlines()[2:]
+    assert len(reward) == 2 and all(line in example for line in reward)
+    try:
+        task = find_task("kerb_walk:TASK", ["environment.rewards.own.soft_landing.weight=-1"])
+    finally:
+        sys.modules.pop("kerb_walk", None)
+    for level, height in ((0, 0.05), (10, 0.25)):
+        tile = training_tiles.make_tile("kerb", level)
+        assert [float(tile.height(x, 0.0)) for x in (0.0, 2.5, 3.5)] == [0.0, pytest.approx(height), 0.0]
+        assert all(side > 0.0 for box in tile.boxes for side in box.half_size)
+    assert [kind.name for kind in task.environment.terrain.tiles] == ["kerb", "flat"]
     kinds = (TileConfiguration(name="kerb", share=1.0, command_limits=(1.0, 0.5, 1.5), sigma=0.5),)
     assert build_palette(TerrainConfiguration(tiles=kinds, levels=3)).index[0, 2].unique().numel() == 1
 
