@@ -18,7 +18,13 @@ PATHS = ROOT / "build" / "package"
 """The folder in which mkdocstrings finds the package (``mkdocs.yml`` names it too)."""
 
 
-def on_config(config: Any) -> Any:
+def on_startup(command: str, dirty: bool) -> None:
+    """Link the package before mkdocstrings looks for its folder, which must exist by then."""
+    link_package()
+    os.environ["JUPYTER_CONFIG_PATH"] = str(Path(__file__).parent)  # jupyter_nbconvert_config.py
+
+
+def link_package() -> None:
     """Let mkdocstrings find the package under its own name, and nothing else.
 
     The repository's root is the package ``gaitgauge``. mkdocstrings reads every Python file below it, and a link to the
@@ -30,8 +36,6 @@ def on_config(config: Any) -> Any:
     for path in ROOT.iterdir():
         if path.suffix == ".py" or (path / "__init__.py").exists():
             (package / path.name).symlink_to(path)
-    os.environ["JUPYTER_CONFIG_PATH"] = str(Path(__file__).parent)  # jupyter_nbconvert_config.py
-    return config
 
 
 def on_files(files: Files, config: Any) -> Files:
