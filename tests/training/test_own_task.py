@@ -204,7 +204,7 @@ def test_rules_that_settings_name_are_there():
 
 
 def test_the_guide_shows_the_example_and_its_tile_can_be_built(monkeypatch):
-    guide = (FOLDER.parents[1] / "docs" / "guides" / "your-task.md").read_text()
+    guide = (FOLDER.parents[1] / "docs" / "your-task.md").read_text()
     shown = guide.split("```python\n")[1].partition("```")[0]
     example = (FOLDER / "quiet_walk.py").read_text()
     assert all(part.strip() in example for part in shown.split("\n\n\n"))

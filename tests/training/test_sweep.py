@@ -101,7 +101,7 @@ def test_the_paper_s_tables_are_sweeps_as_long_as_needed(name):
 
 
 def test_the_guide_s_sweep_fits(tmp_path):
-    (text,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "guides" / "methods.md").read_text(), re.S)
+    (text,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "methods.md").read_text(), re.S)
     sweep = load_sweep(write(tmp_path, text))
     for entry in sweep.entry:
         find_task(entry.task, (*sweep.settings, *entry.settings))
