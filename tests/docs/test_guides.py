@@ -189,13 +189,13 @@ def test_marked_blocks_run(page, tmp_path):
 
 
 def prose_lines(text: str) -> list[tuple[int, str]]:
-    """Return the numbered lines of a page that are neither code nor rows of a table."""
+    """Return the numbered lines of a page that are neither code, nor rows of a table, nor a picture alone."""
     lines: list[tuple[int, str]] = []
     in_code = False
     for number, line in enumerate(text.splitlines(), 1):
         if line.lstrip().startswith("```"):
             in_code = not in_code
-        elif not in_code and not line.lstrip().startswith("|"):
+        elif not in_code and not re.match(r"\s*(\||!\[[^]]*\]\([^)]*\)$)", line):
             lines.append((number, line))
     return lines
 
