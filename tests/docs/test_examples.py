@@ -1,4 +1,4 @@
-"""The examples of the guides that are Python, with values worked out by hand."""
+"""Tests the Python examples of the guides against values worked out by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DOCS = Path(gaitgauge.__path__[0]) / "docs"
 
 
 def test_a_terrain_of_ones_own():
-    code = re.search(r"```python\n(.*?)```", (DOCS / "your-terrain.md").read_text(), re.S)
+    code = re.search(r"```python\n(.*?)```", (DOCS / "guides" / "your-terrain.md").read_text(), re.S)
     assert code
     names: dict = {}
     exec(compile(code[1], "your-terrain.md", "exec"), names)

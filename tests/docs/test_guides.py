@@ -1,4 +1,6 @@
-"""Runs what README and guides show: marked blocks as they stand, every other command as far as its parsing.
+"""Tests that README and pages are right: commands, pictures, links, lengths.
+
+Marked blocks are run as they stand; every other command is parsed.
 
 A block is marked by an HTML comment on the line before it: ``<!-- run -->`` runs it, in the order of the page, in one
 folder for the page; ``<!-- run: FOLDER -->`` needs the results of the demo suite there; ``<!-- file: PATH -->`` writes
@@ -21,8 +23,14 @@ import pytest
 import typer
 from gaitgauge.cli.main import app
 
-ROOT = Path(gaitgauge.__path__[0])
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+ROOT = Path(gaitgauge.__path__[0]).resolve()
+DOCS = ROOT / "docs"
+SITE = sorted(DOCS.rglob("*.md"))
+GUIDES = sorted((DOCS / "guides").glob("*.md"))
+PAGES = [ROOT / "README.md", *SITE]
+EVERYTHING = [*sorted(ROOT.glob("*.md")), *SITE, *sorted(ROOT.glob("examples/**/*.md"))]
+GENERATED = {DOCS / "reference" / "cli.md"}
+"""Pages that only the build of the site writes."""
 _BLOCK = re.compile(
     r"(?:^<!-- (?P<mark>run|file)(?:: (?P<what>\S+))? -->\n)?^```(?P<kind>\w*)[^\n]*\n(?P<text>.*?)^```$", re.M | re.S
 )
@@ -30,7 +38,7 @@ _BLOCK = re.compile(
 
 @dataclass(frozen=True)
 class Block:
-    """One fenced block of a page."""
+    """A fenced block of a page."""
 
     mark: str | None
     what: str | None
@@ -39,13 +47,13 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """All fenced blocks of a page."""
+    """Return all fenced blocks of a page."""
     found = _BLOCK.finditer(page.read_text(encoding="utf-8"))
     return [Block(m["mark"], m["what"], m["kind"], m["text"]) for m in found]
 
 
 def commands(page: Path) -> list[list[str]]:
-    """Every ``gaitgauge`` command line of a page's shell blocks, as words."""
+    """Return every ``gaitgauge`` command line of a page's shell blocks, as words."""
     lines: list[list[str]] = []
     for block in blocks(page):
         if block.kind in ("bash", "sh", ""):
@@ -56,8 +64,24 @@ def commands(page: Path) -> list[list[str]]:
     return lines
 
 
+def title(page: Path) -> str:
+    """Return the path of a page below the repository's root."""
+    return str(page.relative_to(ROOT))
+
+
+def words_in(page: Path) -> int:
+    """Count the words of a page as ``wc -w`` does."""
+    return len(page.read_text(encoding="utf-8").split())
+
+
+def pictures(page: Path) -> list[Path]:
+    """Return the files of the pictures that a page shows."""
+    shown = re.findall(r"!\[[^]]*\]\((?!https?:)([^)\s]+)\)", page.read_text(encoding="utf-8"))
+    return [(page.parent / target).resolve() for target in shown]
+
+
 COMMANDS = typer.main.get_command(app)
-SHOWN = [(page.name, words) for page in PAGES for words in commands(page)]
+SHOWN = [(title(page), words) for page in PAGES for words in commands(page)]
 
 
 def test_pages_show_commands():
@@ -81,8 +105,8 @@ def test_every_command_that_is_shown_exists_with_these_options(page, words):
     command.make_context("gaitgauge", list(words))
 
 
-def test_the_page_of_the_api_names_what_exists_and_every_command():
-    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+def test_the_pages_of_the_api_name_what_exists_and_every_command():
+    text = "".join(page.read_text(encoding="utf-8") for page in sorted((DOCS / "reference" / "api").glob("*.md")))
     names = re.findall(r"(?:`|^::: )(gaitgauge(?:\.\w+)+)", text, re.M)
     assert len(names) > 15
     for name in names:
@@ -90,17 +114,49 @@ def test_the_page_of_the_api_names_what_exists_and_every_command():
     assert [c for c in COMMANDS.list_commands(None) if f"`{c}`" not in text] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", PAGES, ids=title)
 def test_pictures_that_pages_show_are_there_and_small(page):
     """README showed a picture that nobody had made."""
-    for target in re.findall(r"!\[[^]]*\]\((?!https?:)([^)]+)\)", page.read_text(encoding="utf-8")):
-        picture = page.parent / target
-        assert picture.is_file(), f"{page.name} shows {target}"
-        assert picture.stat().st_size <= 3_000_000
+    for picture in pictures(page):
+        assert picture.is_file(), f"{page.name} shows {picture}"
+        assert picture.stat().st_size <= 1_200_000
+
+
+def test_the_pages_show_at_least_15_pictures_and_each_picture_of_the_folder():
+    shown = {picture for page in PAGES for picture in pictures(page)}
+    assert len(shown) >= 15
+    assert sorted(p.name for p in (DOCS / "media").iterdir() if p not in shown) == []
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=title)
+def test_a_guide_has_at_most_900_words(page):
+    assert words_in(page) <= 900
+
+
+def test_start_and_guides_have_at_most_20_000_words():
+    assert sum(map(words_in, [DOCS / "index.md", *(DOCS / "start").glob("*.md"), *GUIDES])) <= 20_000
+
+
+def test_the_glossary_has_at_most_30_words():
+    terms = re.findall(r"^\| \*\*", (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8"), re.M)
+    assert 10 < len(terms) <= 30
+
+
+def test_readme_and_changelog_are_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 90
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+@pytest.mark.parametrize("page", EVERYTHING, ids=title)
+def test_links_lead_to_files(page):
+    prose = _BLOCK.sub("", page.read_text(encoding="utf-8"))
+    targets = re.findall(r"\]\((?!https?:|mailto:|#)([^)\s#]+)[^)]*\)", prose)
+    paths = [(page.parent / target).resolve() for target in targets]
+    assert [os.path.relpath(path, ROOT) for path in paths if not path.exists() and path not in GENERATED] == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in PAGES if any(b.mark for b in blocks(p))], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [p for p in PAGES if any(b.mark for b in blocks(p))], ids=title)
 def test_marked_blocks_run(page, tmp_path):
     site = tmp_path / "site"
     site.mkdir()
@@ -136,11 +192,20 @@ def test_marked_blocks_run(page, tmp_path):
             run([sys.executable, "-c", block.text] if block.kind == "python" else ["bash", "-c", shell + block.text])
 
 
-@pytest.mark.parametrize(
-    "page",
-    sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/**/*.md")]),
-    ids=lambda p: str(p.relative_to(ROOT)),
-)
-def test_lines_are_at_most_100_columns(page):
-    too_long = [f"{i}: {len(line)}" for i, line in enumerate(page.read_text().splitlines(), 1) if len(line) > 100]
+def prose_lines(text: str) -> list[tuple[int, str]]:
+    """Return the numbered lines of a page that are neither code, nor rows of a table, nor a picture alone."""
+    lines: list[tuple[int, str]] = []
+    in_code = False
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.lstrip().startswith("```"):
+            in_code = not in_code
+        elif not in_code and not re.match(r"\s*(\||!\[[^]]*\]\([^)]*\)$)", line):
+            lines.append((number, line))
+    return lines
+
+
+@pytest.mark.parametrize("page", EVERYTHING, ids=title)
+def test_lines_of_prose_are_at_most_100_columns(page):
+    lines = prose_lines(page.read_text(encoding="utf-8"))
+    too_long = [f"{number}: {len(line)}" for number, line in lines if len(line) > 100]
     assert not too_long, f"{page.name}, line: columns {too_long[:10]}"

@@ -1,4 +1,4 @@
-"""What the build of the site reads."""
+"""Tests what the build of the site reads."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ def test_examples_of_commands_are_code(hooks):
 def test_the_reference_reads_the_package_and_nothing_else(hooks, tmp_path, monkeypatch):
     """A link to the repository's root held itself and ``.venv``: the build read it 40 times over and did not end."""
     monkeypatch.setattr(hooks, "PATHS", tmp_path)
-    monkeypatch.setenv("JUPYTER_CONFIG_PATH", "")
-    hooks.on_config({})
+    hooks.link_package()
     walk = os.walk(tmp_path / "gaitgauge", followlinks=True)
     found = {Path(folder, name).resolve() for folder, _, names in walk for name in names if name.endswith(".py")}
     packages = {path.parent for path in ROOT.glob("*/__init__.py")}

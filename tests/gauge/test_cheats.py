@@ -223,7 +223,7 @@ linear_velocity = "commanded"
 
 @pytest.mark.slow
 def test_on_obstacles_the_reference_takes_most_of_what_walking_earns_and_little_of_what_standing_does(folder, policy):
-    """A quirk of the reference that is kept, and said in docs/suites.md: there vertical speed and rates of roll and pitch, which
+    """A quirk of the reference that is kept, and said in docs/reference/suites.md: there vertical speed and rates of roll and pitch, which
     climbing needs, are tracking errors."""
     commanded = folder / "commanded.toml"
     commanded.write_text(COMMANDED)

@@ -192,7 +192,7 @@ def test_friction_margin_weighs_contacts_by_their_load():
 
 def test_tension_between_the_feet_uses_friction_up():
     """Feet that press outwards, as those of the default pose do, leave less margin than feet of the same load that do not: a robot
-    that stands may rank below one that walks (docs/suites.md). Only a margin of the net force would not see it."""
+    that stands may rank below one that walks (docs/reference/suites.md). Only a margin of the net force would not see it."""
     load = rows(37.0, 37.0, 37.0, 37.0)
     tense = friction_margin(load, rows(12.0, 12.0, 12.0, 12.0), scalar(0.6)).item()
     walking = friction_margin(rows(74.0, 0.0, 0.0, 74.0), rows(15.0, 0.0, 0.0, 15.0), scalar(0.6)).item()

@@ -79,7 +79,7 @@ def test_the_second_number_of_a_pair_is_the_growth_up_to_difficulty_1(level, mea
 
 
 def test_levels_go_on_beyond_the_gauge_s_hardest_ground():
-    """As ``docs/training-choices.md`` says: stairs from level 8 on, slopes and bars from level 10 on."""
+    """As ``docs/reference/training-settings.md`` says: stairs from level 8 on, slopes and bars from level 10 on."""
     shape = TileShape(stair_irregularity=0.0, bar_height=(1.0, 1.0))
 
     def highest(kind, level):

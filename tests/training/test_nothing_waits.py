@@ -1,5 +1,5 @@
 """A rollout only asks the device for work. Whatever waits for an answer lets the device stand still until the host has asked for more
-(docs/performance.md has what one such wait a control step was worth).
+(docs/reports/2026-11-27-performance.md has what one such wait a control step was worth).
 """
 
 import pytest
