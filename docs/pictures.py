@@ -98,7 +98,7 @@ def shoot(address: str, file: str, *, width: int = 1150, height: int = 900, at: 
             call("Emulation.setDeviceMetricsOverride", **size)
             call("Page.navigate", url=address)
             time.sleep(wait)
-            notice = "document.querySelector('.mantine-Notifications-root')?.remove();"  # of rendering without a GPU
+            notice = "document.querySelectorAll('[role=alert]').forEach(e => e.remove());"  # rendering without a GPU
             section = f"[...document.querySelectorAll('section')].find(s => s.innerText.trim().startsWith({at!r}))"
             found = f"({section} ?? document.querySelector({at!r})).getBoundingClientRect()"
             script = f"(r => [r.x - 12, r.y - 8 + scrollY, r.width + 24, r.height + 16])({found})"
@@ -126,7 +126,7 @@ def viewer() -> None:
     words = ("play", "pretrained", "--viewer", "viser", "--port", "8093", "--terrain", "stairs_fd", "--level", "6")
     playing = subprocess.Popen(gaitgauge(*words), stdout=subprocess.DEVNULL)
     time.sleep(25)
-    shoot("http://127.0.0.1:8093", "viewer.png", width=1300, height=760, wait=25)
+    shoot("http://127.0.0.1:8093", "viewer.png", width=1300, height=760, wait=45)
     playing.terminate()
     playing.wait()
 
