@@ -150,7 +150,7 @@ def terminals() -> None:
 
 def evaluation() -> None:
     """Show the evaluation of the quick start, the page of a whole one made from its score card, and a training curve."""
-    from gaitgauge.gauge.report import write_report
+    from gaitgauge.gauge.report.page import write_report
 
     text = run("evaluate", "evaluate", "pretrained", "--suite", "demo", "--out", "demo")
     terminal("terminal-evaluate.png", "gaitgauge evaluate pretrained --suite demo --out demo", text)
