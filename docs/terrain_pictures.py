@@ -34,6 +34,7 @@ def drawn(title: str, terrain: Any, *, at: float = 0.0, down: float, far: float)
     position[2] += robot.stand_height
     model = visual_model(robot, terrain, quality)
     model.vis.map.znear = 0.3  # faces that lie nearly in each other would flicker
+    model.geom_sameframe[model.geom("floor").id] = 0  # its own position counts
     model.geom("floor").pos[2] -= 0.1 if terrain.name == "tile_rough_slope" else 0.02
     if "slope" in terrain.name:  # so would shadows of flat faces that touch each other
         model.light_castshadow[:] = False
