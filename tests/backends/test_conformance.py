@@ -108,8 +108,6 @@ def test_the_documentation_lists_every_check():
     text = (Path(__file__).parents[2] / "docs" / "reference" / "conformance.md").read_text()
     listed = " ".join(text.split())
     missing = [
-        c.name
-        for c in CHECKS.values()
-        if f"| `{c.name}` | {' '.join(c.about.rstrip('.').split())} |" not in listed
+        c.name for c in CHECKS.values() if f"| `{c.name}` | {' '.join(c.about.rstrip('.').split())} |" not in listed
     ]
     assert [name for name in missing if name.removeprefix("refusal/") not in CAPABILITY_NAMES] == []
