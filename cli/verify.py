@@ -39,7 +39,7 @@ def run_verification(
         policy=policy,
         beside=place if place.is_dir() else place.parent,
         suite=suite,
-        device=choose_device(content["backend"], device),
+        device=choose_device(content.backend, device),
         threads=threads or os.cpu_count() or 1,
         quick=quick,
         fresh=fresh,

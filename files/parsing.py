@@ -56,6 +56,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, lt=2**53)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
+
 def shown(value: object) -> str:
     """A value as it stands in a sentence: shortened, control characters escaped."""
     short = reprlib.Repr()

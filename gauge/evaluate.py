@@ -42,6 +42,7 @@ from .play.dispatcher import Dispatcher, Speculation, play
 from .play.progress import ProgressMeter, Status
 from .play.segments import count_segments
 from .play.workers import Job, local_workers, start_workers
+from .result import ClusterName, Motors, PolicyName, Provenance, Result
 from .results import fold, health, rows_csv
 from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
@@ -225,7 +226,7 @@ def evaluate(
     resume: bool = False,
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
-) -> dict[str, Any]:
+) -> Result:
     """Evaluate a policy; every finished episode is on disk at once, so that nothing is lost when the process is killed.
 
     Args:
@@ -234,9 +235,6 @@ def evaluate(
         resume: go on with what the folder holds.
         command: the command line, for the provenance.
         watch: called a few times a second.
-
-    Returns:
-        The content of ``results.json``.
 
     Raises:
         SuiteError, RobotError, PolicyError, ContractError, BackendError, WorkerError, ClusterError, StoreError, RecordError: one
@@ -258,50 +256,56 @@ def evaluate(
             effort = play(planners, store.records, store.put, workers, speculation=speculation, watch=on_progress)
         outcomes = [environment_result(environment, store.records, rules) for environment in prepared.environments]
         counted = [record for outcome in outcomes for record in (*outcome.trials, *outcome.records)]
-        results = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
-        results["policy"] = {
-            "path": prepared.policy.path,
-            "contract_hash": prepared.policy.contract.hash,
-            "file_sha256": prepared.policy.file_sha256,
-            "observations": [term.name for term in prepared.policy.contract.observation],
-            "kind_of_observations": kind_of_observations(prepared.policy.contract),
-            "provenance": without_copy(prepared.policy.contract.provenance),
-        }
-        results["coverage"] = coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline)
-        results["pipeline"] = request.pipeline
-        results["backend"] = request.backend
-        results["robot"] = prepared.robot.name
-        motors = joint_parameters(suite, prepared.robot, prepared.policy.contract)
-        results["motors"] = {
-            "stiffness": list(motors.stiffness),
-            "damping": list(motors.damping),
-            "note": gains_note(suite, prepared.robot, prepared.policy.contract),
-        }
-        results["health"] = health([record for outcome in outcomes for record in outcome.records])
-        results["solver"] = dict(find_backend(request.backend, request.device).solver_settings(suite.physics))
-        results["provenance"] = provenance(
-            command=command,
-            device=request.device,
-            threads=request.threads or count,
-            digests={
-                "policy": prepared.policy.digest,
-                "robot": robot_digest(prepared.robot),
-                "suite": suite.digest,
-                "source": source_digest(),
-            },
-            seconds=round(time.perf_counter() - began, 2),
-            physics_steps=effort.physics_steps,
-            processes=count,
-            set_aside=[path.name for path in store.damaged],
+        scores = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
+        contract = prepared.policy.contract
+        motors = joint_parameters(suite, prepared.robot, contract)
+        result = Result(
+            **vars(scores),
+            policy=PolicyName(
+                path=prepared.policy.path,
+                contract_hash=contract.hash,
+                file_sha256=prepared.policy.file_sha256,
+                observations=tuple(term.name for term in contract.observation),
+                kind_of_observations=kind_of_observations(contract),
+                provenance=without_copy(contract.provenance),
+            ),
+            coverage=coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline),
+            pipeline=request.pipeline,
+            backend=request.backend,
+            robot=prepared.robot.name,
+            motors=Motors(
+                stiffness=motors.stiffness,
+                damping=motors.damping,
+                note=gains_note(suite, prepared.robot, contract),
+            ),
+            health=health([record for outcome in outcomes for record in outcome.records]),
+            solver=dict(find_backend(request.backend, request.device).solver_settings(suite.physics)),
+            provenance=Provenance(
+                **provenance(
+                    command=command,
+                    device=request.device,
+                    threads=request.threads or count,
+                    digests={
+                        "policy": prepared.policy.digest,
+                        "robot": robot_digest(prepared.robot),
+                        "suite": suite.digest,
+                        "source": source_digest(),
+                    },
+                ),
+                seconds=round(time.perf_counter() - began, 2),
+                physics_steps=effort.physics_steps,
+                processes=count,
+                set_aside=tuple(path.name for path in store.damaged),
+                cluster=None
+                if request.cluster is None or not isinstance(workers, ClusterWorkers)
+                else ClusterName(address=request.cluster, processors=tuple(sorted(workers.processors))),
+                engine_seconds=None if effort.engine_seconds is None else round(effort.engine_seconds, 2),
+            ),
         )
-        if isinstance(workers, ClusterWorkers):
-            results["provenance"]["cluster"] = {"address": request.cluster, "processors": sorted(workers.processors)}
-        if effort.engine_seconds is not None:
-            results["provenance"]["engine_seconds"] = round(effort.engine_seconds, 2)
         write_atomically(folder / "episodes.csv", rows_csv(counted), StoreError)
-        write_atomically(folder / "results.json", json_text(results), StoreError)
+        write_atomically(folder / "results.json", json_text(result.to_data()), StoreError)
         store.discard_all_but([record.episode for record in counted])
-    return results
+    return result
 
 
 def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None) -> tuple[Job, int, Speculation]:

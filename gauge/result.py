@@ -408,7 +408,9 @@ class Result(Scores):
         if not isinstance(data, Mapping):
             raise error(f"{source} is {shown(data)}; it must be a table")
         if (schema := data.get("schema")) != SCHEMA:
-            raise error(f"{source}: it has schema {shown(schema)}, this version reads {SCHEMA}; evaluate the policy again")
+            raise error(
+                f"{source}: it has schema {shown(schema)}, this version reads {SCHEMA}; evaluate the policy again"
+            )
         figures = take(_figures(cls), data, source, error)
         tables = {
             name: _read(kind, data.get(name), f"{source}: {name}", error)
@@ -477,8 +479,11 @@ _TABLES: Mapping[str, type[Table]] = {
 _NEEDED = ("suite", "policy", "provenance", "chance")
 
 
-def read_result(path: Path, error: type[Exception]) -> Result:
+def read_result(path: Path, error: type[Exception], *, words: str = "") -> Result:
     """Read a results folder, its ``results.json``, or a copy of that.
+
+    Args:
+        words: what a sentence says of a file that cannot be read.
 
     Raises:
         error: there is none, or it is damaged or of another schema.
@@ -490,7 +495,7 @@ def read_result(path: Path, error: type[Exception]) -> Result:
         raise error(f"'{one_line(path)}' cannot be read: {problem.strerror}") from problem
     if not there:
         raise error(f"there are no results at '{one_line(path)}'; give a folder of 'gaitgauge evaluate'")
-    return Result.from_data(read_results(file, "results", error), f"results '{one_line(file)}'", error)
+    return Result.from_data(read_results(file, "results", error), f"results '{one_line(file)}'{words}", error)
 
 
 def unlike(tables: Sequence[Mapping[str, object]]) -> list[str]:

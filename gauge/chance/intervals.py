@@ -1,34 +1,30 @@
 """How sure a score is: what other seeds would have changed, in the levels found and in the quality measured there.
 
 Terrains, frictions, payloads, goals and their sub-commands are the benchmark and stay. Seeds are a sample, twice over: the search
-seeds decide about levels (``level_chance``), the quality seeds about everything that is measured at them. Functions take rows of
-``results.json``, so that a result can be judged long after its episodes are gone.
+seeds decide about levels (``level_chance``), the quality seeds about everything that is measured at them. Functions take the rows
+of a ``Result``, so that it can be judged long after its episodes are gone.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import special
 
-from ...files.parsing import NotNegative, Seed, Share
 from ..episodes import QUALITY
+from ..result import CONFIDENCE, ChanceRules, EnvironmentRow
 from .level_chance import bisected_levels, redraw_levels, shared_luck, success_curves
 from .level_curve import expected_levels
 
 Array = NDArray[np.float64]
-Row = Mapping[str, Any]
-_Seeds = Annotated[tuple[Seed, ...], Field(min_length=1, max_length=10_000)]
 
-CONFIDENCE = 0.95
 _QUALITY_STEP = 0.85
 """What is left of the quality one level higher: 0.84 on waves and 0.79 on obstacles of ``docs/data/repeated_evaluations.json``."""
 _LEVEL_FREEDOM = 8.0
@@ -120,36 +116,15 @@ def wilson_interval(share: float, trials: float) -> tuple[float, float]:
     return max(centre - reach, 0.0), min(centre + reach, 1.0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChanceRules:
-    """What a suite says that decides about chance."""
-
-    level_weight: NotNegative
-    quality_weight: NotNegative
-    pass_rate: Share
-    levels: Annotated[int, Field(ge=1, le=1000)]
-    seeds: _Seeds
-    """Of the quality episodes."""
-    search_seeds: _Seeds
-    shared_noise: bool
-    """Whether the environments of a seed share its random numbers."""
-    resamples: Annotated[int, Field(ge=1, le=100_000)]
-    """Replicates of the level searches."""
-    level: Literal["bisection", "curve"] = "bisection"
-    """How a level is found, as the suite has it; absent from results that are older than the choice."""
-    bracket_seeds: Annotated[int, Field(ge=1, le=1000)] = 2
-    """Seeds that look for the crossing of a curve."""
-
-
 class Evidence:
     """Trials and runs of the environments of one evaluation, as arrays.
 
     Attributes:
-        rows: the environments of ``results.json``.
+        rows: the environments of the result.
         redrawn: maximum levels of the searches done again, (E, B).
     """
 
-    def __init__(self, rows: Sequence[Row], rules: ChanceRules, *, name: str = "") -> None:
+    def __init__(self, rows: Sequence[EnvironmentRow], rules: ChanceRules, *, name: str = "") -> None:
         """Read the rows and redo the searches.
 
         Args:
@@ -157,10 +132,10 @@ class Evidence:
             name: seeds the generator, so that the same rows have the same intervals; evaluations that are compared have two.
         """
         self.rows, self._rules = list(rows), rules
-        self._flat = np.array([r["terrain"] == "flat" for r in rows], dtype=bool)
-        self._reached = np.array([r["level"] or 0 for r in rows], dtype=np.float64)
-        self._searched = np.array([bool(r.get("trials")) for r in rows], dtype=bool)
-        self._played = np.array([bool(r.get("runs")) for r in rows], dtype=bool)
+        self._flat = np.array([r.flat for r in rows], dtype=bool)
+        self._reached = np.array([r.reached for r in rows], dtype=np.float64)
+        self._searched = np.array([bool(r.trials) for r in rows], dtype=bool)
+        self._played = np.array([bool(r.runs) for r in rows], dtype=bool)
         self.redrawn = np.repeat(self._reached[:, None], rules.resamples, axis=1)
         self._redraw(np.random.default_rng(zlib.crc32(f"levels {name}".encode())))
 
@@ -168,12 +143,8 @@ class Evidence:
         searched = np.flatnonzero(self._searched).tolist()
         if not searched:
             return
-        searches = [
-            {int(level): {int(s): bool(o) for s, o in outcomes.items()} for level, outcomes in row["trials"].items()}
-            for row in (self.rows[at] for at in searched)
-        ]
-        rules = self._rules
-        curves = success_curves(searches, [self.rows[at]["terrain"] for at in searched], rules.levels)
+        searches, rules = [self.rows[at].trials for at in searched], self._rules
+        curves = success_curves(searches, [self.rows[at].terrain for at in searched], rules.levels)
         self.redrawn[searched] = redraw_levels(
             curves,
             seeds=len(rules.search_seeds),
@@ -185,7 +156,7 @@ class Evidence:
             generator=generator,
         )
 
-    def of(self, rows: Sequence[Row]) -> Evidence:
+    def of(self, rows: Sequence[EnvironmentRow]) -> Evidence:
         """The same rules and other rows."""
         return Evidence(rows, self._rules)
 
@@ -197,8 +168,8 @@ class Evidence:
         values = np.zeros((len(self.rows), len(self._rules.seeds)))
         for at in np.flatnonzero(self._played).tolist():
             for place, seed in enumerate(self._rules.seeds):
-                run = self.rows[at]["runs"][str(seed)]
-                found = {**run, **run["commands"]}
+                run = self.rows[at].runs[seed]
+                found = {**run.columns, **run.commands}
                 values[at, place] = sum(found[c] for c in columns) / len(columns)
         return values
 
@@ -258,8 +229,7 @@ class Evidence:
         levelled = self._played & ~self._flat
         found = means.copy()
         for at in np.flatnonzero(~self._played & ~self._flat):
-            terrain = self.rows[at]["terrain"]
-            mine = levelled & np.array([r["terrain"] == terrain for r in self.rows])
+            mine = levelled & np.array([r.terrain == self.rows[at].terrain for r in self.rows])
             known = mine if mine.any() else levelled
             found[at] = means[known].mean() if known.any() else _UNKNOWN_QUALITY
         return found

@@ -1,12 +1,12 @@
-"""Quality by direction and by command: pure functions from rows of ``results.json``, for the report."""
+"""Quality by direction and by command: pure functions from the rows of a result, for the report."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any
 
 from ..goals import SUB_COMMANDS, TARGET, command_name
+from ..result import EnvironmentRow
 
 DIRECTIONS: Mapping[str, tuple[int, int]] = {
     "forward": (0, 1),
@@ -35,7 +35,7 @@ def command_label(name: str) -> str:
     return f"{_GOALS[goal]}: {' and '.join(towards)}" if towards else _GOALS[goal]
 
 
-def breakdown(rows: Sequence[Mapping[str, Any]]) -> dict[str, Table]:
+def breakdown(rows: Sequence[EnvironmentRow]) -> dict[str, Table]:
     """Quality (mean@50) as measured, at the levels reached: the mean over a terrain's environments and seeds.
 
     Returns:
@@ -43,9 +43,9 @@ def breakdown(rows: Sequence[Mapping[str, Any]]) -> dict[str, Table]:
     """
     values: dict[str, dict[str, list[float]]] = {}
     for row in rows:
-        for run in row.get("runs", {}).values():
-            for name, value in run.get("commands", {}).items():
-                values.setdefault(name, {}).setdefault(row["terrain"], []).append(value)
+        for run in row.runs.values():
+            for name, value in run.commands.items():
+                values.setdefault(name, {}).setdefault(row.terrain, []).append(value)
     if not values:
         return {}
     directions: dict[str, dict[str, list[float]]] = {}

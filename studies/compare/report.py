@@ -78,7 +78,7 @@ def as_latex(found: Comparison) -> str:
                 ]
                 lines.append(" & ".join(cells) + r" \\")
         tables.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
-    head = one_line(f"{found.suite['name']} {found.suite['version']}; {' '.join(found.sentences)}", _LONGEST)
+    head = one_line(f"{found.suite}; {' '.join(found.sentences)}", _LONGEST)
     return "\n\n".join([f"% {head}", *tables]) + "\n"
 
 

@@ -290,7 +290,7 @@ class _Policy:
             "floor": floor_only(design, self._records[reference], floor, f"{self._name}/floor"),
             "pairs": pairs,
             "attribution": attribution,
-            "health": {label: health(records.values()) for label, records in self._records.items()},
+            "health": {label: health(records.values()).to_data() for label, records in self._records.items()},
         }
 
     # ---- closed loop ----------------------------------------------------------------------------------------------
