@@ -32,7 +32,7 @@ def coverage(
         "payloads": sorted(_distinct(e.payload for e in environments)),
         "seeds": [] if levels_alone else sorted(_distinct(seeds)),
     }
-    axes = {
+    axes: dict[str, Any] = {
         axis: AxisCoverage(
             played=tuple(values),
             missing=tuple(v for v in getattr(matrix, axis) if v not in values),

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, Final, Literal, TypeVar, get_type_hints
 
 from pydantic import Field, GetCoreSchemaHandler, JsonValue, WrapValidator
 from pydantic_core import CoreSchema, core_schema
@@ -18,11 +18,13 @@ from pydantic_core import CoreSchema, core_schema
 from ..files.parsing import Name, NotNegative, Seed, Share, Text, one_line, read_results, shown, take
 from .suite import Friction, Payload
 
-SCHEMA = 2
+SCHEMA: Final = 2
 CONFIDENCE = 0.95
 FLAT = "flat"
-COMPLETE, PART, CUSTOM, UNKNOWN = "complete", "part", "custom", "unknown"
-"""Kinds of coverage."""
+COMPLETE: Final = "complete"
+PART: Final = "part"
+CUSTOM: Final = "custom"
+UNKNOWN: Final = "unknown"
 MOST_ROWS = 10_000
 """Environments of one result."""
 MOST_REPLICATES = 20_000_000
@@ -412,16 +414,16 @@ class Result(Scores):
                 f"{source}: it has schema {shown(schema)}, this version reads {SCHEMA}; evaluate the policy again"
             )
         figures = take(_figures(cls), data, source, error)
-        tables = {
-            name: _read(kind, data.get(name), f"{source}: {name}", error)
+        absent = {name for name in _OPTIONAL if data.get(name) is None}
+        tables: dict[str, Any] = {
+            name: _read(kind, {} if name in absent else data.get(name), f"{source}: {name}", error)
             for name, kind in _TABLES.items()
-            if name in _NEEDED or data.get(name) is not None
         }
         rows = data.get("environments")
         if not isinstance(rows, list) or len(rows) > MOST_ROWS:
             raise error(f"{source}: environments is {shown(rows)}; it must be a list of at most {MOST_ROWS:,}")
         read = (_read(EnvironmentRow, row, f"{source}: environments[{at}]", error) for at, row in enumerate(rows))
-        tables |= {"environments": tuple(read), "lacking": _lacking(cls, data) | (_TABLES.keys() - tables.keys())}
+        tables |= {"environments": tuple(read), "lacking": _lacking(cls, data) | absent}
         found = cls(**vars(figures), **tables)
         if found.score_interval is not None and found.score_interval[0] > found.score_interval[1]:
             raise error(f"{source}: score_interval is {shown(list(found.score_interval))}; its ends must rise")
@@ -476,7 +478,8 @@ _TABLES: Mapping[str, type[Table]] = {
     "motors": Motors,
     "health": Health,
 }
-_NEEDED = ("suite", "policy", "provenance", "chance")
+_OPTIONAL = ("coverage", "motors", "health")
+"""Tables that older files lack."""
 
 
 def read_result(path: Path, error: type[Exception], *, words: str = "") -> Result:
@@ -528,8 +531,7 @@ def _lacking(kind: type[Table], data: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(f.name for f in fields(kind)) - data.keys()
 
 
-@cache
-def _figures(kind: type[Table]) -> type:
+def _without_tables(kind: type[Table]) -> type:
     """Return a dataclass of the fields of a kind that are no tables with a sentence of their own."""
     hints = get_type_hints(kind, include_extras=True)
     own = []
@@ -540,3 +542,6 @@ def _figures(kind: type[Table]) -> type:
         default |= {} if f.default_factory is MISSING else {"default_factory": f.default_factory}
         own.append((f.name, hints[f.name], field(**default)))
     return make_dataclass(kind.__name__, own, frozen=True, kw_only=True)
+
+
+_figures: Callable[[type[Table]], Any] = cache(_without_tables)

@@ -97,7 +97,7 @@ def _figures(result: Result) -> Iterator[Figure]:
         measured |= {f"metrics.{name}": (name, found) for name, found in row.metrics.items()}
         for name, (column, found) in measured.items():
             expected = float(np.mean([run.columns[column] for run in row.runs.values()])) if row.runs else None
-            yield f"environments[{at}].{name}.mean50", found and found.mean50, expected
+            yield f"environments[{at}].{name}.mean50", None if found is None else found.mean50, expected
         if evaluated:
             yield f"environments[{at}].score", row.score, _at_level(row.quality, "mean50", row, rules)
     if "level" not in result.lacking:

@@ -207,7 +207,7 @@ def _environment(
     ), statistics
 
 
-def _named(values: Array) -> dict[str, float]:
+def _named(values: Array) -> dict[str, Any]:
     """Return the statistics of a column by name."""
     return {name: _number(value) for name, value in zip(STATISTICS, values, strict=True)}
 

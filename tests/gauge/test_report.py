@@ -197,9 +197,9 @@ def test_edited_results_are_one_clear_sentence_or_a_page(tmp_path, stress, key, 
         write_report(tmp_path)
     except StoreError as error:
         assert "results.json was edited or is damaged" in str(error) and str(error).isprintable()
-    for read in (lambda: compare([load_result(tmp_path), stress], ["a", "b"]), lambda: load_results(tmp_path)):
+    for again in (lambda: compare([load_result(tmp_path), stress], ["a", "b"]), lambda: load_results(tmp_path)):
         with suppress(ComparisonError, ResultsError):
-            read()
+            again()
 
 
 @pytest.mark.parametrize(
