@@ -531,7 +531,7 @@ def _lacking(kind: type[Table], data: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(f.name for f in fields(kind)) - data.keys()
 
 
-def _without_tables(kind: type[Table]) -> type:
+def _without_tables(kind: Any) -> Any:
     """Return a dataclass of the fields of a kind that are no tables with a sentence of their own."""
     hints = get_type_hints(kind, include_extras=True)
     own = []
@@ -544,4 +544,4 @@ def _without_tables(kind: type[Table]) -> type:
     return make_dataclass(kind.__name__, own, frozen=True, kw_only=True)
 
 
-_figures: Callable[[type[Table]], Any] = cache(_without_tables)
+_figures: Callable[[Any], Any] = cache(_without_tables)
