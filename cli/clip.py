@@ -15,7 +15,7 @@ from ..gauge.result import Result
 SECONDS = 6.0
 """Length of the film [s]."""
 _LONGEST = 300.0
-"""How long it may take [s]."""
+"""Longest time to make it [s]."""
 _SHOWIEST = ("stairs_fd", "obstacle", "wave", "slope_fd", "stairs_bd", "slope_bd")
 """Terrains in the order in which they are preferred."""
 _PACKAGE = __name__.partition(".")[0]

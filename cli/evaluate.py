@@ -83,7 +83,7 @@ def run_evaluation(
 
 
 def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -> str | None:
-    """What to do where the robot fell at once in most episodes."""
+    """Return advice where the robot fell at once in most episodes."""
     at_once = AT_ONCE + suite.settling.longest
     with (folder / "episodes.csv").open(encoding="utf-8", newline="") as file:
         whole = [row for row in csv.DictReader(file) if row["command"] == ALL]
@@ -95,7 +95,7 @@ def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -
 
 
 def shower(display: ProgressDisplay) -> Callable[[Status], None]:
-    """What an evaluation is watched with."""
+    """Return the function that shows the progress of an evaluation."""
 
     def show(status: Status) -> None:
         seconds = status.seconds_left

@@ -48,12 +48,12 @@ from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
 
 _WORLDS = 24
-"""Worlds of a worker on the CPU: more share the loop's cost, fewer keep more workers busy to the end."""
+"""Worlds of a worker on the CPU: more worlds amortize the loop's overhead; fewer balance the load at the end."""
 _GPU_WORLDS = 4096
 """Largest number of worlds on a GPU."""
 GPU_SPECULATION = Speculation(at_work=_GPU_WORLDS, test_probability=0.02, quality_probability=0.25)
-"""A GPU plays nearly every level of every search at once, and quality while the last level tests run: what lasts is the number of
-control steps in a row, and at the end most worlds have nothing to do."""
+"""A GPU plays nearly every level of every search at once, and quality while the last level tests run: the number
+of control steps in a row dominates the run time, and at the end most worlds have nothing to do."""
 _EARLY = 16
 """Episodes of a worker on the CPU up to which it plays others speculatively: more of them slow those that are required."""
 _WATCH_INTERVAL = 0.2
@@ -62,7 +62,7 @@ _WATCH_INTERVAL = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What is to be evaluated, and how. Empty tuples and None stand for the suite's own choice."""
+    """A policy to evaluate, and the choices of the user. Empty tuples and None stand for the suite's own choice."""
 
     policy: str
     suite: str = "gaitgauge-1"
@@ -86,7 +86,7 @@ class Request:
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """A request that can be carried out, and what it names."""
+    """A request that can be carried out, with the suite, robot and policy that it names."""
 
     request: Request
     suite: Suite
@@ -98,7 +98,7 @@ class Prepared:
 
     @property
     def rules(self) -> PlanRules:
-        """What plans depend on."""
+        """The rules that plans depend on."""
         return PlanRules(suite=self.suite, seeds=self.seeds, quality=self.request.pipeline != "level")
 
 
@@ -155,14 +155,14 @@ def prepare(request: Request) -> Prepared:
 
 
 def _robot_and_policy(request: Request) -> tuple[Robot, FilePolicy]:
-    """What is gauged, on which robot: foreign files take their contract from the robot that is asked for."""
+    """Return robot and policy: foreign files take their contract from the robot that is asked for."""
     asked = None if request.robot is None else load_robot(request.robot)
     policy = load_policy(request.policy, asked, trust=request.trust)
     return robot_for(policy.contract, request.robot), policy
 
 
 def _terrains(request: Request, suite: Suite) -> list[str]:
-    """The terrains of a request, in the suite's order."""
+    """Return the terrains of a request, in the suite's order."""
     if request.pipeline not in PIPELINES:
         raise SuiteError(
             f"there is no pipeline '{one_line(request.pipeline, 80)}'; choose one of {', '.join(PIPELINES)}"
@@ -193,7 +193,7 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
 
 
 def identity(prepared: Prepared) -> dict[str, Any]:
-    """What decides about the results: a folder that holds another run is refused."""
+    """Return what decides about the results: a folder that holds another run is refused."""
     request = prepared.request
     return common_identity(prepared.suite, prepared.policy.digest, prepared.robot, request.device, prepared.seeds) | {
         "pipeline": request.pipeline,
@@ -206,7 +206,7 @@ def identity(prepared: Prepared) -> dict[str, Any]:
 
 
 def common_identity(suite: Suite, policy: str, robot: Robot, device: str, seeds: Sequence[int]) -> dict[str, Any]:
-    """The part of it that every run of episodes has; ``policy`` is its digest."""
+    """Return the part of it that every run of episodes has; ``policy`` is its digest."""
     return {
         "suite": f"{suite.name} {suite.version}",
         "suite_digest": suite.digest,
@@ -274,9 +274,7 @@ def evaluate(
             backend=request.backend,
             robot=prepared.robot.name,
             motors=Motors(
-                stiffness=motors.stiffness,
-                damping=motors.damping,
-                note=gains_note(suite, prepared.robot, contract),
+                stiffness=motors.stiffness, damping=motors.damping, note=gains_note(suite, prepared.robot, contract)
             ),
             health=health([record for outcome in outcomes for record in outcome.records]),
             solver=dict(find_backend(request.backend, request.device).solver_settings(suite.physics)),
@@ -309,7 +307,7 @@ def evaluate(
 
 
 def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None) -> tuple[Job, int, Speculation]:
-    """What to play with, how many workers play, and what they play speculatively."""
+    """Return the job of the workers, their number, and the rule by which they play speculatively."""
     request, suite = prepared.request, prepared.suite
     places = [
         (e.terrain, level)
@@ -351,7 +349,7 @@ def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None)
 def _watcher(
     prepared: Prepared, watch: Callable[[Status], None] | None, began: float
 ) -> Callable[[Dispatcher], None] | None:
-    """Tells ``watch`` now and then how far playing is."""
+    """Return the function that tells ``watch`` now and then how far playing is."""
     if watch is None:
         return None
     meter = ProgressMeter(prepared.suite, began)

@@ -7,7 +7,8 @@ edited a file since it was written. The reader ignores entries that no field nam
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, make_dataclass, replace
+from copy import copy
+from dataclasses import dataclass, field, fields, make_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar, get_type_hints
@@ -413,7 +414,7 @@ class Result(Scores):
             raise error(
                 f"{source}: it has schema {shown(schema)}, this version reads {SCHEMA}; evaluate the policy again"
             )
-        figures = take(_figures(cls), data, source, error)
+        figures = take(_figures(), data, source, error)
         absent = {name for name in _OPTIONAL if data.get(name) is None}
         tables: dict[str, Any] = {
             name: _read(kind, {} if name in absent else data.get(name), f"{source}: {name}", error)
@@ -458,15 +459,11 @@ class Result(Scores):
         return self.provenance.versions.get(self.backend.partition(":")[0])
 
     @property
-    def versions(self) -> dict[str, str]:
-        """Versions of gaitgauge and of the engine, and the digest of gaitgauge's source, as far as the result states them."""
-        source = self.provenance.digests.get("source")
-        found = {
-            "gaitgauge": self.provenance.versions.get("gaitgauge"),
-            self.backend.partition(":")[0]: self.engine_version,
-            "source of gaitgauge": source and source[:12],
-        }
-        return {name: version for name, version in found.items() if version is not None}
+    def versions(self) -> dict[str, str | None]:
+        """Versions of gaitgauge and of the engine, and the digest of gaitgauge's source; None where the result does not say."""
+        stated, source = self.provenance.versions, self.provenance.digests.get("source")
+        own = {"gaitgauge": stated.get("gaitgauge"), self.backend.partition(":")[0]: self.engine_version}
+        return {**own, "source of gaitgauge": source and source[:12]}
 
 
 _TABLES: Mapping[str, type[Table]] = {
@@ -522,26 +519,17 @@ def _plain(value: Any) -> Any:
 
 def _read(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
     """Return a table, with the names of the entries that it lacks."""
-    found = take(_figures(kind), data, source, error)
-    assert isinstance(data, Mapping)
-    return kind(**vars(found), lacking=_lacking(kind, data))
+    found = take(kind, data, source, error)
+    return replace(found, lacking=_lacking(kind, data))
 
 
-def _lacking(kind: type[Table], data: Mapping[str, Any]) -> frozenset[str]:
+def _lacking(kind: type[Table], data: Any) -> frozenset[str]:
     return frozenset(f.name for f in fields(kind)) - data.keys()
 
 
-def _without_tables(kind: Any) -> Any:
-    """Return a dataclass of the fields of a kind that are no tables with a sentence of their own."""
-    hints = get_type_hints(kind, include_extras=True)
-    own = []
-    for f in fields(kind):
-        if f.name == "lacking" or (issubclass(kind, Scores) and f.name in (*_TABLES, "environments")):
-            continue
-        default = {} if f.default is MISSING else {"default": f.default}
-        default |= {} if f.default_factory is MISSING else {"default_factory": f.default_factory}
-        own.append((f.name, hints[f.name], field(**default)))
-    return make_dataclass(kind.__name__, own, frozen=True, kw_only=True)
-
-
-_figures: Callable[[Any], Any] = cache(_without_tables)
+@cache
+def _figures() -> Any:
+    """Return a dataclass of the fields of a result that are no tables with a sentence of their own."""
+    apart, hints = (*_TABLES, "environments", "lacking"), get_type_hints(Result, include_extras=True)
+    own = [(f.name, hints[f.name], copy(f)) for f in fields(Result) if f.name not in apart]
+    return make_dataclass("Figures", own, frozen=True, kw_only=True)

@@ -89,8 +89,7 @@ def fold(
         mine = np.array([e.terrain == terrain for e in environments])
         weights, level = mine / len(group), None if terrain == FLAT else _mean_level(group)
         found = TerrainScore(
-            level=level,
-            level_interval=level_interval(level, weights) if any(e.searched for e in group) else None,
+            level=level, level_interval=level_interval(level, weights) if any(e.searched for e in group) else None
         )
         if evaluated:
             statistics = np.mean([v["score"] for v, own in zip(values, mine, strict=True) if own], axis=0)
@@ -225,7 +224,7 @@ def _runs_at(suite: Suite, environment: EnvironmentResult, level: int, columns: 
 
 
 def _commands(suite: Suite, found: Sequence[tuple[float, Record]], column: int) -> dict[str, float]:
-    """Mean@50 of a column in each sub-command of a run, from its records at one or two levels and their weights."""
+    """Return mean@50 of a column in each sub-command of a run, from its records at one or two levels and their weights."""
     values: dict[str, float] = {}
     for weight, record in found:
         played = command_statistics(record, column)
@@ -250,7 +249,7 @@ ALL = "all"
 
 
 def rows_csv(records: Sequence[Record]) -> str:
-    """Episodes as CSV text: a row for each (``command`` is ``all``), then one for each of its sub-commands that was played.
+    """Return episodes as CSV text: a row for each (``command`` is ``all``), then one for each of its sub-commands that was played.
 
     Every metric and the quality have three columns, ``_mean``, ``_mean25`` and ``_mean50``, as measured and without the weight of
     the level: of the whole episode as its score takes them, averaged over goals; of a sub-command over its samples. They are empty
@@ -287,12 +286,12 @@ def rows_csv(records: Sequence[Record]) -> str:
 
 
 def _numbers(names: Sequence[str], values: Sequence[Array]) -> dict[str, float]:
-    """The statistics of all columns under their names; nothing where there are no values."""
+    """Return the statistics of all columns under their names; nothing where there are no values."""
     return dict(zip(names, (_number(v) for v in np.ravel(np.asarray(values))), strict=bool(values)))
 
 
 def self_contact(records: Collection[Record]) -> float | None:
-    """Share of the samples in which parts of the robot touch each other; None where there are none, or a record does not say."""
+    """Return the share of the samples in which parts of the robot touch each other; None where there are none, or a record does not say."""
     touching = [r.touching for r in records if len(r.samples)]
     known = [t for t in touching if t is not None]
     return _number(np.concatenate(known).mean()) if known and len(known) == len(touching) else None

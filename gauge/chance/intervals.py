@@ -1,4 +1,4 @@
-"""How sure a score is: what other seeds would have changed, in the levels found and in the quality measured there.
+"""Estimate how sure a score is: how far other seeds would have changed it, in the levels found and in the quality measured there.
 
 Terrains, frictions, payloads, goals and their sub-commands are the benchmark and stay. Seeds are a sample, twice over: the search
 seeds decide about levels (``level_chance``), the quality seeds about everything that is measured at them. Functions take the rows
@@ -26,7 +26,7 @@ from .level_curve import expected_levels
 Array = NDArray[np.float64]
 
 _QUALITY_STEP = 0.85
-"""What is left of the quality one level higher: 0.84 on waves and 0.79 on obstacles of ``docs/data/repeated_evaluations.json``."""
+"""Share of the quality that is left one level higher: 0.84 on waves and 0.79 on obstacles of ``docs/data/repeated_evaluations.json``."""
 _LEVEL_FREEDOM = 8.0
 """Degrees of freedom of the variance of one environment's level, which rests on a dozen trials: so many keep rare false alarms
 as rare as they should be (``benchmarks/interval_coverage.py --synthetic``)."""
@@ -36,7 +36,7 @@ _UNKNOWN_QUALITY = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Chance:
-    """What chance does to a weighted sum over environments: independent parts whose variances add up."""
+    """The chance in a weighted sum over environments: independent parts with variances that add up."""
 
     levels: Array
     """Deviation in each replicate of the level searches, (B,); zeros where levels were given."""
@@ -47,11 +47,11 @@ class Chance:
 
     @property
     def known(self) -> bool:
-        """Whether it can be estimated: one seed shows no spread."""
+        """True where the spread can be estimated: one seed shows none."""
         return all(table.shape[1] > 1 for table in self.seeds)
 
     def _parts(self) -> tuple[Array, Array]:
-        """Variances that add up, of levels and of every stream of seeds, and their degrees of freedom."""
+        """Return variances that add up, of levels and of every stream of seeds, and their degrees of freedom."""
         tables = [t for t in self.seeds if t.size]
         variances = [(t**2).sum(1) / (t.shape[1] * (t.shape[1] - 1)) for t in tables]
         freedom = [np.full(len(t), t.shape[1] - 1.0) for t in tables]
@@ -69,7 +69,7 @@ class Chance:
         return welch(*self._parts())
 
     def interval(self, value: float, bounds: tuple[float, float] | None = (0.0, 1.0)) -> tuple[float, float] | None:
-        """Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread."""
+        """Return Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread."""
         if not self.known:
             return None
         reach = float(special.stdtrit(self.freedom, 0.5 + 0.5 * CONFIDENCE)) * self.error
@@ -77,7 +77,7 @@ class Chance:
         return max(value - reach, low), min(value + reach, high)
 
     def p_value(self, value: float) -> float | None:
-        """How likely a value at least so far from zero is if it is chance alone, two-sided; None where that is not known."""
+        """Return the chance of a value at least so far from zero if nothing but chance acts, two-sided; None where that is not known."""
         if not self.known:
             return None
         if self.error == 0.0:
@@ -85,7 +85,7 @@ class Chance:
         return 2.0 * float(special.stdtr(self.freedom, -abs(value) / self.error))
 
     def minus(self, other: Chance, *, paired: bool) -> Chance:
-        """Chance in a difference.
+        """Return the chance in a difference.
 
         Args:
             other: of the value that is subtracted; its level searches are independent of these.
@@ -103,13 +103,13 @@ class Chance:
 
 
 def welch(variances: Array, freedoms: Array) -> float:
-    """Degrees of freedom of a sum of estimated variances (Welch and Satterthwaite); infinite for none."""
+    """Return the degrees of freedom of a sum of estimated variances (Welch and Satterthwaite); infinite for none."""
     uncertain = float((variances**2 / freedoms).sum())
     return float(variances.sum()) ** 2 / uncertain if uncertain > 0.0 else math.inf
 
 
 def wilson_interval(share: float, trials: float) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share of successes among so many independent trials (Wilson 1927)."""
+    """Return Wilson's 95 % interval of a share of successes among so many independent trials (Wilson 1927)."""
     z = float(special.ndtri(0.5 + 0.5 * CONFIDENCE))
     centre = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
     reach = z / (1 + z**2 / trials) * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
@@ -157,11 +157,11 @@ class Evidence:
         )
 
     def of(self, rows: Sequence[EnvironmentRow]) -> Evidence:
-        """The same rules and other rows."""
+        """Return evidence by the same rules from other rows."""
         return Evidence(rows, self._rules)
 
     def runs(self, columns: Sequence[str]) -> Array:
-        """Mean of some columns in every run, (E, S); zeros where an environment has none.
+        """Return the mean of some columns in every run, (E, S); zeros where an environment has none.
 
         Columns are metrics, ``quality`` or names of sub-commands, whose column is their quality.
         """
@@ -174,7 +174,7 @@ class Evidence:
         return values
 
     def chance(self, weights: Array, columns: Sequence[str] = (QUALITY,)) -> Chance:
-        """Chance in a weighted sum over environments of level-weighted values: of the score, with the column ``quality``.
+        """Return the chance in a weighted sum over environments of level-weighted values: of the score, with the column ``quality``.
 
         Args:
             weights: (E,).
@@ -190,17 +190,16 @@ class Evidence:
         return replace(at_reached, **self._of_levels(levels), seeds=(*at_reached.seeds, self._search_seeds(weights)))
 
     def chance_at_levels(self, weights: Array, columns: Sequence[str]) -> Chance:
-        """Chance in a weighted sum over environments of values as measured at the levels reached, see ``chance``."""
+        """Return the chance in a weighted sum over environments of values as measured at the levels reached, see ``chance``."""
         values = self.runs(columns)
         deviations = weights[:, None] * (values - values.mean(1, keepdims=True))
         shared = self._rules.shared_noise
         return Chance(
-            levels=np.zeros(self._rules.resamples),
-            seeds=(deviations.sum(0, keepdims=True) if shared else deviations,),
+            levels=np.zeros(self._rules.resamples), seeds=(deviations.sum(0, keepdims=True) if shared else deviations,)
         )
 
     def value(self, weights: Array, columns: Sequence[str] = (QUALITY,)) -> float:
-        """Weighted sum over environments of level-weighted values, see ``chance``."""
+        """Return the weighted sum over environments of level-weighted values, see ``chance``."""
         means = self.runs(columns).mean(1)
         return float(weights @ np.where(self._flat, means, self._at_levels(self._reached, means)))
 
@@ -211,21 +210,21 @@ class Evidence:
         return rules.level_weight * np.maximum(levels - 1.0, 0.0) + of_quality
 
     def level_chance(self, weights: Array) -> Chance:
-        """Chance in a weighted sum of the environments' levels, ``weights`` (E,). Quality seeds play no part."""
+        """Return the chance in a weighted sum of the environments' levels, ``weights`` (E,). Quality seeds play no part."""
         return Chance(**self._of_levels(weights[:, None] * self.redrawn), seeds=(self._search_seeds(weights),))
 
     def _of_levels(self, levels: Array) -> dict[str, Any]:
-        """Part of the levels in ``Chance``, from what each environment adds in each replicate, (E, B)."""
+        """Return the part of the levels in ``Chance``, from what each environment adds in each replicate, (E, B)."""
         freedom = welch(levels.var(axis=1), np.full(len(levels), _LEVEL_FREEDOM))
         total = levels.sum(0)
         return {"levels": total - total.mean(), "level_freedom": freedom}
 
     def _search_seeds(self, weights: Array) -> Array:
-        """No deviations, of as many seeds as stand behind the levels; two where the levels were given, and are certain."""
+        """Return no deviations, of as many seeds as stand behind the levels; two where the levels were given, and are certain."""
         return np.zeros((0, len(self._rules.search_seeds) if (self._searched & (weights != 0.0)).any() else 2))
 
     def _supposed(self, means: Array) -> Array:
-        """Qualities, (E,), and where none was measured, because no level was passed, the mean of the terrain or of all others."""
+        """Return qualities, (E,), and where none was measured, because no level was passed, the mean of the terrain or of all others."""
         levelled = self._played & ~self._flat
         found = means.copy()
         for at in np.flatnonzero(~self._played & ~self._flat):

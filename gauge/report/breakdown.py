@@ -24,7 +24,7 @@ Table = Mapping[str, Mapping[str, float]]
 
 
 def command_label(name: str) -> str:
-    """A sub-command for readers: ``max_velocity +x`` is ``full speed, then stop: forward``; others go by their names."""
+    """Return a sub-command for readers: ``max_velocity +x`` is ``full speed, then stop: forward``; others go by their names."""
     known = {
         command_name(goal, part): (goal, part) for goal, parts in SUB_COMMANDS.items() for part in range(len(parts))
     }
@@ -36,7 +36,7 @@ def command_label(name: str) -> str:
 
 
 def breakdown(rows: Sequence[EnvironmentRow]) -> dict[str, Table]:
-    """Quality (mean@50) as measured, at the levels reached: the mean over a terrain's environments and seeds.
+    """Return quality (mean@50) as measured, at the levels reached: the mean over a terrain's environments and seeds.
 
     Returns:
         ``direction``: of all sub-commands that go there, ``command``: of each sub-command. Empty where none was recorded.
@@ -66,7 +66,7 @@ def _points(signs: Sequence[int], place: tuple[int, int]) -> bool:
 
 
 def _means(values: Mapping[str, Mapping[str, Sequence[float]]]) -> Table:
-    """Means by terrain, and over the terrains, which count the same."""
+    """Return means by terrain, and over the terrains, which count the same."""
     found = {}
     for label, by_terrain in values.items():
         terrains = {terrain: fmean(qualities) for terrain, qualities in by_terrain.items()}

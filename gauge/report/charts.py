@@ -38,12 +38,12 @@ _HEAT_LEFT, _HEAT_TOP, _HEAT_BOTTOM = 34.0, 4.0, 34.0
 
 
 def terrain_label(name: str) -> str:
-    """A terrain's name for readers."""
+    """Return a terrain's name for readers."""
     return TERRAIN_LABELS.get(name, name.replace("_", " "))
 
 
 def number(value: float) -> str:
-    """A number as short as it goes, to three decimals, with a true minus sign."""
+    """Return a number as short as it goes, to three decimals, with a true minus sign."""
     return f"{round(value, 3):g}".replace("-", "−")
 
 
@@ -69,7 +69,7 @@ def _strip_x(value: float) -> float:
 
 
 def radar(terrains: Mapping[str, TerrainScore], statistics: Mapping[str, str]) -> dict[str, Any] | None:
-    """Scores of the terrains on spokes, the first upwards and the others clockwise; None for fewer than three terrains.
+    """Place scores of the terrains on spokes, the first upwards and the others clockwise; None for fewer than three terrains.
 
     Args:
         terrains: terrain by name, with one value in [0, 1] for each statistic.
@@ -110,7 +110,7 @@ def radar(terrains: Mapping[str, TerrainScore], statistics: Mapping[str, str]) -
 
 
 def sweep(rows: Sequence[EnvironmentRow], *, axis: str, quantity: str) -> list[dict[str, Any]]:
-    """Small multiples, one for each terrain: a quantity over friction or payload where only that one varies.
+    """Return small multiples, one for each terrain: a quantity over friction or payload where only that one varies.
 
     Args:
         axis: ``friction`` or ``payload``.
@@ -174,7 +174,7 @@ def _point(row: EnvironmentRow, axis: str, quantity: str, x_of: Any, y_of: Any) 
 
 
 def heat(rows: Sequence[EnvironmentRow], *, quantity: str) -> list[dict[str, Any]]:
-    """For terrains whose frictions and payloads are crossed: one map each, friction to the right, payload upwards.
+    """Return a map of each terrain with crossed frictions and payloads, friction to the right, payload upwards.
 
     Environments without ``quantity`` (``level`` or ``score``) are left out.
     """
@@ -216,7 +216,7 @@ def heat(rows: Sequence[EnvironmentRow], *, quantity: str) -> list[dict[str, Any
 
 
 def searches(rows: Sequence[EnvironmentRow]) -> list[dict[str, Any]]:
-    """Outcomes of the level searches, one chart for each terrain: an environment to the row, a level to the column."""
+    """Return the outcomes of the level searches, one chart for each terrain: an environment to the row, a level to the column."""
     charts = []
     top = int(_top(rows, "level"))
     several = len({r.payload for r in rows}) > 1
@@ -256,7 +256,7 @@ def searches(rows: Sequence[EnvironmentRow]) -> list[dict[str, Any]]:
 
 
 def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]]) -> dict[str, Any]:
-    """Quantities over something that grows, several lines for each label, on axes that begin at zero or below.
+    """Draw quantities over something that grows, several lines for each label, on axes that begin at zero or below.
 
     Args:
         series: by label, for each line the x and y of its points; values that are not finite are left out.
@@ -296,14 +296,14 @@ def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]
 
 
 def _round_values(low: float, high: float) -> list[float]:
-    """Four to eleven multiples of 1, 2 or 5 times a power of ten within a range."""
+    """Return four to eleven multiples of 1, 2 or 5 times a power of ten within a range."""
     power = 10.0 ** math.floor(math.log10((high - low) / 4.0))
     step = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= (high - low) / 4.0 * (1.0 + 1e-9))
     return [float(f"{i * step:.6g}") for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
 
 
 def _tick(value: float) -> str:
-    """A round value with all of its decimals and a true minus sign."""
+    """Return a round value with all of its decimals and a true minus sign."""
     return f"{Decimal(f'{value:.6g}'):f}".replace("-", "−")
 
 
@@ -316,14 +316,14 @@ def _by_terrain(rows: Sequence[EnvironmentRow], quantity: str) -> dict[str, list
 
 
 def _top(rows: Sequence[EnvironmentRow], quantity: str) -> float:
-    """Upper end of the axis of a quantity."""
+    """Return the upper end of the axis of a quantity."""
     if quantity == "score":
         return 1.0
     return float(max([LEVELS, *(r.level for r in rows if r.level is not None)]))
 
 
 def _thin(values: Sequence[float]) -> Sequence[float]:
-    """Every n-th value, so that at most six labels stand beside each other; the first always."""
+    """Return every n-th value, so that at most six labels stand beside each other; the first always."""
     return values[:: math.ceil(len(values) / 6)]
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import Any
 
 from ..coverage import notes, score_label, suite_label
 from ..episodes import QUALITY
-from ..result import EnvironmentRow, Health, MetricScore, Provenance, Result, TerrainScore
+from ..result import EnvironmentRow, Health, MetricScore, Result, TerrainScore
 from ..scoring import STATISTICS
 from ..store import StoreError
 from . import charts
@@ -42,6 +42,12 @@ _SHOWN = 6
 """Environments that a warning names before it says how many more there are."""
 _LONGEST = 400
 """Characters of a provenance entry."""
+_DIVERGED = "The simulation became invalid there; each counts as a fall. The engine or its settings may be at fault."
+_DROPPED = "The engine had no room for all contacts or constraints there, so these values are not exact."
+_FELL = "The robot tilted beyond the suite's limit; the suite says what that ends and what it costs."
+_TOUCHED = "Legs that strike each other can break on a robot; episodes.csv says at which commands."
+_FAILED = "They score zero and no quality is measured there."
+_SANK = "A foot sank into the terrain, and the goal was started again once, as the suite says."
 
 
 def write_report(folder: Path) -> Path:
@@ -59,7 +65,7 @@ def write_report(folder: Path) -> Path:
 
 
 def _clip(folder: Path) -> bytes | None:
-    """The film that lies in a folder of results, None where there is none that fits into a page."""
+    """Return the film that lies in a folder of results, None where there is none that fits into a page."""
     path = folder / CLIP
     return path.read_bytes() if path.is_file() and path.stat().st_size <= _LARGEST_CLIP else None
 
@@ -83,12 +89,12 @@ def render(result: Result, clip: bytes | None = None) -> str:
 
 
 def metric_label(name: str) -> str:
-    """A metric's name for readers."""
+    """Return a metric's name for readers."""
     return METRIC_LABELS[name][0] if name in METRIC_LABELS else name.replace("_", " ")
 
 
 def _short_metric_label(name: str) -> str:
-    """A metric's name at a column's head."""
+    """Return a metric's name at a column's head."""
     return METRIC_LABELS[name][1] if name in METRIC_LABELS else metric_label(name)
 
 
@@ -98,11 +104,19 @@ def report_data(result: Result) -> dict[str, Any]:
     searched = any(r.search is not None for r in rows)
     both = (("friction", "over friction"), ("payload", "over payload"))
     expected = result.chance.level == "curve"
+    counts = [_plural(len(terrains), "terrain"), _plural(len(rows), "environment")]
+    counts += [_plural(result.health.episodes, "quality episode")] if result.health.episodes else []
     groups = {name: (value, result.groups_interval.get(name)) for name, value in result.groups.items()}
     return {
         "result": result,
         "title": PurePath(result.policy.path.replace("\\", "/")).name,
-        "subtitle": _subtitle(result),
+        "subtitle": [
+            suite_label(result),
+            f"{result.pipeline} pipeline",
+            f"robot {result.robot}",
+            f"engine {_engine(result)}",
+            result.provenance.date[:10],
+        ],
         "evaluated": evaluated,
         "searched": searched,
         "score_label": score_label(result),
@@ -113,7 +127,7 @@ def report_data(result: Result) -> dict[str, Any]:
         },
         "level_label": f"mean {'expected' if expected else 'maximum'} level" if searched else "mean level played",
         "expected_level": expected,
-        "counts": _counts(result),
+        "counts": " · ".join(counts),
         "warnings": warnings(rows, result.health, notes(result)),
         "statistics": STATISTIC_LABELS,
         "terrain_strips": {name: _strip(row) for name, row in terrains.items()} if evaluated else {},
@@ -150,50 +164,42 @@ def warnings(rows: Sequence[EnvironmentRow], health: Health, remarks: Sequence[s
         For each kind ``severity`` (``grave`` or ``note``), ``headline``, ``meaning`` and ``places``, the worst first.
     """
     total = _plural(health.episodes, "quality episode")
-    found = []
-    if health.diverged:
-        headline = f"physics diverged in {health.diverged} of {total}"
-        meaning = (
-            "The simulation became invalid there; each counts as a fall. The engine or its settings may be at fault."
-        )
-        found.append(_warning("grave", headline, meaning, _places(rows, "diverged")))
-    if health.overflowed:
-        headline = f"contacts dropped in {health.overflowed} of {total}"
-        meaning = "The engine had no room for all contacts or constraints there, so these values are not exact."
-        found.append(_warning("grave", headline, meaning, _places(rows, "overflowed")))
-    if health.falls:
-        headline = f"{_plural(health.falls, 'fall')} in {total}"
-        meaning = "The robot tilted beyond the suite's limit; the suite says what that ends and what it costs."
-        found.append(_warning("grave", headline, meaning, _places(rows, "falls")))
-    if health.self_contact:
-        headline = f"parts of the robot touch each other in {_percent(health.self_contact)} of the samples"
-        meaning = "Legs that strike each other can break on a robot; episodes.csv says at which commands."
-        found.append(_warning("note", headline, meaning, _places(rows, "self_contact", _percent)))
-    failed = [r for r in rows if r.level == 0]
-    if failed:
-        searched = _plural(sum(r.search is not None for r in rows), "searched environment")
-        headline = f"not even level 1 passed in {len(failed)} of {searched}"
-        meaning = "They score zero and no quality is measured there."
-        found.append(_warning("note", headline, meaning, _places(failed, None)))
-    found += [_warning("note", "for the reader of the score", f"{text[0].upper()}{text[1:]}.", []) for text in remarks]
-    restarted = sum(r.restarted or 0 for r in rows)
-    if restarted:
-        headline = f"restarts in {restarted} of {total}"
-        meaning = "A foot sank into the terrain, and the goal was started again once, as the suite says."
-        found.append(_warning("note", headline, meaning, _places(rows, "restarted")))
-    return found
+    failed, restarted = [r for r in rows if r.level == 0], sum(r.restarted or 0 for r in rows)
+    searched = _plural(sum(r.search is not None for r in rows), "searched environment")
+    share = health.self_contact or 0.0
+    kinds = [
+        (health.diverged, "grave", f"physics diverged in {health.diverged} of {total}", _DIVERGED, "diverged"),
+        (health.overflowed, "grave", f"contacts dropped in {health.overflowed} of {total}", _DROPPED, "overflowed"),
+        (health.falls, "grave", f"{_plural(health.falls, 'fall')} in {total}", _FELL, "falls"),
+        (
+            share,
+            "note",
+            f"parts of the robot touch each other in {_percent(share)} of the samples",
+            _TOUCHED,
+            "self_contact",
+        ),
+        (failed, "note", f"not even level 1 passed in {len(failed)} of {searched}", _FAILED, None),
+        *((text, "note", "for the reader of the score", f"{text[0].upper()}{text[1:]}.", "") for text in remarks),
+        (restarted, "note", f"restarts in {restarted} of {total}", _SANK, "restarted"),
+    ]
+    return [
+        {
+            "severity": severity,
+            "headline": headline,
+            "meaning": meaning,
+            "places": [] if key == "" else _places(failed if key is None else rows, key),
+        }
+        for happened, severity, headline, meaning, key in kinds
+        if happened
+    ]
 
 
-def _warning(severity: str, headline: str, meaning: str, places: list[str]) -> dict[str, Any]:
-    return {"severity": severity, "headline": headline, "meaning": meaning, "places": places}
-
-
-def _places(rows: Sequence[EnvironmentRow], key: str | None, said: Callable[[Any], str] = str) -> list[str]:
+def _places(rows: Sequence[EnvironmentRow], key: str | None) -> list[str]:
     """Return names of environments, those with the most of ``key`` first and how much that is, cut to a readable number."""
     chosen = list(rows)
     if key is not None:
         chosen = sorted((r for r in rows if getattr(r, key)), key=attrgetter(key), reverse=True)
-    payloads = len({r.payload for r in rows}) > 1
+    payloads, said = len({r.payload for r in rows}) > 1, _percent if key == "self_contact" else str
     names = []
     for row in chosen[:_SHOWN]:
         name = f"{terrain_label(row.terrain)}, μ {number(row.friction)}"
@@ -232,8 +238,10 @@ def sources(result: Result) -> dict[str, str]:
         "machine": f"{provenance.host}: {provenance.machine}",
         "date": provenance.date,
         "time": f"{_duration(provenance.seconds)} on {provenance.device}, CPU threads: {provenance.threads}",
-        "physics steps": _grouped(provenance.physics_steps) + _rate(provenance),
+        "physics steps": _grouped(provenance.physics_steps),
     }
+    if provenance.physics_steps and provenance.seconds >= 1.0:  # not wholly resumed
+        entries["physics steps"] += f" ({_grouped(round(provenance.physics_steps / provenance.seconds))} a second)"
     for key, value in policy.provenance.items():
         text = _in_words(value)
         entries[f"policy: {key}"] = text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
@@ -241,7 +249,7 @@ def sources(result: Result) -> dict[str, str]:
 
 
 def _in_words(value: Any) -> str:
-    """A provenance entry, which may be a table or a list, for readers."""
+    """Return a provenance entry, which may be a table or a list, for readers."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_in_words(entry)}" for name, entry in value.items())
     if isinstance(value, Sequence) and not isinstance(value, str):
@@ -253,36 +261,12 @@ def _engine(result: Result) -> str:
     return f"{result.backend} {result.engine_version}" if result.engine_version else result.backend
 
 
-def _rate(provenance: Provenance) -> str:
-    """Return physics steps per second, where the run was long enough and not wholly resumed."""
-    if not provenance.physics_steps or provenance.seconds < 1.0:
-        return ""
-    return f" ({_grouped(round(provenance.physics_steps / provenance.seconds))} a second)"
-
-
-def _subtitle(result: Result) -> list[str]:
-    return [
-        suite_label(result),
-        f"{result.pipeline} pipeline",
-        f"robot {result.robot}",
-        f"engine {_engine(result)}",
-        result.provenance.date[:10],
-    ]
-
-
-def _counts(result: Result) -> str:
-    """Return the numbers that the result rests on, in one line."""
-    episodes = result.health.episodes
-    parts = [_plural(len(result.terrains), "terrain"), _plural(len(result.environments), "environment")]
-    return " · ".join([*parts, _plural(episodes, "quality episode")] if episodes else parts)
-
-
 def _plural(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _figures(rows: Sequence[EnvironmentRow], quantity: str, axes: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
-    """Charts of a quantity over friction and over payload, or over both where they are crossed."""
+    """Return charts of a quantity over friction and over payload, or over both where they are crossed."""
     figures: list[dict[str, Any]] = []
     for axis, words in axes:
         panels = charts.sweep(rows, axis=axis, quantity=quantity)
@@ -305,7 +289,7 @@ _FLAGS = ("diverged", "overflowed", "restarted")
 
 
 def _grouped(value: int) -> str:
-    """A whole number with thin spaces between thousands."""
+    """Return a whole number with thin spaces between thousands."""
     return f"{value:,}".replace(",", "\u202f")
 
 

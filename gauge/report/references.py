@@ -26,11 +26,11 @@ class ReferenceScore:
     version: Name
     """The suite's version: others do not compare."""
     policy: Text
-    """Which policy, in words."""
+    """The policy, in words."""
     score: Share
     """Of the whole suite."""
     source: Text
-    """Who says so."""
+    """The publication."""
     interval: tuple[Share, Share] | None = None
     """95 % interval of the score, where it is known."""
     file_sha256: Name | None = None
@@ -47,7 +47,7 @@ class ReferenceTable:
 
 @cache
 def reference_table() -> ReferenceTable:
-    """The scores that ship with the project.
+    """Return the scores that ship with the project.
 
     Raises:
         ReferenceScoreError: the file is malformed.

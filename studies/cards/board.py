@@ -52,10 +52,10 @@ def write_board(folder: Path, page: Path) -> Path:
 
 
 def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[str, Any]]:
-    """Tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first.
+    """Return the tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first.
 
     Args:
-        folder: what the command that checks a card finds the files in.
+        folder: the folder in which the command that checks a card finds the files.
 
     Returns:
         For each table ``suite``, ``backend``, ``robot``, ``robot_digest`` (None where cards do not say), ``ranked`` (complete
@@ -89,7 +89,7 @@ def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[
 
 
 def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
-    """The page, as HTML text. Whatever cards contain is shown as text and never becomes markup."""
+    """Return the page, as HTML text. The texts of cards are shown as text and never becomes markup."""
     return page_template(__file__, "board.html.j2").render(tables=tables)
 
 

@@ -1,4 +1,4 @@
-"""Does a score card hold here? Its environments are played again, by the same policy under the same rules, and compared."""
+"""Check whether a score card holds here: its environments are played again, by the same policy under the same rules, and compared."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..policies import file_digest
 _APART = 1_000_000
 """Distance of fresh seeds from those of the next number."""
 _OUTCOME = ("level", "score", "quality", "metrics", "trials", "runs", "falls", "diverged", "overflowed", "restarted")
-"""What of an environment's row must be the same to the last digit for a replay to be called equal."""
+"""Entries of an environment's row that must be the same to the last digit for a replay to be called equal."""
 _FIGURES = (
     "score",
     "score_interval",
@@ -39,7 +39,7 @@ _FIGURES = (
     "groups_interval",
     "health",
 )
-"""What else must be, where all environments are replayed."""
+"""Figures that must be the same as well, where all environments are replayed."""
 
 
 class CardError(ValueError):
@@ -58,7 +58,7 @@ def prepare_replay(
     fresh: int | None = None,
     trust: bool = False,
 ) -> Prepared:
-    """What must be played to check a card.
+    """Return the evaluation that checks a card.
 
     Args:
         policy: the policy's file, where it is not at the card's path and none that ships.
@@ -156,7 +156,7 @@ def check_card(card: Result, suite: Suite | None, source: str) -> None:
 
 
 def with_fresh_seeds(prepared: Prepared, number: int) -> Prepared:
-    """The same evaluation with other seeds, which those who made the policy could not know.
+    """Return the same evaluation with other seeds, which the makers of the policy could not know.
 
     Args:
         prepared: an evaluation with the suite's own seeds.
@@ -196,7 +196,7 @@ def verify(
 
 @edited("the card", CardError)
 def judge(card: Result, replay: Result, *, fresh: bool = False) -> dict[str, Any]:
-    """Whether a card holds, given the results of a replay of all or some of its environments.
+    """Judge whether a card holds, given the result of a replay of all or some of its environments.
 
     It holds where the replay's score lies within a band around the card's (``tolerance_band``), whose width is that of the replay's
     interval: what the card says of its own does not count. Where the replay has none (one seed, or levels alone) only the same
@@ -283,7 +283,7 @@ def _settings(result: Result) -> dict[str, Any]:
 
 
 def tolerance_band(score: float | None, interval: Sequence[float] | None) -> list[float] | None:
-    """Where the score of a replay must lie; None where there is no interval.
+    """Return the band in which the score of a replay must lie; None where there is no interval.
 
     Another machine's rounding makes other episodes of the same seeds, so card and replay are two draws: what two may differ by is
     √2 times what one may be off.
@@ -295,7 +295,7 @@ def tolerance_band(score: float | None, interval: Sequence[float] | None) -> lis
 
 
 def _sample(rows: Sequence[EnvironmentRow], suite: Suite) -> list[EnvironmentRow]:
-    """One row of each terrain, at nominal friction and payload where there is one."""
+    """Return one row of each terrain, at nominal friction and payload where there is one."""
     nominal = (suite.matrix.nominal_friction, suite.matrix.nominal_payload)
     chosen: dict[str, EnvironmentRow] = {}
     for row in rows:

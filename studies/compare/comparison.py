@@ -24,7 +24,7 @@ from ...gauge.results import ONE_SEED, environment_weights
 from ..naming import distinct_names
 
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
-"""What is compared, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
+"""Kinds of differences, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
 sub-commands are compared as measured, in the environments where both policies were measured at the same level; all else counts
 levels."""
 _SAME = {"backend": "engine", "robot": "robot", "pipeline": "pipeline"}
@@ -42,7 +42,7 @@ class Difference:
     kind: str
     """One of ``KINDS``."""
     name: str
-    """Which terrain, metric …"""
+    """Terrain, metric …"""
     first: str
     second: str
     """Labels of the policies."""
@@ -52,13 +52,13 @@ class Difference:
     interval: tuple[float, float] | None
     """95 % interval of the difference by itself; None with one seed."""
     p_value: float | None
-    """How likely so large a difference is if both are the same, looked at alone."""
+    """Chance of so large a difference if both are the same, looked at alone."""
     corrected: float | None
     """The same among all that are looked at (Holm)."""
 
     @property
     def real(self) -> bool:
-        """Whether chance is ruled out, all looks considered."""
+        """True where chance is ruled out, all looks considered."""
         return self.corrected is not None and self.corrected < 1.0 - CONFIDENCE
 
 
@@ -88,7 +88,7 @@ class Comparison:
     suite: SuiteName
     policies: tuple[Compared, ...]
     paired: bool
-    """Whether all were given the same seeds."""
+    """True where all were given the same seeds."""
     differences: tuple[Difference, ...]
     """Of all pairs, in the order of ``KINDS``."""
     unlike: Sequence[str] = ()
@@ -96,7 +96,7 @@ class Comparison:
 
     @property
     def sentences(self) -> list[str]:
-        """What the scores say, one for each pair, what the details add, what was not alike, of what suite this is not the score."""
+        """Sentences on the scores, one for each pair, on details, on other versions, and on parts of a suite."""
         scores = [d for d in self.differences if d.kind == "score"]
         found = [_score_sentence(d, len(scores)) for d in scores] + [self._details_sentence()]
         if self.unlike:
@@ -107,7 +107,7 @@ class Comparison:
 
     @property
     def complete(self) -> bool:
-        """Whether all that is compared are scores of the whole suite."""
+        """True where all are scores of the whole suite."""
         return all(p.coverage.complete for p in self.policies)
 
     def _coverage_sentence(self) -> str:
@@ -217,7 +217,7 @@ def compare(results: Sequence[Result], labels: Sequence[str] | None = None) -> C
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down correction: chance of one false alarm or more among all, whatever they have in common."""
+    """Apply Holm's step-down correction: the chance of one false alarm or more among all, whatever they have in common."""
     order = np.argsort(p_values, kind="stable")
     found = np.zeros(len(p_values))
     highest = 0.0
@@ -428,7 +428,7 @@ def _score_sentence(found: Difference, pairs: int) -> str:
 
 
 def format_p(value: float | None) -> str:
-    """A p-value for readers."""
+    """Return a p-value for readers."""
     if value is None:
         return "–"
     return "< 0.001" if value < 0.001 else f"= {value:.3f}"

@@ -1,4 +1,4 @@
-"""A comparison from the command line's arguments: what is a policy is evaluated, what is a result is read."""
+"""Compare what the command line names: evaluate the policies, read the results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .report import write_comparison
 
 
 def is_result(contestant: str) -> bool:
-    """Whether an argument names results rather than a policy: a folder with ``results.json``, or a file that ends in ``.json``."""
+    """Return whether an argument names results rather than a policy: a folder with ``results.json``, or a file that ends in ``.json``."""
     path = Path(contestant)
     return path.suffix == ".json" or (path / "results.json").is_file()
 

@@ -233,14 +233,7 @@ class _Policy:
     """The study of one policy."""
 
     def __init__(
-        self,
-        prepared: PreparedStudy,
-        name: str,
-        policy: FilePolicy,
-        folder: Path,
-        *,
-        resume: bool,
-        watch: Watch,
+        self, prepared: PreparedStudy, name: str, policy: FilePolicy, folder: Path, *, resume: bool, watch: Watch
     ) -> None:
         self._prepared, self._name, self._policy, self._folder = prepared, name, policy, folder
         self._resume, self._watch = resume, watch

@@ -42,11 +42,7 @@ class TrialRequest(PoliciesRequest):
 
 
 def run_trials(
-    request: TrialRequest,
-    folder: Path,
-    *,
-    command: Sequence[str] = (),
-    watch: Watch = lambda *_: None,
+    request: TrialRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
 ) -> dict[str, Any]:
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 

@@ -222,12 +222,11 @@ def test_the_score_of_an_expected_level_lies_between_those_of_the_levels_beside_
     (row,) = result.environments
     assert row.score == pytest.approx(0.75 * 0.474 + 0.25 * 0.526)
     assert row.level == result.level == 5.25
-    assert row["quality"]["mean50"] == pytest.approx(0.55)
-    assert [run["quality"] for run in row["runs"].values()] == pytest.approx([0.53, 0.55, 0.57])
-    assert {at: run["1"]["dof_power"] for at, run in row["runs_by_level"].items()} == pytest.approx(
-        {"5": 0.6, "6": 0.4}
-    )
-    assert row["runs"]["2"]["commands"]["max_velocity +x"] == pytest.approx(0.57)
+    assert row.quality.mean50 == pytest.approx(0.55)
+    assert [run.columns["quality"] for run in row.runs.values()] == pytest.approx([0.53, 0.55, 0.57])
+    powers = {at: runs[1].columns["dof_power"] for at, runs in row.runs_by_level.items()}
+    assert powers == pytest.approx({5: 0.6, 6: 0.4})
+    assert row.runs[2].commands["max_velocity +x"] == pytest.approx(0.57)
     assert result.score == pytest.approx(row.score)
 
 

@@ -19,7 +19,7 @@ GAUGE_FOLDER = "gauge"
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreReport:
-    """What became of one submitted checkpoint."""
+    """The scores of one submitted checkpoint, or the reason why there are none."""
 
     path: Path
     iteration: int
@@ -61,7 +61,7 @@ class Scorer:
 
     @property
     def pending(self) -> int:
-        """How many submitted checkpoints have not been reported."""
+        """Number of submitted checkpoints that have not been reported."""
         return self._side.pending
 
     def drain(self, seconds: float, stop: Callable[[], bool] = lambda: False) -> list[ScoreReport]:
