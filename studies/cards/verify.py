@@ -247,13 +247,7 @@ def judge(card: Result, replay: Result, *, fresh: bool = False) -> dict[str, Any
         "band": band,
         "replayed": here,
         "levels": [
-            {
-                "terrain": old.terrain,
-                "friction": old.friction,
-                "payload": old.payload,
-                "card": old.level,
-                "here": new.level,
-            }
+            dict(zip(("terrain", "friction", "payload"), old.key, strict=True), card=old.level, here=new.level)
             for old, new in pairs
             if old.level != new.level
         ],
