@@ -379,7 +379,7 @@ class Scores(Table):
 
     def left_out(self) -> Iterable[str]:
         """Leave out intervals of groups where there are levels alone."""
-        return () if self.groups_interval else ("groups_interval",)
+        return ("groups_interval",) if self.score is None else ()
 
 
 @dataclass(frozen=True, kw_only=True)
