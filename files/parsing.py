@@ -17,7 +17,7 @@ from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from types import GenericAlias
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
@@ -56,8 +56,6 @@ NotNegative = Annotated[float, Field(ge=0.0, le=1e9)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, lt=2**53)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
-
-_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
 def shown(value: object) -> str:
@@ -266,17 +264,29 @@ def build(kind: type[Kind], data: object, source: str, error: type[Exception], *
     Raises:
         error: an unknown or missing field, a value of another type or out of range, or what ``__post_init__`` refuses.
     """
+    return _built(kind, data, source, error, false_is_none=false_is_none)
+
+
+def _built(
+    kind: type[Kind],
+    data: object,
+    source: str,
+    error: type[Exception],
+    *,
+    false_is_none: bool = False,
+    extra: Literal["forbid", "ignore"] = "forbid",
+) -> Kind:
     data = plain(data, source, error)
     text = json.dumps([_none_for_false(kind, data) if false_is_none else data])
     try:
-        checker: TypeAdapter[tuple[Kind]] = _adapter(kind)  # type: ignore[arg-type]
+        checker: TypeAdapter[tuple[Kind]] = _adapter(kind, extra)  # type: ignore[arg-type]
         return checker.validate_json(text)[0]
     except ValidationError as problem:
         raise _error(problem, kind, source, error, "false" if false_is_none else "") from problem
 
 
 def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
-    """A dataclass from the entries of a table that bear its fields' names.
+    """Return a dataclass from the entries of a table that bear its fields' names, and so for the tables in it.
 
     Raises:
         error: as ``build``.
@@ -284,7 +294,7 @@ def take(kind: type[Kind], data: object, source: str, error: type[Exception]) ->
     if not isinstance(data, Mapping):
         raise error(f"{source} is {shown(data)}; it must be a table")
     own = {f.name: data[f.name] for f in fields(kind) if f.name in data}  # type: ignore[arg-type]
-    return build(kind, own, source, error)
+    return _built(kind, own, source, error, extra="ignore")
 
 
 def check_fields(instance: Any, source: str, error: type[Exception]) -> None:
@@ -326,9 +336,9 @@ def from_text(hint: Any, text: str, key: str, error: type[Exception]) -> Any:
 
 
 @cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
+def _adapter(kind: Any, extra: Literal["forbid", "ignore"]) -> TypeAdapter[Any]:
     # The tuple carries the configuration, which dataclasses of the standard library have no place for.
-    return TypeAdapter(tuple[kind], config=_CONFIG)
+    return TypeAdapter(tuple[kind], config=ConfigDict(extra=extra, allow_inf_nan=False, strict=True))
 
 
 @cache
@@ -364,7 +374,7 @@ def _text_adapter(hint: Any) -> TypeAdapter[Any]:
     return TypeAdapter(hint, config=None if is_dataclass(hint) else ConfigDict(allow_inf_nan=False))
 
 
-_MEMBER = re.compile(r"(float|int|str|bool|constrained-\w+|(tuple|dict|function|nullable)[^\w.]*\[.*)$")
+_MEMBER = re.compile(r"(float|int|str|bool|constrained-\w+|(tuple|dict|function|nullable)[-\w]*\[.*)$")
 """How pydantic names the members of a union in a path."""
 
 

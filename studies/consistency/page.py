@@ -22,11 +22,7 @@ CURVES = {
     "joints": ("joint angles, root mean square", "rad"),
     "energy": ("difference of mechanical energy", "J"),
 }
-TESTS = {
-    "air": "Chirp in free fall",
-    "stand": "Standing pose held",
-    "walk": "The policy’s recorded targets",
-}
+TESTS = {"air": "Chirp in free fall", "stand": "Standing pose held", "walk": "The policy’s recorded targets"}
 FIELD_LABELS = {
     "total_mass": "total mass [kg]",
     "body_mass": "body masses [kg]",

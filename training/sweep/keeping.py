@@ -80,10 +80,10 @@ def _keep(sweep: Sweep, run: SweepRun, target: SweepRun) -> bool:
     if results is not None and gauged:
         card = read_card(results)
         if policy is not None:
-            of_policy = {"path": KEPT_POLICY, "file_sha256": file_digest(str(place / KEPT_POLICY))}
-            card["policy"] = {**card["policy"], **of_policy}
-        card["provenance"] = without_place(card["provenance"])
-        write_atomically(place / RESULTS, json_text(card), SweepError)
+            kept = replace(card.policy, path=KEPT_POLICY, file_sha256=file_digest(str(place / KEPT_POLICY)))
+            card = replace(card, policy=kept)
+        card = replace(card, provenance=card.provenance.without_place())
+        write_atomically(place / RESULTS, json_text(card.to_data()), SweepError)
     done = run.description() | {"outcome": "finished", "kept_iteration": run.wanted_iteration(sweep)}
     write_atomically(place / "run.json", json_text(_for_everybody(done)), SweepError)
     return True

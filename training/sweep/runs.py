@@ -10,6 +10,7 @@ from typing import Any
 from ...backends.base import BackendError, DeviceError
 from ...files.parsing import one_line, read_results, shown
 from ...files.writing import json_text, make_folder, write_atomically
+from ...gauge.result import Result
 from ...gauge.suite import SuiteError, load_suite
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
@@ -154,8 +155,7 @@ class SweepRun:
     def _check_kept(self, sweep: Sweep) -> None:
         wanted, there = self.wanted_iteration(sweep), self.description().get("kept_iteration")
         if there is None and (self._kept / RESULTS).is_file():
-            provenance = read_card(self._kept)["policy"].get("provenance")
-            there = provenance.get("iteration") if isinstance(provenance, dict) else None
+            there = read_card(self._kept).policy.provenance.get("iteration")
         if there is not None and there != wanted:
             raise SweepError(
                 f"'{one_line(self._kept)}' keeps the policy of iteration {shown(there)}, and checkpoint '{sweep.checkpoint}' is that of "
@@ -190,8 +190,8 @@ class SweepRun:
         """Whether a folder is free for results of this suite and a policy's file, or has them or begun with them; None for any."""
         if (folder / RESULTS).is_file():
             card = read_card(folder)
-            its = card["policy"]["file_sha256"]
-            return card["suite"]["digest"] == self.suite_digest and (policy is None or its == file_digest(str(policy)))
+            same_policy = policy is None or card.policy.file_sha256 == file_digest(str(policy))
+            return card.suite.digest == self.suite_digest and same_policy
         if policy is None or not (folder / "request.json").is_file():
             return True
         begun = read_results(folder / "request.json", "request", SweepError)
@@ -291,8 +291,8 @@ def _read_policy(path: Path) -> FilePolicy:
         raise SweepError(f"{error}; put it back, or remove it and call again: {how}") from error
 
 
-def read_card(folder: Path) -> dict[str, Any]:
-    """The results in a folder.
+def read_card(folder: Path) -> Result:
+    """Return the result in a folder.
 
     Raises:
         ComparisonError: there are none, or they are damaged.
@@ -300,7 +300,7 @@ def read_card(folder: Path) -> dict[str, Any]:
     try:
         card = load_result(folder)
         for name in SCORES:
-            if name not in card:
+            if name in card.lacking:
                 raise ComparisonError(f"results '{one_line(folder / RESULTS)}' lack {name}")
     except ComparisonError as error:
         raise ComparisonError(f"{error}; delete it and call again, which makes it anew") from error
