@@ -27,6 +27,8 @@ from ..episodes import QUALITY, Episode, Record
 from ..goals import TARGET
 from ..suite import Suite
 from .control_step import ControlStep
+from .cpu_step import CpuStep
+from .gpu_step import GpuStep
 from .sampling import Samples
 from .segments import Segment, SegmentOutcome, SegmentQueue
 from .world_buffers import SegmentCounts
@@ -69,7 +71,11 @@ class Rollout:
         self.suite, self.backend = suite, backend
         self._terrain_index = terrain_index
         self.poll_interval = poll_interval or (1 if backend.device.type == "cpu" else POLL_INTERVAL)
-        self._step = ControlStep(suite, policy, backend, early_outs=self.poll_interval == 1, capture=capture)
+        self._step: ControlStep = (
+            CpuStep(suite, policy, backend)
+            if self.poll_interval == 1
+            else GpuStep(suite, policy, backend, capture=capture)
+        )
         self._queue = SegmentQueue(self._step.rules, (*self._step.samples.names, QUALITY))
         self._columns = len(self._step.samples.names) + 1
         self._segments: dict[int, Segment] = {}  # by the world in which it is at work
@@ -85,7 +91,7 @@ class Rollout:
     @property
     def captured(self) -> bool:
         """Whether control steps are captured as CUDA graphs, or will be."""
-        return self._step.recording.enabled
+        return self._step.captured
 
     # ---- what there is to play ------------------------------------------------------------------------------------
 
@@ -152,7 +158,7 @@ class Rollout:
         step, mask = self._step, self._step.buffers.mask(sorted(self._respawn))
         step.buffers.active |= mask
         if self._changed:
-            step.arrange(self._segments, targets=any(s.goal == TARGET for s in self._segments.values()))
+            step.arrange()
         if self._respawn:
             step.reset(mask)
             self.physics_steps += len(self._respawn)
@@ -171,11 +177,11 @@ class Rollout:
             return []
         self._launched = False
         step, buffers = self._step, self._step.buffers
-        if step.early_outs and not step.refused and not bool((buffers.ended | buffers.respawn).any()):
+        found = torch.stack((buffers.ended, buffers.respawn, buffers.not_finite))
+        if self.poll_interval == 1 and not bool(found.any()):
             return []
-        flags = torch.stack((buffers.ended, buffers.respawn, buffers.not_finite)).tolist()
         ended, respawn, not_finite = (
-            [world for world, flag in enumerate(row) if flag and world in self._segments] for row in flags
+            [world for world, flag in enumerate(row) if flag and world in self._segments] for row in found.tolist()
         )
         buffers.ended.zero_()
         buffers.respawn.zero_()
