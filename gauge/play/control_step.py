@@ -1,12 +1,10 @@
-"""The base of the two control steps, for a CPU and for a GPU: all that both work with (gauge protocol §3.3).
-
-Both are lists of the same functions (``step_functions.py``), which hand on values.
-"""
+"""The two control steps of a rollout, for a CPU and for a GPU (gauge protocol §3.3): two lists of the same functions."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import NamedTuple
 
 import torch
@@ -19,10 +17,23 @@ from ...robots.body_plan import total_mass
 from ..episodes import Episode
 from ..goals import LATERAL_SPEED, Schedule
 from ..suite import Suite
-from .noise import make_stream
+from .noise import NoiseReader, make_stream
+from .recording import StepRecording
 from .sampling import GRAVITY, SampleTable
 from .segments import SegmentRules
-from .step_functions import SamplePlan, StepCommand, accept_action, find_push, plan_samples
+from .step_functions import (
+    Events,
+    SamplePlan,
+    StepCommand,
+    accept_action,
+    advance,
+    count_falls,
+    end_segments,
+    find_events,
+    find_push,
+    give_commands,
+    plan_samples,
+)
 from .world_buffers import WorldBuffers
 
 
@@ -47,7 +58,7 @@ class Motion(NamedTuple):
 
 
 class ControlStep(ABC):
-    """Take control steps of all worlds of a rollout: observe, act, step, judge."""
+    """Take control steps of all worlds of a rollout: observe, act, step, judge. The tensors of a step go from function to function."""
 
     def __init__(self, suite: Suite, policy: Policy, backend: PhysicsBackend, *, one_by_one: bool) -> None:
         """Prepare empty worlds.
@@ -128,14 +139,14 @@ class ControlStep(ABC):
             buffers.tick.masked_fill_(mask, 0)
 
     def observe(self, command: StepCommand, noise: dict[str, torch.Tensor], *, aimed: bool) -> torch.Tensor:
-        """Return the observations, (K, W); ``noise`` by observation term, ``aimed`` as for ``give_commands``."""
+        """Return the observations, (K, W); ``noise`` by observation term, ``aimed``: any robot may aim at a target."""
         told, limits = command.velocity, self.buffers.limits
         if aimed and self._must_clip:
             told = torch.clamp(told, -limits, limits)
         return self.builder.build(self.backend.state, told, self.buffers.action, noise)
 
     def act(self, seen: Seen, action: torch.Tensor) -> Motion:
-        """Return what the engine gets for the policy's action, (K, J); ``accept_action`` tells what becomes of one that is not finite."""
+        """Return the engine's input for the policy's action, (K, J). An action that is not finite makes its world inactive."""
         buffers, suite = self.buffers, self.suite
         accept_action(buffers, action, seen.observation)
         self._world_steps += buffers.active.sum()
@@ -149,3 +160,121 @@ class ControlStep(ABC):
         if motion.force is not None:
             self.backend.apply_force(motion.force)
         self.backend.step(motion.targets, delay=seen.delay, sample_at=motion.plan.at, worlds=self.buffers.active)
+
+
+class CpuStep(ControlStep):
+    """Take control steps where reading a value is free, and leave out work that no world needs. The rollout polls after each."""
+
+    def __init__(self, suite: Suite, policy: Policy, backend: PhysicsBackend) -> None:
+        """Prepare empty worlds; see ``ControlStep``."""
+        super().__init__(suite, policy, backend, one_by_one=True)
+        self._noise = NoiseReader(self.stream, backend.num_worlds, backend.device)
+        self.arrange()
+
+    def read_noise(self, worlds: Sequence[int], episodes: Sequence[Episode], starts: Sequence[int], steps: int) -> None:
+        """See ``ControlStep.read_noise``."""
+        self._noise.begin(worlds, episodes, starts, steps)
+
+    def arrange(self) -> None:
+        """See ``ControlStep.arrange``."""
+        active = self.buffers.active
+        none = torch.zeros_like(active)
+        self._no_events = Events(none, none, active * self.substeps)
+        self._aimed = bool((self.buffers.aims & active).any())
+        # rows that need an action, filled up to a multiple of eight
+        rows = (int(active.sum()) + 7) // 8 * 8
+        few = self.few_rows_suffice and rows < len(active)
+        self._rows = torch.argsort(~active, stable=True)[:rows] if few else None
+
+    def run(self, steps: int) -> None:
+        """Take control steps up to one in which the policy's action is not finite; that one ends before its physics."""
+        buffers, suite, backend, table, aimed = self.buffers, self.suite, self.backend, self.samples, self._aimed
+        for _ in range(steps):
+            command = give_commands(buffers, backend.state, suite, self.schedule, aimed=aimed)
+            noise, delay = self._noise.next()
+            seen = Seen(command, self.observe(command, noise, aimed=aimed), delay)
+            motion = self.act(seen, self.session.act(seen.observation, self._rows))
+            if bool(buffers.not_finite.any()):
+                return
+            self.move(seen, motion)
+            state, plan, happened = backend.state, motion.plan, self._something_happened()
+            events = self._no_events
+            if happened:
+                events = find_events(buffers, state, plan, table.count, suite, self.substeps)
+            due, keep = advance(buffers, plan, command, events, suite)
+            if bool(due.any()):
+                table.write(backend.sample, due, keep, command.velocity)
+            table.end_step(state, buffers.active)
+            if happened:
+                count_falls(buffers, command, events, suite, self.substeps)
+            end_segments(buffers, state, command, events, suite, aimed=aimed)
+
+    def _something_happened(self) -> bool:
+        """Return whether the engine saw a fall, an error or a penetration that matters in an active world."""
+        if not self.backend.eventful:
+            return False
+        state, buffers = self.backend.state, self.buffers
+        trouble = state.tilt_substep + state.diverged + state.overflowed
+        if self.rules.restarts:
+            trouble = trouble + state.penetration_substep * buffers.watched
+        return bool((trouble * buffers.active).any())
+
+
+class GpuStep(ControlStep):
+    """Take control steps without waiting for the device, as CUDA graphs where the device has them.
+
+    Everything is worked out for every world. A world stands still once its segment has ended, or once its robot has to go back to
+    its spawn, until the rollout polls. Control steps are counted on the device, so no result depends on when the rollout polls.
+    """
+
+    def __init__(self, suite: Suite, policy: Policy, backend: PhysicsBackend, *, capture: bool) -> None:
+        """Prepare empty worlds; see ``ControlStep``. ``capture``: capture steps as CUDA graphs on a CUDA device."""
+        super().__init__(suite, policy, backend, one_by_one=False)
+        self._action = torch.zeros_like(self.buffers.action)
+        self._recording = StepRecording(backend.device, enabled=capture and backend.device.type == "cuda")
+
+    @property
+    def captured(self) -> bool:
+        """See ``ControlStep.captured``."""
+        return self._recording.enabled
+
+    def read_noise(self, worlds: Sequence[int], episodes: Sequence[Episode], starts: Sequence[int], steps: int) -> None:
+        """See ``ControlStep.read_noise``."""
+        for world, episode, start in zip(worlds, episodes, starts, strict=True):
+            self.stream.assign(world, episode, start + steps)
+
+    def run(self, steps: int) -> None:
+        """See ``ControlStep.run``."""
+        recording = self._recording
+        if recording.enabled:
+            recording.prepare(self._moving_memory())
+        for _ in range(steps):
+            seen = recording.run(self._observe)
+            # a captured observation is overwritten by the next one, and a policy may keep what it is given
+            answer = self.session.act(seen.observation.clone() if recording.enabled else seen.observation)
+            motion = recording.run(self.act, seen, self._action.copy_(answer) if recording.enabled else answer)
+            self.move(seen, motion)
+            recording.run(self._judge, seen, motion)
+
+    def _moving_memory(self) -> tuple[torch.Tensor, ...]:
+        """Return the memory that a captured step uses and that may move."""
+        states = (self.backend.state, self.backend.sample)
+        tensors = [getattr(state, field.name) for state in states for field in fields(state)]
+        return (*tensors, *self.stream.tables, self.samples.rows)
+
+    def _observe(self) -> Seen:
+        buffers = self.buffers
+        command = give_commands(buffers, self.backend.state, self.suite, self.schedule, aimed=True)
+        noise, delay = self.stream.draw(buffers.noise_start + buffers.control_steps)
+        return Seen(command, self.observe(command, noise, aimed=True), delay)
+
+    def _judge(self, seen: Seen, motion: Motion) -> None:
+        buffers, suite, table, command, plan = self.buffers, self.suite, self.samples, seen.command, motion.plan
+        state = self.backend.state
+        events = find_events(buffers, state, plan, table.count, suite, self.substeps)
+        due, keep = advance(buffers, plan, command, events, suite)
+        table.write(self.backend.sample, due, keep, command.velocity)
+        table.end_step(state, buffers.active)
+        count_falls(buffers, command, events, suite, self.substeps)
+        end_segments(buffers, state, command, events, suite, aimed=True)
+        buffers.active &= ~(buffers.respawn | buffers.ended)

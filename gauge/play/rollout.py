@@ -26,9 +26,7 @@ from ...policy.base import Policy, PolicyError
 from ..episodes import QUALITY, Episode, Record
 from ..goals import TARGET
 from ..suite import Suite
-from .control_step import ControlStep
-from .cpu_step import CpuStep
-from .gpu_step import GpuStep
+from .control_step import ControlStep, CpuStep, GpuStep
 from .sampling import Samples
 from .segments import Segment, SegmentOutcome, SegmentQueue
 from .world_buffers import SegmentCounts

@@ -11,7 +11,7 @@ import torch
 
 from ...backends.base import PhysicsState
 from ..goals import Schedule, target_command, target_offset
-from ..suite import Commands, Settling
+from ..suite import Suite
 from .pushes import sideways
 from .world_buffers import WorldBuffers
 
@@ -47,22 +47,13 @@ class Events(NamedTuple):
     """Substeps until the event, all of them without an event, 0 in worlds that are not active, int64."""
 
 
-def find_standing(buffers: WorldBuffers, state: PhysicsState, rules: Settling) -> torch.Tensor:
-    """Return the settling robots that stand, or have settled for the longest time, (K,) bool."""
-    speed = torch.linalg.vector_norm(state.base_linear_velocity_w, dim=1)
-    still = (speed < rules.speed) & (state.time > rules.shortest)
-    return buffers.settling & buffers.active & (still | (state.time > rules.longest))
-
-
 def give_commands(
-    buffers: WorldBuffers, schedule: Schedule, state: PhysicsState, rules: Settling, *, aimed: bool
+    buffers: WorldBuffers, state: PhysicsState, suite: Suite, schedule: Schedule, *, aimed: bool
 ) -> StepCommand:
-    """Count a control step of the robots that do not settle, and return the command of each world.
-
-    Args:
-        aimed: whether any world may aim at a target.
-    """
-    stands = find_standing(buffers, state, rules)
+    """Count a control step of the robots that do not settle, and return the commands; ``aimed``: any may aim at a target."""
+    rules, speed = suite.settling, torch.linalg.vector_norm(state.base_linear_velocity_w, dim=1)
+    still = (speed < rules.speed) & (state.time > rules.shortest)
+    stands = buffers.settling & buffers.active & (still | (state.time > rules.longest))
     commanded = buffers.active & ~buffers.settling
     buffers.commanded_steps += commanded
     velocity = schedule.commands(buffers.first_row + buffers.commanded_steps, buffers.limits)
@@ -98,17 +89,14 @@ def find_push(buffers: WorldBuffers, state: PhysicsState, commanded: torch.Tenso
 
 
 def find_events(
-    buffers: WorldBuffers, state: PhysicsState, plan: SamplePlan, rows: torch.Tensor, substeps: int, *, watches: bool
+    buffers: WorldBuffers, state: PhysicsState, plan: SamplePlan, rows: torch.Tensor, suite: Suite, substeps: int
 ) -> Events:
-    """Find falls, and penetrations that make a target goal start again.
+    """Find falls, and penetrations that make a target goal start again, in a control step of ``substeps``.
 
     The first penetration of a velocity goal's segment interrupts nothing. The buffers remember how far the segment was.
-
-    Args:
-        rows: samples that each world has taken before, (K,) int64.
-        substeps: those of a control step.
-        watches: whether penetrations matter in the suite.
+    ``rows``: samples that each world has taken before, (K,) int64.
     """
+    watches = suite.events.penetration is not None
     active = buffers.active
     never = torch.full_like(state.tilt_substep, substeps + 1)
     fell_at = torch.where(state.tilt_substep > 0, state.tilt_substep, never)
@@ -137,91 +125,62 @@ def find_events(
 
 
 def advance(
-    buffers: WorldBuffers, plan: SamplePlan, command: StepCommand, events: Events, *, settling_counts: bool
+    buffers: WorldBuffers, plan: SamplePlan, command: StepCommand, events: Events, suite: Suite
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Count the substeps up to each event.
-
-    Args:
-        settling_counts: whether samples of settling robots count.
-
-    Returns:
-        Samples that were taken by then, and those that count, (K,) bool each.
-    """
+    """Count the substeps up to each event; returns the worlds that took a sample, and those that took one that counts, (K,) bool."""
     buffers.tick += events.substeps
     buffers.substeps += events.substeps
     due = plan.due & (plan.at <= events.substeps)
-    return due, due if settling_counts else due & command.commanded
+    return due, due if suite.settling.sampled else due & command.commanded
 
 
-def count_falls(
-    buffers: WorldBuffers, events: Events, commanded: torch.Tensor, interval: int, substeps: int, *, closes_goal: bool
-) -> None:
-    """Count falls, and the samples that a fall costs: those of the rest of the sub-command, unless a fall closes the goal.
-
-    Args:
-        interval: substeps between two samples.
-        substeps: those of a control step.
-    """
+def count_falls(buffers: WorldBuffers, command: StepCommand, events: Events, suite: Suite, substeps: int) -> None:
+    """Count falls, and the samples that a fall costs: those of the rest of the sub-command, unless a fall closes the goal."""
     buffers.falls += events.fall
-    if closes_goal:
+    if suite.events.fall == "close-goal":
         return
+    interval = suite.metrics.interval
     # a fall while settling costs the whole sub-command that would have followed
-    begun = (buffers.commanded_steps - 1) * commanded
-    step_began = torch.where(commanded, buffers.tick - events.substeps, buffers.tick)
+    begun = (buffers.commanded_steps - 1) * command.commanded
+    step_began = torch.where(command.commanded, buffers.tick - events.substeps, buffers.tick)
     ends = step_began + (buffers.length - begun) * substeps
     lost = ends // interval - buffers.tick // interval
     costs = events.fall & buffers.sampled & ~buffers.aims
     buffers.lost_samples.copy_(torch.where(costs, lost, buffers.lost_samples))
 
 
-def end_settling(buffers: WorldBuffers, command: StepCommand) -> tuple[torch.Tensor, torch.Tensor]:
-    """Let robots that stand end their settling.
+def end_segments(
+    buffers: WorldBuffers, state: PhysicsState, command: StepCommand, events: Events, suite: Suite, *, aimed: bool
+) -> None:
+    """End settling and segments, and work out the next commands of robots that aim at a target.
 
-    Returns:
-        Robots that do not settle any more, and those of them with a sub-command, or a time for the way, that is over, (K,) bool.
+    Where penetrations matter, a robot at the end of its way goes back to its spawn and settles once more before the segment ends.
+
+    Args:
+        aimed: whether any robot may aim at a target.
     """
     buffers.settling &= ~command.stands
     settled = buffers.active & ~buffers.settling
-    return settled, settled & (buffers.commanded_steps >= buffers.length)
-
-
-def lead_to_target(
-    buffers: WorldBuffers,
-    state: PhysicsState,
-    commands: Commands,
-    command: StepCommand,
-    events: Events,
-    settled: torch.Tensor,
-    full: torch.Tensor,
-    *,
-    settles_again: bool,
-) -> torch.Tensor:
-    """Work out the next commands of robots that aim at a target, and find those at the target.
-
-    Args:
-        settled: robots that do not settle any more, (K,) bool.
-        full: those of them with a sub-command, or a time for the way, that is over, (K,) bool.
-        settles_again: whether a robot at the end of its way goes back to its spawn and settles once more.
-
-    Returns:
-        Segments that have ended, of all goals, (K,) bool.
-    """
+    full = settled & (buffers.commanded_steps >= buffers.length)
+    if not aimed:
+        buffers.ended |= full | events.fall
+        return
+    commands = suite.commands
     offset = target_offset(state, buffers.target, commands.target_distance)
     near = torch.hypot(offset[:, 0], offset[:, 1]) < commands.target_radius
-    going = command.commanded & buffers.aims & ~(events.fall | events.restart)
-    over = (near | full) & going
+    over = (near | full) & command.commanded & buffers.aims & ~(events.fall | events.restart)
     if commands.heading_frame != commands.target_distance:
         offset = target_offset(state, buffers.target, commands.heading_frame)
     buffers.target_command.copy_(target_command(offset, buffers.backward, buffers.speed, buffers.limits[:, 2]))
     over &= ~buffers.done
     buffers.reached |= over & near
     ended = (full & ~buffers.aims) | events.fall
-    if not settles_again:
-        return ended | over
+    if suite.events.penetration is None:
+        buffers.ended |= ended | over
+        return
     # a penetration while the robot settles once more can still undo it
     buffers.done &= ~events.restart
     buffers.reached &= ~events.restart
     buffers.respawn |= over | events.restart
-    ended = ended | (buffers.done & settled & ~events.restart)
+    buffers.ended |= ended | (buffers.done & settled & ~events.restart)
     buffers.done |= over
-    return ended

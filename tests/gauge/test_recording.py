@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaitgauge.gauge.play import gpu_step, recording
+from gaitgauge.gauge.play import control_step, recording
 from gaitgauge.gauge.play.recording import StepRecording
 from gaitgauge.gauge.play.rollout import Rollout
 from gaitgauge.policy.base import PolicyError
@@ -85,7 +85,7 @@ def tapes(monkeypatch):
     """Recording on the CPU, where a rollout is asked to capture."""
     Tape.made = 0
     monkeypatch.setattr(
-        gpu_step, "StepRecording", lambda device, *, enabled: StepRecording(device, enabled=capturing[-1])
+        control_step, "StepRecording", lambda device, *, enabled: StepRecording(device, enabled=capturing[-1])
     )
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Tape)
     monkeypatch.setattr(torch.cuda, "graph", Recorder)
