@@ -15,7 +15,6 @@ from ..backends.base import PhysicsOptions
 from ..files.parsing import (
     Name,
     NotNegative,
-    Positive,
     Seed,
     Share,
     Text,
@@ -28,6 +27,7 @@ from ..files.parsing import (
 )
 from ..terrains.registry import terrain_names
 from .commands import Phase
+from .metric_rules import Metrics
 
 SUITE_FOLDER = Path(__file__).parent / "suites"
 
@@ -46,17 +46,6 @@ Payload = Annotated[float, Field(ge=LEAST_PAYLOAD, le=MOST_PAYLOAD)]
 GoalName = Literal["diagonal_velocity", "max_velocity", "target_pos_velocity"]
 """The paper's goals, whose commands are written in ``goals.py``: the reference's clock and its rounding errors are part of them."""
 _AIMED = "target_pos_velocity"
-METRIC_NAMES = (
-    "lin_vel_err",
-    "ang_vel_err",
-    "dof_limits",
-    "dof_power",
-    "orientation_stability",
-    "torque_smoothness",
-    "zmp_margin",
-    "friction_margin",
-)
-"""What ``metrics.py`` measures."""
 
 
 class SuiteError(ValueError):
@@ -163,39 +152,6 @@ class Settling:
     """[s] since the reset."""
     sampled: bool
     """Whether samples taken meanwhile count."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Metrics:
-    """Which metrics count, and how they are taken."""
-
-    weights: Annotated[Mapping[str, Annotated[float, Field(gt=0.0, le=1000.0)]], Field(min_length=1)]
-    """Exponent of each metric in the quality of a sample; its keys are the suite's metrics."""
-    interval: Annotated[int, Field(ge=1, le=100_000)]
-    """Substeps between samples."""
-    clock: Literal["run", "reset"]
-    """``run``: samples on a grid that runs through resets; ``reset``: the grid starts anew at every reset."""
-    angular_velocity: Literal["twice-rotated", "body", "commanded"]
-    """``twice-rotated``: the reference's three components; ``body``: the same in the body frame; ``commanded``: yaw alone."""
-    linear_velocity: Literal["body", "commanded"]
-    """``body``: three components in the body frame; ``commanded``: the two commanded ones, forward and lateral."""
-    smoothness: Literal["samples", "control-steps"]
-    """Torque difference between ``samples``, or between consecutive ``control-steps``."""
-    power_scale: Positive
-    """RMS joint power that scores zero [W]."""
-    torque_scale: Positive
-    """RMS torque difference that scores zero [N·m]."""
-    soft_limit: Annotated[float, Field(gt=0.0, le=1.0)]
-    """Share of each joint range, around its middle, inside which no limit is exceeded."""
-    soft_limit_joints: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
-    """The joints that the limit metric watches: ``hip``, ``thigh`` and ``calf`` by their place in the leg, else parts of names."""
-    zmp_span: Positive | None = None
-    """Diagonal stance span that normalizes the ZMP distance [m]; None: that of the robot's default pose."""
-    contact_share: Share = 0.05
-    """Share of the weight that the ground must carry for the contact metrics to be defined."""
-    flight: Literal["left-out", "filled"] = "left-out"
-    """What stands for a contact metric in the quality of a sample without contact: nothing (``left-out``), or the metric's mean
-    over the sub-command's other samples (``filled``; zero where there are none)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,8 +267,17 @@ def load_suite(name: str) -> Suite:
     path, data = _tables(name, ())
     source = f"suite file {one_line(path)}"
     suite = build(Suite, data, source, SuiteError, false_is_none=True)
+    own = path.resolve().parent != SUITE_FOLDER.resolve()
+    if own:
+        from .metrics import MetricError, find_metric  # listing the project's suites must not wait for torch
+
+        try:
+            for metric in suite.metrics.weights:
+                find_metric(metric)
+        except MetricError as error:
+            raise SuiteError(f"{source}: {error}") from error
     _check(suite, source)
-    if path.resolve().parent != SUITE_FOLDER.resolve() and suite.name in suite_names():
+    if own and suite.name in suite_names():
         raise SuiteError(f"{source} is called '{suite.name}' as a suite that ships with the project; {_OWN_NAME}")
     return suite
 
@@ -442,11 +407,6 @@ def _check(suite: Suite, source: str) -> None:
             f"matrix.terrains has the unknown terrain {shown(name)}{did_you_mean(name, grounds) or ';'} choose from "
             f"{', '.join(grounds)}"
         ] = name in grounds
-    for name in metrics.weights:
-        rules[
-            f"metrics.weights has the unknown metric {shown(name)}{did_you_mean(name, METRIC_NAMES) or ';'} choose from "
-            f"{', '.join(METRIC_NAMES)}"
-        ] = name in METRIC_NAMES
     for rule, kept in rules.items():
         if not kept:
             raise SuiteError(f"{source}: {rule}")

@@ -86,7 +86,7 @@ class ControlStep(ABC):
         self.rules = SegmentRules(suite, self.schedule)
         self.stream = make_stream(suite.noise, scene.robot.num_joints, count, device)
         weight = GRAVITY * total_mass(scene.robot)
-        self.samples = SampleTable(suite, scene.robot, weight, count, device, dtype, one_by_one=one_by_one)
+        self.samples = SampleTable(suite, scene.robot, weight, backend.state, one_by_one=one_by_one)
         self.buffers = WorldBuffers.allocate(count, scene.robot.num_joints, device, dtype)
         commands = suite.commands
         fastest = max(commands.target_speed.values(), default=0.0)
