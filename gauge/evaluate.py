@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-from ..backends.mujoco import MujocoBackend
 from ..backends.registry import find_backend, make_backend
 from ..files.parsing import one_line, shown
 from ..files.provenance import plugins, provenance, source_digest, versions
@@ -108,13 +107,13 @@ def prepare(request: Request) -> Prepared:
         SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, ClusterError: one sentence on what is wrong.
     """
     suite = load_suite(request.suite)
-    find_backend(request.backend, request.device)
+    engine = find_backend(request.backend, request.device)
     if request.cluster is not None:
         check_address(request.cluster)
-        if request.backend != MujocoBackend.name:
+        if not engine.parallel_processes or torch.device(request.device).type != "cpu":
             raise ClusterError(
-                f"a cluster plays with backend '{MujocoBackend.name}' on CPUs, not with '{request.backend}'; leave out --cluster "
-                "or --backend"
+                f"a cluster plays with an engine that runs as several processes on CPUs, which backend '{request.backend}' on "
+                f"'{request.device}' does not; leave out --cluster, --backend or --device"
             )
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:

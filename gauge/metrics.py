@@ -374,10 +374,11 @@ def find_metric(name: str) -> Metric:
 
 
 def metric_label(name: str, *, short: bool = False) -> str:
-    """Return a metric's name for readers; one that is not installed here goes by its own."""
-    if name not in metric_names():
+    """Return a metric's name for readers; a metric that is not installed here, or broken, goes by its own name."""
+    try:
+        metric = find_metric(name)
+    except MetricError:
         return name.replace("_", " ")
-    metric = find_metric(name)
     return (short and metric.short_label) or metric.label
 
 

@@ -29,7 +29,7 @@ from typing import Any, Protocol
 import torch
 
 from ...backends.base import PhysicsBackend, Scene
-from ...backends.mujoco import MujocoBackend
+from ...backends.registry import engine_class
 from ...policy.base import Policy
 from ...policy.foreign.fenced_policy import FencedPolicy
 from ...policy.loading import restore_policy
@@ -235,8 +235,12 @@ def start_workers(job: Job, count: int) -> Transport:
 
 
 def local_workers(backend: str, device: str, *, threads: int, most: int) -> int:
-    """How many workers share the CPU threads of this machine: an engine that has threads of its own, or a GPU, wants one."""
-    several = backend == MujocoBackend.name and torch.device(device).type == "cpu" and os.name == "posix"
+    """Return the number of workers on this machine, ``most`` at most: one on a GPU, or for an engine without ``parallel_processes``.
+
+    Raises:
+        BackendError: no such engine.
+    """
+    several = torch.device(device).type == "cpu" and os.name == "posix" and engine_class(backend).parallel_processes
     return max(min(threads, most), 1) if several else 1
 
 
