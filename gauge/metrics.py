@@ -259,8 +259,9 @@ class Metric:
     """Name at the head of a column; the same as ``label`` if empty."""
     group: str = ""
     """Group in ``gaitgauge validate``: ``tracking``, ``safety``, ``quality`` or another; none if empty. In a score, the suite groups."""
-    check: Callable[[MetricConstants], object] | None = None
-    """Called before anything is played; raises ``MetricError`` if the metric cannot be measured on the robot."""
+    prepare: Callable[[MetricConstants], object] | None = None
+    """Called before anything is played: works out constants from the robot's files, which may be gone later, and raises
+    ``MetricError`` if the metric cannot be measured on the robot."""
 
 
 def _linear_velocity(at: Instants) -> torch.Tensor:
@@ -308,7 +309,7 @@ METRICS: Mapping[str, Metric] = {
         state=("joint_position",),
         label="joint limits",
         group="safety",
-        check=lambda constants: constants.limits,
+        prepare=lambda constants: constants.limits,
     ),
     "dof_power": Metric(
         function=lambda at: joint_power(at.state.joint_torque, at.state.joint_velocity, at.constants.rules.power_scale),
@@ -333,7 +334,11 @@ METRICS: Mapping[str, Metric] = {
         group="quality",
     ),
     "zmp_margin": Metric(
-        function=_zmp_margin, state=("ground_moment_w", "ground_force_w"), label="ZMP margin", group="quality"
+        function=_zmp_margin,
+        state=("ground_moment_w", "ground_force_w"),
+        label="ZMP margin",
+        group="quality",
+        prepare=lambda constants: constants.span,
     ),
     "friction_margin": Metric(
         function=_friction_margin,
@@ -369,8 +374,8 @@ def find_metric(name: str) -> Metric:
     columns = [field.name for field in fields(PhysicsState)]
     if missing := [column for column in metric.state if column not in columns]:
         raise MetricError(f"{origin(plugin)} reads the state {shown(missing[0])}; choose from {', '.join(columns)}")
-    check = metric.check and partial(guarded, plugin, MetricError, metric.check)
-    return replace(metric, function=partial(guarded, plugin, MetricError, metric.function), check=check)
+    prepare = metric.prepare and partial(guarded, plugin, MetricError, metric.prepare)
+    return replace(metric, function=partial(guarded, plugin, MetricError, metric.function), prepare=prepare)
 
 
 def metric_label(name: str, *, short: bool = False) -> str:
@@ -408,8 +413,8 @@ class MetricEvaluator:
         """Fields of ``PhysicsState`` that the metrics read."""
         self._weights = torch.tensor([rules.weights[n] for n in self.names], device=device, dtype=dtype)
         for metric in self._metrics.values():
-            if metric.check is not None:
-                metric.check(self.constants)
+            if metric.prepare is not None:
+                metric.prepare(self.constants)
 
     def evaluate(self, instants: Instants) -> torch.Tensor:
         """Return the metrics of N instants, (N, M), NaN where a metric is not defined.

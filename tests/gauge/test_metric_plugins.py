@@ -25,7 +25,7 @@ UNKNOWN_COLUMN = Metric(function=lambda at: at.friction, state=("mood",), label=
 UNDECLARED = Metric(function=lambda at: at.state.joint_velocity[:, 0], state=("joint_position",), label="undeclared")
 RAISES = Metric(function=lambda at: 1 / 0, state=(), label="raises")
 SHAPELESS = Metric(function=lambda at: at.command, state=(), label="shapeless")
-REFUSES = Metric(function=lambda at: at.friction, state=(), label="refuses", check=lambda constants: {}["arm"])
+REFUSES = Metric(function=lambda at: at.friction, state=(), label="refuses", prepare=lambda constants: {}["arm"])
 PLUGINS = {
     "level_feet": "FEET",
     "gone": "MISSING",
