@@ -40,5 +40,5 @@ class Metrics:
     contact_share: Share = 0.05
     """Share of the weight that the ground must carry for the contact metrics to be defined."""
     flight: Literal["left-out", "filled"] = "left-out"
-    """What stands for a contact metric in the quality of a sample without contact: nothing (``left-out``), or the metric's mean
+    """Value of a contact metric in the quality of a sample without contact: nothing (``left-out``), or the metric's mean
     over the sub-command's other samples (``filled``; zero where there are none)."""

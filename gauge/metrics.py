@@ -177,7 +177,7 @@ class MetricConstants:
 
     @cached_property
     def limits(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Indices of the joints that ``soft_limit_joints`` names by parts of legs (``LEG_PARTS``), or by parts of their names, their
+        """Return the indices of the joints that ``soft_limit_joints`` names by parts of legs (``LEG_PARTS``), or by parts of their names, their
         lower and upper soft limits, and their full ranges [rad], (W,) each.
 
         Raises:
@@ -202,7 +202,7 @@ class MetricConstants:
 
     @cached_property
     def span(self) -> float:
-        """Diagonal stance span [m]."""
+        """Return the diagonal stance span [m]."""
         return stance_span(self.robot) if self.rules.zmp_span is None else self.rules.zmp_span
 
 

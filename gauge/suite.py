@@ -1,4 +1,4 @@
-"""What a score depends on, as versioned data: one TOML file for each suite in ``gauge/suites/``."""
+"""The rules that a score depends on, as versioned data: one TOML file for each suite in ``gauge/suites/``."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Friction = Annotated[float, Field(gt=0.0, le=MOST_FRICTION)]
 Payload = Annotated[float, Field(ge=LEAST_PAYLOAD, le=MOST_PAYLOAD)]
 """Mass added to the base [kg]."""
 GoalName = Literal["diagonal_velocity", "max_velocity", "target_pos_velocity"]
-"""The paper's goals, whose commands are written in ``goals.py``: the reference's clock and its rounding errors are part of them."""
+"""The paper's goals. Their commands are code (``goals.py``), with the reference's clock and its rounding errors."""
 _AIMED = "target_pos_velocity"
 
 
@@ -57,13 +57,13 @@ class Goal:
     """One kind of motion, made of sub-commands. The robot goes back to the spawn after each of them."""
 
     name: Name
-    """One of ``GoalName``, whose commands are the paper's, or any other for a goal that is all data."""
+    """One of ``GoalName``, with the paper's commands, or any other for a goal that is all data."""
     phases: tuple[_Time, ...] = ()
     """Length of each phase of a sub-command of the paper's goals [s]; empty for the one that ends at its target."""
     sub_commands: Annotated[
         tuple[Annotated[tuple[Phase, ...], Field(min_length=1, max_length=100)], ...], Field(max_length=100)
     ] = ()
-    """What a goal of one's own commands: its sub-commands, each a row of phases."""
+    """Sub-commands of a goal of one's own, each a row of phases."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +130,7 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class Events:
-    """What interrupts an episode."""
+    """Events that interrupt an episode."""
 
     fall_tilt: _Tilt
     """Tilt of the base that counts as a fall [rad]."""
@@ -142,7 +142,7 @@ class Events:
 
 @dataclass(frozen=True, kw_only=True)
 class Settling:
-    """How an episode waits for the robot to stand after a reset."""
+    """The time after a reset until the robot stands."""
 
     speed: NotNegative
     """Base speed below which the robot stands [m/s]."""
@@ -151,12 +151,12 @@ class Settling:
     longest: Annotated[float, Field(ge=0.0, le=60.0)]
     """[s] since the reset."""
     sampled: bool
-    """Whether samples taken meanwhile count."""
+    """True: samples taken meanwhile count."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scoring:
-    """How samples become scores."""
+    """The rules by which samples become scores."""
 
     level_weight: Share
     """Score of each level passed before the last (0.09)."""
@@ -184,7 +184,7 @@ class Push:
     """A sudden lateral push: a force on the base's centre of mass, to the left or right of its heading, chance says which."""
 
     goal: Name
-    """Velocity goal of whose sub-commands each has a push."""
+    """Velocity goal; each of its sub-commands has a push."""
     after: tuple[_Time, _Time]
     """Earliest and latest beginning, from the first commanded control step on, all between equally likely [s]."""
     duration: _Time
@@ -213,13 +213,13 @@ class Suite:
     metrics: Metrics
     scoring: Scoring
     gains: Literal["suite", "contract"] = "suite"
-    """Whose motor gains kp and kd every policy is played with: those of ``parameters``, or those of its own contract."""
+    """Motor gains kp and kd of every policy: those of ``parameters``, or those of the policy's own contract."""
     push: Push | None = None
     """None: nothing pushes."""
 
     @property
     def digest(self) -> str:
-        """SHA-256 over every rule, hexadecimal: two suites of one name and different rules differ in it."""
+        """Return the SHA-256 over every rule, hexadecimal: two suites of one name and different rules differ in it."""
         rules = asdict(self)
         for goal in rules["goals"]:
             if not goal["sub_commands"]:
@@ -232,11 +232,11 @@ class Suite:
         return hashlib.sha256(json.dumps(rules, sort_keys=True).encode()).hexdigest()
 
     def goal(self, name: str) -> Goal:
-        """The goal of that name."""
+        """Return the goal of that name."""
         return next(g for g in self.goals if g.name == name)
 
     def command_limits(self, family: str) -> Limits:
-        """Command limits on a terrain family."""
+        """Return the command limits on a terrain family."""
         return self.commands.flat if family == "flat" else self.commands.levelled
 
 
@@ -254,7 +254,7 @@ _ADDED: Mapping[str, Any] = {
 
 
 def suite_names() -> list[str]:
-    """Names of the suites that ship with the project."""
+    """Return the names of the suites that ship with the project."""
     return sorted(p.stem for p in SUITE_FOLDER.glob("*.toml"))
 
 
@@ -286,7 +286,7 @@ _OWN_NAME = "give it a 'name' of its own, so that results are not taken for that
 
 
 def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
-    """A suite's file and its tables, laid over those of the suite that it extends; the files ``behind`` extend it."""
+    """Return a suite's file and its tables, laid over those of the suite that it extends; the files ``behind`` extend it."""
     own = name.endswith(".toml")
     path = Path(name) if own else SUITE_FOLDER / f"{name}.toml"
     if own and behind:
@@ -322,7 +322,7 @@ _LONGEST_CHAIN = 10
 
 
 def _goal_rules(suite: Suite) -> dict[str, bool]:
-    """Sentences on goals, and whether each rule is kept."""
+    """Return sentences on goals, each with True if the rule is kept."""
     paper, goals = get_args(GoalName), [g.name for g in suite.goals]
     rules = {
         f"goals must differ in their first word, which names files; they are {', '.join(goals)}": (
@@ -350,7 +350,7 @@ def _goal_rules(suite: Suite) -> dict[str, bool]:
 
 
 def _check(suite: Suite, source: str) -> None:
-    """Refuse what each field alone allows and all of them together do not.
+    """Refuse values that are allowed one by one and not together.
 
     Raises:
         SuiteError: one sentence.

@@ -31,7 +31,7 @@ class NoiseStream(ABC):
 
     @abstractmethod
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """Noise by observation term and delay [substeps] of every world.
+        """Return noise by observation term and delay [substeps] of every world.
 
         Args:
             step: place in each world's stream, in control steps, (…, K) int64.
@@ -144,7 +144,7 @@ class CounterStream(NoiseStream):
 
 
 def uniform_hash(key: torch.Tensor, step: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    """Uniform numbers in [0, 1) from integers, the same on every device (the SplitMix64 finalizer over a Weyl sequence).
+    """Return uniform numbers in [0, 1) from integers, the same on every device (the SplitMix64 finalizer over a Weyl sequence).
 
     Arguments are int64 and broadcast against each other; returns float32 with 24 random bits.
     """
@@ -156,12 +156,12 @@ def uniform_hash(key: torch.Tensor, step: torch.Tensor, index: torch.Tensor) -> 
 
 
 def _shift(value: torch.Tensor, bits: int) -> torch.Tensor:
-    """Logical right shift of int64."""
+    """Shift int64 to the right, filled up with zeros."""
     return (value >> bits) & ((1 << (64 - bits)) - 1)
 
 
 def make_stream(noise: Noise, joints: int, worlds: int, device: torch.device) -> ReferenceStream | CounterStream:
-    """The stream that a suite asks for."""
+    """Return the stream that a suite asks for."""
     return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, worlds, device)
 
 
@@ -190,7 +190,7 @@ class NoiseReader:
         self._block = []
 
     def next(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """Noise by observation term, (K, width), and delays, (K,), of the next control step."""
+        """Return noise by observation term, (K, width), and delays, (K,), of the next control step."""
         if not self._block:
             terms, delays = self._stream.draw(self._now + self._ahead + self._offset)
             columns = [value.unbind(0) for value in terms.values()]

@@ -26,7 +26,7 @@ class StepRecording:
     """
 
     def __init__(self, device: torch.device | str, *, enabled: bool) -> None:
-        """``device``: where the functions run; ``enabled``: whether to record at all."""
+        """Prepare; functions run on ``device``, and none is recorded unless ``enabled``."""
         self._device = device
         self.enabled = enabled
         """True while functions are recorded, or will be."""

@@ -1,4 +1,4 @@
-"""What the metrics need to know of each sample, kept while a segment runs; the metrics themselves are worked out at its end."""
+"""Keeps the state of each sample while a segment runs; the metrics are computed at the end of the segment."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SampleTable:
         Args:
             weight: its weight [N].
             like: any state of the K worlds.
-            one_by_one: evaluate metrics segment by segment. In a CPU's vector units the last bit may depend on who else is in a
+            one_by_one: evaluate metrics segment by segment. In a CPU's vector units the last bit may depend on the rest of a
                 batch, while a GPU evaluates all segments at once.
         """
         worlds, device, dtype = len(like.joint_position), like.joint_position.device, like.joint_position.dtype
@@ -82,16 +82,16 @@ class SampleTable:
         self.count.masked_fill_(mask, 0)
 
     def forget_torque(self, mask: torch.Tensor) -> None:
-        """Some robots, (K,) bool, were reset: there is no torque to compare their next one with."""
+        """Forget the last torque of robots that were reset, (K,) bool."""
         self._torque_known &= ~mask
 
     def write(self, sample: PhysicsState, due: torch.Tensor, keep: torch.Tensor, command: torch.Tensor) -> None:
-        """Write a row for every world whose sample is due.
+        """Write a row for every world that takes a sample.
 
         Args:
             sample: the state at which it is taken; the other worlds' rows do not matter.
             due: (K,) bool; none may be before ``reserve``.
-            keep: whether it counts, (K,) bool.
+            keep: samples that count, (K,) bool.
             command: commanded velocities, (K, 3).
         """
         if not self.capacity:
@@ -107,7 +107,7 @@ class SampleTable:
             self._torque_known |= due
 
     def end_step(self, state: PhysicsState, active: torch.Tensor) -> None:
-        """A control step has ended: its torque is the one to compare with, where the suite says so."""
+        """Keep the torque at the end of a control step for the next comparison, where the suite says so."""
         if not self._between_samples:
             self._torque.copy_(state.joint_torque)
             self._torque_known |= active
@@ -115,7 +115,7 @@ class SampleTable:
     def read(
         self, worlds: Sequence[int], counts: Sequence[int], limits: torch.Tensor, friction: torch.Tensor
     ) -> list[Samples]:
-        """What the metrics say of some worlds' first samples.
+        """Return the metrics of the first samples of some worlds.
 
         Args:
             counts: number of samples T of each, at least 1.
@@ -139,7 +139,7 @@ class SampleTable:
     def _evaluate(
         self, rows: torch.Tensor, limits: torch.Tensor, friction: torch.Tensor, counts: Sequence[int]
     ) -> torch.Tensor:
-        """Metrics and quality of rows of the table, then whether they count, (N, columns + 1) float32.
+        """Return the metrics and quality of rows of the table, and 1 for those that count, (N, columns + 1) float32.
 
         The rows are those of some segments, one after the other, with so many samples each.
         """
