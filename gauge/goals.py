@@ -149,7 +149,7 @@ def check_terrain(suite: Suite, terrain: Terrain, *, searched: bool) -> None:
 
 
 def target_offset(state: PhysicsState, target: torch.Tensor, frame: str) -> torch.Tensor:
-    """Return the target minus base position, (N, 2): in the base's own x-y plane (``body``), or the yawed horizontal one (``horizontal``)."""
+    """Return the target minus base position, (N, 2): in the plane of the base (``body``) or the yawed horizontal one (``horizontal``)."""
     offset = target - state.base_position_w
     if frame == "body":
         return rotate_inverse(state.base_quaternion_w, offset)[:, :2]

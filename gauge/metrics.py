@@ -177,8 +177,9 @@ class MetricConstants:
 
     @cached_property
     def limits(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the indices of the joints that ``soft_limit_joints`` names by parts of legs (``LEG_PARTS``), or by parts of their names, their
-        lower and upper soft limits, and their full ranges [rad], (W,) each.
+        """Return indices, lower and upper soft limits, and full ranges [rad] of the watched joints, (W,) each.
+
+        ``soft_limit_joints`` names these joints by parts of legs (``LEG_PARTS``), or by parts of their names.
 
         Raises:
             MetricError: no such joint has limits.
