@@ -145,14 +145,19 @@ class ControlStep(ABC):
             told = torch.clamp(told, -limits, limits)
         return self.builder.build(self.backend.state, told, self.buffers.action, noise)
 
-    def act(self, seen: Seen, action: torch.Tensor) -> Motion:
-        """Return the engine's input for the policy's action, (K, J). An action that is not finite makes its world inactive."""
+    def act(self, seen: Seen, action: torch.Tensor, *, pushed: bool = True) -> Motion:
+        """Return the engine's input for the policy's action, (K, J). An action that is not finite makes its world inactive.
+
+        ``pushed``: any active world may have a push.
+        """
         buffers, suite = self.buffers, self.suite
         accept_action(buffers, action, seen.observation)
         self._world_steps += buffers.active.sum()
         plan = plan_samples(buffers, suite.metrics.interval, self.substeps)
         targets = self.builder.targets(action)
-        force = None if suite.push is None else find_push(buffers, self.backend.state, seen.command.commanded)
+        force = None
+        if pushed and suite.push is not None:
+            force = find_push(buffers, self.backend.state, seen.command.commanded)
         return Motion(targets, force, plan)
 
     def move(self, seen: Seen, motion: Motion) -> None:
@@ -181,6 +186,7 @@ class CpuStep(ControlStep):
         none = torch.zeros_like(active)
         self._no_events = Events(none, none, active * self.substeps)
         self._aimed = bool((self.buffers.aims & active).any())
+        self._pushed = bool((self.buffers.push_end * active).any())
         # rows that need an action, filled up to a multiple of eight
         rows = (int(active.sum()) + 7) // 8 * 8
         few = self.few_rows_suffice and rows < len(active)
@@ -193,7 +199,7 @@ class CpuStep(ControlStep):
             command = give_commands(buffers, backend.state, suite, self.schedule, aimed=aimed)
             noise, delay = self._noise.next()
             seen = Seen(command, self.observe(command, noise, aimed=aimed), delay)
-            motion = self.act(seen, self.session.act(seen.observation, self._rows))
+            motion = self.act(seen, self.session.act(seen.observation, self._rows), pushed=self._pushed)
             if bool(buffers.not_finite.any()):
                 return
             self.move(seen, motion)
