@@ -328,6 +328,9 @@ class PhysicsBackend(ABC):
     scene: Scene
     device: torch.device
     dtype: torch.dtype
+    parallel_processes: ClassVar[bool] = False
+    """True for an engine on the CPU that plays faster as one process a core than as one process with threads. Several processes may
+    then build worlds at the same time, here and on a cluster; results may not depend on their number."""
     state_stays: ClassVar[bool] = False
     """Whether ``state`` is the same tensors for good, numbers in float32, which every call changes in place."""
     engine_seconds: float | None = None

@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-from ..backends.mujoco import MujocoBackend
 from ..backends.registry import choose_device, find_backend, make_backend
 from ..files.choices import cpu_threads
 from ..files.parsing import one_line, shown
@@ -91,13 +90,13 @@ def prepare(request: Request) -> Prepared:
     # None with a cluster stands for all of its processors
     threads = request.threads if request.cluster is not None else cpu_threads(request.threads)
     request = replace(request, device=device, threads=threads)
-    find_backend(request.backend, device)
+    engine = find_backend(request.backend, device)
     if request.cluster is not None:
         check_address(request.cluster)
-        if request.backend != MujocoBackend.name:
+        if not engine.parallel_processes or torch.device(request.device).type != "cpu":
             raise ClusterError(
-                f"a cluster plays with backend '{MujocoBackend.name}' on CPUs, not with '{request.backend}'; leave out --cluster "
-                "or --backend"
+                f"a cluster plays with an engine that runs as several processes on CPUs, which backend '{request.backend}' on "
+                f"'{request.device}' does not; leave out --cluster, --backend or --device"
             )
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:

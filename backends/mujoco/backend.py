@@ -54,6 +54,7 @@ class MujocoBackend(PhysicsBackend):
     """MuJoCo (C engine) on the CPU. Results do not depend on the number of threads nor on the other worlds."""
 
     name: ClassVar[str] = "mujoco"
+    parallel_processes: ClassVar[bool] = True
 
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
+from functools import partial
 from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import Any
 
 from ..coverage import notes, score_label, suite_label
 from ..episodes import QUALITY
+from ..metrics import metric_label
 from ..result import EnvironmentRow, Health, MetricScore, Result, TerrainScore
 from ..scoring import STATISTICS
 from ..store import StoreError
@@ -21,18 +23,6 @@ from .references import references_for
 
 STATISTIC_LABELS = {"mean": "mean", "mean50": "mean@50", "mean25": "mean@25"}
 """In the order in which the radar draws them."""
-
-METRIC_LABELS: Mapping[str, tuple[str, str]] = {
-    "lin_vel_err": ("linear velocity tracking", "linear velocity"),
-    "ang_vel_err": ("angular velocity tracking", "angular velocity"),
-    "dof_limits": ("joint limits", "joint limits"),
-    "dof_power": ("joint power", "joint power"),
-    "orientation_stability": ("orientation stability", "orien\u00adtation"),
-    "torque_smoothness": ("torque smoothness", "smooth\u00adness"),
-    "zmp_margin": ("ZMP margin", "ZMP margin"),
-    "friction_margin": ("friction margin", "friction margin"),
-}
-"""Long and short label; other metrics go by their name."""
 
 CLIP = "clip.webp"
 """A film of the robot beside the results; it becomes part of the page."""
@@ -82,20 +72,10 @@ def render(result: Result, clip: bytes | None = None) -> str:
         number=number,
         terrain=terrain_label,
         metric=metric_label,
-        short_metric=_short_metric_label,
+        short_metric=partial(metric_label, short=True),
         grouped=_grouped,
     )
     return template.render(**report_data(result), clip=None if clip is None else base64.b64encode(clip).decode())
-
-
-def metric_label(name: str) -> str:
-    """Return a metric's name for readers."""
-    return METRIC_LABELS[name][0] if name in METRIC_LABELS else name.replace("_", " ")
-
-
-def _short_metric_label(name: str) -> str:
-    """Return a metric's name at a column's head."""
-    return METRIC_LABELS[name][1] if name in METRIC_LABELS else metric_label(name)
 
 
 def report_data(result: Result) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import jinja2
 
 from ...files.parsing import edited, one_line
 from ...files.writing import csv_text, make_folder, write_atomically
+from ...gauge.metrics import metric_label
 from ...gauge.report.charts import terrain_label
-from ...gauge.report.page import metric_label
 from ...gauge.report.pages import page_template
 from .. import interval_charts
 from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p

@@ -7,8 +7,8 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ...files.parsing import shown
+from ...gauge.metrics import metric_label
 from ...gauge.report.charts import number, terrain_label
-from ...gauge.report.page import metric_label
 from ...gauge.report.pages import page_of, page_template
 from ...gauge.store import StoreError
 from .. import interval_charts

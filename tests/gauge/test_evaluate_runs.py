@@ -23,6 +23,7 @@ from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import RobotError
 from gaitgauge.terrains.registry import TerrainError
+from gaitgauge_fake_engine import FakeBackend
 from scripted_gauge import GO2, Puppet
 from tiny_runs import SMALL, TINY, evaluate, without_provenance
 
@@ -85,6 +86,16 @@ def test_the_same_request_gives_the_same_results(whole_run, tmp_path):
     evaluate(replace(request, threads=2), again)
     assert without_provenance(again) == without_provenance(once)
     assert (again / "episodes.csv").read_bytes() == (once / "episodes.csv").read_bytes()
+
+
+@pytest.mark.parametrize("parallel", [True, False])
+def test_an_engine_from_outside_gets_the_workers_that_it_declares(whole_run, tmp_path, monkeypatch, parallel):
+    request, once = whole_run
+    monkeypatch.setattr(FakeBackend, "parallel_processes", parallel)
+    results = evaluate(replace(request, threads=2), tmp_path / "run")
+    assert results["provenance"]["processes"] == (2 if parallel else 1)
+    assert without_provenance(tmp_path / "run") == without_provenance(once)
+    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (once / "episodes.csv").read_bytes()
 
 
 def test_a_level_run_has_levels_and_no_score(request_for, tmp_path):
