@@ -55,7 +55,7 @@ def steady_session(policy: Policy, num_episodes: int) -> tuple[PolicySession, bo
         The session, and whether it may also be asked for the actions of any multiple of eight rows.
     """
     if not _same(policy, ROWS):
-        if not getattr(policy, "not_rebuilt", ""):  # else that was said when it was loaded
+        if not getattr(policy, "row_by_row", False):  # else the warning came when the policy was loaded
             logging.getLogger(__name__).warning("'%s' goes through its network row by row, which is slow", policy.path)
         return policy.rowwise_session(num_episodes), False
     fewer = all(_same(policy, count) for count in range(8, ROWS, 8))

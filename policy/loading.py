@@ -24,7 +24,6 @@ from .foreign.adapters import (
     mjlab_contract,
     sidecar_contract,
 )
-from .foreign.batched_policy import rebuilt
 from .foreign.fence.archive import archive_names, read_limited
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 
@@ -63,7 +62,7 @@ def load_policy(
     data = read_limited(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
     contract = None if contract_file is None else described_contract(contract_file, stand_in)
-    policy = rebuilt(_load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract))
+    policy = _load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract)
     policy.file_sha256 = hashlib.sha256(data).hexdigest()
     if sentence := assumptions(policy.contract):
         _say(policy.path, sentence)
@@ -82,7 +81,7 @@ def restore_policy(
     """
     if isinstance(stored, StoredNetwork):
         return NativePolicy(contract, stored, path=path)
-    return rebuilt(_foreign(stored, Path(path), path, robot, contract=contract))
+    return _foreign(stored, Path(path), path, robot, contract=contract)
 
 
 @cache  # once, and not again in each process that is forked from this one

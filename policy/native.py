@@ -294,8 +294,8 @@ class FilePolicy(Policy):
 
     stored: StoredNetwork | ForeignFile
     """Its network, for ``save_policy``."""
-    not_rebuilt: str = ""
-    """Why a foreign file's own code is run in each step, which is slow; empty where it is not."""
+    row_by_row: bool = False
+    """A foreign file's program takes one robot at a time, which is slow; the user was told when it was loaded."""
     file_sha256: str = ""
     """SHA-256 of the file's bytes as they were loaded, hexadecimal, as ``sha256sum`` prints it; empty where it came out of none."""
 

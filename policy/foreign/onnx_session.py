@@ -140,7 +140,7 @@ class GraphProgram:
         if request["do"] == "width":
             return {"width": self.file.width}
         self.prepare(PolicyContract.from_json(request["contract"]))
-        return {}
+        return {"batched": self._batch is not None}
 
     def prepare(self, contract: PolicyContract) -> None:
         """Try the file on zeros and find a batched form of it.

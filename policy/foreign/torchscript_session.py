@@ -171,7 +171,7 @@ class ScriptProgram:
         if request["do"] == "width":
             return {"width": input_width(self._module, request["candidates"], source=self.source)}
         self.prepare(PolicyContract.from_json(request["contract"]), request["attributes"])
-        return {}
+        return {"batched": self.memories is not None}
 
     def prepare(self, contract: PolicyContract, attributes: Collection[str]) -> None:
         """Find out how to run the module in batches.

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.contract import PolicyContract
-from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import ARCHITECTURES, unit
@@ -124,7 +124,7 @@ def test_a_torchscript_session_gives_what_its_module_gives(tmp_path: Path, contr
     path = tmp_path / "policy.pt"
     path.write_bytes(archive.getvalue())
     policy, observations = load_policy(path), frames()
-    assert isinstance(policy, RebuiltPolicy)
+    assert isinstance(policy, FencedPolicy)
     session = policy.session(EPISODES)
     with torch.inference_mode():
         module.history = torch.zeros(EPISODES, 3, 45)

@@ -6,7 +6,7 @@ from gaitgauge.policy.base import Policy, PolicySession, RowwiseSession
 from gaitgauge.policy.batch_invariance import steady_session
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.export.files import export_onnx, export_torchscript
-from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import ARCHITECTURES, MlpNetwork
@@ -71,7 +71,7 @@ def policy(request, tmp_path_factory):
     export = export_torchscript if request.param == "torchscript" else export_onnx
     export(own, path)
     made = load_policy(path, ROBOT)
-    assert isinstance(made, RebuiltPolicy)
+    assert isinstance(made, FencedPolicy)
     return made
 
 

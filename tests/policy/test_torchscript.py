@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.policy.base import PolicyError
+from gaitgauge.policy.batch_invariance import steady_session
 from gaitgauge.policy.contract import History
-from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.foreign.fence.script import check_script
 from gaitgauge.policy.foreign.torchscript_session import BatchSession, CopiesSession, ScriptProgram
 from gaitgauge.policy.importing import import_policy
@@ -159,14 +160,13 @@ def modules(network) -> dict[str, nn.Module]:
     }
 
 
-REBUILT = ("history", "in place", "nested", "plain", "normalized", "fixed")
 TOGETHER = ("history", "in place", "nested", "plain", "recurrent")
-"""Whose own code takes all episodes at once."""
-KINDS = (*REBUILT, "recurrent", "counting")
+"""Files with code that takes all episodes at once."""
+KINDS = (*TOGETHER, "normalized", "fixed", "counting")
 
 
-def own_code(path, contract) -> ScriptProgram:
-    """The file as it is run where its code is not understood."""
+def unfenced(path, contract) -> ScriptProgram:
+    """Return the program of a file in this process."""
     script = check_script(path.read_bytes(), source="policy")
     program = ScriptProgram(script.data, "policy")
     program.prepare(contract, script.attributes)
@@ -190,8 +190,9 @@ def loaded(tmp_path_factory, cts_network):
 def test_batch_equals_single_modules(loaded, observations, name, run):
     """The reference is the exported module itself, loaded anew for each episode and for each reset."""
     path, policy = loaded(name)
-    own = own_code(path, policy.contract).session(EPISODES)
-    assert isinstance(policy, RebuiltPolicy) == (name in REBUILT)
+    own = unfenced(path, policy.contract).session(EPISODES)
+    assert isinstance(policy, FencedPolicy)
+    assert policy.row_by_row == (name not in TOGETHER)
     assert isinstance(own, BatchSession if name in TOGETHER else CopiesSession)
     played = [run(session, observations) for session in (policy.session(EPISODES), own)]
     with warnings.catch_warnings(), torch.no_grad(), torch.jit.optimized_execution(False):
@@ -206,10 +207,15 @@ def test_batch_equals_single_modules(loaded, observations, name, run):
                     np.testing.assert_allclose(actions[step, row], expected[0], atol=1e-5)
 
 
-def test_what_is_not_rebuilt_is_said(tmp_path, cts_network, caplog):
-    policy = load_policy(save(modules(cts_network)["counting"], tmp_path / "policy.pt"))
-    assert policy.not_rebuilt == "it changes 'steps', which is no tensor"
-    assert policy.not_rebuilt in caplog.text and policy.path in caplog.text
+@pytest.mark.parametrize(("name", "warned"), [("history", False), ("fixed", True), ("counting", True)])
+def test_a_warning_comes_once_where_a_file_plays_row_by_row(tmp_path, cts_network, caplog, name, warned):
+    path = save(modules(cts_network)[name], tmp_path / "policy.pt")
+    policy = load_policy(path)
+    load_policy(path)
+    steady_session(policy, EPISODES)
+    messages = [record.getMessage() for record in caplog.records if "slow" in record.getMessage()]
+    assert len(messages) == int(warned)
+    assert not warned or (policy.path in messages[0] and "gaitgauge import" in messages[0])
 
 
 @pytest.mark.parametrize("name", ["history", "recurrent", "fixed", "counting"])
@@ -288,7 +294,7 @@ class InList(WithHistory):
 )
 def test_actions_are_first_in_every_kind_of_output(tmp_path, cts_network, cts_file, observations, variant, run):
     policy = load_policy(save(variant(cts_network), tmp_path / "policy.pt"))
-    assert isinstance(policy, RebuiltPolicy)
+    assert isinstance(policy, FencedPolicy)
     expected = run(load_policy(cts_file).session(EPISODES), observations)
     np.testing.assert_allclose(run(policy.session(EPISODES), observations), expected, atol=1e-5)
 
