@@ -17,26 +17,15 @@ from pydantic import Field
 
 from ..files.parsing import LARGEST, Text, build, check_fields, parse_json, shown
 from ..robots.base import Angle, Damping, Robot, Speed, Stiffness
+from .observation_table import OBSERVATIONS, STANDARD, ObservationError, observation
 
 SCHEMA_VERSION: Literal[1] = 1
 HistoryOrder = Literal["frame-major", "term-major", "frame-major-newest-first"]
 
-# Width of each observation term for a robot with J joints; None stands for J.
-TERM_WIDTH: Mapping[str, int | None] = {
-    "base_linear_velocity_b": 3,
-    "base_angular_velocity_b": 3,
-    "projected_gravity_b": 3,
-    "command": 3,
-    "joint_position": None,
-    "joint_velocity": None,
-    "last_action": None,
-}
-
-
 PER_JOINT = ("default_joint_position", "action_scale", "stiffness", "damping", "target_range")
 """Fields of a contract with a value for each joint."""
-PRIVILEGED_TERMS = ("base_linear_velocity_b",)
-"""Observation terms that no sensor of a robot measures."""
+PRIVILEGED_TERMS = tuple(each.name for each in OBSERVATIONS.values() if each.privileged)
+"""The project's own observation terms that no sensor of a robot measures."""
 
 
 class ContractError(ValueError):
@@ -59,7 +48,7 @@ class ObservationTerm:
     """
 
     name: Text
-    """A key of ``TERM_WIDTH``."""
+    """Name of an observation of ``observation_table``."""
     scale: Annotated[tuple[_Factor, ...], Field(min_length=1, max_length=_MOST)]
     """Factor per entry; one entry stands for all."""
     clip: _Clip | Annotated[tuple[_Clip, ...], Field(min_length=1, max_length=_MOST)] | None = None
@@ -67,9 +56,10 @@ class ObservationTerm:
 
     def __post_init__(self) -> None:
         check_fields(self, "contract", ContractError)
-        if self.name not in TERM_WIDTH:
-            known = ", ".join(TERM_WIDTH)
-            raise ContractError(f"contract: unknown observation term {shown(self.name)}; choose from: {known}")
+        try:
+            observation(self.name)
+        except ObservationError as error:
+            raise ContractError(f"contract: {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +149,7 @@ class PolicyContract:
     @cached_property
     def term_widths(self) -> tuple[int, ...]:
         """Width of each observation term."""
-        return tuple(TERM_WIDTH[term.name] or self.num_joints for term in self.observation)
+        return tuple(observation(term.name).width or self.num_joints for term in self.observation)
 
     @cached_property
     def frame_width(self) -> int:
@@ -209,7 +199,7 @@ class PolicyContract:
 
 def kind_of_observations(contract: PolicyContract) -> Literal["measurable", "privileged"]:
     """Whether a robot can measure all that a policy is told."""
-    return "privileged" if any(t.name in PRIVILEGED_TERMS for t in contract.observation) else "measurable"
+    return "privileged" if any(observation(t.name).privileged for t in contract.observation) else "measurable"
 
 
 def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
@@ -246,7 +236,7 @@ def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyCon
         return tuple(values[i] for i in index) if isinstance(values, tuple) and len(values) == len(index) else values
 
     terms = tuple(
-        term if TERM_WIDTH[term.name] else replace(term, scale=moved(term.scale), clip=moved(term.clip))
+        term if observation(term.name).width else replace(term, scale=moved(term.scale), clip=moved(term.clip))
         for term in contract.observation
     )
     values = {name: moved(getattr(contract, name)) for name in PER_JOINT}
@@ -309,14 +299,7 @@ def standard_contract(
         stiffness=motors.stiffness,
         damping=motors.damping,
         control_period=0.02,
-        observation=(
-            ObservationTerm(name="base_angular_velocity_b", scale=(0.25,)),
-            ObservationTerm(name="projected_gravity_b", scale=(1.0,)),
-            ObservationTerm(name="command", scale=(2.0, 2.0, 0.25)),
-            ObservationTerm(name="joint_position", scale=(1.0,)),
-            ObservationTerm(name="joint_velocity", scale=(0.05,)),
-            ObservationTerm(name="last_action", scale=(1.0,)),
-        ),
+        observation=tuple(ObservationTerm(name=name, scale=OBSERVATIONS[name].scale) for name in STANDARD),
         history=history or History(),
         command_limits=robot.command_limits,
         provenance=provenance or {},

@@ -22,12 +22,13 @@ from ...files.writing import make_folder, replacing, same_file
 from ...robots import Robot
 from ..base import PROBE_EPISODES, Policy, PolicyError
 from ..contract import HistoryOrder, ObservationTerm, PolicyContract, difference
-from ..foreign.adapters import FOREIGN_TERMS, deploy_contract
+from ..foreign.adapters import deploy_contract
 from ..foreign.torchscript_session import CONTRACT_FILE
 from ..loading import load_policy
 from ..native import NativePolicy
 from ..networks.architectures import MlpNetwork
 from ..observation import term_major_order
+from ..observation_table import observation
 from .modules import SCRIPTS, Explained, TermMajor
 
 PARTS = ("torchscript", "onnx", "deploy")
@@ -41,9 +42,6 @@ measures, is commanded or may be sent.
 """
 ONNX_OPSET, ONNX_IR_VERSION = 17, 8
 """What onnxruntime 1.16 reads, which the published C++ controller prescribes on the robot."""
-
-DEPLOY_TERMS = {own: name for name, own in reversed([*FOREIGN_TERMS.items()])}
-"""This project's observation terms as Isaac Lab, whose names the C++ runtime knows, calls them: the first name of each."""
 
 
 class ExportError(PolicyError):
@@ -189,7 +187,7 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
     """Metadata under mjlab's names. Lists are joined by commas; a term with a scale per entry joins them by semicolons.
 
     mjlab clips a whole term to one magnitude, and does it before scaling; nothing is returned for a contract whose clips
-    need more than that, so that its runtime refuses the file.
+    need more than that, or that has an observation without a name there, so that its runtime refuses the file.
     """
 
     def numbers(values: tuple[float, ...]) -> str:
@@ -197,7 +195,8 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
 
     terms = contract.observation
     limits = [_limit_before_scaling(term) for term in terms]
-    if None in limits:
+    names = [observation(term.name).foreign_names[:1] for term in terms]
+    if None in limits or () in names:
         return {}
     return {
         "run_path": str(contract.provenance.get("run", "")),
@@ -206,7 +205,7 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
         "joint_damping": numbers(contract.damping),
         "default_joint_pos": numbers(contract.default_joint_position),
         "command_names": "twist",
-        "observation_names": ",".join(DEPLOY_TERMS[term.name] for term in terms),
+        "observation_names": ",".join(name for (name,) in names),
         "observation_terms_scale": ",".join(";".join(repr(s) for s in term.scale) for term in terms),
         "observation_terms_clip": ",".join(f"-{limit!r};{limit!r}" for limit in limits),
         "observation_terms_history_length": ",".join([str(contract.history.length)] * len(terms)),
@@ -254,7 +253,12 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
             raise ExportError(
                 f"a deploy.yaml has one clip for all entries of an observation; '{term.name}' has {len(term.clip)}"
             )
-        observations[DEPLOY_TERMS[term.name]] = {
+        names = observation(term.name).foreign_names
+        if not names:
+            raise ExportError(
+                f"a deploy.yaml has no name for the observation '{term.name}'; give it foreign_names, or leave deploy.yaml out"
+            )
+        observations[names[0]] = {
             "params": {"command_name": "base_velocity"} if term.name == "command" else {},
             "clip": clips(term.clip or unclipped),
             "scale": list(term.scale) if len(term.scale) == width else list(term.scale) * width,

@@ -26,24 +26,10 @@ from ..contract import (
     standard_contract,
 )
 from ..native import StoredNetwork
+from ..observation_table import ObservationError, foreign_observation
 
 AT_ONCE = 1.0
 """Time after standing within which a fall says that the policy is run wrongly [s]."""
-# Observation terms as Isaac Lab and mjlab name them.
-FOREIGN_TERMS: Mapping[str, str] = {
-    "base_lin_vel": "base_linear_velocity_b",
-    "base_ang_vel": "base_angular_velocity_b",
-    "projected_gravity": "projected_gravity_b",
-    "velocity_commands": "command",
-    "command": "command",
-    "joint_pos_rel": "joint_position",
-    "joint_pos": "joint_position",
-    "joint_vel_rel": "joint_velocity",
-    "joint_vel": "joint_velocity",
-    "last_action": "last_action",
-    "actions": "last_action",
-}
-
 LONGEST_HISTORY = 20
 
 
@@ -242,10 +228,11 @@ def _listed(value: Any, missing: float, count: int = 1) -> list[float]:
 
 
 def _own_term(name: str, source: object) -> str:
-    """The project's name of an observation."""
-    if name not in FOREIGN_TERMS:
-        raise PolicyError(f"'{source}' asks for the observation '{name}'; supported are: {', '.join(FOREIGN_TERMS)}")
-    return FOREIGN_TERMS[name]
+    """Return the project's name of an observation."""
+    try:
+        return foreign_observation(name).name
+    except ObservationError as error:
+        raise PolicyError(f"'{source}' {error}") from error
 
 
 def _limit(low: float, high: float, name: str, source: object) -> float:

@@ -11,8 +11,8 @@ import torch
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.batch_invariance import steady_session
 from gaitgauge.policy.contract import History
-from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.foreign.fence.script import check_script
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.foreign.torchscript_session import BatchSession, CopiesSession, ScriptProgram
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
