@@ -194,6 +194,11 @@ def prepare(request: TrainRequest) -> TrainPlan:
             entries = read_checkpoint(weights, training_state=False, purpose="start from")
             check_network(weights, entries, task, "start")
             begun = _going_on(task, entries)
+            if "training" not in entries:
+                notice = (
+                    f"'{request.init_from}' holds no teacher and no critic: the first "
+                    f"{task.training.run.bootstrap_iterations} iterations find them for it (training.run.bootstrap_iterations)"
+                )
         task = find_task(request.task, [*begun, *own], robot=robot)
     _check_rollout(task)
     check_logger(task.training.run.logger)
