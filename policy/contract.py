@@ -75,7 +75,7 @@ class History:
     frames of the first term, oldest first, then the next term.
     """
     start: Literal["zeros", "repeat"] = "zeros"
-    """What fills the frames before the first one: ``zeros``, as in the published training, or ``repeat`` for copies of
+    """Content of the frames before the first one: ``zeros``, as in the published training, or ``repeat`` for copies of
     the first frame, as the robot's own controller does it."""
 
     def __post_init__(self) -> None:
@@ -113,7 +113,7 @@ class PolicyContract:
     command_limits: tuple[Speed, Speed, Speed]
     """Largest forward, lateral [m/s] and yaw [rad/s] command the policy was made for."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Where the policy comes from (training run, file, adapter); not part of the hash."""
+    """Origin of the policy (training run, file, adapter); not part of the hash."""
     schema_version: Literal[1] = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
@@ -143,26 +143,26 @@ class PolicyContract:
 
     @cached_property
     def num_joints(self) -> int:
-        """Number of joints, which is the width of an action."""
+        """Return the number of joints, which is the width of an action."""
         return len(self.joint_names)
 
     @cached_property
     def term_widths(self) -> tuple[int, ...]:
-        """Width of each observation term."""
+        """Return the width of each observation term."""
         return tuple(observation(term.name).width or self.num_joints for term in self.observation)
 
     @cached_property
     def frame_width(self) -> int:
-        """Width of one observation frame."""
+        """Return the width of one observation frame."""
         return sum(self.term_widths)
 
     @cached_property
     def observation_width(self) -> int:
-        """Width of the network's input."""
+        """Return the width of the network's input."""
         return self.frame_width * self.history.length
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, ready for JSON."""
+        """Return plain data, ready for JSON."""
         return asdict(self)
 
     @classmethod
@@ -186,19 +186,19 @@ class PolicyContract:
         return cls.from_dict(parse_json(text, "the contract", ContractError))
 
     def to_json(self) -> str:
-        """JSON text in full precision."""
+        """Return the JSON text in full precision."""
         return json.dumps(self.to_dict(), indent=2)
 
     @property
     def hash(self) -> str:
-        """SHA-256 over everything but the provenance, hexadecimal."""
+        """Return the SHA-256 over everything but the provenance, hexadecimal."""
         data = self.to_dict()
         del data["provenance"]
         return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def kind_of_observations(contract: PolicyContract) -> Literal["measurable", "privileged"]:
-    """Whether a robot can measure all that a policy is told."""
+    """Return whether a robot's sensors can measure every observation of a policy."""
     return "privileged" if any(observation(t.name).privileged for t in contract.observation) else "measurable"
 
 
@@ -225,7 +225,7 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
 
 
 def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyContract:
-    """The contract with its joints in another order; every value per joint goes with its joint.
+    """Return the contract with its joints in another order; every value per joint goes with its joint.
 
     Args:
         joint_names: the contract's joints, each once.
@@ -244,14 +244,14 @@ def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyCon
 
 
 def other_width(contract: PolicyContract, width: int) -> str:
-    """What a contract says of its observation's width, for a sentence on a network that takes another one, and which history it fits."""
+    """Return a contract's observation width as part of a sentence on a network with another width, and the history that would fit."""
     frames, rest = divmod(width, contract.frame_width)
     fits = f"; {frames} frames are {width}: history = {{ length = {frames} }}" if frames and not rest else ""
     return f"but its contract's observation has {contract.observation_width}{fits}"
 
 
 def difference(a: PolicyContract, b: PolicyContract) -> str:
-    """What differs between two contracts, one line per field (``field: value in a -> value in b``); empty if they are
+    """Return the differences between two contracts, one line per field (``field: value in a -> value in b``); empty if they are
     equal.
 
     The provenance does not count.
@@ -281,7 +281,7 @@ def _flat(contract: PolicyContract) -> dict[str, str]:
 def standard_contract(
     robot: Robot, *, history: History | None = None, provenance: Mapping[str, Any] | None = None
 ) -> PolicyContract:
-    """The interface that the CTS family of policies for the Unitree Go2 shares (paper, section on observations).
+    """Return the interface that the CTS family of policies for the Unitree Go2 shares (paper, section on observations).
 
     Angular velocity, gravity, command, joint positions, joint velocities and the last action make 45 entries; an action
     moves the target around the standing pose by the robot's action scale, 0.25 rad per unit for the Go2, every 0.02 s.

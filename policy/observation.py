@@ -26,7 +26,7 @@ class ObservationBuilder:
         """Prepare buffers and index maps.
 
         Args:
-            robot: the robot whose joint order the physics uses.
+            robot: the robot; the physics uses its joint order.
             num_episodes: number of rows N.
             device: where the physics' tensors live.
 
@@ -77,7 +77,7 @@ class ObservationBuilder:
         last_action: torch.Tensor,
         noise: Mapping[str, torch.Tensor] | None = None,
     ) -> torch.Tensor:
-        """Observations of all episodes. With a history, each call adds one frame to it: call once per control step.
+        """Return observations of all episodes. With a history, each call adds one frame to it: call once per control step.
 
         Commands are not clipped here: which limits hold depends on the terrain, and the caller knows them.
 
@@ -136,7 +136,7 @@ class ObservationBuilder:
         return frames.reshape(self.num_episodes, -1)
 
     def targets(self, action: torch.Tensor) -> torch.Tensor:
-        """Joint targets [rad] of raw actions, both (N, J): actions in the policy's joint order, targets in the robot's.
+        """Return joint targets [rad] of raw actions, both (N, J): actions in the policy's joint order, targets in the robot's.
 
         NaN stays NaN.
         """
@@ -149,7 +149,7 @@ class ObservationBuilder:
 
 
 def term_major_order(contract: PolicyContract, frames: int) -> torch.Tensor:
-    """Position in a term-major history of each entry of the frame-major one, (frames * F,) int64; both oldest first."""
+    """Return the position in a term-major history of each entry of the frame-major one, (frames * F,) int64; both oldest first."""
     entries = torch.arange(frames * contract.frame_width)
     blocks = entries.split([frames * width for width in contract.term_widths])
     return torch.cat([block.view(frames, -1) for block in blocks], dim=1).flatten()

@@ -96,7 +96,7 @@ def test_a_session_gives_what_its_network_gives(name, inference, tmp_path, contr
             assert torch.equal(action, expected)
             rows = None if step % 4 == 3 else chosen[: 8 + 8 * (step % 2)]
             picked = slice(None) if rows is None else rows
-            # the last bit may depend on the number of rows, which is why the gauge keeps to one (test_steady.py)
+            # the last bit may depend on the number of rows, which is why the gauge keeps to one (test_batch_invariance.py)
             torch.testing.assert_close(some.act(frame, rows)[picked], expected[picked], rtol=1e-5, atol=1e-5)
     assert torch.equal(given, observations)  # what it was handed is not its memory
     for action, expected in zip(kept, expected_actions(network, observations), strict=True):
