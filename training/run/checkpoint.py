@@ -258,7 +258,9 @@ def write_apart(source: str | Path, destination: Path) -> None:
     whole = {name: entries[name] for name in ("format", "version", "contract", "network", "state_dict")}
     actor = entries["actor_state_dict"]
     more = {n: value for n, value in actor.items() if not n.startswith("student.")}
-    rest = {name: entries[name] for name in ("critic_state_dict", "iter", "bootstrap", "training") if name in entries}
+    rest: dict[str, Any] = {
+        name: entries[name] for name in ("critic_state_dict", "iter", "bootstrap", "training") if name in entries
+    }
     write_checkpoint(destination, whole)
     write_checkpoint(training_part(destination), {"policy": checksum(entries), "actor_state_dict": more, **rest})
 
