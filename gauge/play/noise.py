@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from ...policy.observation_table import OBSERVATIONS
 from ..episodes import Episode
 from ..suite import Noise
 
@@ -112,23 +113,35 @@ class ReferenceStream(NoiseStream):
         return terms, self._delays.flatten()[at]
 
 
+_COUNTER_ORDER = (
+    "joint_position",
+    "joint_velocity",
+    "base_angular_velocity_b",
+    "projected_gravity_b",
+    "base_linear_velocity_b",
+)
+"""The project's own observations by their index in a ``CounterStream``; scores depend on it."""
+
+
 class CounterStream(NoiseStream):
     """A hash of (episode, control step, index): every episode has a stream of its own, with no state to carry."""
 
     def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
         self._noise = noise
         self._key = torch.zeros(worlds, dtype=torch.int64, device=device)
-        terms = {
-            "joint_position": (joints, noise.joint_position),
-            "joint_velocity": (joints, noise.joint_velocity),
-            "base_angular_velocity_b": (3, noise.base_angular_velocity),
-            "projected_gravity_b": (3, noise.projected_gravity),
-            "base_linear_velocity_b": (3, noise.base_linear_velocity),
-        }
-        self._widths = {name: width for name, (width, _) in terms.items()}
-        half = [value for width, value in terms.values() for _ in range(width)]
+        noisy = [OBSERVATIONS[name] for name in _COUNTER_ORDER]
+        noisy += [o for o in OBSERVATIONS.values() if o.noise is not None and o.name not in _COUNTER_ORDER]
+        self._widths = {each.name: each.width or joints for each in noisy}
+        half = [each.half_width(noise) for each in noisy for _ in range(self._widths[each.name])]
         self._half = torch.tensor(half, device=device)
-        self._index = torch.arange(len(half) + 1, dtype=torch.int64, device=device)
+        own = sum(self._widths[name] for name in _COUNTER_ORDER)
+        index = [*range(own)]
+        for each in noisy[len(_COUNTER_ORDER) :]:
+            # a plug-in's numbers depend on its name alone, not on what else is installed
+            start = own + 1 + zlib.crc32(each.name.encode())
+            index += range(start, start + self._widths[each.name])
+        # the delay's index comes behind those of the project's own
+        self._index = torch.tensor([*index, own], dtype=torch.int64, device=device)
 
     def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
         """See ``NoiseStream.assign``."""

@@ -10,7 +10,7 @@ import torch
 from gaitgauge.gauge.coverage import notes, score_label
 from gaitgauge.gauge.evaluate import Request, prepare
 from gaitgauge.policy.base import PolicySession
-from gaitgauge.policy.contract import TERM_WIDTH, ObservationTerm, standard_contract
+from gaitgauge.policy.contract import ObservationTerm, standard_contract
 from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.policy.native import FilePolicy, StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import MlpNetwork
@@ -142,7 +142,7 @@ class Altered(FilePolicy):
 class AlteredSession(PolicySession):
     def __init__(self, policy, walking, num_episodes):
         self.policy, self.walking, self.step = policy, walking, torch.zeros(num_episodes)
-        widths = [TERM_WIDTH[t.name] or 12 for t in policy.contract.observation]
+        widths = policy.contract.term_widths
         place = [t.name for t in policy.contract.observation].index("command")
         self.scale = torch.tensor(policy.contract.observation[place].scale)
         self.frame, self.place = sum(widths), sum(widths[:place])

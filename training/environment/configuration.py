@@ -161,6 +161,9 @@ class ObservationConfiguration:
     """Height of the base over the ground that a scan entry of 0 stands for [m]."""
     scan_cell: _Metres = 0.05
     """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
+    policy: tuple[str, ...] = ()
+    """Observations that the policy sees behind the standard ones: names of installed ones, or ``module:name`` of a
+    ``policy.observation_table.Observation`` of one's own, which this process alone knows. They become part of the policy contract."""
     own: tuple[OwnObservation, ...] = ()
     """Entries of one's own behind those of ``privileged``. The mirror images of ``training.algorithm.symmetry`` do not
     know them."""

@@ -21,7 +21,7 @@ from ...backends.base import Randomization, ResetState, Scene
 from ...backends.graphs import WARM_UP, RecordedFunction
 from ...backends.registry import make_backend
 from ...files.parsing import shown
-from ...policy.contract import History, PolicyContract, standard_contract
+from ...policy.contract import History, ObservationTerm, PolicyContract, standard_contract
 from ...policy.robot_of import REMEMBERED
 from ...robots.base import JointParameters, Robot
 from ...robots.identity import identify
@@ -35,7 +35,7 @@ from .events import EpisodeStart
 from .height_scan import heading
 from .memory import copied, fitting, restore
 from .observations import Observations
-from .own_terms import resolve_own
+from .own_terms import policy_observations, resolve_own
 from .step import EnvironmentStep, StepResult
 from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
 
@@ -436,15 +436,23 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
 def training_contract(
     robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
 ) -> PolicyContract:
-    """The interface of a policy trained here: one frame of observation, the gains, the control period and the largest
+    """Return the interface of a policy trained here: one frame of observation, the gains, the control period and the largest
     commands of the training.
+
+    Raises:
+        ConfigurationError: an observation of one's own is not there, or breaks a rule.
     """
     tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
     provenance = {REMEMBERED: identify(robot, configuration.robot)}
+    standard = standard_contract(
+        robot, history=History(start=configuration.observations.history_start), provenance=provenance
+    )
+    more = tuple(
+        ObservationTerm(name=each.name, scale=each.scale) for each in policy_observations(configuration.observations)
+    )
     return replace(
-        standard_contract(
-            robot, history=History(start=configuration.observations.history_start), provenance=provenance
-        ),
+        standard,
+        observation=standard.observation + more,
         command_limits=largest_commands(configuration.commands, [tile.command_limits for tile in tiles]),
         stiffness=parameters.stiffness,
         damping=parameters.damping,

@@ -16,7 +16,9 @@ import torch
 
 from ...files.parsing import one_line, shown
 from ...files.plugins import imported, raised
+from ...policy.observation_table import STANDARD, Observation, ObservationError, observation, register
 from ..configuration import ConfigurationError, to_plain
+from .configuration import ObservationConfiguration
 
 Kind = TypeVar("Kind")
 _PACKAGE = __name__.partition(".")[0]
@@ -117,6 +119,29 @@ def resolve_own(
             resolve(term.function, where), f"{where} is {shown(term.function)}", gives, rule
         )
     return functions
+
+
+def policy_observations(settings: ObservationConfiguration) -> list[Observation]:
+    """Return the policy's observations behind the standard ones; those of ``module:name`` become known in this process.
+
+    Raises:
+        ConfigurationError: an observation is not there, is named twice, or breaks a rule.
+    """
+    found: list[Observation] = []
+    for path in settings.policy:
+        where = f"environment.observations.policy has {shown(path)}"
+        try:
+            made = imported(path, f"{where}, but", ConfigurationError) if ":" in path else observation(path)
+            if not isinstance(made, Observation):
+                raise ConfigurationError(
+                    f"{where}; it must be a gaitgauge.policy.observation_table.Observation, not {shown(made)}"
+                )
+            found.append(register(made) if ":" in path else made)
+        except ObservationError as error:
+            raise ConfigurationError(f"{where}: {error}") from error
+        if made.name in STANDARD or any(made.name == other.name for other in found[:-1]):
+            raise ConfigurationError(f"{where}, and the policy has '{made.name}' already; name it once")
+    return found
 
 
 def _checked(

@@ -132,7 +132,9 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: s
     if policy:
         _check_policy(entries, str(path), purpose)
     if not training_state and training is None and policy:
-        return entries
+        entries = _with_training_part(entries, Path(path), cannot)
+        if (training := entries.get("training")) is None:
+            return entries
     if not training_state and not policy:
         raise CheckpointError(
             f"{cannot} holds no networks of this project; give a model_<iteration>.pt of a training run or a .gauge.pt."
@@ -235,6 +237,49 @@ def learned_networks(entries: Mapping[str, Any], *, raw: bool = False) -> Mappin
 def student_state(actor: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """The deployed network's part of an actor's state dictionary."""
     return {n.removeprefix("student."): value for n, value in actor.items() if n.startswith("student.")}
+
+
+def training_part(policy: Path) -> Path:
+    """Return where the networks that only training needs lie beside a policy file: ``go2.training.pt`` of ``go2.gauge.pt``."""
+    return policy.with_name(f"{policy.name.removesuffix('.pt').removesuffix('.gauge')}.training.pt")
+
+
+def write_apart(source: str | Path, destination: Path) -> None:
+    """Write a file of ``trim_checkpoint`` in two: a policy file with what plays, and what only training reads beside it.
+
+    Raises:
+        CheckpointError: ``source`` is no such file, or one of the two cannot be written.
+    """
+    entries = read_checkpoint(source, training_state=False, purpose="use")
+    if "training" not in entries or "average" in entries:
+        raise CheckpointError(
+            f"Cannot use '{source}': it is no policy with teacher and critic; write one with import --trainable."
+        )
+    whole = {name: entries[name] for name in ("format", "version", "contract", "network", "state_dict")}
+    actor = entries["actor_state_dict"]
+    more = {n: value for n, value in actor.items() if not n.startswith("student.")}
+    rest: dict[str, Any] = {
+        name: entries[name] for name in ("critic_state_dict", "iter", "bootstrap", "training") if name in entries
+    }
+    write_checkpoint(destination, whole)
+    write_checkpoint(training_part(destination), {"policy": checksum(entries), "actor_state_dict": more, **rest})
+
+
+def _with_training_part(entries: dict[str, Any], path: Path, cannot: str) -> dict[str, Any]:
+    """Return a policy file's entries with what ``write_apart`` put beside it, where there is such a file.
+
+    Raises:
+        CheckpointError: the file beside it is damaged, or belongs to another policy.
+    """
+    part = training_part(path)
+    if part == path or not part.is_file():
+        return entries
+    beside = _load(part, "start from")
+    if beside.get("policy") != checksum(entries):
+        raise CheckpointError(f"{cannot} is not the policy that '{one_line(part)}' belongs to; move that file away.")
+    with edited(f"Cannot start from '{path}': '{one_line(part)}' beside it", CheckpointError, RuntimeError):
+        student = {f"student.{name}": value for name, value in entries["state_dict"].items()}
+        return {**entries, **beside, "actor_state_dict": {**beside["actor_state_dict"], **student}}
 
 
 def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False) -> None:

@@ -25,7 +25,7 @@ from ..algorithms.symmetry import build_mirror
 from ..configuration import ConfigurationError, TrainingConfiguration, to_plain
 from ..environment.configuration import EnvironmentConfiguration
 from ..environment.environment import TrainingEnvironment
-from ..environment.own_terms import foreign_functions
+from ..environment.own_terms import foreign_functions, policy_observations
 from ..environment.terrain_configuration import FLAT_TILE
 from ..tasks import TASKS, Task, find_task
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
@@ -98,6 +98,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
     own = own_overrides(request)
     robot = None if request.robot is None else lasting(request.robot)
     known, task = find_task(request.task), find_task(request.task, own, robot=robot)
+    policy_observations(task.environment.observations)  # contracts that are read from here on may name them
     checkpoint, run, weights, notice = None, None, None, ""
     if request.resume is not None:
         checkpoint = find_checkpoint(
@@ -141,6 +142,11 @@ def prepare(request: TrainRequest) -> TrainPlan:
             entries = read_checkpoint(weights, training_state=False, purpose="start from")
             check_network(weights, entries, task, "start")
             begun = _going_on(task, entries)
+            if "training" not in entries:
+                notice = (
+                    f"'{request.init_from}' holds no teacher and no critic: the first "
+                    f"{task.training.run.bootstrap_iterations} iterations find them for it (training.run.bootstrap_iterations)"
+                )
         task = find_task(request.task, [*begun, *own], robot=robot)
     _check_rollout(task)
     check_logger(task.training.run.logger)
