@@ -14,7 +14,6 @@ from pydantic import Field
 from pydantic_core import to_jsonable_python
 
 from ..files.parsing import Count, NotNegative, Positive, Seed, Share
-from .environment.configuration import Ramp
 
 METHODS: tuple[str, ...] = ("cts", "ac_moe", "mcp", "him", "dreamwaq")
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
@@ -24,6 +23,7 @@ LOGGERS: tuple[str, ...] = ("tensorboard", "wandb", "neptune")
 COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default")
 
 
+Range = tuple[float, float]
 _Rate = Annotated[float, Field(gt=0.0, le=1e3)]
 Width = Annotated[int, Field(ge=1, le=65_536)]
 
@@ -42,6 +42,32 @@ def _positive(owner: object, *names: str) -> None:
         value = getattr(owner, name)
         if not value > 0:
             raise ConfigurationError(f"{name} is {value}; it must be greater than zero.")
+
+
+def check_rising(configuration: object, *names: str) -> None:
+    """Refuse ranges that end below their beginning.
+
+    Raises:
+        ValueError: one sentence.
+    """
+    for name in names:
+        low, high = getattr(configuration, name)
+        if low > high:
+            raise ValueError(f"{name} is {low:g} to {high:g}; it must rise")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ramp:
+    """A number that moves linearly from ``start`` to ``end`` between two fractions of the run and stays there."""
+
+    start: float
+    """Value until ``begin``."""
+    end: float
+    """Value from ``until`` on."""
+    begin: Share = 0.0
+    """Fraction of the run at which the change begins."""
+    until: Share = 1.0
+    """Fraction of the run at which the change is complete."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from ..policy.contract import standard_contract
 from ..robots import Robot, load_robot
 from ..robots.body_plan import body_plan
-from .configuration import TrainingConfiguration
-from .environment.configuration import CommandStage, EnvironmentConfiguration, Ramp, Range
+from .configuration import Ramp, Range, TrainingConfiguration
+from .environment.configuration import CommandStage, EnvironmentConfiguration
 
 Triple = tuple[float, float, float]
 

@@ -11,16 +11,15 @@ from ..files.parsing import one_line, shown
 from ..files.plugins import imported
 from ..robots import load_robot
 from ..robots.loading import robot_digest
-from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
+from .configuration import AlgorithmConfiguration, NetworkConfiguration, Ramp, RunConfiguration, TrainingConfiguration
 from .environment.configuration import (
     CommandConfiguration,
     CommandStage,
     EnvironmentConfiguration,
-    Ramp,
     RandomizationConfiguration,
-    RewardConfiguration,
     TerminationConfiguration,
 )
+from .environment.reward_configuration import RewardConfiguration
 from .environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
 from .overrides import TaskError, apply_overrides
 from .scaling import scaled

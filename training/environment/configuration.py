@@ -15,43 +15,20 @@ from pydantic import Field
 from ...backends.base import TRAINING_PHYSICS, PhysicsOptions
 from ...files.parsing import Count, NotNegative, Positive, Seed, Share
 from ...robots.base import Angle, Damping, Inertia, Torque
+from ..configuration import Ramp, Range, check_rising
+from .reward_configuration import DEFAULT_REWARDS, Extent, Metres, RewardConfiguration
+from .reward_configuration import (
+    OwnReward as OwnReward,
+)
 from .terrain_configuration import TRAINING_TERRAIN, TerrainConfiguration
 
-Range = tuple[float, float]
 _Factor = Annotated[float, Field(ge=0.0, le=100.0)]
 _SpeedFactor = Annotated[float, Field(ge=0.01, le=100.0)]
 _Friction = Annotated[float, Field(ge=0.0, le=10.0)]
 _Kilograms = Annotated[float, Field(ge=-1_000.0, le=1_000.0)]
 _Shift = Annotated[float, Field(ge=-10.0, le=10.0)]
 _Delay = Annotated[float, Field(ge=0.0, le=1.0)]
-_Extent = Annotated[float, Field(ge=0.0, le=10.0)]
-_Metres = Annotated[float, Field(gt=0.0, le=100.0)]
-
-
-def _check_rising(configuration: object, *names: str) -> None:
-    """Refuse ranges that end below their beginning.
-
-    Raises:
-        ValueError: one sentence.
-    """
-    for name in names:
-        low, high = getattr(configuration, name)
-        if low > high:
-            raise ValueError(f"{name} is {low:g} to {high:g}; it must rise")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ramp:
-    """A number that moves linearly from ``start`` to ``end`` between two fractions of the run and stays there."""
-
-    start: float
-    """Value until ``begin``."""
-    end: float
-    """Value from ``until`` on."""
-    begin: Share = 0.0
-    """Fraction of the run at which the change begins."""
-    until: Share = 1.0
-    """Fraction of the run at which the change is complete."""
+_STATIONARY = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,18 +55,6 @@ class JointConfiguration:
     """Passive damping of every joint [N·m·s/rad]; None keeps the set's."""
     friction_loss: Torque | None = None
     """Dry friction of every joint [N·m]; None keeps the set's. 0 spares the solver twelve constraints per world."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OwnReward:
-    """A reward term of one's own."""
-
-    name: str
-    """Name in the log and in settings."""
-    function: str
-    """``module:function`` of ``StepInputs`` to one number for each world, (N,)."""
-    weight: Ramp | float
-    """Weight per second; penalties are negative."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,111 +114,21 @@ class ObservationConfiguration:
     """What the history holds at the start of an episode: ``repeat`` for copies of the first frame, as the robot's own
     controller fills it, or ``zeros`` as published. It becomes part of the policy contract."""
     noise: NoiseConfiguration = NoiseConfiguration()
-    scan_length: _Metres = 1.6
+    scan_length: Metres = 1.6
     """Extent of the height scan along the heading [m]."""
-    scan_width: _Metres = 1.0
+    scan_width: Metres = 1.0
     """Extent of the height scan across the heading [m]."""
-    scan_spacing: _Metres = 0.1
+    scan_spacing: Metres = 0.1
     """Distance between scan points [m]."""
     foot_force_scale: Positive = 1e-3
     """Factor on the feet's contact forces, which teacher and critic see [1/N]."""
     height_offset: float = 0.5
     """Height of the base over the ground that a scan entry of 0 stands for [m]."""
-    scan_cell: _Metres = 0.05
+    scan_cell: Metres = 0.05
     """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
     own: tuple[OwnObservation, ...] = ()
     """Entries of one's own behind those of ``privileged``. The mirror images of ``training.algorithm.symmetry`` do not
     know them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RewardConfiguration:
-    """Weights of the reward terms, per second: each step's term is multiplied by its weight and the control period. 0
-    leaves a term out.
-
-    Formulas are in ``rewards.py``; the paper's table of rewards is the source where nothing else is said.
-    """
-
-    linear_tracking: float = 1.0
-    """Tracking of the commanded horizontal velocity."""
-    yaw_tracking: float = 0.5
-    """Tracking of the commanded yaw rate."""
-    progress: float = 0.0
-    """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an
-    obstacle."""
-    progress_along: Literal["command", "straight", "base"] = "straight"
-    """Heading at which ``progress``, being stuck and the commanded way to the next level count: ``straight`` for the robot's own
-    when the command was drawn, with straight commands, which hold it, and for whichever heading the robot has now in arcs;
-    ``command`` for the first always, turned by the yaw rate commanded since, from which a robot that turns at another rate drifts
-    away without seeing how far; ``base`` for the second always, with which turning away from a step costs nothing."""
-    vertical_velocity: Ramp = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
-    """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
-    roll_pitch_rate: float = -0.05
-    """Squared roll and pitch rates."""
-    joint_acceleration: float = -2.5e-7
-    """Squared joint accelerations."""
-    joint_power: float = -2e-5
-    """Absolute mechanical power."""
-    torque: float = -1e-4
-    """Squared motor torques."""
-    base_height: Ramp = Ramp(start=-1.0, end=-10.0, begin=0.0, until=0.2)
-    """Squared error of the base's height over the ground below the trunk; grows against sagging."""
-    action_rate: float = -0.01
-    """Squared first difference of the actions."""
-    action_smoothness: float = -0.01
-    """Squared second difference of the actions."""
-    collision: float = -1.0
-    """Number of thighs, calves and what hangs on them that touch something."""
-    base_collision: float = 0.0
-    """The base touches something; head and chin too."""
-    joint_limits: float = -2.0
-    """Joint angle beyond the soft limits [rad]."""
-    joint_speed_limits: float = 0.0
-    """Joint speed beyond the soft limit of the motor's own [rad/s]. In suites without a limit of torque over speed, as the
-    published one, a policy may otherwise move its legs faster than the robot's motors can."""
-    foot_regulation: float = -0.05
-    """Squared foot speed close to the ground."""
-    hip_regulation: float = -0.05
-    """Absolute deviation of the hips from the standing pose [rad]."""
-    hip_symmetry: float = 0.0
-    """Left-right asymmetry of the hips at forward commands; the paper's fast task."""
-    roll: float = 0.0
-    """Squared sideways component of gravity; the gauge's orientation metric looks at roll alone."""
-    torque_change: float = 0.0
-    """Squared change of the motor torques between control steps [N²·m²]; the gauge's smoothness metric."""
-    stand_still: float = 0.0
-    """Absolute deviation from the standing pose [rad] under the zero command."""
-    termination: float = 0.0
-    """Falls, counted once and not per second."""
-
-    tracking_sigma: Positive = 0.25
-    """Width of the tracking kernels, exp(-error²/sigma) [m²/s² and rad²/s²]."""
-    dynamic_sigma: bool = True
-    """Whether sigma grows with command and terrain level (paper, dynamic velocity tracking precision adjustment)."""
-    sigma_linear_range: Range = (0.5, 1.5)
-    """Commanded speed between which sigma grows to the terrain's largest [m/s]."""
-    sigma_yaw_range: Range = (1.0, 2.0)
-    """Commanded yaw rate between which sigma grows to the terrain's largest [rad/s]."""
-    base_height_target: _Metres = 0.38
-    """[m]."""
-    trunk_area: tuple[_Extent, _Extent] = (0.4, 0.3)
-    """Length and width of the area below the base whose mean ground the base's height is measured from [m]; points of the
-    height scan count."""
-    foot_height_scale: Positive = 0.025
-    """Foot regulation fades with foot height over this share of ``base_height_target``."""
-    foot_height_over: Literal["foot", "base"] = "foot"
-    """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
-    collision_force: float = 0.1
-    """Contact force from which a thigh, a calf or the base counts as touching [N]."""
-    soft_limit: Share = 0.9
-    """Share of a joint's range, about its middle, that is free of the joint-limit penalty."""
-    soft_speed_limit: Share = 0.9
-    """Share of the motors' no-load speed that is free of the penalty on joint speeds."""
-    own: tuple[OwnReward, ...] = ()
-    """Terms of one's own."""
-
-    def __post_init__(self) -> None:
-        _check_rising(self, "sigma_linear_range", "sigma_yaw_range")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +145,7 @@ class CommandStage:
     """Yaw rate [rad/s]."""
 
     def __post_init__(self) -> None:
-        _check_rising(self, "forward", "lateral", "yaw")
+        check_rising(self, "forward", "lateral", "yaw")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,7 +181,7 @@ class CommandConfiguration:
     and 1/3 for the fast task."""
     flip_probability: Share = 0.2
     """Chance that an extreme command is followed by its opposite."""
-    stationary_probability: Ramp = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
+    stationary_probability: Ramp = _STATIONARY
     """Share of stationary draws, without linear velocity."""
     stationary_yaw_probability: Share = 0.25
     """Chance that a stationary command keeps its yaw rate, so that the robot turns on the spot. Published: always."""
@@ -334,11 +209,11 @@ class ResetConfiguration:
     """Largest component of the base's linear [m/s] and angular [rad/s] velocity."""
     clearance: float | None = None
     """Height of the base over the highest ground below the robot [m]; None for the robot's ``stand_height``."""
-    footprint: tuple[_Extent, _Extent] = (0.5, 0.4)
+    footprint: tuple[Extent, Extent] = (0.5, 0.4)
     """Length and width of what counts as below the robot there [m]."""
 
     def __post_init__(self) -> None:
-        _check_rising(self, "joint_scale")
+        check_rising(self, "joint_scale")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -367,7 +242,7 @@ class RandomizationConfiguration:
     """Time for which the previous target still acts [s], in whole substeps, every control step."""
 
     def __post_init__(self) -> None:
-        _check_rising(self, *(f.name for f in fields(self)))
+        check_rising(self, *(f.name for f in fields(self)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,7 +294,7 @@ class EnvironmentConfiguration:
     joints: JointConfiguration = JointConfiguration()
     schedule: ScheduleConfiguration = ScheduleConfiguration()
     observations: ObservationConfiguration = ObservationConfiguration()
-    rewards: RewardConfiguration = RewardConfiguration()
+    rewards: RewardConfiguration = DEFAULT_REWARDS
     commands: CommandConfiguration = CommandConfiguration()
     terrain: TerrainConfiguration = TRAINING_TERRAIN
     reset: ResetConfiguration = ResetConfiguration()

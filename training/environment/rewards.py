@@ -12,8 +12,9 @@ from collections.abc import Callable, Mapping
 import torch
 
 from ...robots.rotation import projected_gravity
-from .configuration import Ramp, RewardConfiguration
+from ..configuration import Ramp
 from .own_terms import resolve_own
+from .reward_configuration import RewardWeights
 from .schedules import RampTable
 from .step_inputs import StepInputs
 
@@ -195,13 +196,13 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
         termination,
     )
 }
-"""All terms by the names of their weights in ``RewardConfiguration``, which adds those of one's own."""
+"""All terms by the names of their weights in ``RewardWeights``, which adds those of one's own."""
 
 
 class RewardFunction:
     """The weighted sum of the terms whose weight is not zero."""
 
-    def __init__(self, configuration: RewardConfiguration, control_period: float, device: torch.device | str) -> None:
+    def __init__(self, configuration: RewardWeights, control_period: float, device: torch.device | str) -> None:
         """Choose the terms and put their weights on the device.
 
         Raises:

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from ..configuration import ConfigurationError
-from .configuration import Ramp
+from ..configuration import ConfigurationError, Ramp
 
 
 class RampTable:

@@ -116,6 +116,20 @@ class TrainRequest:
         Choice("CPU threads of the side process. Default: half of the machine.", SCORES),
     ] = None
 
+    def own_overrides(self) -> list[str]:
+        """Return options and settings as overrides, options first, so that a setting spelled out wins."""
+        options = {
+            "environment.num_envs": self.num_envs,
+            "environment.seed": self.seed,
+            "training.run.seed": self.seed,
+            "training.run.iterations": self.iterations,
+            "training.run.run_name": self.run_name,
+            "training.run.gauge_interval": self.score_every,
+            "training.run.video_interval": self.video_every,
+            "training.run.logger": self.logger,
+        }
+        return [f"{key}={value}" for key, value in options.items() if value is not None] + list(self.overrides)
+
     def __post_init__(self) -> None:
         """Check the types and ranges of all fields."""
         from ...files.parsing import check_fields
