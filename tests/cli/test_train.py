@@ -20,9 +20,9 @@ from gaitgauge.cli.train import parse_duration
 from gaitgauge.files import writing
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.overrides import override_keys
+from gaitgauge.training.processes import idle_gpus
 from gaitgauge.training.run.logger import make_writer
 from gaitgauge.training.run.plan import prepare
-from gaitgauge.training.run.processes import idle_gpus
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.scoring import Scorer, scores_of
 from gaitgauge.training.run.side_process import PROGRAM

@@ -4,8 +4,8 @@ import json
 
 import pytest
 import torch
+from gaitgauge.training.processes import Processes, ProcessLostError
 from gaitgauge.training.run.checkpoint import read_checkpoint
-from gaitgauge.training.run.processes import Processes, ProcessLostError
 from gaitgauge.training.run.resuming import TrainingDivergedError
 from gaitgauge.training.run.run_directory import update_run_json
 from gaitgauge.training.run.runner import TrainingRunner

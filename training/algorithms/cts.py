@@ -124,11 +124,12 @@ class CTS(PPO):
         behaviour; afterwards the teacher acts about as the student does.
         """
         return Bootstrap(
-            self,
             iterations,
+            self.configuration,
             parameters=[*self.actor.teacher_encoder.parameters(), *self.critic.parameters()],
             losses=self._teacher_losses,
             names=("teacher_latent", "value"),
+            joined=self.joined,
         )
 
     def _teacher_losses(self, teacher: torch.Tensor, student: torch.Tensor) -> torch.Tensor:

@@ -162,11 +162,12 @@ class EstimatorPPO(PPO):
     def make_bootstrap(self, iterations: int) -> Bootstrap:
         """The critic learns the values of the policy's behaviour, and what only training needs fits itself to the encoder."""
         return Bootstrap(
-            self,
             iterations,
+            self.configuration,
             parameters=[*self.critic.parameters(), *self.actor.helpers()],
             losses=self._bare_losses,
             names=("value", "estimation"),
+            joined=self.joined,
         )
 
     def _bare_losses(self, rows: torch.Tensor) -> torch.Tensor:

@@ -17,7 +17,7 @@ from ...policy.foreign.fence.archive import LARGEST_FILE
 from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
 from ..environment.schedules import RampTable
 from ..networks import StudentActor, ValueNetwork, Widths
-from ..run.processes import Processes
+from ..processes import Processes
 from .bootstrap import Bootstrap
 from .losses import Losses
 from .optimization import FlatGradients, load_moments, take_step
@@ -291,13 +291,14 @@ class PPO:
             Means over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
             and were dropped.
         """
-        self.storage.step = self.steps = 0
-        if self.bootstrap is not None:
-            losses = self.bootstrap.update()
-            if self.bootstrap.over:
-                self.bootstrap = None
-            return losses
         storage, settings = self.storage, self.configuration
+        storage.step = self.steps = 0
+        if (bootstrap := self.bootstrap) is not None:
+            self.losses.prepare_student()
+            self.pass_over(storage.minibatch_rows(settings.minibatches), bootstrap.step)
+            losses = bootstrap.finish()
+            self.bootstrap = None if bootstrap.over else bootstrap
+            return losses
         self._policy_metrics.zero_()
         self._student_metrics.zero_()
         groups = storage.minibatch_rows(settings.minibatches)

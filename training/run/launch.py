@@ -17,10 +17,10 @@ from ..algorithms.symmetry import build_mirror
 from ..configuration import ConfigurationError
 from ..environment.environment import TrainingEnvironment
 from ..environment.terrain_configuration import FLAT_TILE
+from ..processes import Processes, ProcessLostError, idle_gpus
 from .checkpoint import CheckpointError
 from .filming import Filmer
 from .plan import TrainPlan
-from .processes import Processes, ProcessLostError, idle_gpus
 from .resuming import begin_with, resume_run
 from .run_directory import describe_run, new_run_directory, read_run_json, update_run_json, write_parameters
 from .runner import TrainingRunner

@@ -22,10 +22,10 @@ from ..algorithms.storage import check_minibatches, split_sizes
 from ..configuration import ConfigurationError, RunConfiguration, TrainingConfiguration, to_plain
 from ..environment.configuration import EnvironmentConfiguration
 from ..environment.own_terms import foreign_functions
+from ..processes import own_device
 from ..tasks import TASKS, Task, find_task
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .logger import check_logger
-from .processes import own_device
 from .request import TrainRequest
 from .resuming import check_environments, check_network
 from .run_directory import find_checkpoint, read_run_json, refuse_links

@@ -14,8 +14,8 @@ from typing import Any
 
 import torch
 
+from ..processes import ProcessLostError
 from .keepsake import Keepsake
-from .processes import ProcessLostError
 from .resuming import TrainingDivergedError, write_learned
 from .run_directory import read_run_json
 from .state import RunState

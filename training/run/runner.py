@@ -18,10 +18,10 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from ..configuration import TrainingConfiguration
+from ..processes import ProcessLostError
 from .beside import Scores, Videos
 from .filming import Filmer
 from .logger import make_writer
-from .processes import ProcessLostError
 from .rescue import Rescue
 from .resuming import TrainingDivergedError, intact_checkpoint, save_run
 from .run_directory import update_run_json

@@ -15,10 +15,10 @@ from ..algorithms.methods import METHODS
 from ..algorithms.symmetry import Mirror
 from ..configuration import TrainingConfiguration
 from ..networks import command_entries
+from ..processes import Processes
 from .averaging import WeightAverage
 from .checkpoint import CheckpointError
 from .logger import RunLogger
-from .processes import Processes
 from .run_directory import update_run_json
 from .stopping import TrainingOutcome
 

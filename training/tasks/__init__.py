@@ -7,21 +7,21 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from types import MappingProxyType
 
-from ..files.parsing import one_line, shown
-from ..files.plugins import imported
-from ..robots import load_robot
-from ..robots.loading import robot_digest
-from .configuration import AlgorithmConfiguration, NetworkConfiguration, Ramp, RunConfiguration, TrainingConfiguration
-from .environment.configuration import (
+from ...files.parsing import one_line, shown
+from ...files.plugins import imported
+from ...robots import load_robot
+from ...robots.loading import robot_digest
+from ..configuration import AlgorithmConfiguration, NetworkConfiguration, Ramp, RunConfiguration, TrainingConfiguration
+from ..environment.configuration import (
     CommandConfiguration,
     CommandStage,
     EnvironmentConfiguration,
     RandomizationConfiguration,
     TerminationConfiguration,
 )
-from .environment.reward_configuration import RewardConfiguration
-from .environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
-from .overrides import TaskError, apply_overrides
+from ..environment.reward_configuration import RewardConfiguration
+from ..environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
+from ..overrides import TaskError, apply_overrides
 from .scaling import scaled
 
 

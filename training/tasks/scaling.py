@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ..policy.contract import standard_contract
-from ..robots import Robot, load_robot
-from ..robots.body_plan import body_plan
-from .configuration import Ramp, Range, TrainingConfiguration
-from .environment.configuration import CommandStage, EnvironmentConfiguration
+from ...policy.contract import standard_contract
+from ...robots import Robot, load_robot
+from ...robots.body_plan import body_plan
+from ..configuration import Ramp, Range, TrainingConfiguration
+from ..environment.configuration import CommandStage, EnvironmentConfiguration
 
 Triple = tuple[float, float, float]
 

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import distributed
 
-from ...backends.registry import choose_device
-from ...files.parsing import one_line, shown
-from ..configuration import ConfigurationError
+from ..backends.registry import choose_device
+from ..files.parsing import one_line, shown
+from .configuration import ConfigurationError
 
 PATIENCE = 300.0
 """Longest wait for the others [s]; compiling may take one of them a minute longer."""
