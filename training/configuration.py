@@ -6,6 +6,7 @@ The numbers are those of concurrent teacher-student learning as published with i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Annotated, Any
@@ -15,7 +16,14 @@ from pydantic_core import to_jsonable_python
 
 from ..files.parsing import Count, NotNegative, Positive, Seed, Share
 
-METHODS: tuple[str, ...] = ("cts", "ac_moe", "mcp", "him", "dreamwaq")
+METHODS: Mapping[str, str] = {
+    "cts": "cts:CTS",
+    "ac_moe": "ac_moe:AcMoe",
+    "mcp": "mcp:Mcp",
+    "him": "him:Him",
+    "dreamwaq": "dreamwaq:Dreamwaq",
+}
+"""Methods by name: file in ``training/algorithms`` and class, which ``algorithms.methods.find_method`` imports."""
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
 SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "alternate")
 PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
@@ -133,7 +141,8 @@ class AlgorithmConfiguration:
 
     method: str = "cts"
     """``cts`` (concurrent teacher and student), ``ac_moe`` (the same with experts in actor and critic), ``mcp`` (with an actor that
-    multiplies primitives), ``him`` (hybrid internal model) or ``dreamwaq`` (variational estimator)."""
+    multiplies primitives), ``him`` (hybrid internal model) or ``dreamwaq`` (variational estimator);
+    or ``module:name`` of a class of your own that is derived from one of theirs."""
     student_period: int = 4
     """Environment i belongs to the student if i is a multiple of this, else to the teacher, where the method has one."""
     epochs: int = 5
@@ -179,7 +188,8 @@ class AlgorithmConfiguration:
     Compiling takes about half a minute at the start."""
 
     def __post_init__(self) -> None:
-        _choose("method", self.method, METHODS)
+        if ":" not in self.method:
+            _choose("method", self.method, (*METHODS, "module:name of a class of your own"))
         _choose("symmetry", self.symmetry, SYMMETRY_MODES)
         _choose("precision", self.precision, PRECISIONS)
         _choose("compile_mode", self.compile_mode, COMPILE_MODES)

@@ -132,8 +132,15 @@ class StudentActor(nn.Module):
 
         Args:
             architecture: name in ``policy.networks.ARCHITECTURES`` of the student network.
+
+        Raises:
+            ConfigurationError: there is no such architecture.
         """
         super().__init__()
+        if architecture not in ARCHITECTURES:
+            raise ConfigurationError(
+                f"the deployed network is a {architecture!r}; allowed are {', '.join(ARCHITECTURES)}, which policies are played with"
+            )
         self.architecture = architecture
         self.arguments = arguments
         self.student: Any = ARCHITECTURES[architecture](**arguments)

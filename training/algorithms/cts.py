@@ -57,6 +57,10 @@ class CtsLosses(Losses):
             for part in (self.actor.teacher_latent(seen), latent)
         ]
 
+    def latent_error(self, latent: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the mean squared error of the student's latents (B, L), a scalar tensor."""
+        return (latent - target).square().mean()
+
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Latent error of rows of the flattened student-only buffers, plus the experts' load balancing loss; and
         ``student_names``, (3,), detached.
@@ -70,7 +74,7 @@ class CtsLosses(Losses):
         history = self.with_images(history, None if self.mirror is None else self.mirror.history)
         with self.autocast():
             latent, weights = self.actor.student_latent(history)
-        error = (latent.float() - target).square().mean()
+        error = self.latent_error(latent.float(), target)
         if weights is None:
             return error, torch.stack((error, torch.zeros_like(error), torch.zeros_like(error))).detach()
         balance, largest = load_balance(weights)

@@ -63,6 +63,20 @@ def _found(path: str, setting: str) -> Callable[..., Any]:
     return found  # type: ignore[no-any-return]
 
 
+def find_class(path: str, setting: str, base: type[Kind]) -> type[Kind]:
+    """Return the class at ``module:name`` itself.
+
+    Raises:
+        ConfigurationError: there is no such module or class, or it is not derived from ``base``.
+    """
+    found = _found(_present(path), setting)
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise ConfigurationError(
+            f"{setting} is {shown(path)}; it must be a class derived from {base.__module__}:{base.__name__}"
+        )
+    return found
+
+
 def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> Callable[..., Kind]:
     """The class at ``module:name``.
 
@@ -73,10 +87,7 @@ def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> C
     Raises:
         ConfigurationError: as ``resolve``, or it is no such class.
     """
-    path = _present(path)
-    found, where = _found(path, setting), f"{setting} is {shown(path)}"
-    if not isinstance(found, type) or not issubclass(found, base):
-        raise ConfigurationError(f"{where}; it must be a class derived from {base.__module__}:{base.__name__}")
+    found, where = find_class(path, setting, base), f"{setting} is {shown(_present(path))}"
     if _own(path):
         return found
 
@@ -138,17 +149,20 @@ def _checked(
     return checked
 
 
-def guarded(call: Callable[..., Any], where: str) -> Callable[..., Any]:
-    """Somebody's code, of which whatever it raises, its wish to end the program included, is one sentence.
+def guarded(
+    call: Callable[..., Any], where: str, passed_on: tuple[type[BaseException], ...] = ()
+) -> Callable[..., Any]:
+    """Return a user's function with its exceptions, and its attempts to end the program, turned into one sentence.
 
     Args:
         where: the beginning of the sentence.
+        passed_on: exceptions that stay as they are, as ``ConfigurationError`` does.
     """
 
     def called(*arguments: Any, **named: Any) -> Any:
         try:
             return call(*arguments, **named)
-        except ConfigurationError:
+        except (ConfigurationError, *passed_on):
             raise
         except (Exception, SystemExit) as error:
             raise ConfigurationError(f"{where}, which {raised(error)}; mend it") from error

@@ -17,7 +17,7 @@ from ...policy.contract import PolicyContract
 from ...policy.finding import find_policy, latest_checkpoint, shipped_policies
 from ...policy.robot_of import robot_for
 from ...robots.registry import lasting
-from ..algorithms.methods import METHODS
+from ..algorithms.methods import find_method
 from ..algorithms.storage import check_minibatches, split_sizes
 from ..configuration import ConfigurationError, RunConfiguration, TrainingConfiguration, to_plain
 from ..environment.configuration import EnvironmentConfiguration
@@ -185,7 +185,7 @@ def _check_rollout(task: Task) -> None:
         ConfigurationError: they do not fit together.
     """
     algorithm, run = task.training.algorithm, task.training.run
-    period = algorithm.student_period if METHODS[algorithm.method].has_teacher else 1
+    period = algorithm.student_period if find_method(algorithm.method).has_teacher else 1
     teachers, students = split_sizes(task.environment.num_envs, period)
     check_minibatches(algorithm.minibatches, steps=run.steps_per_iteration, teachers=teachers, students=students)
     if run.steps_per_iteration * task.environment.num_envs < 2:

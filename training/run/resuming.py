@@ -16,7 +16,7 @@ from ...policy.finding import latest_checkpoint
 from ...policy.native import StoredNetwork
 from ...policy.networks.estimators import VELOCITY
 from ..algorithms.bootstrap import iterations_left
-from ..algorithms.methods import METHODS
+from ..algorithms.methods import find_method
 from ..networks import Widths, command_entries
 from ..tasks import Task
 from .checkpoint import (
@@ -307,7 +307,7 @@ def check_network(path: Path, entries: Mapping[str, Any], task: Task, verb: str)
         command_entries=command_entries(contract),
     )
     with torch.device("meta"):
-        mine, _ = METHODS[training.algorithm.method].networks(training, widths)
+        mine, _ = find_method(training.algorithm.method).networks(training, widths)
     with edited(cannot, CheckpointError):
         its, given = str(entries["network"]["architecture"]), dict(json.loads(entries["network"]["arguments"]))
     own = mine.arguments

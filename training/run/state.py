@@ -11,7 +11,7 @@ import torch
 from rsl_rl.env import VecEnv
 
 from ...policy.contract import PolicyContract
-from ..algorithms.methods import METHODS
+from ..algorithms.methods import find_method
 from ..algorithms.symmetry import Mirror
 from ..configuration import TrainingConfiguration
 from ..networks import command_entries
@@ -69,7 +69,7 @@ class RunState:
         self.processes = processes or Processes()
         self.settings = dict(settings or {})
         self.message = message or (lambda _: None)
-        method = METHODS[configuration.algorithm.method]
+        method = find_method(configuration.algorithm.method)
         self.alg = method.build(
             env.get_observations(),
             configuration,
