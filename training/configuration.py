@@ -120,7 +120,7 @@ class HimConfiguration:
     prototypes: Annotated[int, Field(ge=2, le=65_536)] = 32
     """Number of prototypes."""
     temperature: Positive = 0.1
-    """Of the predictions."""
+    """Temperature of the predictions."""
     code_sharpness: Positive = 0.05
     """Entropy of the codes in Sinkhorn-Knopp: the smaller, the nearer to one prototype each."""
     sinkhorn_iterations: Count = 3
@@ -207,7 +207,7 @@ class AlgorithmConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfiguration:
-    """How long a run lasts and what it leaves behind."""
+    """Length of a run, and the files and figures that it leaves behind."""
 
     experiment: str = "go2_moe_cts"
     """Name of the folder under ``logs/rsl_rl``."""
@@ -234,16 +234,16 @@ class RunConfiguration:
     gauge_wait: NotNegative = 900.0
     """Longest wait for pending scores, and for pending videos, at the end of a run [s]."""
     random_episode_start: bool = True
-    """Whether the first episodes start at random ages, so that resets spread over time."""
+    """Start the first episodes at random ages, so that resets spread over time."""
     keep_episodes: bool = True
-    """Whether checkpoints hold the running episodes, so that resuming equals never having stopped. They are
-    half of a checkpoint with 8,192 environments; without them a resumed run begins new episodes on the levels reached."""
+    """Keep the running episodes in checkpoints, so that resuming equals never having stopped. They are half of a checkpoint with 8,192
+    environments; without them a resumed run begins new episodes on the levels reached."""
     bootstrap_iterations: int = 60
     """Iterations at the start of a run from a bare policy (``--init-from``) in which only a teacher and a critic for
     it are learned."""
     average_age: float = 0.1
-    """How far back the averaged weights, which are played and gauged, lie in the mean: a fraction of the iterations done (see
-    ``averaging``); 0 for the weights of the last iteration alone, at most 0.5."""
+    """Mean age of the averaged weights, which are played and gauged, as a fraction of the iterations done (see ``averaging``); 0 for
+    the weights of the last iteration alone, at most 0.5."""
     nonfinite_limit: Share = 0.01
     """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run
     stops."""

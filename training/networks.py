@@ -59,7 +59,7 @@ def command_entries(contract: PolicyContract) -> tuple[int, ...]:
 
 
 def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason: str) -> dict[str, Any]:
-    """Arguments of a network of ``policy.networks`` whose encoder is plain.
+    """Return the arguments of a network of ``policy.networks`` with a plain encoder.
 
     Raises:
         ConfigurationError: another encoder is asked for; ``reason`` says what of the method does not go with it.
@@ -158,8 +158,8 @@ class StudentActor(nn.Module):
         raise NotImplementedError
 
     def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """What the distribution of the actions is updated with, and the weights of the actor's experts (N, K) where it has any,
-        for latents (N, L) and current frames (N, F).
+        """Return the parameters of the action distribution, and the weights of the actor's experts (N, K) where it has any, for latents
+        (N, L) and current frames (N, F).
         """
         return self.action_mean(latent, policy), None
 
@@ -174,11 +174,11 @@ class StudentActor(nn.Module):
         return std
 
     def policy_parameters(self) -> list[nn.Parameter]:
-        """What reinforcement learning trains."""
+        """Return the parameters that reinforcement learning trains."""
         return [*self.student.actor.parameters(), *self.distribution.parameters()]
 
     def student_parameters(self) -> list[nn.Parameter]:
-        """What supervision trains: the encoder, and what only training needs for it."""
+        """Return the parameters that supervision trains: the encoder, and its helpers in training."""
         return list(self.student.encoder.parameters())
 
 
@@ -209,16 +209,16 @@ class CtsActor(StudentActor):
         return functional.normalize(self.student.encoder(frames.flatten(1)), dim=-1), None
 
     def policy_parameters(self) -> list[nn.Parameter]:
-        """What reinforcement learning trains: teacher encoder, actor and exploration noise."""
+        """Return the parameters that reinforcement learning trains: teacher encoder, actor and exploration noise."""
         return [*self.teacher_encoder.parameters(), *super().policy_parameters()]
 
 
 class ComposedActor(CtsActor):
-    """Teacher encoder, and a student whose actor is composed of experts: AC-MoE and MCP."""
+    """Teacher encoder, and a student with an actor composed of experts: AC-MoE and MCP."""
 
     def composed(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[Sequence[torch.Tensor], torch.Tensor]:
-        """What the actor says, and the weights of its experts (N, K), for latents (N, L) and frames (N, F); in float32, since
-        probability ratios live on small differences of actions.
+        """Return the actor's output and the weights of its experts (N, K), for latents (N, L) and frames (N, F), in float32:
+        probability ratios depend on small differences of actions.
         """
         with torch.autocast(latent.device.type, enabled=False):
             values = torch.cat((latent.float(), policy), dim=-1)
@@ -231,9 +231,7 @@ class ComposedActor(CtsActor):
 
 
 class ValueNetwork(nn.Module):
-    """Values for a latent, a privileged observation and the weights of the actor's experts, of which a method takes what it
-    needs.
-    """
+    """Values for a latent, a privileged observation and the weights of the actor's experts; a method uses those that it needs."""
 
     def value(
         self, latent: torch.Tensor, privileged: torch.Tensor, weights: torch.Tensor | None = None
@@ -259,8 +257,8 @@ class CtsCritic(ValueNetwork):
 
 
 def last_in_float32(layers: nn.Sequential, values: torch.Tensor) -> torch.Tensor:
-    """A perceptron whose last layer is computed in float32 whatever the precision of the others: an action in bfloat16 is off by
-    hundredths of the exploration noise, and probability ratios live on such differences.
+    """Apply a perceptron, its last layer in float32 in every precision: an action in bfloat16 is off by hundredths of the exploration
+    noise, and probability ratios depend on such differences.
     """
     *hidden, last = layers
     for layer in hidden:

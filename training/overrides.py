@@ -95,7 +95,7 @@ def _replaced(node: Any, name: str, value: Any, key: str) -> Any:
 
 
 def _takes_plain(node: Any, name: str) -> bool:
-    """Whether a field that holds a dataclass may hold a number or text as well."""
+    """Return True if a field that holds a dataclass may hold a number or text as well."""
     hint = get_type_hints(type(node))[name]
     return any(option in (int, float, str) for option in get_args(hint))
 

@@ -47,7 +47,7 @@ class ProcessLostError(RuntimeError):
 
 @dataclass(frozen=True, kw_only=True)
 class Processes:
-    """Where this process stands among those of the run, and how they agree."""
+    """Rank of this process, and messages to the others."""
 
     rank: int = 0
     """Number of this process; the first one speaks, logs and writes."""
@@ -56,7 +56,7 @@ class Processes:
 
     @classmethod
     def told(cls) -> Processes:
-        """What torchrun says in the environment; nobody is joined.
+        """Read the variables that torchrun sets; no process is joined.
 
         Raises:
             ConfigurationError: it is nonsense.
@@ -97,7 +97,7 @@ class Processes:
 
     @property
     def several(self) -> bool:
-        """Whether there are others."""
+        """True if there are other processes."""
         return self.count > 1
 
     def average(self, values: torch.Tensor) -> None:

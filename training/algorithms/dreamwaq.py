@@ -73,7 +73,7 @@ class DreamwaqLosses(EstimatorLosses):
         super().__init__(*arguments, **settings)
         samples = self.storage.num_steps * self.storage.num_envs * (2 if self.settings.symmetry == "augment" else 1)
         self.noise = torch.zeros(samples, self.storage.student_latent.shape[-1] - VELOCITY, device=self.device)
-        """Of the latents' samples, new for each update: a recorded step draws no random numbers."""
+        """Noise of the latents' samples, new for each update: a recorded step draws no random numbers."""
 
     def prepare_student(self) -> None:
         """New noise."""

@@ -1,4 +1,4 @@
-"""PPO with an estimator: what DreamWaQ and HIM share.
+"""Share the parts of DreamWaQ and HIM: PPO with an estimator.
 
 One network acts everywhere, on the current frame and on what an encoder makes of the history: the base's velocity and a latent.
 The critic sees the true state. PPO trains actor and critic with the estimates that the rollout acted on; nothing of it reaches
@@ -58,7 +58,7 @@ class EstimatorActor(StudentActor):
         return self.student_latent(history)[0]
 
     def helpers(self) -> list[nn.Parameter]:
-        """What only training needs: the encoder learns with it."""
+        """Return parameters that exist in training only: the encoder learns with them."""
         raise NotImplementedError
 
     def student_parameters(self) -> list[nn.Parameter]:
@@ -82,7 +82,7 @@ class StateCritic(ValueNetwork):
 
 
 class EstimatorLosses(Losses):
-    """What an estimator learns from: histories, true velocities, next states, and which samples have one."""
+    """Histories, true velocities, next states, and a mask of the samples that have one: the data of an estimator."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
@@ -91,7 +91,7 @@ class EstimatorLosses(Losses):
         self.next_state_map = None if self.mirror is None else MirrorMap.joined([self.velocity_map, self.mirror.policy])
 
     def prepare_policy(self) -> None:
-        """What the rollout would have acted on in mirror images."""
+        """Compute the latents on which the rollout would have acted in mirror images."""
         if (mirror := self.mirror) is not None:
             history, velocity = self.storage.student_history.flatten(0, 1), self.velocities()
             self.fill(
@@ -107,7 +107,7 @@ class EstimatorLosses(Losses):
         return self.storage.privileged[..., :VELOCITY].flatten(0, 1)
 
     def samples(self, rows: torch.Tensor) -> Sequence[torch.Tensor]:
-        """Of rows of the rollout, mirrored as the symmetry asks for: histories (B, H·F), states one step later, velocity and
+        """Return samples of the rollout, mirrored as the symmetry asks for: histories (B, H·F), states one step later, velocity and
         frame (B, 3 + F), the present velocity (B, 3), and 1 where the episode went on, (B,).
         """
         storage, mirror = self.storage, self.mirror

@@ -24,9 +24,9 @@ class Losses:
     """
 
     policy_names: Sequence[str] = POLICY_LOSSES
-    """What ``policy`` reports."""
+    """Names of the figures that ``policy`` returns."""
     student_names: Sequence[str]
-    """What ``student`` reports."""
+    """Names of the figures that ``student`` returns."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class Losses:
             self.fill(self.mirrored_latent, lambda rows: self.actor.student_latent(mirror.history(history[rows]))[0])
 
     def prepare_student(self) -> None:
-        """What the student learns from, before it learns."""
+        """Prepare the student's targets, before it learns."""
         raise NotImplementedError
 
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -84,7 +84,7 @@ class Losses:
                 target[rows].copy_(compute(rows))
 
     def latents(self, privileged: Sequence[torch.Tensor], stored: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """What the actor is given of each block of samples, in order.
+        """Return the actor's latents for each block of samples, in order.
 
         Args:
             privileged: of the blocks, each (B, P): those of a rollout's groups, then their mirror images where there are any.
@@ -94,7 +94,7 @@ class Losses:
         return list(stored)
 
     def with_images(self, values: torch.Tensor, mapping: MirrorMap | None) -> torch.Tensor:
-        """Values (B, D) of which the first half is mirrored, or which are followed by their mirror images, as the symmetry asks for."""
+        """Return values (B, D) with the first half mirrored, or with their mirror images appended, as the symmetry asks for."""
         if mapping is None:
             return values
         if self.settings.symmetry == "alternate":

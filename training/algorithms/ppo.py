@@ -1,4 +1,4 @@
-"""What all methods share: PPO on a rollout, then supervised learning of the deployed network's encoder on the same rollout.
+"""Share PPO on a rollout, then supervised learning of the deployed network's encoder on the same rollout, among all methods.
 
 A method is a class derived from ``PPO``: its networks, what the actor is given of an observation, and the losses
 (``losses.Losses``) of the encoder. Nothing in the passes waits for the device.
@@ -36,7 +36,7 @@ class PPO:
     losses_class: ClassVar[type[Losses]]
     """Losses of the method."""
     has_teacher: ClassVar[bool] = False
-    """Whether a teacher acts in some environments (``student_period``)."""
+    """True if a teacher acts in some environments (``student_period``)."""
     estimated: ClassVar[int] = 0
     """Entries of the next state before its frame, the base's velocity, that an encoder estimates beside its latent; 0 for none."""
 
@@ -241,7 +241,7 @@ class PPO:
     def latents(
         self, obs: TensorDict, privileged: torch.Tensor, history: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the actor is given, (N, L) in block order, and the students' part of it, (Ns, L), as it is to be stored.
+        """Return the actor's latents, (N, L) in block order, and the students' part of them, (Ns, L), as it is to be stored.
 
         Args:
             obs: all groups, in environment order.

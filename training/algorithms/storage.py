@@ -11,7 +11,7 @@ from ..networks import Widths
 
 
 def split_sizes(num_envs: int, period: int) -> tuple[int, int]:
-    """How many of ``num_envs`` environments are the teacher's and the student's, every ``period``-th one.
+    """Return the numbers of the teacher's and of the student's environments; the student has every ``period``-th one.
 
     Raises:
         ConfigurationError: too few environments for at least one of each.
@@ -40,7 +40,7 @@ def check_minibatches(num_minibatches: int, *, steps: int, teachers: int, studen
 
 @dataclass(frozen=True)
 class EnvironmentSplit:
-    """Which environments belong to the teacher and which to the student.
+    """Environments of the teacher and of the student.
 
     Environment i is a student's if i is a multiple of ``period`` (so every contiguous range of environments, and with
     it every kind of terrain, holds both); with a period of 1 all are. Blocks: rows ``[0, num_teacher)`` are the teacher's,
@@ -112,7 +112,7 @@ class RolloutStorage:
         self.returns = zeros(self.num_envs)
         self.advantages = zeros(self.num_envs)
         self.next_state = zeros(split.num_student, next_state_width)
-        """What the students' next state is predicted as, where a method does."""
+        """Targets of the students' predicted next state, for methods that predict one."""
 
     def add(self, **entries: torch.Tensor) -> None:
         """Store entries of the present step by name, each (rows, …) in block order."""

@@ -33,21 +33,21 @@ class CommandDraw:
     steps: torch.Tensor
     """Control steps for which the command holds, (N,) int64, at least 1."""
     extreme: torch.Tensor
-    """Whether the command is an extreme one, (N,) bool."""
+    """True for extreme commands, (N,) bool."""
     holds_heading: torch.Tensor
-    """Whether it is a straight one, whose heading is to be held, (N,) bool."""
+    """True for straight commands, during which the heading is held, (N,) bool."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """What commands may be, for each world: the stage's range capped by the terrain's limits."""
+    """Range of commands for each world: the stage's, capped by the terrain's limits."""
 
     low: torch.Tensor
     """Lowest command of every axis, (N, 3)."""
     high: torch.Tensor
     """Highest command of every axis, (N, 3)."""
     downward: torch.Tensor
-    """How far the linear axes go below zero [m/s], (N, 2)."""
+    """Largest backward and rightward speeds [m/s], (N, 2)."""
     either: torch.Tensor
     """Linear speed that is allowed in both directions [m/s], (N, 2)."""
     reach: torch.Tensor
@@ -137,7 +137,7 @@ class CommandGenerator:
         self._interval = torch.tensor(self.interval_steps, device=device)
 
     def ranges(self, kind: torch.Tensor, progress: torch.Tensor) -> Ranges:
-        """What the present stage allows each world."""
+        """Return the range that the present stage allows each world."""
         stage = (progress >= self._begins).sum() - 1
         rows = self._table.index_select(0, stage.reshape(1)).squeeze(0)[kind]
         low, high, downward, either, reach = rows.split(_RANGE_WIDTHS, dim=1)

@@ -33,11 +33,11 @@ _STATIONARY = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
 
 @dataclass(frozen=True, kw_only=True)
 class ScheduleConfiguration:
-    """What "a fraction of the run" means."""
+    """Number of steps of a whole run, and the fraction of it at which the run begins."""
 
     horizon_steps: Count = 240_000
-    """Environment steps, per environment, of the whole run, of which every ramp and stage is a fraction. A task sets it to the
-    steps of its iterations, unless it is given on the command line."""
+    """Environment steps, per environment, of the whole run; every ramp and stage is a fraction of it. A task sets it to the steps of
+    its iterations, unless it is given on the command line."""
     begin: Share = 0.0
     """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin
     with the commands of a robot that cannot walk yet."""
@@ -66,7 +66,7 @@ class OwnTermination:
     function: str
     """``module:function`` of ``StepInputs`` and ``TerminationConfiguration`` to (N,) bool."""
     time_out: bool = False
-    """Whether the end is no failure: what would have followed is bootstrapped."""
+    """True if the end is no failure: the learner bootstraps the missing future."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ class OwnEvent:
     name: str
     """Name in settings."""
     function: str
-    """``module:function`` of the environment and the worlds whose episode begins, (N,) bool; called in every step after
+    """``module:function`` of the environment and a mask of the worlds that begin an episode, (N,) bool; called in every step after
     resets and pushes."""
 
 
@@ -106,13 +106,13 @@ class NoiseConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationConfiguration:
-    """What the networks see."""
+    """Inputs of the networks."""
 
     history_length: Annotated[int, Field(ge=1, le=1000)] = 5
     """Frames in the student's history, the current one included."""
     history_start: Literal["zeros", "repeat"] = "repeat"
-    """What the history holds at the start of an episode: ``repeat`` for copies of the first frame, as the robot's own
-    controller fills it, or ``zeros`` as published. It becomes part of the policy contract."""
+    """Contents of the history at the start of an episode: ``repeat`` for copies of the first frame, as the robot's own controller fills
+    it, or ``zeros`` as published. It becomes part of the policy contract."""
     noise: NoiseConfiguration = NoiseConfiguration()
     scan_length: Metres = 1.6
     """Extent of the height scan along the heading [m]."""
@@ -150,7 +150,7 @@ class CommandStage:
 
 @dataclass(frozen=True, kw_only=True)
 class CommandConfiguration:
-    """What the robot is told to do (paper, command design)."""
+    """Commands of the robot (paper, command design)."""
 
     stages: tuple[CommandStage, ...] = (
         CommandStage(begin=0.0, forward=(-0.5, 0.5), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),
@@ -159,13 +159,12 @@ class CommandConfiguration:
     )
     """Ranges over the run; a terrain's own limits cap every stage."""
     curriculum: bool = True
-    """Whether commands go through the stages; otherwise they are drawn from the last one's ranges throughout (paper, command
-    curriculum)."""
+    """Draw commands from stage after stage; otherwise from the last stage's ranges throughout (paper, command curriculum)."""
     interval: Positive = 5.0
     """Time between two draws [s]."""
     dynamic: bool = True
-    """Whether the smallest speed drawn makes sure that the robot can still leave its tile in the rest of the episode (paper, dynamic
-    command sampling)."""
+    """Raise the smallest speed drawn until the robot can still leave its tile in the rest of the episode (paper, dynamic command
+    sampling)."""
     required_distance: float = 5.0
     """Distance that the commands of an episode shall add up to at least [m] (``dynamic``)."""
     straight_probability: Share = 0.3
@@ -201,7 +200,7 @@ class CommandConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class ResetConfiguration:
-    """How episodes start."""
+    """Start of an episode."""
 
     joint_scale: Range = (0.5, 1.5)
     """Factor on the standing pose, per joint, within the joint limits."""
@@ -256,12 +255,12 @@ class PushConfiguration:
     angular: NotNegative = 0.6
     """Largest change of the angular velocity per axis [rad/s]."""
     add: bool = True
-    """Whether the change is added; otherwise it replaces the velocity, as published, which stops a fast robot dead."""
+    """Add the change to the velocity; otherwise it replaces the velocity, as published, which stops a fast robot dead."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TerminationConfiguration:
-    """What ends an episode early (``training/environment/terminations.py``)."""
+    """Conditions that end an episode early (``training/environment/terminations.py``)."""
 
     trunk_contact: NotNegative | None = None
     """Force of the ground on the trunk, head and chin apart, that ends an episode [N]. None for never."""

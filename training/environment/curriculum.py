@@ -1,4 +1,4 @@
-"""Which tile each world stands on, and when its level changes (paper, game-inspired curriculum).
+"""Choose each world's tile, and change its level (paper, game-inspired curriculum).
 
 All tiles of all kinds and levels are one palette of terrains; a new level is another terrain index at the next reset.
 """
@@ -39,7 +39,7 @@ class TrainingPalette:
 
 
 def build_palette(configuration: TerrainConfiguration) -> TrainingPalette:
-    """Build the tiles of every kind whose share is not zero.
+    """Build the tiles of every kind with a share above zero.
 
     Raises:
         TerrainError: unknown kind, or more levels than tiles have.
@@ -81,7 +81,7 @@ def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
 
 
 class Levels:
-    """Which tile each world stands on."""
+    """Level and tile of each world."""
 
     def __init__(self, configuration: TerrainConfiguration, palette: TrainingPalette, kind: torch.Tensor) -> None:
         """Put the tiles' indices on the device.
@@ -108,7 +108,7 @@ class Levels:
     def move(
         self, memory: EnvironmentMemory, uniform: UniformColumns, worlds: torch.Tensor, failed: torch.Tensor
     ) -> None:
-        """Level and tile of the next episode of the masked worlds, of which some ``failed``, both (N,) bool."""
+        """Move the masked worlds to the level and tile of their next episode; ``failed`` marks those with a failure; both (N,) bool."""
         level = self._rule(
             self._settings,
             level=memory.level,

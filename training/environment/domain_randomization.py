@@ -1,4 +1,4 @@
-"""What differs between worlds, and from episode to episode in one world (paper, domain randomization table)."""
+"""Draw the physical differences between worlds and between a world's episodes (paper, domain randomization table)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_speed", "motor
 def draw_bodies(
     ranges: RandomizationConfiguration, num_envs: int, num_bodies: int, generator: torch.Generator
 ) -> dict[str, torch.Tensor]:
-    """What is drawn once per world, on the generator's device, by the names of ``Randomization``: effective sliding friction (N,),
-    what is added to the base's mass [kg] (N,), factors on the other bodies' masses (N, bodies), and the shift of the base's centre
-    of mass [m] (N, 3).
+    """Draw once per world, on the generator's device, by the names of ``Randomization``: effective sliding friction (N,), mass added to
+    the base [kg] (N,), factors on the other bodies' masses (N, bodies), and the shift of the base's centre of mass [m] (N, 3).
     """
 
     def between(bounds: Range, *shape: int) -> torch.Tensor:

@@ -299,15 +299,15 @@ class TrainingEnvironment(VecEnv):
         return TensorDict(dict(vars(observations)), batch_size=[self.num_envs], device=self.device)
 
     def _log(self) -> dict[str, torch.Tensor]:
-        """What happened since the last log, as tensors on the device."""
+        """Return the figures since the last log, as tensors on the device."""
         log = self.parts.log.read(self.parts.memory, self.parts.progress())
         return log | {"Physics/overflow_worlds": self.backend.state.overflowed.sum().float()}
 
     # --- resuming ---------------------------------------------------------------------------------------------------
 
     def progress_dict(self) -> dict[str, Any]:
-        """What a run has reached, without its running episodes: step counter, levels, and the bodies that were drawn,
-        for which the levels were found.
+        """Return the progress of a run without its running episodes: step counter, levels, and the bodies that were drawn, since the
+        levels were found with them.
         """
         return {
             "version": STATE_VERSION,

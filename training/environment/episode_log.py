@@ -1,4 +1,4 @@
-"""What is logged of episodes: rewards and ends by name, tracking errors, levels."""
+"""Log episodes: rewards and ends by name, tracking errors, levels."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class EpisodeLog:
     def record(
         self, memory: EnvironmentMemory, inputs: StepInputs, rewards: torch.Tensor, ends: Ends, done: torch.Tensor
     ) -> None:
-        """Add a step: weighted rewards (N, terms), and whose episode is over, (N,) bool."""
+        """Add a step: weighted rewards (N, terms), and a mask of the episodes that are over, (N,) bool."""
         memory.episode_rewards.add_(rewards)
         memory.episode_steps.add_(1.0)
         linear = (inputs.command[:, :2] - inputs.base_linear_velocity_b[:, :2]).norm(dim=1)

@@ -24,7 +24,7 @@ from .terrain_configuration import TerrainConfiguration
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeStart:
-    """How the masked worlds begin their next episode."""
+    """Draw the start of the masked worlds' next episode."""
 
     worlds: torch.Tensor
     """(N,) bool."""
@@ -114,7 +114,7 @@ class Pushes:
     def __call__(
         self, done: torch.Tensor, state: PhysicsState, memory: EnvironmentMemory, uniform: UniformColumns
     ) -> Push | None:
-        """Pushes of the worlds whose clock says so and whose episode goes on; None where there are none at all."""
+        """Return the pushes of worlds that are due and go on; None where no world is ever pushed."""
         if self.steps == 0:
             return None
         due = ((memory.episode_length + memory.push_phase) % self.steps == 0) & ~done

@@ -56,24 +56,24 @@ class EnvironmentMemory:
     terrain_index: torch.Tensor
     """Terrain of the present episode, (N,) int64."""
     moves_level: torch.Tensor
-    """Whether the present episode counts for the curriculum, (N,) bool."""
+    """True if the present episode counts for the curriculum, (N,) bool."""
     farthest: torch.Tensor
     """Largest distance from the tile's middle in this episode, larger of |x| and |y| [m], (N,)."""
     commanded_way: torch.Tensor
-    """Where the commands of this episode would have led, at the commanded headings [m], (N, 2)."""
+    """Position to which the commands of this episode would have led, at the commanded headings [m], (N, 2)."""
     commanded_farthest: torch.Tensor
     """Largest distance of ``commanded_way`` from its start [m], (N,)."""
     command: torch.Tensor
     """Present command, (N, 3)."""
     commanded_heading: torch.Tensor
-    """Where the robot should be heading: its own heading when the command was drawn, turned by the yaw rate commanded since; unit
+    """Heading that the commands ask for: the robot's own when the command was drawn, turned by the yaw rates commanded since; unit
     vector in the world's xy plane, (N, 2)."""
     command_steps: torch.Tensor
     """Control steps until the next draw, (N,) int64."""
     command_extreme: torch.Tensor
-    """Whether the present command is an extreme one, (N,) bool."""
+    """True for extreme commands, (N,) bool."""
     holds_heading: torch.Tensor
-    """Whether the present command is a straight one, which leaves the commanded heading as it is, (N,) bool."""
+    """True for straight commands, which leave the commanded heading as it is, (N,) bool."""
     issued: torch.Tensor
     """Sum of the linear commands issued in this episode [m/s], (N, 2)."""
     shortfall: torch.Tensor
@@ -91,7 +91,7 @@ class EnvironmentMemory:
     foot_force: torch.Tensor
     """Norm of each foot's contact force after the last step [N], (N, F)."""
     just_reset: torch.Tensor
-    """Worlds whose episode has just begun, (N,) bool."""
+    """Worlds at the first step of an episode, (N,) bool."""
     history: torch.Tensor
     """Last frames with their noise, oldest first, (N, H, frame width)."""
     push_phase: torch.Tensor
@@ -105,7 +105,7 @@ class EnvironmentMemory:
     finished_steps: torch.Tensor
     """Their control steps, scalar."""
     finished_ends: torch.Tensor
-    """How many of them ended in which way, (E,)."""
+    """Number of ends by reason, (E,)."""
     metric_sums: torch.Tensor
     """Sums over worlds and steps since the last log, (M,)."""
     metric_steps: torch.Tensor
@@ -195,7 +195,7 @@ class EnvironmentMemory:
         self.just_reset.copy_(worlds)
 
     def by_name(self) -> dict[str, torch.Tensor]:
-        """Everything but the tensors of which others are columns."""
+        """Return all tensors except views, the columns of others."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("episode", "sums")}
 
 

@@ -133,7 +133,7 @@ def resolve_own(
 def _checked(
     function: Callable[..., Any], where: str, gives: Callable[[Any, Any], bool] | None, rule: str
 ) -> Callable[..., Any]:
-    """A function whose results are looked at."""
+    """Return a function that checks its results."""
     if gives is None:
         return function
 
@@ -171,7 +171,7 @@ def guarded(
 
 
 def foreign_functions(settings: Any, known: Any) -> list[str]:
-    """What settings would import: every ``module:function`` in them that is neither the package's own nor named in ``known``.
+    """Return every ``module:function`` that settings would import and that is neither the package's own nor named in ``known``.
 
     Args:
         settings: frozen dataclasses, of any depth, or plain data.
@@ -191,7 +191,7 @@ def _names(value: Any) -> Iterator[str]:
 
 
 def _own(path: str) -> bool:
-    """Whether a module of this package defines the function; what it imported from elsewhere is not its own."""
+    """Return True if a module of this package defines the function; functions that it imported from elsewhere are not its own."""
     module, _, name = _present(path).partition(":")
     if not module.startswith(f"{_PACKAGE}.training."):
         return False

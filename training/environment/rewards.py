@@ -54,7 +54,7 @@ def progress_share(inputs: StepInputs) -> torch.Tensor:
 
 
 def commanded_to_move(command: torch.Tensor) -> torch.Tensor:
-    """Whether the linear command is fast enough to ask for progress, (N,) bool."""
+    """Return True where the linear command is fast enough to ask for progress, (N,) bool."""
     return command[:, :2].square().sum(dim=1) >= SLOWEST_COMMAND**2
 
 
@@ -200,7 +200,7 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
 
 
 class RewardFunction:
-    """The weighted sum of the terms whose weight is not zero."""
+    """Weighted sum of the terms with a weight other than zero."""
 
     def __init__(self, configuration: RewardWeights, control_period: float, device: torch.device | str) -> None:
         """Choose the terms and put their weights on the device.

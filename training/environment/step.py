@@ -35,7 +35,7 @@ from .terminations import Terminations
 
 @dataclass(frozen=True, kw_only=True)
 class StepResult:
-    """What came of a step."""
+    """Results of a step."""
 
     reward: torch.Tensor
     """(N,)."""
@@ -44,7 +44,7 @@ class StepResult:
     time_out: torch.Tensor
     """Ends that are no failure, (N,) bool."""
     start: EpisodeStart
-    """The next episodes of the worlds whose episode is over."""
+    """Starts of the next episodes, for worlds at the end of one."""
     push: Push | None
     """Pushed bases, None where there are no pushes."""
 
@@ -169,7 +169,7 @@ class EnvironmentStep:
         return self.memory.step.float() * (1.0 / self.configuration.schedule.horizon_steps)
 
     def after_physics(self) -> StepResult:
-        """Judge the step, update the memory, and prepare the next episode of the worlds whose episode is over."""
+        """Judge the step, update the memory, and prepare the next episode of worlds at the end of one."""
         memory = self.memory
         memory.step.add_(1)
         memory.episode_length.add_(1)

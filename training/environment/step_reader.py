@@ -121,7 +121,7 @@ class StepReader:
     def __call__(
         self, state: PhysicsState, memory: EnvironmentMemory, action: torch.Tensor, progress: torch.Tensor
     ) -> StepInputs:
-        """What the step led to.
+        """Return the inputs of rewards and terminations after a step.
 
         Args:
             state: physics after the step.

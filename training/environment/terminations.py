@@ -29,9 +29,9 @@ class Termination:
     """A rule, and what its end means."""
 
     rule: Rule
-    """Which worlds' episode is over, (N,) bool."""
+    """Episodes that are over, (N,) bool."""
     time_out: bool = False
-    """Whether the end is no failure."""
+    """True if the end is no failure."""
 
 
 def time_out(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
@@ -79,12 +79,12 @@ TERMINATIONS: dict[str, Termination] = {
     "stuck": Termination(rule=stuck),
     "diverged": Termination(rule=diverged),
 }
-"""All rules by name. A rule whose setting of the same name is None is left out; ``own`` adds more."""
+"""All rules by name. A rule is left out where its setting, of the same name, is None; ``own`` adds more."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ends:
-    """Which episodes are over, and why."""
+    """Ends of episodes, with their reasons."""
 
     failed: torch.Tensor
     """(N,) bool."""

@@ -27,7 +27,7 @@ class TileConfiguration:
     sigma: Positive
     """Largest tracking sigma on this kind (``RewardConfiguration.dynamic_sigma``)."""
     ends: bool = True
-    """Whether the kind has an edge: at which ``TerrainConfiguration.leave_distance`` acts, and which crossings lead to."""
+    """True if the kind has an edge, at which ``TerrainConfiguration.leave_distance`` acts and to which crossings lead."""
 
 
 _MODERATE, _SLOW, _STRAIGHT = (1.5, 1.0, 1.5), (1.0, 1.0, 1.5), (1.0, 0.5, 1.5)
@@ -51,7 +51,7 @@ upwards, bars and obstacles; waves and all that is to be climbed have more than 
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainConfiguration:
-    """Which ground, and how it gets harder."""
+    """Kinds of ground, and their levels."""
 
     tiles: tuple[TileConfiguration, ...] = ALL_TILES
     """Kinds of training tile."""
@@ -64,7 +64,7 @@ class TerrainConfiguration:
     seed: Seed = 0
     """Seed of the tiles' chance."""
     curriculum: bool = True
-    """Whether levels follow success; otherwise every episode draws its level."""
+    """Let levels follow success; otherwise every episode draws its level."""
     highest_start_level: Annotated[int, Field(ge=0, lt=NUM_TILE_LEVELS)] = 5
     """Levels at the start are uniform from 0 to this, or to the last of ``levels``."""
     promotion_distance: _Distance = 4.0
@@ -72,7 +72,7 @@ class TerrainConfiguration:
     demotion_share: Share = 0.5
     """Share of the commanded way below which the level falls."""
     demote_falls: bool = True
-    """Whether a fall before promotion lowers the level whatever the distance."""
+    """Lower the level after a fall before promotion, at any distance."""
     leave_distance: _Distance | None = 4.75
     """Distance from the tile's middle at which an episode is cut short as a time-out [m]; None for never. Beyond the
     edge there is only level ground, on which the published robots had the next tile."""

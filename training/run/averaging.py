@@ -47,9 +47,7 @@ class WeightAverage:
             torch._foreach_lerp_(means, self._now, share)
 
     def state_dict(self) -> dict[str, Any]:
-        """What ``load_state_dict`` takes: the averaged modules' state dictionaries, which later updates change, and of how many
-        iterations they are averages.
-        """
+        """Return the averaged modules' state dictionaries, which later updates change, and the number of averaged iterations."""
         return {"iterations": self._count, **self._states}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:

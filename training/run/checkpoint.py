@@ -111,7 +111,7 @@ def _whole(path: Path) -> Iterator[Path]:
 
 
 def rank_file(path: Path, rank: int) -> Path:
-    """Where process ``rank`` of a run keeps its part of a checkpoint."""
+    """Return the file with the part of process ``rank`` of a checkpoint."""
     return path.with_suffix(f".rank{rank}{path.suffix}")
 
 
@@ -154,7 +154,7 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: s
 
 @dataclass(frozen=True, kw_only=True)
 class RunNumbers:
-    """What a checkpoint says of its run in numbers and names."""
+    """Numbers and names of a checkpoint's run."""
 
     task: Text
     iteration: Annotated[int, Field(ge=0, lt=2**53)]
@@ -181,8 +181,8 @@ def run_numbers(entries: Mapping[str, Any], path: Path) -> RunNumbers:
 
 
 def read_rank(path: Path, rank: int, written: Any) -> dict[str, Any] | None:
-    """What process ``rank`` of a run kept beside a checkpoint; None if there is nothing that was ``written`` with it: the first
-    process may have been the only one that came to write, or the checkpoint is a copy.
+    """Read the part of process ``rank`` of a checkpoint; None if none was ``written`` with it: the first process may have been the only
+    one that came to write, or the checkpoint is a copy.
 
     Raises:
         CheckpointError: the file is damaged or holds more than tensors and plain data.
@@ -208,7 +208,7 @@ def _load(file: Path, purpose: str) -> dict[str, Any]:
 
 
 def _check_policy(entries: Mapping[str, Any], source: str, purpose: str) -> None:
-    """Refuse a checkpoint whose policy is damaged, or a program: training goes on with weights."""
+    """Refuse a checkpoint with a damaged policy, or with a program: training goes on with weights."""
     try:
         _, network = read_policy(entries, source=source)
     except PolicyError as error:
@@ -221,8 +221,8 @@ def _check_policy(entries: Mapping[str, Any], source: str, purpose: str) -> None
 
 
 def reached(entries: Mapping[str, Any]) -> float:
-    """Fraction of its schedules that the run of a checkpoint or policy file had gone through; 1 where the file does not
-    say: who trains on from a finished policy wants what it was trained for at the end.
+    """Return the fraction of its schedules that the run of a file had gone through; 1 where the file does not say: a finished policy
+    goes on with the end of its schedules.
     """
     return min(float(entries.get("training", {}).get("progress", 1.0)), 1.0)
 

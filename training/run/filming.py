@@ -62,7 +62,7 @@ class Filmer:
 
     @property
     def pending(self) -> int:
-        """How many videos are still to come."""
+        """Number of videos still to come."""
         return self._side.pending
 
     def close(self) -> None:

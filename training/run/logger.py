@@ -1,4 +1,4 @@
-"""What a run logs: rsl_rl's scalars under rsl_rl's names, collected on the device, through rsl_rl's writers."""
+"""Log a run: rsl_rl's scalars under rsl_rl's names, collected on the device, through rsl_rl's writers."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class RunLogger:
         """Their lengths [control steps]."""
         self.group_returns: dict[str, deque[float]] = {name: deque(maxlen=WINDOW) for name in ("teacher", "student")}
         self.scalars: dict[str, float] = {}
-        """What the last iteration wrote, by key."""
+        """Scalars of the last iteration, by key."""
         self.reward_sum = torch.zeros(num_envs, device=device)
         self.episode_length = torch.zeros(num_envs, device=device)
         self._finished = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
@@ -193,7 +193,7 @@ class RunLogger:
 
     @property
     def _in_order(self) -> bool:
-        """Whether the writer's service takes steps in rising order only."""
+        """True if the writer's service takes steps in rising order only."""
         return hasattr(self.writer, "save_model")
 
     def write(self, scalars: Mapping[str, float], iteration: int) -> None:
@@ -228,7 +228,7 @@ class RunLogger:
         self.writer = None
 
     def state_dict(self) -> dict[str, Any]:
-        """What continues across a resume: totals, running episodes and the window of finished ones."""
+        """Return the state that continues across a resume: totals, running episodes and the window of finished ones."""
         return {
             "total_steps": self.total_steps,
             "total_time": self.total_time,

@@ -12,7 +12,7 @@ from ...files import MOST_THREADS
 from ...files.choices import PLACE, PLAYED, SCORES, SPAN, WRITTEN, Choice
 
 LOG_ROOT = Path("logs/rsl_rl")
-"""Where training runs lie: ``<LOG_ROOT>/<experiment>/<run>/``."""
+"""Root of the training runs: ``<LOG_ROOT>/<experiment>/<run>/``."""
 QUICK_SUITE = "quick"
 """Suite of the scores of checkpoints."""
 

@@ -1,4 +1,4 @@
-"""What of a run goes into its checkpoints, and how a run continues from one or begins with its networks."""
+"""Write a run into checkpoints, continue it from one, or begin a run with the networks of one."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def _load_environment(run: RunState, path: Path, state: Any) -> bool:
 
 
 def _runs_on(run: RunState, local: Mapping[str, Any]) -> bool:
-    """Whether a checkpoint holds running episodes; of an environment of another kind, the settings tell."""
+    """Return True if a checkpoint holds running episodes; for an environment of another kind, the settings tell."""
     state = local["environment"]
     return "memory" in state if "bodies" in state else run.configuration.run.keep_episodes
 
@@ -290,7 +290,7 @@ def check_environments(path: Path, theirs: int, mine: int) -> None:
 
 
 def check_network(path: Path, entries: Mapping[str, Any], task: Task, verb: str) -> None:
-    """Refuse to ``resume`` or ``start`` from a file whose network is not the one that a task trains; nothing is built for it.
+    """Refuse to ``resume`` or ``start`` from a file with another network than a task trains; nothing is built for it.
 
     Raises:
         CheckpointError: it is not.

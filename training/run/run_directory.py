@@ -104,7 +104,7 @@ def write_parameters(run: Path, *, environment: Any, agent: Any) -> None:
 def describe_run(
     *, task: str, backend: str, num_envs: int, seed: int, device: str, contract: PolicyContract
 ) -> dict[str, Any]:
-    """What ``run.json`` says about where and with what a run was made."""
+    """Return the entries of ``run.json`` on the place and the parts of a run."""
     return {
         "task": task,
         "backend": backend,
@@ -117,7 +117,7 @@ def describe_run(
 
 @dataclass(frozen=True, kw_only=True)
 class _Noted:
-    """What readers of a ``run.json`` take for granted."""
+    """Entries that readers of a ``run.json`` rely on."""
 
     task: Text = ""
     outcome: Text = ""
@@ -144,7 +144,7 @@ def read_run_json(run: Path) -> dict[str, Any]:
 
 
 def refuse_links(run: Path) -> None:
-    """Refuse to go on in a run directory that leads elsewhere: training writes to its folders, whoever made them.
+    """Refuse to go on in a run directory that leads elsewhere: training writes to its folders.
 
     Raises:
         CheckpointError: there is a link to a folder, or a link in one of its folders.

@@ -19,25 +19,25 @@ from .sharing import shared_gpus
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """What the folder of ``--keep`` has now."""
+    """Contents of the folder of ``--keep``."""
 
     labels: Sequence[str]
     """Runs that were kept by this call."""
     unkept: Mapping[str, str]
-    """Why runs could not be kept, by label, beside what failed before."""
+    """Reasons why runs could not be kept, by label, besides earlier failures."""
     there: int
-    """How many of the call's runs it holds."""
+    """Number of the call's runs that it holds."""
     to_gauge: int
-    """How many of these are not gauged yet."""
+    """Number of those that are not gauged yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepCall:
-    """What became of a call."""
+    """Result of a call."""
 
     runs: Sequence[SweepRun]
     refused: Mapping[str, str]
-    """Why entries cannot start, by name."""
+    """Reasons why entries cannot start, by name."""
     outcome: SweepOutcome
     found: Mapping[str, Any]
     """As ``fold_sweep``."""
@@ -46,7 +46,7 @@ class SweepCall:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Why runs failed, by label."""
+        """Reasons why runs failed, by label."""
         return _failures(self.runs, self.found)
 
 

@@ -40,7 +40,7 @@ _LAST_PATIENCE = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOutcome:
-    """How the processes of a sweep ended."""
+    """End of the processes of a sweep."""
 
     failures: Mapping[str, str]
     """One sentence for each run that failed, by label."""
@@ -129,7 +129,7 @@ class Jobs:
 
     @contextmanager
     def _failing(self, run: SweepRun) -> Iterator[None]:
-        """Around what concerns one run: what goes wrong is its failure, and the others go on."""
+        """Turn an error of one run into its failure; the others go on."""
         try:
             yield
         except RUN_ERRORS as error:
@@ -137,7 +137,7 @@ class Jobs:
             self._say(f"{run.label} failed: {self._failures[run.label]}")
 
     def _is_left(self, run: SweepRun) -> bool:
-        """Whether a later call goes on with a run that has not failed."""
+        """Return True if a later call goes on with a run that has not failed."""
         if run.label not in self._failures:
             with self._failing(run):
                 return not (run.trained and run.gauged(self._sweep))
@@ -211,7 +211,7 @@ class Jobs:
                 self._take_in(job.run, job.process.returncode, job.log, gauged=job.place == "gauge")
 
     def _take_in(self, run: SweepRun, code: int, log: Path, *, gauged: bool) -> None:
-        """What became of a process.
+        """Handle the end of a process.
 
         Raises:
             SweepError: it failed.
@@ -269,7 +269,7 @@ def _take(lock: BinaryIO, doing: str) -> None:
 
 
 def _reason(code: int, log: Path) -> str:
-    """Why a process failed: the signal that ended it, or the last sentence of its log."""
+    """Return the reason of a process's failure: the signal that ended it, or the last sentence of its log."""
     if code < 0:
         return "ended by " + next((known.name for known in signal.Signals if known == -code), f"signal {-code}")
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]

@@ -1,4 +1,4 @@
-"""What is kept of runs that are trained, small enough to carry home and to commit.
+"""Keep trained runs in a form small enough to carry home and to commit.
 
 ``runs/<entry>/seed-<n>/kept/`` holds ``run.json`` with the settings, ``curves.csv``, ``policy.gauge.pt`` and, where it was gauged,
 ``results.json``, a score card of that policy; no checkpoints, no episodes, no machine's name and no command. A sweep does not train
@@ -59,7 +59,7 @@ def _in(folder: Path, run: SweepRun) -> SweepRun:
 
 
 def _keep(sweep: Sweep, run: SweepRun, target: SweepRun) -> bool:
-    """Write the small form of a run, whose description, by which it is known, comes last; False where it is there already."""
+    """Write the small form of a run, its description, which identifies it, last; False where it is there already."""
     target.claim(option="--keep")
     gauged, there, place = run.gauged(sweep), target.trained, target.folder / KEPT
     if there and (target.gauged(sweep) or not gauged):
@@ -90,7 +90,7 @@ def _keep(sweep: Sweep, run: SweepRun, target: SweepRun) -> bool:
 
 
 def _for_everybody(description: Mapping[str, Any]) -> dict[str, Any]:
-    """What is said of a run without machine, commands and folders, those of its resumes too."""
+    """Return the description of a run without machine, commands and folders, in its resumes too."""
     found = without_place(description)
     if found.get("begun_with"):
         found["begun_with"] = Path(found["begun_with"]).name

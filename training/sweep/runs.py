@@ -33,15 +33,15 @@ KEPT_CURVES = "curves.csv"
 KEPT_POLICY = "policy.gauge.pt"
 RESULTS = "results.json"
 SCORES = ("score", "score_interval", "level", "groups")
-"""What a table tells of results."""
+"""Entries of results that a table shows."""
 _SEEDS = ("training.run.seed", "environment.seed")
 """Settings that would be the same in all runs of an entry."""
 RUN_ERRORS = (SweepError, CheckpointError, ComparisonError, PolicyError, ContractError, OSError)
-"""What may be wrong with the files of one run; the others go on."""
+"""Errors in the files of one run; the others go on."""
 
 
 class DamagedNoteError(SweepError):
-    """What a run's folder says of its settings cannot be read; other runs of the entry are none the worse."""
+    """The settings noted in a run's folder cannot be read; other runs of the entry are not affected."""
 
 
 def what_failed(error: Exception) -> str:
@@ -59,18 +59,18 @@ class SweepRun:
     entry: SweepEntry
     seed: int
     settings: tuple[str, ...]
-    """Of sweep and entry."""
+    """Settings of sweep and entry."""
     backend: str
     on_gpu: bool
-    """Whether its engine runs on a GPU."""
+    """True if its engine runs on a GPU."""
     iterations: int
     """Updates of the whole run."""
     folder: Path
-    """Where its run directory and its gauging go."""
+    """Folder of its run directory and its gauging."""
     suite_digest: str
-    """Of the suite that gauges it."""
+    """Digest of the suite that gauges it."""
     init_from: str | None = None
-    """What it begins with; None for nothing."""
+    """Shipped policy or checkpoint with its first networks; None for untrained ones."""
 
     @property
     def label(self) -> str:
@@ -79,7 +79,7 @@ class SweepRun:
 
     @property
     def log(self) -> Path:
-        """What its training printed."""
+        """Output of its training."""
         return self.folder / "train.log"
 
     @property
@@ -99,7 +99,7 @@ class SweepRun:
 
     @property
     def trained(self) -> bool:
-        """Whether all of its iterations are done.
+        """True if all of its iterations are done.
 
         Raises:
             CheckpointError: its description is damaged.
@@ -126,7 +126,7 @@ class SweepRun:
         return noted | ({} if last is None else {"iteration": int(last.stem.removeprefix("model_"))})
 
     def policy(self, sweep: Sweep) -> Path | None:
-        """What of it is gauged; None before it is trained, and where it was not kept.
+        """File that is gauged; None before the run is trained, and where the file was not kept.
 
         Raises:
             SweepError: another checkpoint was kept than the sweep asks for.
@@ -142,7 +142,7 @@ class SweepRun:
         return best if sweep.checkpoint == "best" and best.is_file() else latest_checkpoint(run)
 
     def wanted_iteration(self, sweep: Sweep) -> int | None:
-        """Of the checkpoint that the sweep asks for, as the description notes it; None where it does not.
+        """Iteration of the checkpoint that the sweep asks for, as noted in the description; None where it is not.
 
         Raises:
             CheckpointError: the description is damaged.
@@ -163,7 +163,7 @@ class SweepRun:
             )
 
     def results(self, sweep: Sweep) -> Path | None:
-        """Where the gauging of its policy goes; None before it is trained. Results of another suite or policy keep their place.
+        """Folder of the gauging of its policy; None before it is trained. Results of another suite or policy keep their place.
 
         Raises:
             SweepError: what was kept is of another checkpoint, or of another suite and without a policy.
@@ -187,7 +187,9 @@ class SweepRun:
         return usual.with_name(f"{policy.stem}-{self.suite_digest[:8]}-{file_digest(str(policy))[:8]}")
 
     def _is_place(self, folder: Path, policy: Path | None) -> bool:
-        """Whether a folder is free for results of this suite and a policy's file, or has them or begun with them; None for any."""
+        """Return True if a folder is free for results of this suite and a policy's file, or has them or began with them; None stands
+        for any.
+        """
         if (folder / RESULTS).is_file():
             card = read_card(folder)
             its = card["policy"]["file_sha256"]
@@ -198,17 +200,17 @@ class SweepRun:
         return begun.get("suite_digest") == self.suite_digest and begun.get("policy") == _read_policy(policy).digest
 
     def gauged(self, sweep: Sweep) -> bool:
-        """Whether its policy has been gauged on this suite; raises as ``results``."""
+        """True if its policy has been gauged on this suite; raises as ``results``."""
         results = self.results(sweep)
         return results is not None and (results / RESULTS).is_file()
 
     @property
     def has_results(self) -> bool:
-        """Whether there are results of any suite and policy."""
+        """True if there are results of any suite and policy."""
         return (self._kept / RESULTS).is_file() or any(self.folder.glob(f"gauge/*/{RESULTS}"))
 
     def damage(self, sweep: Sweep) -> str:
-        """What is wrong with the checkpoint that it goes on from, or with what is gauged of it; empty where nothing is."""
+        """Damage of the checkpoint that it goes on from, or of the gauged file, as a sentence; empty for none."""
         run = self.directory
         try:
             for path in filter(None, {latest_checkpoint(run) if run else None, self.policy(sweep)}):
@@ -278,7 +280,7 @@ class SweepRun:
 
 
 def _named(note: Mapping[str, Any]) -> dict[str, Any]:
-    """What a run's note says, and each of its settings by its name."""
+    """Return the text of a run's note, and each of its settings by name."""
     settings = note.get("settings")
     return {**note, **(dict(str(s).partition("=")[::2] for s in settings) if isinstance(settings, list) else {})}
 
@@ -308,7 +310,7 @@ def read_card(folder: Path) -> dict[str, Any]:
 
 
 def _is_trained(run: SweepRun) -> bool:
-    """Whether nothing of a run is left to train; one whose description is damaged is told of when it is to go on."""
+    """Return True if nothing of a run is left to train; a damaged description is reported when the run is to go on."""
     try:
         return run.trained
     except CheckpointError:
@@ -316,7 +318,7 @@ def _is_trained(run: SweepRun) -> bool:
 
 
 def _check_seeds(seeds: Sequence[int], settings: Sequence[str]) -> None:
-    """Refuse an entry whose runs would not differ.
+    """Refuse an entry with runs that would not differ.
 
     Raises:
         SweepError: it is one.
@@ -329,7 +331,8 @@ def _check_seeds(seeds: Sequence[int], settings: Sequence[str]) -> None:
 
 
 def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[list[SweepRun], dict[str, str]]:
-    """The runs of a sweep, those of the first seed first, and of each entry of which a run cannot start one sentence on why.
+    """Return the runs of a sweep, those of the first seed first, and for each entry with a run that cannot start one sentence on the
+    reason.
 
     Args:
         to_train: whether this machine must be able to train what is left to train, which is noted in their folders. What was

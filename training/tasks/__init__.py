@@ -27,16 +27,16 @@ from .scaling import scaled
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What is to be learned, and how."""
+    """Environment and method of a training, under a name."""
 
     name: str
     """Name on the command line."""
     title: str
     """One line for people."""
     environment: EnvironmentConfiguration
-    """Where it is learned."""
+    """Settings of the environment."""
     training: TrainingConfiguration
-    """How it is learned."""
+    """Settings of the method and the run."""
 
     def with_overrides(self, overrides: Iterable[str]) -> Task:
         """The task with some settings changed: ``environment.…`` and ``training.…`` keys.
@@ -68,7 +68,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class _Settings:
-    """What overrides may change."""
+    """Settings that overrides may change."""
 
     environment: EnvironmentConfiguration
     training: TrainingConfiguration

@@ -20,20 +20,20 @@ class Ratios:
     """A robot's sizes over those of the robot that a task was written for."""
 
     length: float
-    """Of stretched legs."""
+    """Ratio of the stretched legs' lengths."""
     height: float
-    """Of the base above the ground on stretched legs."""
+    """Ratio of the base's heights above the ground on stretched legs."""
     stance: tuple[float, float]
-    """Of the length and the width of the rectangle between the feet in the standing pose."""
+    """Ratios of length and width of the rectangle between the feet in the standing pose."""
     mass: float
     action: float
-    """Of the angle that an output of 1 of the network moves a joint's target, the mean of all joints."""
+    """Ratio of the angles by which an output of 1 of the network moves a joint's target, means over all joints."""
     speed: Triple
-    """Of the largest forward, lateral and yaw commands."""
+    """Ratios of the largest forward, lateral and yaw commands."""
 
     @property
     def torque(self) -> float:
-        """Of what a leg must carry: weight times length."""
+        """Ratio of the legs' loads: weight times length."""
         return self.mass * self.length
 
 
