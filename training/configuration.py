@@ -279,8 +279,8 @@ class TrainingConfiguration:
 
 
 def to_plain(value: Any) -> Any:
-    """Configuration as plain data that YAML and JSON can hold and read back safely: dataclasses and mappings become dictionaries,
-    tuples lists, paths texts.
+    """Return a configuration as plain data that YAML and JSON can hold and read back safely: dataclasses and mappings become
+    dictionaries, tuples lists, paths texts.
 
     Raises:
         ValueError: a value has no plain form.

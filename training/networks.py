@@ -39,7 +39,7 @@ class Widths:
     """Entries of a frame that hold the command."""
 
     def arguments(self, latent_width: int) -> dict[str, Any]:
-        """Arguments, plain data, that all networks of ``policy.networks`` with an encoder have."""
+        """Return the arguments, plain data, that all networks of ``policy.networks`` with an encoder have."""
         return {
             "frame_width": self.frame,
             "num_actions": self.actions,
@@ -49,7 +49,7 @@ class Widths:
 
 
 def command_entries(contract: PolicyContract) -> tuple[int, ...]:
-    """Entries of an observation frame that hold the command."""
+    """Return the entries of an observation frame that hold the command."""
     start = 0
     for term, width in zip(contract.observation, contract.term_widths, strict=True):
         if term.name == "command":
@@ -73,7 +73,7 @@ def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason
 
 
 def composed_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
-    """Arguments of a network of ``policy.composed``.
+    """Return the arguments of a network of ``policy.composed``.
 
     Raises:
         ConfigurationError: the student's encoder is no plain one.
@@ -152,7 +152,7 @@ class StudentActor(nn.Module):
         self._frames = (int(arguments["history_length"]), int(arguments["frame_width"]))
 
     def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Latents (N, L) and gate weights of the encoder (N, K), None without experts, from flat histories (N, H·F), oldest
+        """Return latents (N, L) and gate weights of the encoder (N, K), None without experts, from flat histories (N, H·F), oldest
         frame first.
         """
         raise NotImplementedError
@@ -164,12 +164,12 @@ class StudentActor(nn.Module):
         return self.action_mean(latent, policy), None
 
     def action_mean(self, latent: torch.Tensor, policy: torch.Tensor) -> torch.Tensor:
-        """Mean actions (N, J) for latents (N, L) and current frames (N, F)."""
+        """Return the mean actions (N, J) for latents (N, L) and current frames (N, F)."""
         return last_in_float32(self.student.actor, torch.cat((latent, policy), dim=-1))
 
     @property
     def output_std(self) -> torch.Tensor:
-        """Present standard deviation of the exploration noise, (J,)."""
+        """Return the present standard deviation of the exploration noise, (J,)."""
         std: torch.Tensor = self.distribution.std_param.detach().clamp(*self.distribution.std_range)
         return std
 
@@ -197,11 +197,11 @@ class CtsActor(StudentActor):
         self.teacher_encoder = teacher
 
     def teacher_latent(self, privileged: torch.Tensor) -> torch.Tensor:
-        """Unit latents (N, L) from privileged observations (N, P)."""
+        """Return unit latents (N, L) from privileged observations (N, P)."""
         return functional.normalize(self.teacher_encoder(privileged), dim=-1)
 
     def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Unit latents (N, L) and gate weights (N, K), None without experts; see ``StudentActor``."""
+        """Return unit latents (N, L) and gate weights (N, K), None without experts; see ``StudentActor``."""
         frames = history.unflatten(-1, self._frames)
         if isinstance(self.student.encoder, ExpertMixture):
             latent, weights = self.student.encoder(frames)
@@ -236,7 +236,7 @@ class ValueNetwork(nn.Module):
     def value(
         self, latent: torch.Tensor, privileged: torch.Tensor, weights: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Values (N, 1) for detached latents (N, L), privileged observations (N, P) and weights (N, K)."""
+        """Return values (N, 1) for detached latents (N, L), privileged observations (N, P) and weights (N, K)."""
         raise NotImplementedError
 
 

@@ -22,7 +22,7 @@ class TaskError(ValueError):
 
 
 def apply_overrides(configuration: Options, overrides: Iterable[str]) -> Options:
-    """A copy of a configuration with some settings changed.
+    """Return a copy of a configuration with some settings changed.
 
     Args:
         configuration: a frozen dataclass, nested as deep as it likes.
@@ -40,7 +40,7 @@ def apply_overrides(configuration: Options, overrides: Iterable[str]) -> Options
 
 
 def override_keys(configuration: Any, prefix: str = "") -> list[str]:
-    """All keys that a configuration has, depth first."""
+    """Return all keys that a configuration has, depth first."""
     keys: list[str] = []
     for name, value in _children(configuration):
         keys.extend(override_keys(value, f"{prefix}{name}.") if _has_children(value) else [prefix + name])

@@ -27,7 +27,7 @@ PATIENCE_AFTER_SIGNAL = 10.0
 
 
 def told_number(name: str, default: int) -> int:
-    """A number that torchrun tells its processes in their environment.
+    """Return a number that torchrun tells its processes in their environment.
 
     Raises:
         ConfigurationError: it is none.
@@ -115,7 +115,7 @@ class Processes:
                     distributed.broadcast(tensor.data, src=0)
 
     def largest(self, number: int) -> int:
-        """The largest of the processes' numbers."""
+        """Return the largest of the processes' numbers."""
         if not self.several:
             return number
         shared = torch.tensor(number)
@@ -124,7 +124,7 @@ class Processes:
         return int(shared)
 
     def firsts(self, value: Any) -> Any:
-        """The first process's value, plain data."""
+        """Return the first process's value, plain data."""
         shared = [value]
         if self.several:
             with _heard():
@@ -163,7 +163,7 @@ def _heard() -> Iterator[None]:
 
 
 def own_device(asked: str | None, backend: str) -> str:
-    """The torch device of this process.
+    """Return the torch device of this process.
 
     Raises:
         ConfigurationError: there is no such device here.
@@ -178,7 +178,7 @@ def own_device(asked: str | None, backend: str) -> str:
 
 
 def idle_gpus(device: str) -> str:
-    """A sentence on GPUs that no process of a run uses, empty if there are none."""
+    """Return a sentence on GPUs that no process of a run uses, empty if there are none."""
     processes = told_number("LOCAL_WORLD_SIZE", 1)
     gpus = torch.cuda.device_count() if device.startswith("cuda") else 0
     if processes >= gpus:

@@ -20,7 +20,7 @@ class AcMoeActor(ComposedActor):
     """An actor that mixes the actions of its experts."""
 
     def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean actions (N, J) and weights of the experts (N, K); see ``StudentActor``."""
+        """Return the mean actions (N, J) and weights of the experts (N, K); see ``StudentActor``."""
         (mean,), weights = self.composed(latent, policy)
         return mean, weights
 

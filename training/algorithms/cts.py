@@ -41,7 +41,7 @@ class CtsLosses(Losses):
             self.mirrored_targets = torch.zeros_like(latents)
 
     def prepare_student(self) -> None:
-        """The teacher's latents, before the student learns."""
+        """Compute the teacher's latents, before the student learns."""
         storage = self.storage
         privileged = storage.privileged[:, storage.split.num_teacher :].flatten(0, 1)
         self.fill(self.targets, lambda rows: self.actor.teacher_latent(privileged[rows]))
@@ -50,7 +50,7 @@ class CtsLosses(Losses):
             self.fill(self.mirrored_targets, lambda rows: self.actor.teacher_latent(mirrored(privileged[rows])))
 
     def latents(self, privileged: Sequence[torch.Tensor], stored: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """Blocks: the teacher's, the student's, and their mirror images in the same order."""
+        """Return the blocks of latents: the teacher's, the student's, and their mirror images in the same order."""
         return [
             part
             for seen, latent in zip(privileged[::2], stored, strict=True)
@@ -62,7 +62,7 @@ class CtsLosses(Losses):
         return (latent - target).square().mean()
 
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Latent error of rows of the flattened student-only buffers, plus the experts' load balancing loss; and
+        """Return the latent error of rows of the flattened student-only buffers, plus the experts' load balancing loss; and
         ``student_names``, (3,), detached.
         """
         history = self.storage.student_history.flatten(0, 1)[rows]
@@ -115,7 +115,7 @@ class CTS(PPO):
         return self.values(torch.cat((teacher, student)), policy, privileged)
 
     def values(self, latent: torch.Tensor, policy: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
-        """Values (N, 1) for latents (N, L), frames (N, F) and states (N, P), without gradients but the critic's own."""
+        """Return values (N, 1) for latents (N, L), frames (N, F) and states (N, P), without gradients but the critic's own."""
         del policy
         return self.critic.value(latent, privileged)
 
@@ -124,7 +124,7 @@ class CTS(PPO):
         return () if self.actor.architecture == "moe_cts" else ("load_balance", "largest_expert_share")
 
     def make_bootstrap(self, iterations: int) -> Bootstrap:
-        """The teacher encoder learns the student's latent from what the teacher sees, the critic the values of the student's
+        """Return a learner of the teacher encoder, from the student's latents, and of the critic, from the values of the student's
         behaviour; afterwards the teacher acts about as the student does.
         """
         return Bootstrap(
@@ -137,7 +137,7 @@ class CTS(PPO):
         )
 
     def _teacher_losses(self, teacher: torch.Tensor, student: torch.Tensor) -> torch.Tensor:
-        """Latent error on the student's samples and value error on all, (2,)."""
+        """Return the latent error on the student's samples and value error on all, (2,)."""
         actor, storage, mirror = self.actor, self.storage, self.losses.mirror
         states = storage.privileged.flatten(0, 1)
         in_history = storage.student_rows(student)

@@ -46,7 +46,7 @@ class DreamwaqActor(EstimatorActor):
         self.register_buffer("trust", torch.zeros(()))
 
     def context(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Velocity (N, 3), means and logarithms of the variances of the latent, (N, L) each, from flat histories (N, H·F)."""
+        """Return the velocity (N, 3), means and logarithms of the variances of the latent, (N, L) each, from flat histories (N, H·F)."""
         width = self.student.latent_width
         encoded = self.student.encoder(history).float()
         velocity, mean, log_variance = encoded.split((VELOCITY, width, width), dim=-1)
@@ -76,7 +76,7 @@ class DreamwaqLosses(EstimatorLosses):
         """Noise of the latents' samples, new for each update: a recorded step draws no random numbers."""
 
     def prepare_student(self) -> None:
-        """New noise."""
+        """Draw new noise."""
         self.noise.normal_()
 
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -26,7 +26,7 @@ from .symmetry import VECTOR, MirrorMap
 
 
 def estimator_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
-    """Arguments of a network of ``policy.estimators``.
+    """Return the arguments of a network of ``policy.estimators``.
 
     Raises:
         ConfigurationError: the encoder is no plain one, or the privileged state does not begin with velocity and frame.
@@ -44,16 +44,16 @@ class EstimatorActor(StudentActor):
     """A network that acts on its estimate, with exploration noise; methods add what the encoder learns with."""
 
     def frames(self, history: torch.Tensor) -> torch.Tensor:
-        """Frames (N, H, F) of flat histories (N, H·F)."""
+        """Return frames (N, H, F) of flat histories (N, H·F)."""
         return history.unflatten(-1, self._frames)
 
     def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Estimates (N, 3 + L), as they are deployed; see ``StudentActor``."""
+        """Return estimates (N, 3 + L), as they are deployed; see ``StudentActor``."""
         estimate: torch.Tensor = self.student.encode(self.frames(history))[0]
         return estimate, None
 
     def acted_on(self, history: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
-        """Estimates (N, 3 + L) as the rollout acts on them, where the true velocity is (N, 3)."""
+        """Return estimates (N, 3 + L) as the rollout acts on them, where the true velocity is (N, 3)."""
         del velocity
         return self.student_latent(history)[0]
 
@@ -100,7 +100,7 @@ class EstimatorLosses(Losses):
             )
 
     def prepare_student(self) -> None:
-        """Nothing: all is in the rollout."""
+        """Prepare nothing: all is in the rollout."""
 
     def velocities(self) -> torch.Tensor:
         """True velocity of the base of every sample, (T·N, 3)."""
@@ -160,7 +160,7 @@ class EstimatorPPO(PPO):
         following.copy_(privileged[:, : following.shape[1]])
 
     def make_bootstrap(self, iterations: int) -> Bootstrap:
-        """The critic learns the values of the policy's behaviour, and what only training needs fits itself to the encoder."""
+        """Return a learner of the critic, from the values of the policy's behaviour, and of the encoder's helpers."""
         return Bootstrap(
             iterations,
             self.configuration,
@@ -171,7 +171,7 @@ class EstimatorPPO(PPO):
         )
 
     def _bare_losses(self, rows: torch.Tensor) -> torch.Tensor:
-        """Value error and the encoder's loss, (2,)."""
+        """Return the value error and the encoder's loss, (2,)."""
         states = self.storage.privileged.flatten(0, 1)[rows]
         error = self.critic.value(states, states).squeeze(-1) - self.storage.returns.flatten(0, 1)[rows]
         return torch.stack((error.square().mean(), self.losses.student(rows)[0]))

@@ -71,7 +71,7 @@ class HimLosses(EstimatorLosses):
 def swapped_prediction(
     source: torch.Tensor, target: torch.Tensor, counts: torch.Tensor, settings: HimConfiguration
 ) -> torch.Tensor:
-    """Mean cross entropy of each side's prediction with the other side's code.
+    """Return the mean cross entropy of each side's prediction with the other side's code.
 
     Args:
         source: cosines of the embeddings with the prototypes, (B, K).
@@ -86,8 +86,8 @@ def swapped_prediction(
 
 @torch.no_grad()
 def sinkhorn(scores: torch.Tensor, counts: torch.Tensor, settings: HimConfiguration) -> torch.Tensor:
-    """Codes (B, K) that add up to one for each sample and, nearly, to B / K for each prototype: Sinkhorn-Knopp on
-    exp(scores / sharpness).
+    """Return codes (B, K) that add up to one for each sample and, nearly, to B / K for each prototype: Sinkhorn-Knopp on exp(scores /
+    sharpness).
 
     Args:
         scores: cosines, (B, K).

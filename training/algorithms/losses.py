@@ -54,7 +54,7 @@ class Losses:
             self.mirrored_latent = torch.zeros_like(storage.student_latent.flatten(0, 1))
 
     def autocast(self) -> AbstractContextManager[Any]:
-        """Matrix products in bfloat16, where that is the precision."""
+        """Return a context with matrix products in bfloat16, where that is the precision."""
         return torch.autocast(
             self.device.type,
             dtype=torch.bfloat16,
@@ -63,7 +63,7 @@ class Losses:
         )
 
     def prepare_policy(self) -> None:
-        """The student's latents of mirror images, before the policy learns."""
+        """Compute the student's latents of mirror images, before the policy learns."""
         if (mirror := self.mirror) is not None:
             history = self.storage.student_history.flatten(0, 1)
             self.fill(self.mirrored_latent, lambda rows: self.actor.student_latent(mirror.history(history[rows]))[0])
@@ -73,7 +73,7 @@ class Losses:
         raise NotImplementedError
 
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Supervised loss of rows of the flattened student-only buffers, and ``student_names``, detached."""
+        """Return the supervised loss of rows of the flattened student-only buffers, and ``student_names``, detached."""
         raise NotImplementedError
 
     def fill(self, target: torch.Tensor, compute: Callable[[slice], torch.Tensor], chunk: int = 65_536) -> None:
@@ -102,7 +102,7 @@ class Losses:
         return torch.cat((values, mapping(values)))
 
     def policy(self, *groups: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """PPO loss of rows of the flattened storage, and ``policy_names``, detached.
+        """Return the PPO loss of rows of the flattened storage, and ``policy_names``, detached.
 
         The surrogate is the sum of the means over each group, so that the fewer student samples count as much as the teacher's;
         value loss and entropy are means over all.
@@ -168,7 +168,7 @@ class Losses:
     def balanced(
         self, loss: torch.Tensor, metrics: torch.Tensor, weights: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The policy's loss and figures with those of the weights (B, K) of an actor's experts."""
+        """Return the policy's loss and figures with those of the weights (B, K) of an actor's experts."""
         del weights
         return loss, metrics
 

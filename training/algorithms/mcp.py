@@ -18,7 +18,7 @@ class McpActor(ComposedActor):
     """An actor that multiplies the primitives' distributions."""
 
     def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Mean and standard deviation of the actions, (N, 2, J); see ``StudentActor``. The critic needs no weights, and no loss
+        """Return the mean and standard deviation of the actions, (N, 2, J); see ``StudentActor``. The critic needs no weights, and no loss
         keeps them balanced.
         """
         (mean, deviation), _ = self.composed(latent, policy)
@@ -50,5 +50,5 @@ class Mcp(CTS):
 
     @property
     def action_std(self) -> torch.Tensor:
-        """Mean standard deviation of the exploration noise in the rollout, (J,)."""
+        """Return the mean standard deviation of the exploration noise in the rollout, (J,)."""
         return self.storage.action_std.mean(dim=(0, 1))

@@ -157,7 +157,7 @@ class PPO:
 
     @classmethod
     def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
-        """The method's actor and critic.
+        """Return the method's actor and critic.
 
         Raises:
             ConfigurationError: settings that do not fit.
@@ -166,7 +166,7 @@ class PPO:
 
     @classmethod
     def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:
-        """The method's storage of a rollout."""
+        """Return the method's storage of a rollout."""
         period = configuration.algorithm.student_period if cls.has_teacher else 1
         return RolloutStorage(
             EnvironmentSplit.build(widths.environments, period, device),
@@ -179,7 +179,7 @@ class PPO:
 
     @property
     def learning_rate(self) -> float:
-        """Present learning rate of the policy optimizer; reading it waits for the device."""
+        """Return the present learning rate of the policy optimizer; reading it waits for the device."""
         return float(self._rate.item())
 
     @learning_rate.setter
@@ -188,7 +188,7 @@ class PPO:
 
     @property
     def action_std(self) -> torch.Tensor:
-        """Standard deviation of the exploration noise, (J,)."""
+        """Return the standard deviation of the exploration noise, (J,)."""
         std: torch.Tensor = self.actor.output_std
         return std
 
@@ -203,7 +203,7 @@ class PPO:
         self.bootstrap = self.make_bootstrap(iterations) if iterations > 0 else None
 
     def make_bootstrap(self, iterations: int) -> Bootstrap:
-        """The learner of what a bare policy lacks."""
+        """Return the learner of the networks that a bare policy lacks."""
         raise NotImplementedError
 
     # Rollout
@@ -264,7 +264,7 @@ class PPO:
 
     @torch.no_grad()
     def compute_returns(self, obs: TensorDict) -> None:
-        """Returns and advantages; advantages are normalized over all samples together."""
+        """Compute returns and advantages; advantages are normalized over all samples together."""
         split = self.storage.split
         policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
         history = obs["history"][split.order[split.num_teacher :]]
@@ -274,7 +274,7 @@ class PPO:
         self.storage.compute_returns(last_values, discount=settings.discount, gae_lambda=settings.gae_lambda)
 
     def last_values(self, policy: torch.Tensor, privileged: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
-        """Values (N, 1) of the states after the rollout: frames (N, F) and states (N, P) in block order, the students' histories
+        """Return values (N, 1) of the states after the rollout: frames (N, F) and states (N, P) in block order, the students' histories
         (Ns, H·F).
         """
         raise NotImplementedError
@@ -334,7 +334,7 @@ class PPO:
         return means | {"skipped_minibatches": skipped}
 
     def without_meaning(self) -> tuple[str, ...]:
-        """Figures of the student's loss that mean nothing with these networks."""
+        """Return figures of the student's loss that mean nothing with these networks."""
         return ()
 
     def _prepare_steps(self) -> None:
@@ -356,8 +356,8 @@ class PPO:
         *,
         graphs: bool = True,
     ) -> Callable[..., None]:
-        """One step of two halves: gradients of a loss of rows, and what follows from them. Between several processes each half is a
-        CUDA graph of its own, where there are any and ``graphs`` says so: a message inside a graph could not be given up when a
+        """Join two halves to one step: gradients of a loss of rows, and the step along them. Between several processes each half is a
+        CUDA graph of its own, where there are any and ``graphs`` allows it: a message inside a graph could not be given up when a
         process is lost.
         """
 
@@ -396,7 +396,7 @@ class PPO:
         take_step(self.student_optimizer, self._student_gradients, limit, self._student_metrics)
 
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
-        """rsl_rl's rule, on the device: slower above twice the desired divergence, faster below half of it."""
+        """Adapt the learning rate on the device as rsl_rl does: slower above twice the desired divergence, faster below half of it."""
         if not self._adapts:
             return
         low, high = self.configuration.learning_rate_range
@@ -408,7 +408,7 @@ class PPO:
     # Checkpoints
 
     def save(self) -> dict[str, Any]:
-        """State of all networks and of both optimizers, under rsl_rl's names, and of ``bootstrap`` while it lasts."""
+        """Return the state of all networks and of both optimizers, under rsl_rl's names, and of ``bootstrap`` while it lasts."""
         bare = {} if self.bootstrap is None else {"bootstrap": self.bootstrap.save()}
         return bare | {
             "actor_state_dict": self.actor.state_dict(),

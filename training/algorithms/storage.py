@@ -120,7 +120,7 @@ class RolloutStorage:
             getattr(self, name)[self.step].copy_(value)
 
     def compute_returns(self, last_values: torch.Tensor, *, discount: float, gae_lambda: float) -> None:
-        """Generalized advantage estimation (Schulman et al., 2016); advantages are normalized over all samples.
+        """Estimate advantages (Schulman et al., 2016, generalized advantage estimation), normalized over all samples.
 
         Args:
             last_values: values of the states after the last step, (N,).
@@ -158,5 +158,5 @@ class RolloutStorage:
         return tuple(draw(count, first) for count, first in ((teachers, 0), (students, teachers)) if count)
 
     def student_rows(self, rows: torch.Tensor) -> torch.Tensor:
-        """Rows of the flattened student-only buffers that belong to student rows of the flattened storage."""
+        """Return rows of the flattened student-only buffers that belong to student rows of the flattened storage."""
         return rows // self.num_envs * self.split.num_student + rows % self.num_envs - self.split.num_teacher

@@ -194,7 +194,7 @@ class CommandConfiguration:
 
     @property
     def drawn_stages(self) -> tuple[CommandStage, ...]:
-        """The stages that commands go through."""
+        """Return the stages that commands go through."""
         return self.stages if self.curriculum else tuple(replace(stage, begin=0.0) for stage in self.stages[-1:])
 
 

@@ -34,7 +34,7 @@ class TrainingPalette:
 
     @property
     def num_levels(self) -> int:
-        """Levels per kind, L."""
+        """Return the levels per kind, L."""
         return self.index.shape[1]
 
 
@@ -64,8 +64,8 @@ def build_palette(configuration: TerrainConfiguration) -> TrainingPalette:
 
 
 def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
-    """Kind of every world, (N,) int64: contiguous blocks in proportion to the shares, so that teacher and student
-    share every kind.
+    """Return the kind of every world, (N,) int64: contiguous blocks in proportion to the shares, so that teacher and student share every
+    kind.
 
     Raises:
         ConfigurationError: shares that are negative or all zero.
@@ -140,7 +140,7 @@ def next_level(
     fallen: torch.Tensor,
     uniform: torch.Tensor,
 ) -> torch.Tensor:
-    """Level of the next episode, were this one over.
+    """Return the level of the next episode, were this one over.
 
     Up after leaving the middle of the tile far enough; down after a fall, or with too little of the commanded way
     made. Who masters the last level starts anywhere again, so that easy tiles are not forgotten.

@@ -47,7 +47,7 @@ class MotorParameters:
     def __init__(
         self, ranges: RandomizationConfiguration, num_envs: int, num_joints: int, device: torch.device | str
     ) -> None:
-        """Motors as the robot's parameter set says."""
+        """Return motors as the robot's parameter set says."""
         bounds = [getattr(ranges, name) for name in MOTOR_COLUMNS]
         self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
         self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]
@@ -59,7 +59,7 @@ class MotorParameters:
         """All of them, (N, 5, J)."""
 
     def redraw(self, uniform: torch.Tensor, worlds: torch.Tensor) -> None:
-        """New values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
+        """Draw new values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
         drawn = uniform.view(self.values.shape) * self._span + self._low
         torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
 
@@ -72,5 +72,5 @@ class MotorParameters:
         backend.randomize(Randomization(**{name: values[name] for name in self._varied}))
 
     def by_name(self) -> dict[str, torch.Tensor]:
-        """The values by the names of ``Randomization``, (N, J) each."""
+        """Return the values by the names of ``Randomization``, (N, J) each."""
         return dict(zip(self.NEUTRAL, self.values.unbind(1), strict=True))

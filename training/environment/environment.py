@@ -150,14 +150,12 @@ class TrainingEnvironment(VecEnv):
 
     @property
     def progress(self) -> torch.Tensor:
-        """Fraction of the run that schedules are at, a scalar tensor."""
+        """Return the fraction of the run that schedules are at, a scalar tensor."""
         return self.parts.progress()
 
     @staticmethod
     def _start_levels(configuration: EnvironmentConfiguration) -> torch.Tensor:
-        """Levels at the start: random, since a pattern over the worlds would give the student's only every second
-        level.
-        """
+        """Draw the levels at the start at random, since a pattern over the worlds would give the student's only every second level."""
         terrain = configuration.terrain
         highest = min(terrain.highest_start_level, terrain.levels - 1) if terrain.curriculum else terrain.levels - 1
         random = torch.Generator().manual_seed(configuration.seed)
@@ -180,7 +178,7 @@ class TrainingEnvironment(VecEnv):
 
     @contextmanager
     def _trial(self) -> Iterator[None]:
-        """Inside, both torch parts may run: what that changes is put back."""
+        """Let both torch parts run inside the context; their changes are put back."""
         memory, motors = self.parts.memory.by_name(), self.parts.motors.by_name()
         before = copied(memory), copied(motors)
         try:
@@ -224,7 +222,7 @@ class TrainingEnvironment(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Control steps of every world's present episode, (N,) int64. Assigning copies into the same tensor."""
+        """Return control steps of every world's present episode, (N,) int64. Assigning copies into the same tensor."""
         return self.parts.memory.episode_length
 
     @episode_length_buf.setter
@@ -232,7 +230,7 @@ class TrainingEnvironment(VecEnv):
         self.parts.memory.episode_length.copy_(value)
 
     def get_observations(self) -> TensorDict:
-        """Present observations, copies."""
+        """Return present observations, copies."""
         return self._pack(self._observations.clone())
 
     @torch.no_grad()
@@ -318,8 +316,8 @@ class TrainingEnvironment(VecEnv):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that continuing needs: memory, random state, randomization, observations, and poses and
-        velocities of the physics.
+        """Return everything that continuing needs: memory, random state, randomization, observations, and poses and velocities of the
+        physics.
 
         The physics itself is put back by a reset: what an engine carries from step to step beside positions,
         velocities and targets (a solver's warm start, contact caches) is lost. On an engine without such memory,
@@ -414,7 +412,7 @@ class TrainingEnvironment(VecEnv):
 
 
 def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
-    """The joint constants of the training physics.
+    """Return the joint constants of the training physics.
 
     Raises:
         ConfigurationError: the robot has no such parameter set.
@@ -436,8 +434,8 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
 def training_contract(
     robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
 ) -> PolicyContract:
-    """The interface of a policy trained here: one frame of observation, the gains, the control period and the largest
-    commands of the training.
+    """Return the interface of a policy trained here: one frame of observation, the gains, the control period and the largest commands
+    of the training.
     """
     tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
     provenance = {REMEMBERED: identify(robot, configuration.robot)}

@@ -59,7 +59,7 @@ class EpisodeLog:
         memory.diverged_total.add_(inputs.diverged.sum())
 
     def read(self, memory: EnvironmentMemory, progress: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Means since the last reading, as tensors on the device; sums start anew."""
+        """Return means since the last reading, as tensors on the device; sums start anew."""
         values = torch.cat(
             (
                 memory.finished_rewards / (memory.finished_steps * self._period),

@@ -76,8 +76,8 @@ class EpisodeStarts:
         )
 
     def __call__(self, worlds: torch.Tensor, memory: EnvironmentMemory, uniform: UniformColumns) -> EpisodeStart:
-        """A start for the masked worlds, above the highest ground below the robot; the memory learns whether their
-        episode counts for the curriculum.
+        """Return a start for the masked worlds, above the highest ground below the robot; the memory learns whether their episode
+        counts for the curriculum.
         """
         spread = uniform["spread"][:, 0] < self._terrain.spread_probability
         torch.where(worlds, ~spread, memory.moves_level, out=memory.moves_level)
@@ -132,7 +132,7 @@ class Latency:
         self._first, self._last = (min(round(t / physics.timestep), physics.substeps) for t in configuration.delay)
 
     def __call__(self, uniform: UniformColumns) -> torch.Tensor | None:
-        """Substeps, (N,) int64; None if there is no latency."""
+        """Return substeps, (N,) int64; None if there is no latency."""
         if self._last == 0:
             return None
         spread = self._last - self._first

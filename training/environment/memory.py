@@ -33,7 +33,7 @@ SUMS = ("finished_rewards", "finished_steps", "finished_ends", "metric_sums", "m
 def _block(
     numbers: Callable[..., torch.Tensor], *shape: int, names: Sequence[str], widths: Sequence[int | None]
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """A tensor, and views of its neighbouring columns by name; a width of None is a column without an axis of its own."""
+    """Return a tensor, and views of its neighbouring columns by name; a width of None is a column without an axis of its own."""
     whole = numbers(*shape, sum(1 if width is None else width for width in widths))
     parts = whole.split([1 if width is None else width for width in widths], dim=-1)
     views = [part.squeeze(-1) if width is None else part for part, width in zip(parts, widths, strict=True)]
@@ -135,7 +135,7 @@ class EnvironmentMemory:
         metrics: int,
         device: torch.device | str,
     ) -> EnvironmentMemory:
-        """Zeros of the right shapes."""
+        """Return zeros of the right shapes."""
 
         def numbers(*shape: int) -> torch.Tensor:
             return torch.zeros(shape, device=device)
@@ -200,7 +200,7 @@ class EnvironmentMemory:
 
 
 def copied(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Copies by name."""
+    """Return copies by name."""
     return {name: value.clone() for name, value in tensors.items()}
 
 
@@ -215,7 +215,7 @@ def restore(saved: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> No
 
 
 def fitting(saved: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Saved tensors by the names of present ones, each with the type and on the device of that one.
+    """Return saved tensors by the names of present ones, each with the type and on the device of that one.
 
     Raises:
         ValueError: one is missing, is no tensor or has another shape.

@@ -42,7 +42,7 @@ class _Named(Protocol):
 
 
 def resolve(path: str, setting: str) -> Callable[..., Any]:
-    """The function or class at ``module:name``. What it raises when it is called, and is not of this package, is one sentence.
+    """Return the function or class at ``module:name``; calling a user's turns its exceptions into one sentence.
 
     Raises:
         ConfigurationError: there is no such module or function, or importing it fails.
@@ -78,7 +78,7 @@ def find_class(path: str, setting: str, base: type[Kind]) -> type[Kind]:
 
 
 def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> Callable[..., Kind]:
-    """The class at ``module:name``.
+    """Return the class at ``module:name``.
 
     Args:
         base: what it must be derived from.
@@ -108,7 +108,7 @@ def resolve_own(
     gives: Callable[[Any, Any], bool] | None = None,
     rule: str = "",
 ) -> dict[str, Callable[..., Any]]:
-    """The functions of all terms by name.
+    """Return the functions of all terms by name.
 
     Args:
         taken: names that they cannot have.
@@ -182,7 +182,7 @@ def foreign_functions(settings: Any, known: Any) -> list[str]:
 
 
 def _names(value: Any) -> Iterator[str]:
-    """All texts with a colon, so that a field that is added some day is not forgotten here."""
+    """Return all texts with a colon, so that a field that is added some day is not forgotten here."""
     if isinstance(value, dict | list | tuple):
         for entry in value.values() if isinstance(value, dict) else value:
             yield from _names(entry)

@@ -157,15 +157,15 @@ class EnvironmentStep:
         )
 
     def targets(self) -> torch.Tensor:
-        """Joint targets of the present action [rad], (N, J)."""
+        """Return the joint targets of the present action [rad], (N, J)."""
         return self._builder.targets(self.action)
 
     def delay(self) -> torch.Tensor | None:
-        """Substeps for which the previous target still acts, (N,) int64; None if there is no latency."""
+        """Return substeps for which the previous target still acts, (N,) int64; None if there is no latency."""
         return self.latency(self.uniform)
 
     def progress(self) -> torch.Tensor:
-        """Fraction of the run, scalar."""
+        """Return the fraction of the run, scalar."""
         return self.memory.step.float() * (1.0 / self.configuration.schedule.horizon_steps)
 
     def after_physics(self) -> StepResult:
@@ -207,7 +207,7 @@ class EnvironmentStep:
         return start
 
     def _hold_heading(self, own: torch.Tensor, progress: torch.Tensor) -> None:
-        """Command yaw rates that lead straight commands back to their heading; ``own`` are the robots' headings, (N, 2)."""
+        """Return the command yaw rates that lead straight commands back to their heading; ``own`` are the robots' headings, (N, 2)."""
         memory, wanted = self.memory, self.memory.commanded_heading
         off = torch.atan2(own[:, 0] * wanted[:, 1] - own[:, 1] * wanted[:, 0], (own * wanted).sum(dim=1))
         yaw = self.commands.held_yaw_rate(off, kind=self.kind, progress=progress)
@@ -235,5 +235,5 @@ class EnvironmentStep:
         return due
 
     def observe(self) -> Observations:
-        """Observations of the present state, which is fresh for worlds that were just reset or pushed."""
+        """Return observations of the present state, which is fresh for worlds that were just reset or pushed."""
         return self.observer(self.inputs, self.memory, self.uniform)

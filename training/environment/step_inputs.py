@@ -29,7 +29,7 @@ AFTER_RESET = AFTER_STEP[:6]
 
 
 def static_inputs(state: PhysicsState) -> PhysicsState:
-    """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32."""
+    """Return tensors that physics states are copied into: as ``state`` in shape, floating point as float32."""
     values = {f.name: getattr(state, f.name).clone() for f in fields(PhysicsState)}
     return PhysicsState(**{name: v.float() if v.is_floating_point() else v for name, v in values.items()})
 

@@ -101,7 +101,7 @@ class StepReader:
         return torch.tensor(found, dtype=torch.int64, device=self._device)
 
     def sigma(self, memory: EnvironmentMemory) -> torch.Tensor:
-        """Tracking width of every command axis, (N, 3) (paper, dynamic velocity tracking precision adjustment)."""
+        """Return the tracking width of every command axis, (N, 3) (paper, dynamic velocity tracking precision adjustment)."""
         base = self._settings.tracking_sigma
         command = memory.command
         if not self._settings.dynamic_sigma:
@@ -110,7 +110,7 @@ class StepReader:
         return base + speed * (self._difficulty[memory.level] * self._sigma_growth)[:, None]
 
     def _commanded_heading(self, memory: EnvironmentMemory, heading_xy: torch.Tensor) -> torch.Tensor:
-        """``StepInputs.commanded_heading_xy``, where ``heading_xy`` are the robots' own."""
+        """Return ``StepInputs.commanded_heading_xy``, where ``heading_xy`` are the robots' own."""
         along = self._settings.progress_along
         if along == "base":
             return heading_xy

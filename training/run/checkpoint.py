@@ -45,7 +45,7 @@ class CheckpointError(RuntimeError):
 
 
 def checkpoint_entries(contract: PolicyContract, network: StoredNetwork, extra: Mapping[str, Any]) -> dict[str, Any]:
-    """The dictionary of a checkpoint: the entries of a policy file, and ``extra``.
+    """Return the dictionary of a checkpoint: the entries of a policy file, and ``extra``.
 
     Raises:
         CheckpointError: ``extra`` holds something other than tensors and plain data, or takes a name of the policy
@@ -168,7 +168,7 @@ class RunNumbers:
 
 
 def run_numbers(entries: Mapping[str, Any], path: Path) -> RunNumbers:
-    """The numbers of a checkpoint that ``read_checkpoint`` read with its training state.
+    """Return the numbers of a checkpoint that ``read_checkpoint`` read with its training state.
 
     Raises:
         CheckpointError: one is missing, of the wrong type or out of range.
@@ -228,12 +228,12 @@ def reached(entries: Mapping[str, Any]) -> float:
 
 
 def learned_networks(entries: Mapping[str, Any], *, raw: bool = False) -> Mapping[str, Any]:
-    """``actor_state_dict`` and ``critic_state_dict`` of a checkpoint: the averages where it has any, unless ``raw``."""
+    """Return ``actor_state_dict`` and ``critic_state_dict`` of a checkpoint: the averages where it has any, unless ``raw``."""
     return entries if raw else entries.get("average", entries)
 
 
 def student_state(actor: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The deployed network's part of an actor's state dictionary."""
+    """Return the deployed network's part of an actor's state dictionary."""
     return {n.removeprefix("student."): value for n, value in actor.items() if n.startswith("student.")}
 
 

@@ -30,14 +30,14 @@ class Keepsake:
             self._done.record(torch.cuda.current_stream(device))
 
     def take(self) -> Mapping[str, Any] | None:
-        """The copy, None if there is none."""
+        """Return the copy, None if there is none."""
         if self._done is not None:
             self._done.synchronize()
         return self._copy
 
 
 def host_copy(tree: Mapping[str, Any], device: torch.device | str) -> Mapping[str, Any]:
-    """A copy of a tree in the host's memory."""
+    """Return a copy of a tree in the host's memory."""
     copy: Mapping[str, Any] = _copied(tree, None)
     if torch.device(device).type == "cuda":
         torch.cuda.current_stream(device).synchronize()

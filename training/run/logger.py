@@ -83,7 +83,7 @@ class RunLogger:
         device: str,
         has_teacher: bool = True,
     ) -> None:
-        """Without a writer nothing is written.
+        """Prepare; without a writer nothing is written.
 
         Args:
             configuration: steps of an iteration, and every which environment is a student's.
@@ -259,5 +259,5 @@ class RunLogger:
 
 
 def _window(values: Iterable[Any]) -> deque[float]:
-    """The last of some numbers."""
+    """Return the last of some numbers."""
     return deque(map(float, values), maxlen=WINDOW)

@@ -43,13 +43,13 @@ class TrainingDivergedError(RuntimeError):
 
 
 def intact_checkpoint(run: Path | None) -> str:
-    """A sentence on the last checkpoint of a run directory, behind another one; empty where there is none."""
+    """Return a sentence on the last checkpoint of a run directory, behind another one; empty where there is none."""
     last = None if run is None else latest_checkpoint(run)
     return "" if last is None else f" The last checkpoint, '{last}', is intact."
 
 
 def stored_network(run: RunState, average: Mapping[str, Any] | None = None) -> StoredNetwork:
-    """The student as it is deployed: with averaged weights."""
+    """Return the student as it is deployed: with averaged weights."""
     actor = run.alg.actor
     weights = student_state((average or run.average.state_dict())["actor_state_dict"])
     return StoredNetwork(architecture=actor.architecture, arguments=actor.arguments, state_dict=weights)
@@ -136,7 +136,7 @@ def resume_run(run: RunState, path: Path) -> None:
 
 
 def _take_over(run: RunState, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> bool:
-    """Returns whether this process had a part of the checkpoint to itself."""
+    """Return True if this process had a part of the checkpoint to itself."""
     training = entries["training"]
     try:
         run.alg.load(entries)

@@ -61,8 +61,8 @@ def new_run_directory(root: Path, experiment: str, run_name: str = "", now: date
 def find_checkpoint(
     choice: str, *, experiment: str, task: str = "", root: Path = LOG_ROOT, others: Sequence[str] = ()
 ) -> Path:
-    """The checkpoint that ``--resume`` or ``--init-from`` names: ``latest`` (of the experiment), a run directory (its last), or a
-    file; ``others`` are the names that the option takes besides.
+    """Return the checkpoint that ``--resume`` or ``--init-from`` names: ``latest`` (of the experiment), a run directory (its last), or
+    a file; ``others`` are the names that the option takes besides.
 
     Raises:
         CheckpointError: there is none.
@@ -130,7 +130,7 @@ class _Noted:
 
 
 def read_run_json(run: Path) -> dict[str, Any]:
-    """Entries of a run directory's ``run.json``, none if there is no such file.
+    """Return the entries of a run directory's ``run.json``, none if there is no such file.
 
     Raises:
         CheckpointError: it is damaged.

@@ -110,7 +110,7 @@ class TrainingRunner(RunState):
         self.logger.close()
 
     def rollout_step(self, obs: TensorDict) -> TensorDict:
-        """Act, step and store; returns the next observations. Nothing in it waits for the device."""
+        """Return act, step and store; returns the next observations. Nothing in it waits for the device."""
         actions = self.alg.act(obs)
         obs, rewards, dones, extras = self.env.step(actions.to(self.env.device))
         obs, rewards, dones = self._guard(obs.to(self.device), rewards.to(self.device), dones.to(self.device))

@@ -23,7 +23,7 @@ def seed_everything(seed: int) -> None:
 
 
 def random_state(device: torch.device | str) -> dict[str, Any]:
-    """States of the global generators of Python, NumPy and PyTorch (CPU and ``device``), as tensors and plain data."""
+    """Return the states of the global generators of Python, NumPy and PyTorch (CPU and ``device``), as tensors and plain data."""
     version, words, gauss = random.getstate()
     name, keys, position, has_gauss, cached = np.random.get_state()  # type: ignore[misc]
     state: dict[str, Any] = {

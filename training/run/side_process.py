@@ -35,7 +35,7 @@ class Job:
 
     @property
     def log(self) -> Path:
-        """File of its standard error."""
+        """Return file of its standard error."""
         return self.output.with_suffix(".log")
 
 
@@ -64,7 +64,7 @@ class SideProcess:
         self._start_next()
 
     def poll(self) -> list[Finished]:
-        """Jobs that ended since the last call, without waiting."""
+        """Return jobs that ended since the last call, without waiting."""
         if self._running is not None:
             job, process = self._running
             if (code := process.poll()) is not None:
@@ -124,7 +124,7 @@ class SideProcess:
 
 @cache
 def parent_pipe() -> int:
-    """The standard input of ``CHILD_PROGRAM``: a pipe in which nothing is written, open as long as this process lives."""
+    """Return the standard input of ``CHILD_PROGRAM``: a pipe in which nothing is written, open as long as this process lives."""
     child_end, _ = os.pipe()
     return child_end
 

@@ -46,7 +46,7 @@ class SweepCall:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Reasons why runs failed, by label."""
+        """Return reasons why runs failed, by label."""
         return _failures(self.runs, self.found)
 
 

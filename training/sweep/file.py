@@ -81,7 +81,7 @@ class Sweep:
             raise ValueError(f"has {runs:,} trainings; at most {MOST_RUNS:,} are possible")
 
     def seeds_of(self, entry: SweepEntry) -> tuple[int, ...]:
-        """The entry's own seeds, or else the sweep's."""
+        """Return the entry's own seeds, or else the sweep's."""
         return self.seeds if entry.seeds is None else entry.seeds
 
 

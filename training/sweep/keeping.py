@@ -54,7 +54,7 @@ def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> tuple[lis
 
 
 def _in(folder: Path, run: SweepRun) -> SweepRun:
-    """A run's counterpart in the folder that it is kept in."""
+    """Return a run's counterpart in the folder that it is kept in."""
     return replace(run, folder=folder / "runs" / run.entry.name / f"seed-{run.seed}")
 
 

@@ -45,7 +45,7 @@ class DamagedNoteError(SweepError):
 
 
 def what_failed(error: Exception) -> str:
-    """One sentence on one of ``RUN_ERRORS``."""
+    """Return one sentence on one of ``RUN_ERRORS``."""
     if not isinstance(error, OSError):
         return str(error)
     reason = (error.strerror or one_line(error)).lower()
@@ -79,12 +79,12 @@ class SweepRun:
 
     @property
     def log(self) -> Path:
-        """Output of its training."""
+        """Return the output of its training."""
         return self.folder / "train.log"
 
     @property
     def directory(self) -> Path | None:
-        """Its run directory, the latest with a checkpoint, or what was kept of it; None before the first checkpoint."""
+        """Return its run directory, the latest with a checkpoint, or the kept form of it; None before the first checkpoint."""
         found = [run for run in self.folder.glob("logs/*/*") if latest_checkpoint(run)]
         if found:
             return max(found, key=lambda run: run.name)
@@ -109,7 +109,7 @@ class SweepRun:
         return finished and noted.get("iteration", 0) >= self.iterations
 
     def description(self) -> dict[str, Any]:
-        """Its ``run.json`` with the ``iteration`` of its last checkpoint; empty before the first.
+        """Return its ``run.json`` with the ``iteration`` of its last checkpoint; empty before the first.
 
         Raises:
             CheckpointError: it is damaged.
@@ -126,7 +126,7 @@ class SweepRun:
         return noted | ({} if last is None else {"iteration": int(last.stem.removeprefix("model_"))})
 
     def policy(self, sweep: Sweep) -> Path | None:
-        """File that is gauged; None before the run is trained, and where the file was not kept.
+        """Return the file that is gauged; None before the run is trained, and where the file was not kept.
 
         Raises:
             SweepError: another checkpoint was kept than the sweep asks for.
@@ -142,7 +142,7 @@ class SweepRun:
         return best if sweep.checkpoint == "best" and best.is_file() else latest_checkpoint(run)
 
     def wanted_iteration(self, sweep: Sweep) -> int | None:
-        """Iteration of the checkpoint that the sweep asks for, as noted in the description; None where it is not.
+        """Return the iteration of the checkpoint that the sweep asks for, as noted in the description; None where it is not.
 
         Raises:
             CheckpointError: the description is damaged.
@@ -163,7 +163,7 @@ class SweepRun:
             )
 
     def results(self, sweep: Sweep) -> Path | None:
-        """Folder of the gauging of its policy; None before it is trained. Results of another suite or policy keep their place.
+        """Return the folder of the gauging of its policy; None before it is trained. Results of another suite or policy keep their place.
 
         Raises:
             SweepError: what was kept is of another checkpoint, or of another suite and without a policy.
@@ -210,7 +210,7 @@ class SweepRun:
         return (self._kept / RESULTS).is_file() or any(self.folder.glob(f"gauge/*/{RESULTS}"))
 
     def damage(self, sweep: Sweep) -> str:
-        """Damage of the checkpoint that it goes on from, or of the gauged file, as a sentence; empty for none."""
+        """Return the damage of the checkpoint that it goes on from, or of the gauged file, as a sentence; empty for none."""
         run = self.directory
         try:
             for path in filter(None, {latest_checkpoint(run) if run else None, self.policy(sweep)}):
@@ -220,7 +220,7 @@ class SweepRun:
         return ""
 
     def training_command(self, sweep: Sweep, *, seconds: float | None, score_threads: int) -> list[str]:
-        """Begins the training or goes on with it; ``seconds`` is its wall-clock limit [s]."""
+        """Return the command that begins the training or goes on with it; ``seconds`` is its wall-clock limit [s]."""
         options = ["--no-score"]
         if sweep.training_suite != NO_SUITE:
             options = ["--score-suite", sweep.training_suite, "--score-threads", str(score_threads)]
@@ -235,7 +235,7 @@ class SweepRun:
         return [*CHILD_PROGRAM, "train", self.entry.task, *self.settings, *options]
 
     def gauging_command(self, sweep: Sweep, *, where: Sequence[str]) -> list[str]:
-        """Gauges its policy, or goes on with that; ``where`` are the options ``--threads`` and ``--cluster``."""
+        """Return the command that gauges its policy or goes on with that; ``where`` are the options ``--threads`` and ``--cluster``."""
         policy, results = self.policy(sweep), self.results(sweep)
         assert policy is not None and results is not None
         options = ["--suite", sweep.suite, *where, "--out", str(results), "--json", "--no-clip"]
@@ -294,7 +294,7 @@ def _read_policy(path: Path) -> FilePolicy:
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """The results in a folder.
+    """Return the results in a folder.
 
     Raises:
         ComparisonError: there are none, or they are damaged.

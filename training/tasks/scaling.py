@@ -33,7 +33,7 @@ class Ratios:
 
     @property
     def torque(self) -> float:
-        """Ratio of the legs' loads: weight times length."""
+        """Return the ratio of the legs' loads: weight times length."""
         return self.mass * self.length
 
 
@@ -60,7 +60,7 @@ def ratios(robot: Robot, reference: Robot) -> Ratios:
 def scaled(
     environment: EnvironmentConfiguration, training: TrainingConfiguration, source: str
 ) -> tuple[EnvironmentConfiguration, TrainingConfiguration]:
-    """A task's settings for another robot, which explores by the same angles, in an experiment that is named for it.
+    """Return a task's settings for another robot, which explores by the same angles, in an experiment that is named for it.
 
     Scaled are the height of the base with what the legs reach; the place to start on with the stance; masses that are added;
     penalties on torque and power with what the robot must carry; penalties on actions with the angle that an action is;
@@ -149,7 +149,7 @@ def _action_scale(robot: Robot) -> float:
 
 
 def _limits(limits: Triple, factor: Triple, robot: Robot) -> Triple:
-    """A terrain's limits: faster for a faster robot, but for a slower one only as slow as it is."""
+    """Return a terrain's limits: faster for a faster robot, but for a slower one only as slow as it is."""
     forward, lateral, yaw = (
         max(limit * by, min(limit, own)) for limit, by, own in zip(limits, factor, robot.command_limits, strict=True)
     )
