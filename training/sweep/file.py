@@ -8,7 +8,7 @@ from typing import Literal
 
 from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read_text
 from ...gauge.suite import SuiteError, load_suite
-from ..run.launch import DEFAULT_BACKEND
+from ..run.plan import DEFAULT_BACKEND
 
 NO_SUITE = "none"
 MOST_RUNS = 1000

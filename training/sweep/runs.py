@@ -21,7 +21,7 @@ from ...studies.policies import file_digest
 from ..configuration import ConfigurationError
 from ..overrides import TaskError
 from ..run.checkpoint import CheckpointError
-from ..run.launch import prepare
+from ..run.plan import prepare
 from ..run.request import TrainRequest
 from ..run.run_directory import read_run_json
 from ..run.side_process import CHILD_PROGRAM
