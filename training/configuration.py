@@ -87,8 +87,8 @@ class NetworkConfiguration:
     teacher_hidden: tuple[Width, ...] = (512, 256)
     """Hidden layers of the teacher encoder; of the next state's encoder (``him``), of the decoder (``dreamwaq``)."""
     student_encoder: str = "moe"
-    """``mlp`` (CTS), ``moe`` (MoE-CTS, the paper's) or ``moe_ng`` (experts that do not see the command); other methods than
-    ``cts`` take ``mlp``."""
+    """``mlp`` (CTS), ``moe`` (MoE-CTS, the paper's) or ``moe_ng`` (experts that do not see the command); other methods than ``cts`` take
+    ``mlp``."""
     student_hidden: tuple[Width, ...] = (512, 256)
     """Hidden layers of the student encoder, or of its experts' shared trunk."""
     expert_count: Width = 8
@@ -113,8 +113,8 @@ class NetworkConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class HimConfiguration:
-    """The contrast of ``him``: swapped prediction of prototypes. Where the method's paper gives no number, that of SwAV, from which
-    it takes the idea.
+    """The contrast of ``him``: swapped prediction of prototypes. Where the method's paper gives no number, that of SwAV, from which it
+    takes the idea.
     """
 
     prototypes: Annotated[int, Field(ge=2, le=65_536)] = 32
@@ -141,8 +141,8 @@ class AlgorithmConfiguration:
 
     method: str = "cts"
     """``cts`` (concurrent teacher and student), ``ac_moe`` (the same with experts in actor and critic), ``mcp`` (with an actor that
-    multiplies primitives), ``him`` (hybrid internal model) or ``dreamwaq`` (variational estimator);
-    or ``module:name`` of a class of your own that is derived from one of theirs."""
+    multiplies primitives), ``him`` (hybrid internal model) or ``dreamwaq`` (variational estimator); or ``module:name`` of a class of your
+    own that is derived from one of theirs."""
     student_period: int = 4
     """Environment i belongs to the student if i is a multiple of this, else to the teacher, where the method has one."""
     epochs: int = 5
@@ -164,8 +164,8 @@ class AlgorithmConfiguration:
     learning_rate_range: tuple[_Rate, _Rate] = (1e-5, 1e-2)
     """Bounds of the adaptive learning rate."""
     desired_kl: Ramp | Positive | None = 0.01
-    """KL divergence that the learning rate is adapted to after every minibatch; a ramp moves with the environment's schedules, None
-    keeps the rate fixed."""
+    """KL divergence that the learning rate is adapted to after every minibatch; a ramp moves with the environment's schedules, None keeps
+    the rate fixed."""
     max_gradient_norm: float = 1.0
     """Gradient norm limit, of each optimizer; actor side and critic share one norm."""
     student_learning_rate: _Rate = 1e-3
@@ -173,12 +173,11 @@ class AlgorithmConfiguration:
     him: HimConfiguration = HimConfiguration()
     dreamwaq: DreamwaqConfiguration = DreamwaqConfiguration()
     load_balance_coefficient: float = 0.01
-    """Weight of the load balancing loss of the Mixture of Experts, a sum over the experts (the paper's equation). The published
-    code takes the mean: a collapse of all samples onto one of 8 experts would then cost 0.0011 beside a latent error of the
-    order of 0.01."""
+    """Weight of the load balancing loss of the Mixture of Experts, a sum over the experts (the paper's equation). The published code
+    takes the mean: a collapse of all samples onto one of 8 experts would then cost 0.0011 beside a latent error of the order of 0.01."""
     symmetry: str = "none"
-    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image) or ``alternate`` (half of a minibatch
-    is replaced by its mirror image, the other half in the next pass: half of the work of ``augment``)."""
+    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image) or ``alternate`` (half of a minibatch is
+    replaced by its mirror image, the other half in the next pass: half of the work of ``augment``)."""
     precision: str = "tf32"
     """Matrix products on a GPU: ``float32``, ``tf32`` or ``bfloat16`` (autocast; losses stay in float32)."""
     cuda_graphs: bool | None = None
@@ -239,14 +238,12 @@ class RunConfiguration:
     """Keep the running episodes in checkpoints, so that resuming equals never having stopped. They are half of a checkpoint with 8,192
     environments; without them a resumed run begins new episodes on the levels reached."""
     bootstrap_iterations: int = 60
-    """Iterations at the start of a run from a bare policy (``--init-from``) in which only a teacher and a critic for
-    it are learned."""
+    """Iterations at the start of a run from a bare policy (``--init-from``) in which only a teacher and a critic for it are learned."""
     average_age: float = 0.1
-    """Mean age of the averaged weights, which are played and gauged, as a fraction of the iterations done (see ``averaging``); 0 for
-    the weights of the last iteration alone, at most 0.5."""
+    """Mean age of the averaged weights, which are played and gauged, as a fraction of the iterations done (see ``averaging``); 0 for the
+    weights of the last iteration alone, at most 0.5."""
     nonfinite_limit: Share = 0.01
-    """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run
-    stops."""
+    """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run stops."""
 
     def __post_init__(self) -> None:
         _positive(self, "steps_per_iteration", "iterations", "save_interval", "nonfinite_limit")

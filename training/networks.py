@@ -1,7 +1,7 @@
 """The networks of a method, and those of concurrent teacher-student learning.
 
-The student is the very network that is deployed: an architecture of ``policy.networks``, whose actor a teacher
-borrows. Teacher encoder and critic exist in training only.
+The student is the very network that is deployed: an architecture of ``policy.networks``, whose actor a teacher borrows. Teacher encoder
+and critic exist in training only.
 """
 
 from __future__ import annotations
@@ -116,9 +116,7 @@ def student_architecture(configuration: NetworkConfiguration, widths: Widths) ->
 
 
 class StudentActor(nn.Module):
-    """The deployed network, called student whatever the method, with its exploration noise; methods add what only training
-    needs.
-    """
+    """The deployed network, called student whatever the method, with its exploration noise; methods add what only training needs."""
 
     def __init__(
         self,
@@ -152,8 +150,8 @@ class StudentActor(nn.Module):
         self._frames = (int(arguments["history_length"]), int(arguments["frame_width"]))
 
     def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Return latents (N, L) and gate weights of the encoder (N, K), None without experts, from flat histories (N, H·F), oldest
-        frame first.
+        """Return latents (N, L) and gate weights of the encoder (N, K), None without experts, from flat histories (N, H·F), oldest frame
+        first.
         """
         raise NotImplementedError
 
@@ -217,8 +215,8 @@ class ComposedActor(CtsActor):
     """Teacher encoder, and a student with an actor composed of experts: AC-MoE and MCP."""
 
     def composed(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[Sequence[torch.Tensor], torch.Tensor]:
-        """Return the actor's output and the weights of its experts (N, K), for latents (N, L) and frames (N, F), in float32:
-        probability ratios depend on small differences of actions.
+        """Return the actor's output and the weights of its experts (N, K), for latents (N, L) and frames (N, F), in float32: probability
+        ratios depend on small differences of actions.
         """
         with torch.autocast(latent.device.type, enabled=False):
             values = torch.cat((latent.float(), policy), dim=-1)

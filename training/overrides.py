@@ -1,8 +1,8 @@
 """``key=value`` settings on nested frozen dataclasses, converted to the type of the field they change.
 
-A key is a path of field names separated by dots. An element of a tuple is addressed by its number or, if it has a
-``name``, by that: ``terrain.tiles.stairs_up.share=0.3``. Values: numbers, ``true``/``false``, ``none`` where a field
-may be None, text, and tuples as numbers separated by commas.
+A key is a path of field names separated by dots. An element of a tuple is addressed by its number or, if it has a ``name``, by that:
+``terrain.tiles.stairs_up.share=0.3``. Values: numbers, ``true``/``false``, ``none`` where a field may be None, text, and tuples as
+numbers separated by commas.
 """
 
 from __future__ import annotations

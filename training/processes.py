@@ -1,7 +1,7 @@
 """The processes of one run: one for each GPU, as torchrun starts them, or this one alone; and which GPU each takes.
 
-CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it
-instead. Whoever waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
+CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it instead.
+Whoever waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
 """
 
 from __future__ import annotations

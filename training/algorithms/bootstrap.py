@@ -1,7 +1,7 @@
 """Begin a method's training with a deployed policy alone, which has no critic, no teacher and no decoder.
 
-While it lasts, the student acts in all environments; encoder, actor and exploration noise stand still, and the missing networks
-learn from its behaviour. Afterwards training goes on as if it had never been cut in two.
+While it lasts, the student acts in all environments; encoder, actor and exploration noise stand still, and the missing networks learn
+from its behaviour. Afterwards training goes on as if it had never been cut in two.
 """
 
 from __future__ import annotations

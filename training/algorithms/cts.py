@@ -1,7 +1,7 @@
 """Concurrent teacher-student PPO (paper, method): CTS, MoE-CTS and MoE-NG, which differ by the student's encoder.
 
-Most environments are driven by the teacher, which sees the true state, the others by the student, which sees the last
-few observations. Both share one actor and one critic. Per iteration:
+Most environments are driven by the teacher, which sees the true state, the others by the student, which sees the last few observations.
+Both share one actor and one critic. Per iteration:
 
 1. PPO on both groups. The policy gradient of teacher samples reaches the teacher encoder through the actor; the critic
    gets the latent detached, and so do actor and critic on student samples. Nothing of this trains the student encoder.
@@ -26,8 +26,8 @@ from .symmetry import half_replaced
 
 
 class CtsLosses(Losses):
-    """The teacher's latents are computed where the policy learns, since it learns with it; where the student learns, the teacher
-    stands still and the student's targets are computed once.
+    """The teacher's latents are computed where the policy learns, since it learns with it; where the student learns, the teacher stands
+    still and the student's targets are computed once.
     """
 
     student_names = ("latent", "load_balance", "largest_expert_share")

@@ -1,15 +1,14 @@
-"""DreamWaQ (Nahrendra et al., "DreamWaQ: Learning Robust Quadrupedal Locomotion With Implicit Terrain Imagination via Deep
-Reinforcement Learning", 2023).
+"""DreamWaQ (Nahrendra et al., "DreamWaQ: Learning Robust Quadrupedal Locomotion With Implicit Terrain Imagination via Deep Reinforcement
+Learning", 2023).
 
-A context estimator, a beta variational autoencoder: the encoder of the history gives the base's velocity and a Gaussian latent, a
-decoder predicts the next frame from both. Its loss is the error of the velocity, that of the predicted frame, and beta times the
-latent's divergence from the standard normal distribution. The actor sees a sample of the latent where it learns and the mean
-where it is deployed.
+A context estimator, a beta variational autoencoder: the encoder of the history gives the base's velocity and a Gaussian latent, a decoder
+predicts the next frame from both. Its loss is the error of the velocity, that of the predicted frame, and beta times the latent's
+divergence from the standard normal distribution. The actor sees a sample of the latent where it learns and the mean where it is deployed.
 
 Adaptive bootstrapping: whether the actor is given the true or the estimated velocity is drawn for every sample. The estimate's
-probability is 1 - tanh(deviation / mean) of what the policy earns over the randomized worlds: as long as that differs much, the
-policy is not to learn from an estimate that is no better. What it earns is taken from the returns of the last rollout, which
-need no episode to end.
+probability is 1 - tanh(deviation / mean) of what the policy earns over the randomized worlds: as long as that differs much, the policy is
+not to learn from an estimate that is no better. What it earns is taken from the returns of the last rollout, which need no episode to
+end.
 """
 
 from __future__ import annotations

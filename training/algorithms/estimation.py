@@ -1,9 +1,9 @@
 """Share the parts of DreamWaQ and HIM: PPO with an estimator.
 
-One network acts everywhere, on the current frame and on what an encoder makes of the history: the base's velocity and a latent.
-The critic sees the true state. PPO trains actor and critic with the estimates that the rollout acted on; nothing of it reaches
-the encoder. Afterwards the encoder learns from the true velocity and from the state one step later, on the same rollout. Samples
-whose episode ended have no next state and count for the velocity alone.
+One network acts everywhere, on the current frame and on what an encoder makes of the history: the base's velocity and a latent. The
+critic sees the true state. PPO trains actor and critic with the estimates that the rollout acted on; nothing of it reaches the encoder.
+Afterwards the encoder learns from the true velocity and from the state one step later, on the same rollout. Samples whose episode ended
+have no next state and count for the velocity alone.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ class EstimatorLosses(Losses):
         return self.storage.privileged[..., :VELOCITY].flatten(0, 1)
 
     def samples(self, rows: torch.Tensor) -> Sequence[torch.Tensor]:
-        """Return samples of the rollout, mirrored as the symmetry asks for: histories (B, H·F), states one step later, velocity and
-        frame (B, 3 + F), the present velocity (B, 3), and 1 where the episode went on, (B,).
+        """Return samples of the rollout, mirrored as the symmetry asks for: histories (B, H·F), states one step later, velocity and frame
+        (B, 3 + F), the present velocity (B, 3), and 1 where the episode went on, (B,).
         """
         storage, mirror = self.storage, self.mirror
         history = storage.student_history.flatten(0, 1)[rows]

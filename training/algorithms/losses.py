@@ -19,8 +19,8 @@ POLICY_LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
 class Losses:
     """Computes losses from row indices; what both phases need beside the rollout is prepared once for each.
 
-    First the policy learns while the student's encoder stands still, so that the student's latents are those of the
-    rollout; then the encoder learns by supervision, which a method adds: ``prepare_student`` and ``student``.
+    First the policy learns while the student's encoder stands still, so that the student's latents are those of the rollout; then the
+    encoder learns by supervision, which a method adds: ``prepare_student`` and ``student``.
     """
 
     policy_names: Sequence[str] = POLICY_LOSSES
@@ -104,8 +104,8 @@ class Losses:
     def policy(self, *groups: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the PPO loss of rows of the flattened storage, and ``policy_names``, detached.
 
-        The surrogate is the sum of the means over each group, so that the fewer student samples count as much as the teacher's;
-        value loss and entropy are means over all.
+        The surrogate is the sum of the means over each group, so that the fewer student samples count as much as the teacher's; value
+        loss and entropy are means over all.
         """
         storage, mirror, settings = self.storage, self.mirror, self.settings
         sizes = [len(rows) for rows in groups]
@@ -174,8 +174,8 @@ class Losses:
 
 
 def load_balance(weights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Load balancing loss of a mixture's weights (B, K), the squared distance of their means from equal shares (paper, load
-    balancing loss), and the largest share.
+    """Load balancing loss of a mixture's weights (B, K), the squared distance of their means from equal shares (paper, load balancing
+    loss), and the largest share.
     """
     share = weights.float().mean(dim=0)
     return (share - 1.0 / len(share)).square().sum(), share.max()

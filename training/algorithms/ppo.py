@@ -1,7 +1,7 @@
 """Share PPO on a rollout, then supervised learning of the deployed network's encoder on the same rollout, among all methods.
 
-A method is a class derived from ``PPO``: its networks, what the actor is given of an observation, and the losses
-(``losses.Losses``) of the encoder. Nothing in the passes waits for the device.
+A method is a class derived from ``PPO``: its networks, what the actor is given of an observation, and the losses (``losses.Losses``) of
+the encoder. Nothing in the passes waits for the device.
 """
 
 from __future__ import annotations
@@ -114,8 +114,7 @@ class PPO:
         """Build networks, storage and algorithm for an environment.
 
         Args:
-            observations: the groups ``policy`` (N, F), ``history`` (N, H·F) frame by frame, oldest first, and
-                ``privileged`` (N, P).
+            observations: the groups ``policy`` (N, F), ``history`` (N, H·F) frame by frame, oldest first, and ``privileged`` (N, P).
             num_actions: width J of an action.
             command_entries: entries of a frame that hold the command.
             mirror: mirror maps, needed for symmetry.
@@ -210,9 +209,7 @@ class PPO:
 
     @torch.no_grad()
     def act(self, obs: TensorDict) -> torch.Tensor:
-        """Sample and store actions, (N, J) in environment order: a teacher's in its environments, the student's in the
-        others.
-        """
+        """Sample and store actions, (N, J) in environment order: a teacher's in its environments, the student's in the others."""
         split, actor = self.storage.split, self.actor
         # Indexing copies, so an environment may reuse the memory of its observations.
         policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
@@ -251,8 +248,8 @@ class PPO:
         raise NotImplementedError
 
     def store_outcome(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, Any]) -> None:
-        """Store the outcome of the actions, (N,) each in environment order. An episode that ends by ``time_outs`` is
-        worth its last value beyond.
+        """Store the outcome of the actions, (N,) each in environment order. An episode that ends by ``time_outs`` is worth its last value
+        beyond.
         """
         storage, order = self.storage, self.storage.split.order
         rewards = rewards[order]
@@ -357,8 +354,8 @@ class PPO:
         graphs: bool = True,
     ) -> Callable[..., None]:
         """Join two halves to one step: gradients of a loss of rows, and the step along them. Between several processes each half is a
-        CUDA graph of its own, where there are any and ``graphs`` allows it: a message inside a graph could not be given up when a
-        process is lost.
+        CUDA graph of its own, where there are any and ``graphs`` allows it: a message inside a graph could not be given up when a process
+        is lost.
         """
 
         def compute(*rows: torch.Tensor) -> None:

@@ -42,9 +42,8 @@ def check_minibatches(num_minibatches: int, *, steps: int, teachers: int, studen
 class EnvironmentSplit:
     """Environments of the teacher and of the student.
 
-    Environment i is a student's if i is a multiple of ``period`` (so every contiguous range of environments, and with
-    it every kind of terrain, holds both); with a period of 1 all are. Blocks: rows ``[0, num_teacher)`` are the teacher's,
-    the rest the student's.
+    Environment i is a student's if i is a multiple of ``period`` (so every contiguous range of environments, and with it every kind of
+    terrain, holds both); with a period of 1 all are. Blocks: rows ``[0, num_teacher)`` are the teacher's, the rest the student's.
     """
 
     num_teacher: int
@@ -73,10 +72,9 @@ class EnvironmentSplit:
 class RolloutStorage:
     """One rollout: T steps of N environments in block order, in memory that stays where it is (CUDA graphs rely on it).
 
-    Histories are kept for student rows only: the teacher never looks at them, and they are the widest group. Student
-    latents are kept because the student encoder does not change before the PPO passes are over, so they need not be
-    computed again in every minibatch. Minibatches are row indices into the flattened storage; nothing is copied until
-    a minibatch is used.
+    Histories are kept for student rows only: the teacher never looks at them, and they are the widest group. Student latents are kept
+    because the student encoder does not change before the PPO passes are over, so they need not be computed again in every minibatch.
+    Minibatches are row indices into the flattened storage; nothing is copied until a minibatch is used.
     """
 
     def __init__(

@@ -1,5 +1,5 @@
-"""Velocity commands: the curriculum of ranges, and the dynamic, extreme, opposite and stationary draws (paper,
-command design); and crossings, which last an episode.
+"""Velocity commands: the curriculum of ranges, and the dynamic, extreme, opposite and stationary draws (paper, command design); and
+crossings, which last an episode.
 """
 
 from __future__ import annotations

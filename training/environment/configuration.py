@@ -1,8 +1,7 @@
 """Settings of the training environment.
 
-Progress is a fraction of the run: environment steps taken so far (per environment) over
-``ScheduleConfiguration.horizon_steps``. Defaults are chosen for policies that transfer; ``docs/training-choices.md`` lists
-every difference from the published code and its reason.
+Progress is a fraction of the run: environment steps taken so far (per environment) over ``ScheduleConfiguration.horizon_steps``. Defaults
+are chosen for policies that transfer; ``docs/training-choices.md`` lists every difference from the published code and its reason.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ class ScheduleConfiguration:
     """Number of steps of a whole run, and the fraction of it at which the run begins."""
 
     horizon_steps: Count = 240_000
-    """Environment steps, per environment, of the whole run; every ramp and stage is a fraction of it. A task sets it to the steps of
-    its iterations, unless it is given on the command line."""
+    """Environment steps, per environment, of the whole run; every ramp and stage is a fraction of it. A task sets it to the steps of its
+    iterations, unless it is given on the command line."""
     begin: Share = 0.0
-    """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin
-    with the commands of a robot that cannot walk yet."""
+    """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin with the commands of a
+    robot that cannot walk yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +85,8 @@ class OwnEvent:
     name: str
     """Name in settings."""
     function: str
-    """``module:function`` of the environment and a mask of the worlds that begin an episode, (N,) bool; called in every step after
-    resets and pushes."""
+    """``module:function`` of the environment and a mask of the worlds that begin an episode, (N,) bool; called in every step after resets
+    and pushes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,8 +126,7 @@ class ObservationConfiguration:
     scan_cell: Metres = 0.05
     """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
     own: tuple[OwnObservation, ...] = ()
-    """Entries of one's own behind those of ``privileged``. The mirror images of ``training.algorithm.symmetry`` do not
-    know them."""
+    """Entries of one's own behind those of ``privileged``. The mirror images of ``training.algorithm.symmetry`` do not know them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,16 +166,15 @@ class CommandConfiguration:
     required_distance: float = 5.0
     """Distance that the commands of an episode shall add up to at least [m] (``dynamic``)."""
     straight_probability: Share = 0.3
-    """Share of the uniform draws with zero yaw rate. Published: 0; the gauge's commands are all straight or a pure
-    turn."""
+    """Share of the uniform draws with zero yaw rate. Published: 0; the gauge's commands are all straight or a pure turn."""
     heading_gain: NotNegative = 0.0
-    """Yaw rate commanded in straight draws for each radian by which the robot is off the heading it had when the command was drawn
-    [1/s], within the range: a robot that turned away is told to turn back. 0 commands no yaw there."""
+    """Yaw rate commanded in straight draws for each radian by which the robot is off the heading it had when the command was drawn [1/s],
+    within the range: a robot that turned away is told to turn back. 0 commands no yaw there."""
     extreme_probability: Share = 0.2
     """Share of draws with every axis at a limit or zero."""
     extreme_zero_probability: tuple[float, float, float] = (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)
-    """Chance of the forward, lateral and yaw speed of an extreme command to be zero. Published: 0, 0 and 1/3, and 0, 1
-    and 1/3 for the fast task."""
+    """Chance of the forward, lateral and yaw speed of an extreme command to be zero. Published: 0, 0 and 1/3, and 0, 1 and 1/3 for the
+    fast task."""
     flip_probability: Share = 0.2
     """Chance that an extreme command is followed by its opposite."""
     stationary_probability: Ramp = _STATIONARY
@@ -269,8 +266,8 @@ class TerminationConfiguration:
     joint_velocity: Positive = 150.0
     """Joint speed beyond anything real, which counts as a diverged world [rad/s]."""
     stuck: Positive | None = None
-    """Time without progress after which a robot that did as commanded before is stuck [s]: its episode ends as a failure and moves
-    the level down. None for never."""
+    """Time without progress after which a robot that did as commanded before is stuck [s]: its episode ends as a failure and moves the
+    level down. None for never."""
     stuck_from: NotNegative = 0.1
     """Fraction of the run from which being stuck ends episodes: a robot that cannot walk yet is always stuck."""
     own: tuple[OwnTermination, ...] = ()

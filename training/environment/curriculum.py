@@ -29,8 +29,7 @@ class TrainingPalette:
     tiles: tuple[TileConfiguration, ...]
     """Kinds in use; a kind's number is its place here."""
     index: torch.Tensor
-    """Terrain index of every kind, level and variant, (K, L, V) int64; tiles repeat where a kind has no levels or no
-    chance."""
+    """Terrain index of every kind, level and variant, (K, L, V) int64; tiles repeat where a kind has no levels or no chance."""
 
     @property
     def num_levels(self) -> int:
@@ -142,8 +141,8 @@ def next_level(
 ) -> torch.Tensor:
     """Return the level of the next episode, were this one over.
 
-    Up after leaving the middle of the tile far enough; down after a fall, or with too little of the commanded way
-    made. Who masters the last level starts anywhere again, so that easy tiles are not forgotten.
+    Up after leaving the middle of the tile far enough; down after a fall, or with too little of the commanded way made. Who masters the
+    last level starts anywhere again, so that easy tiles are not forgotten.
 
     Args:
         level: present level from 0, (N,) int64.

@@ -47,7 +47,7 @@ class MotorParameters:
     def __init__(
         self, ranges: RandomizationConfiguration, num_envs: int, num_joints: int, device: torch.device | str
     ) -> None:
-        """Return motors as the robot's parameter set says."""
+        """Prepare motors as the robot's parameter set says."""
         bounds = [getattr(ranges, name) for name in MOTOR_COLUMNS]
         self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
         self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]

@@ -1,9 +1,8 @@
 """The training environment: rsl_rl's ``VecEnv`` on any physics backend.
 
-One step, in order: the action becomes joint targets with a drawn latency; the physics advances one control period;
-rewards, ends, curriculum and commands are judged on the new state; worlds whose episode is over are reset and others
-pushed; observations are made of the state after that, so that the first observation of an episode is fresh. Nothing
-in a step waits for the device.
+One step, in order: the action becomes joint targets with a drawn latency; the physics advances one control period; rewards, ends,
+curriculum and commands are judged on the new state; worlds whose episode is over are reset and others pushed; observations are made of
+the state after that, so that the first observation of an episode is fresh. Nothing in a step waits for the device.
 """
 
 from __future__ import annotations
@@ -69,13 +68,12 @@ class TrainingEnvironment(VecEnv):
             device: torch device of the physics and of everything else.
             threads: CPU threads for engines that use them.
             capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
-            fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels
-                into a few; numbers differ in the last digits. None: on a GPU, unless a function of one's own cannot be
-                compiled, which ``unfused`` then says.
+            fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels into a few; numbers
+                differ in the last digits. None: on a GPU, unless a function of one's own cannot be compiled, which ``unfused`` then says.
 
         Raises:
-            ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device, or ``fuse`` for a
-                function that cannot be compiled.
+            ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device, or ``fuse`` for a function that
+                cannot be compiled.
             BackendError: the engine cannot do what is asked.
         """
         if capture and torch.device(device).type != "cuda":
@@ -319,9 +317,8 @@ class TrainingEnvironment(VecEnv):
         """Return everything that continuing needs: memory, random state, randomization, observations, and poses and velocities of the
         physics.
 
-        The physics itself is put back by a reset: what an engine carries from step to step beside positions,
-        velocities and targets (a solver's warm start, contact caches) is lost. On an engine without such memory,
-        continuing equals never having stopped.
+        The physics itself is put back by a reset: what an engine carries from step to step beside positions, velocities and targets (a
+        solver's warm start, contact caches) is lost. On an engine without such memory, continuing equals never having stopped.
         """
         state = self.backend.state
         return {
@@ -336,8 +333,8 @@ class TrainingEnvironment(VecEnv):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``, or begin new episodes from ``progress_dict``. The environment must have been
-        built with the same configuration.
+        """Continue from ``state_dict``, or begin new episodes from ``progress_dict``. The environment must have been built with the same
+        configuration.
 
         Raises:
             ValueError: the state is of another version or of another environment.
@@ -402,11 +399,7 @@ class TrainingEnvironment(VecEnv):
 
     @staticmethod
     def _require_below(numbers: torch.Tensor, count: int, name: str) -> None:
-        """Refuse saved numbers of things that are not there: engines read memory by them, unchecked.
-
-        Raises:
-            ValueError: one is negative or not below ``count``.
-        """
+        """Refuse saved numbers of things that are not there: engines read memory by them, unchecked."""
         if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < count:
             raise ValueError(f"the saved environment does not fit: '{name}' is not between 0 and {count - 1}")
 
@@ -434,8 +427,8 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
 def training_contract(
     robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
 ) -> PolicyContract:
-    """Return the interface of a policy trained here: one frame of observation, the gains, the control period and the largest commands
-    of the training.
+    """Return the interface of a policy trained here: one frame of observation, the gains, the control period and the largest commands of
+    the training.
     """
     tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
     provenance = {REMEMBERED: identify(robot, configuration.robot)}

@@ -1,7 +1,7 @@
 """What happens to the physics beside the robot's own doing: starts of episodes, pushes, and late actions.
 
-What differs between worlds and is drawn with them is in ``domain_randomization.py``. All draws are functions of uniform
-numbers, without branches on data.
+What differs between worlds and is drawn with them is in ``domain_randomization.py``. All draws are functions of uniform numbers, without
+branches on data.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ class EpisodeStarts:
         )
 
     def __call__(self, worlds: torch.Tensor, memory: EnvironmentMemory, uniform: UniformColumns) -> EpisodeStart:
-        """Return a start for the masked worlds, above the highest ground below the robot; the memory learns whether their episode
-        counts for the curriculum.
+        """Return a start for the masked worlds, above the highest ground below the robot; the memory learns whether their episode counts
+        for the curriculum.
         """
         spread = uniform["spread"][:, 0] < self._terrain.spread_probability
         torch.where(worlds, ~spread, memory.moves_level, out=memory.moves_level)

@@ -1,8 +1,7 @@
 """Ground heights on the device: one small raster per terrain of the palette, read by all worlds at once.
 
-A raster holds ``Terrain.height`` at nodes of a square grid about the terrain's origin. A query takes the nearest
-node: riser edges stay vertical, at most half a cell from where they are, and one query is one gather. Beyond the
-raster the height of its edge continues.
+A raster holds ``Terrain.height`` at nodes of a square grid about the terrain's origin. A query takes the nearest node: riser edges stay
+vertical, at most half a cell from where they are, and one query is one gather. Beyond the raster the height of its edge continues.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Everything the training environment remembers from step to step, in one place, so that saving it is saving all of
-it.
-"""
+"""Everything the training environment remembers from step to step, in one place, so that saving it is saving all of it."""
 
 from __future__ import annotations
 
@@ -66,8 +64,8 @@ class EnvironmentMemory:
     command: torch.Tensor
     """Present command, (N, 3)."""
     commanded_heading: torch.Tensor
-    """Heading that the commands ask for: the robot's own when the command was drawn, turned by the yaw rates commanded since; unit
-    vector in the world's xy plane, (N, 2)."""
+    """Heading that the commands ask for: the robot's own when the command was drawn, turned by the yaw rates commanded since; unit vector
+    in the world's xy plane, (N, 2)."""
     command_steps: torch.Tensor
     """Control steps until the next draw, (N,) int64."""
     command_extreme: torch.Tensor
@@ -116,8 +114,8 @@ class EnvironmentMemory:
     """Diverged worlds that were reset in the run, scalar int64."""
 
     episode: torch.Tensor
-    """The numbers that are zero when an episode begins, one row for each world, (N, …): ``EPISODE`` are its columns, so that one
-    kernel clears them all."""
+    """The numbers that are zero when an episode begins, one row for each world, (N, …): ``EPISODE`` are its columns, so that one kernel
+    clears them all."""
     sums: torch.Tensor
     """All sums since the last log in one row: ``SUMS`` are its columns."""
 

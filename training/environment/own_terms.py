@@ -1,9 +1,8 @@
-"""Terms of one's own: functions that settings name, so that a task adds rewards, terminations, observations and events
-without touching the environment's loop.
+"""Terms of one's own: functions that settings name, so that a task adds rewards, terminations, observations and events without touching
+the environment's loop.
 
-A function is named ``module:function``; the module must be importable where the run is started and resumed. ``docs/``
-has a worked example. Names that come out of a checkpoint, perhaps a stranger's, are imported only where they are trusted
-(``foreign_functions``).
+A function is named ``module:function``; the module must be importable where the run is started and resumed. ``docs/`` has a worked
+example. Names that come out of a checkpoint, perhaps a stranger's, are imported only where they are trusted (``foreign_functions``).
 """
 
 from __future__ import annotations
@@ -112,8 +111,7 @@ def resolve_own(
 
     Args:
         taken: names that they cannot have.
-        gives: whether a function's result is what it must be, from its first argument and the result; None where nothing is
-            looked at.
+        gives: whether a function's result is what it must be, from its first argument and the result; None where nothing is looked at.
         rule: how a sentence says that.
 
     Raises:

@@ -1,8 +1,7 @@
 """One draw of uniform numbers per step, handed out by name.
 
-A single kernel fills all random numbers that a step may need, whether or not it uses them. So a captured step is a
-pure function of its inputs, random numbers do not depend on what happened in other worlds, and one generator state is
-all that a checkpoint needs.
+A single kernel fills all random numbers that a step may need, whether or not it uses them. So a captured step is a pure function of its
+inputs, random numbers do not depend on what happened in other worlds, and one generator state is all that a checkpoint needs.
 """
 
 from __future__ import annotations

@@ -33,8 +33,7 @@ class OwnReward:
 
 @dataclass(frozen=True, kw_only=True)
 class RewardWeights:
-    """Weights of the reward terms, per second: each step's term is multiplied by its weight and the control period. 0
-    leaves a term out.
+    """Weights of the reward terms, per second: each step's term is multiplied by its weight and the control period. 0 leaves a term out.
 
     Formulas are in ``rewards.py``; the paper's table of rewards is the source where nothing else is said.
     """
@@ -44,8 +43,7 @@ class RewardWeights:
     yaw_tracking: float = 0.5
     """Tracking of the commanded yaw rate."""
     progress: float = 0.0
-    """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an
-    obstacle."""
+    """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an obstacle."""
     vertical_velocity: Ramp = _VERTICAL_VELOCITY
     """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
     roll_pitch_rate: float = -0.05
@@ -69,8 +67,8 @@ class RewardWeights:
     joint_limits: float = -2.0
     """Joint angle beyond the soft limits [rad]."""
     joint_speed_limits: float = 0.0
-    """Joint speed beyond the soft limit of the motor's own [rad/s]. In suites without a limit of torque over speed, as the
-    published one, a policy may otherwise move its legs faster than the robot's motors can."""
+    """Joint speed beyond the soft limit of the motor's own [rad/s]. In suites without a limit of torque over speed, as the published one,
+    a policy may otherwise move its legs faster than the robot's motors can."""
     foot_regulation: float = -0.05
     """Squared foot speed close to the ground."""
     hip_regulation: float = -0.05
@@ -102,15 +100,14 @@ class RewardShapes:
     sigma_yaw_range: Range = (1.0, 2.0)
     """Commanded yaw rate between which sigma grows to the terrain's largest [rad/s]."""
     progress_along: Literal["command", "straight", "base"] = "straight"
-    """Heading that a command refers to in ``progress``, in being stuck and in the commanded way to the next level.
-    ``command``: the robot's heading when the command was drawn, turned by the yaw rates commanded since; a robot that turns at
-    another rate drifts away from it without observing that. ``base``: the robot's present heading; turning away from a step then
-    costs nothing. ``straight``: as ``command`` during straight commands, which hold the heading, and as ``base`` in arcs."""
+    """Heading that a command refers to in ``progress``, in being stuck and in the commanded way to the next level. ``command``: the
+    robot's heading when the command was drawn, turned by the yaw rates commanded since; a robot that turns at another rate drifts away
+    from it without observing that. ``base``: the robot's present heading; turning away from a step then costs nothing. ``straight``: as
+    ``command`` during straight commands, which hold the heading, and as ``base`` in arcs."""
     base_height_target: Metres = 0.38
     """Height of the base over the ground below the trunk, from which ``base_height`` measures the error [m]."""
     trunk_area: tuple[Extent, Extent] = (0.4, 0.3)
-    """Length and width of the area below the base [m]: the base's height is measured from the mean of the height scan's points in
-    it."""
+    """Length and width of the area below the base [m]: the base's height is measured from the mean of the height scan's points in it."""
     foot_height_scale: Positive = 0.025
     """Foot regulation fades with foot height over this share of ``base_height_target``."""
     foot_height_over: Literal["foot", "base"] = "foot"

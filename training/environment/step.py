@@ -1,9 +1,9 @@
 """The torch part of an environment step, as a list of its parts: what a step led to, ends, rewards, log, levels, pushes, the next
 episodes; and observing.
 
-Two functions without arguments, ``after_physics`` and ``observe``, read fixed tensors (inputs, memory, uniform
-numbers) and have static shapes, no random state and no branch on data, so that each can be captured in a CUDA graph.
-Between them the environment resets, randomizes and pushes the physics.
+Two functions without arguments, ``after_physics`` and ``observe``, read fixed tensors (inputs, memory, uniform numbers) and have static
+shapes, no random state and no branch on data, so that each can be captured in a CUDA graph. Between them the environment resets,
+randomizes and pushes the physics.
 """
 
 from __future__ import annotations
@@ -191,8 +191,8 @@ class EnvironmentStep:
     def begin_episodes(
         self, worlds: torch.Tensor, failed: torch.Tensor, progress: torch.Tensor, heading_xy: torch.Tensor
     ) -> EpisodeStart:
-        """Draw the next episode of the masked worlds, and new commands where they are due; the memory is updated in
-        place. ``heading_xy`` are the headings at which the other worlds' episodes go on, (N, 2).
+        """Draw the next episode of the masked worlds, and new commands where they are due; the memory is updated in place. ``heading_xy``
+        are the headings at which the other worlds' episodes go on, (N, 2).
         """
         memory, uniform = self.memory, self.uniform
         self.levels.move(memory, uniform, worlds, failed)
@@ -207,7 +207,7 @@ class EnvironmentStep:
         return start
 
     def _hold_heading(self, own: torch.Tensor, progress: torch.Tensor) -> None:
-        """Return the command yaw rates that lead straight commands back to their heading; ``own`` are the robots' headings, (N, 2)."""
+        """Write the command yaw rates that lead straight commands back to their heading; ``own`` are the robots' headings, (N, 2)."""
         memory, wanted = self.memory, self.memory.commanded_heading
         off = torch.atan2(own[:, 0] * wanted[:, 1] - own[:, 1] * wanted[:, 0], (own * wanted).sum(dim=1))
         yaw = self.commands.held_yaw_rate(off, kind=self.kind, progress=progress)

@@ -40,8 +40,8 @@ class StepReader:
             scan: points of the height scan about the base [m], (P, 2).
 
         Raises:
-            ConfigurationError: no point of the scan is below the trunk, or joint speeds are judged of motors whose no-load
-                speeds nobody knows.
+            ConfigurationError: no point of the scan is below the trunk, or joint speeds are judged of motors whose no-load speeds nobody
+                knows.
         """
         self._settings, self._rasters = configuration.rewards, rasters
         self._joint_velocity_limit = configuration.termination.joint_velocity

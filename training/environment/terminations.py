@@ -1,8 +1,7 @@
-"""Ends of episodes. Each rule is a function of ``StepInputs`` and the settings that says which worlds' episode is over;
-``TERMINATIONS`` names them.
+"""Ends of episodes. Each rule is a function of ``StepInputs`` and the settings that says which worlds' episode is over; ``TERMINATIONS``
+names them.
 
-An end is a failure, or a time-out, whose missing future the learner bootstraps. A failure lowers the level, unless the
-physics failed.
+An end is a failure, or a time-out, whose missing future the learner bootstraps. A failure lowers the level, unless the physics failed.
 """
 
 from __future__ import annotations

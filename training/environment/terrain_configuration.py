@@ -45,8 +45,8 @@ ALL_TILES = (
     TileConfiguration(name="obstacles", share=0.13, command_limits=_STRAIGHT, sigma=0.75),
     FLAT_TILE,
 )
-"""Every kind. Sigmas are the published ones (bars have that of obstacles), limits too but for slower sideways commands on stairs
-upwards, bars and obstacles; waves and all that is to be climbed have more than their published share, slopes and flat less."""
+"""Every kind. Sigmas are the published ones (bars have that of obstacles), limits too but for slower sideways commands on stairs upwards,
+bars and obstacles; waves and all that is to be climbed have more than their published share, slopes and flat less."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,13 +74,12 @@ class TerrainConfiguration:
     demote_falls: bool = True
     """Lower the level after a fall before promotion, at any distance."""
     leave_distance: _Distance | None = 4.75
-    """Distance from the tile's middle at which an episode is cut short as a time-out [m]; None for never. Beyond the
-    edge there is only level ground, on which the published robots had the next tile."""
+    """Distance from the tile's middle at which an episode is cut short as a time-out [m]; None for never. Beyond the edge there is only
+    level ground, on which the published robots had the next tile."""
     spawn_jitter: _Spread = 1.0
     """Episodes start up to this far from the tile's middle, in x and in y [m]."""
     spread_probability: Share = 0.1
-    """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; they do not move
-    levels."""
+    """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; they do not move levels."""
     spread_distance: _Spread = 3.0
     """Those episodes start up to this far from the tile's middle, in x and in y [m]."""
     level_rule: str = "gaitgauge.training.environment.curriculum:next_level"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from .checkpoint import copy_checkpoint
 from .filming import Filmer
@@ -12,19 +13,31 @@ from .run_directory import update_run_json
 from .scoring import Scorer, ScoreReport
 from .state import RunState
 
-
-def never() -> bool:
-    """Return False: nothing asks a wait to end."""
-    return False
+Side = TypeVar("Side", Scorer, Filmer)
 
 
-class Scores:
+class Beside(Generic[Side]):
+    """A run and its side process, if it has one; without one, all methods do nothing."""
+
+    def __init__(self, run: RunState, side: Side | None) -> None:
+        """Begin with nothing asked for."""
+        self._run, self._side = run, side
+
+    @property
+    def pending(self) -> bool:
+        """True while a result is to come."""
+        return self._side is not None and self._side.pending > 0
+
+    def close(self) -> None:
+        """Give up pending results."""
+        if self._side is not None:
+            self._side.close()
+
+
+class Scores(Beside[Scorer]):
     """Scores of checkpoints, and the checkpoint with the best one."""
 
-    def __init__(self, run: RunState, scorer: Scorer | None) -> None:
-        """Score with a scorer; with None, all methods do nothing."""
-        self._run, self._scorer = run, scorer
-        self._submitted = -1
+    _submitted = -1
 
     def begin(self) -> None:
         """Ask for no score of the present iteration: an earlier call of ``learn`` has done that."""
@@ -33,23 +46,24 @@ class Scores:
     def submit(self, checkpoint: Path | None) -> None:
         """Ask the first process for the scores of a checkpoint, once for each iteration."""
         run = self._run
-        if self._scorer is None or checkpoint is None or self._submitted == run.iteration or run.processes.rank:
+        if self._side is None or checkpoint is None or self._submitted == run.iteration or run.processes.rank:
             return
         self._submitted = run.iteration
-        self._scorer.submit(checkpoint, run.iteration)
+        self._side.submit(checkpoint, run.iteration)
 
-    def take(self, seconds: float = 0.0, stop: Callable[[], bool] = never) -> None:
+    def take(self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False) -> None:
         """Log scores at their checkpoints' iterations, after a wait of at most ``seconds`` [s], and keep the best checkpoint."""
-        for report in [] if self._scorer is None else self._scorer.drain(seconds, stop):
+        if self._side is None:
+            return
+        for report in self._side.drain(seconds, stop):
             if report.failure:
                 self._run.message(f"No gauge score for iteration {report.iteration}: {report.failure}.")
             else:
-                self._log(report)
+                self._log(report, self._side.suite)
 
-    def _log(self, report: ScoreReport) -> None:
+    def _log(self, report: ScoreReport, suite: str) -> None:
         run, wanted = self._run, self._run.configuration.run.gauge_score
-        assert self._scorer is not None
-        scalars = {f"Gauge/{self._scorer.suite}/{name}": value for name, value in report.scores.items()}
+        scalars = {f"Gauge/{suite}/{name}": value for name, value in report.scores.items()}
         run.logger.write(scalars, report.iteration)
         run.logger.scalars |= scalars
         score = report.scores.get(wanted)
@@ -64,45 +78,21 @@ class Scores:
                 update_run_json(run.log_dir, {"best_score": score, "best_iteration": report.iteration})
             run.message(f"Best gauge score so far: {score:.4f} at iteration {report.iteration}.")
 
-    @property
-    def pending(self) -> bool:
-        """True while a score is to come."""
-        return self._scorer is not None and self._scorer.pending > 0
 
-    def close(self) -> None:
-        """Give up pending scores."""
-        if self._scorer is not None:
-            self._scorer.close()
-
-
-class Videos:
+class Videos(Beside[Filmer]):
     """Videos of checkpoints."""
-
-    def __init__(self, run: RunState, filmer: Filmer | None) -> None:
-        """Film with a filmer; with None, all methods do nothing."""
-        self._run, self._filmer = run, filmer
 
     def submit(self, checkpoint: Path | None) -> None:
         """Ask for a video of a checkpoint."""
-        if self._filmer is not None and checkpoint is not None:
-            self._filmer.submit(checkpoint, self._run.iteration)
+        if self._side is not None and checkpoint is not None:
+            self._side.submit(checkpoint, self._run.iteration)
 
-    def take(self, seconds: float = 0.0, stop: Callable[[], bool] = never) -> None:
+    def take(self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False) -> None:
         """Log finished videos, after a wait of at most ``seconds`` [s]."""
-        if self._filmer is None:
+        if self._side is None:
             return
-        videos, sentence = self._filmer.take(seconds, stop)
+        videos, sentence = self._side.take(seconds, stop)
         for video, iteration in videos:
             self._run.logger.send(video, iteration)
         if sentence:
             self._run.message(sentence)
-
-    @property
-    def pending(self) -> bool:
-        """True while a video is to come."""
-        return self._filmer is not None and self._filmer.pending > 0
-
-    def close(self) -> None:
-        """Give up pending videos."""
-        if self._filmer is not None:
-            self._filmer.close()

@@ -1,9 +1,9 @@
 """Checkpoints: a policy file that also holds everything a run needs to continue as if it had never stopped.
 
-A checkpoint is a file of ``policy.native``'s format (contract, network, averaged weights of the student), so every command
-that takes a policy takes it. Beside these it has rsl_rl's usual entries (``actor_state_dict`` … ``iter``; the weights after the
-last update), ``average`` (the averaged networks) and ``training``, what only a resumed run reads. It holds tensors and plain data
-only and is read without the ability to run code.
+A checkpoint is a file of ``policy.native``'s format (contract, network, averaged weights of the student), so every command that takes a
+policy takes it. Beside these it has rsl_rl's usual entries (``actor_state_dict`` … ``iter``; the weights after the last update),
+``average`` (the averaged networks) and ``training``, what only a resumed run reads. It holds tensors and plain data only and is read
+without the ability to run code.
 """
 
 from __future__ import annotations
@@ -221,8 +221,8 @@ def _check_policy(entries: Mapping[str, Any], source: str, purpose: str) -> None
 
 
 def reached(entries: Mapping[str, Any]) -> float:
-    """Return the fraction of its schedules that the run of a file had gone through; 1 where the file does not say: a finished policy
-    goes on with the end of its schedules.
+    """Return the fraction of its schedules that the run of a file had gone through; 1 where the file does not say: a finished policy goes
+    on with the end of its schedules.
     """
     return min(float(entries.get("training", {}).get("progress", 1.0)), 1.0)
 
@@ -238,8 +238,8 @@ def student_state(actor: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 
 def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False) -> None:
-    """Write a checkpoint's networks without what only resuming needs: a policy file from which training can begin anew
-    (``--init-from``), with its teacher and its critic.
+    """Write a checkpoint's networks without what only resuming needs: a policy file from which training can begin anew (``--init-from``),
+    with its teacher and its critic.
 
     Args:
         raw: the weights after the last update instead of their average.

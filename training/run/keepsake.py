@@ -1,7 +1,7 @@
 """The last good state of what a run learns, in the host's memory: what is left when another process is lost.
 
-A GPU that waits for a message from a lost process answers no more, so its memory is copied out after every iteration; the
-copy runs while the next rollout begins.
+A GPU that waits for a message from a lost process answers no more, so its memory is copied out after every iteration; the copy runs while
+the next rollout begins.
 """
 
 from __future__ import annotations

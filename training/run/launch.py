@@ -153,11 +153,7 @@ def _runner(
 
 @contextmanager
 def _enough_memory(otherwise: str) -> Iterator[None]:
-    """Turn a lack of memory, of the device or of the machine, into one sentence.
-
-    Raises:
-        ConfigurationError: the memory does not suffice.
-    """
+    """Turn a lack of memory, of the device or of the machine, into one sentence."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:

@@ -133,9 +133,7 @@ class RunLogger:
             self._entries.append((tuple(entries), torch.stack([v.to(device, torch.float32) for v in values])))
 
     def collect(self) -> dict[str, float]:
-        """Take the iteration's finished episodes and mean ``log`` entries to the host; entries that are NaN in a step
-        do not count.
-        """
+        """Take the iteration's finished episodes and mean ``log`` entries to the host; entries that are NaN in a step do not count."""
         rows = self._finished.nonzero()
         finished = torch.stack(
             (self._returns[self._finished], self._lengths[self._finished], rows[:, 1].float()), dim=1
@@ -197,8 +195,8 @@ class RunLogger:
         return hasattr(self.writer, "save_model")
 
     def write(self, scalars: Mapping[str, float], iteration: int) -> None:
-        """Write scalars if there is a writer. What comes late, such as a score, is at the present iteration where the
-        service drops what is behind it.
+        """Write scalars if there is a writer. What comes late, such as a score, is at the present iteration where the service drops what
+        is behind it.
         """
         if self._in_order:
             iteration = self._latest = max(iteration, self._latest)

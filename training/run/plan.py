@@ -1,7 +1,7 @@
 """Check a request for a training before anything is built or written.
 
-A run has one of three beginnings, each a pure function from the request to a ``TrainPlan``: ``new_run``,
-``run_with_weights`` (``--init-from``) and ``resumed_run`` (``--resume``).
+A run has one of three beginnings, each a pure function from the request to a ``TrainPlan``: ``new_run``, ``run_with_weights``
+(``--init-from``) and ``resumed_run`` (``--resume``).
 """
 
 from __future__ import annotations
@@ -131,11 +131,7 @@ def _checked_plan(
     weights: Path | None = None,
     notice: str = "",
 ) -> TrainPlan:
-    """Check the parts that all three beginnings share.
-
-    Raises:
-        ConfigurationError, BackendError, SuiteError: one sentence on what is wrong.
-    """
+    """Check the parts that all three beginnings share."""
     _check_rollout(task)
     check_logger(task.training.run.logger)
     device = own_device(request.device, backend)
@@ -165,11 +161,7 @@ def _named_task(request: TrainRequest, first: Iterable[str] = ()) -> Task:
 
 
 def _of_this_command(request: TrainRequest, run: RunConfiguration) -> RunConfiguration:
-    """Return the run's settings with those changed that belong to this command alone and are not kept.
-
-    Raises:
-        SuiteError: no such suite.
-    """
+    """Return the run's settings with those changed that belong to this command alone and are not kept."""
     if request.seconds is not None and not any(o.startswith(_GAUGE_WAIT) for o in request.own_overrides()):
         run = replace(run, gauge_wait=0.0)  # the limit holds for the whole command
     if request.score_suite is None:
@@ -179,11 +171,7 @@ def _of_this_command(request: TrainRequest, run: RunConfiguration) -> RunConfigu
 
 
 def _check_rollout(task: Task) -> None:
-    """Refuse numbers of worlds, steps and minibatches from which nothing can be learned.
-
-    Raises:
-        ConfigurationError: they do not fit together.
-    """
+    """Refuse numbers of worlds, steps and minibatches from which nothing can be learned."""
     algorithm, run = task.training.algorithm, task.training.run
     period = algorithm.student_period if find_method(algorithm.method).has_teacher else 1
     teachers, students = split_sizes(task.environment.num_envs, period)
@@ -198,11 +186,7 @@ def _check_rollout(task: Task) -> None:
 
 
 def _first_weights(request: TrainRequest, choice: str, task: Task) -> Path:
-    """Return the file with the first networks: a policy that ships with the project, or what ``--resume`` takes.
-
-    Raises:
-        CheckpointError: there is none.
-    """
+    """Return the file with the first networks: a policy that ships with the project, or what ``--resume`` takes."""
     shipped = shipped_policies()
     if choice in shipped:
         return find_policy(choice)
@@ -213,8 +197,8 @@ def _first_weights(request: TrainRequest, choice: str, task: Task) -> Path:
 def _settings_to_go_on(task: Task, entries: Mapping[str, Any]) -> list[str]:
     """Return settings for trained networks; those of the request come after them.
 
-    Schedules go on where the earlier training stopped, robots that can walk start on all levels, steps are smaller,
-    and a policy without its exploration noise gets little.
+    Schedules go on where the earlier training stopped, robots that can walk start on all levels, steps are smaller, and a policy without
+    its exploration noise gets little.
     """
     return [
         f"environment.schedule.begin={reached(entries):g}",
@@ -236,8 +220,8 @@ def _own_directory(checkpoint: Path, task: str) -> Path | None:
 
 
 def _last_of_its_run(run: Path | None, iteration: int) -> tuple[Path | None, str]:
-    """Return the run directory to continue and an empty text; None and a sentence if the run has gone on without this iteration:
-    two branches in one folder would be one run, and its last checkpoint could be either's.
+    """Return the run directory to continue and an empty text; None and a sentence if the run has gone on without this iteration: two
+    branches in one folder would be one run, and its last checkpoint could be either's.
     """
     last = None if run is None else latest_checkpoint(run)
     reached = 0 if last is None else int(last.stem.rpartition("_")[2])
@@ -250,11 +234,7 @@ def _last_of_its_run(run: Path | None, iteration: int) -> tuple[Path | None, str
 
 
 def _stored_task(entries: Mapping[str, Any], checkpoint: Path, name: str) -> tuple[Task, str, int]:
-    """Return the task with the settings of a checkpoint's run, its backend, and the iterations that the run had done.
-
-    Raises:
-        CheckpointError: it is of another task, or its settings are not those of this version.
-    """
+    """Return the task with the settings of a checkpoint's run, its backend, and the iterations that the run had done."""
     numbers = run_numbers(entries, checkpoint)
     if (its := numbers.task) != name:
         hint = f"write gaitgauge train {its}" if its in TASKS else "give that task's name"
@@ -279,8 +259,8 @@ def _stored_task(entries: Mapping[str, Any], checkpoint: Path, name: str) -> tup
 
 
 def _with_logger_of(named: Task, stored: Task, checkpoint: Path) -> tuple[Task, str]:
-    """Return the stored task with the logger of the named one, and a sentence if that is another: a checkpoint, perhaps a
-    stranger's, never decides where data are sent.
+    """Return the stored task with the logger of the named one, and a sentence if that is another: a checkpoint, perhaps a stranger's,
+    never decides where data are sent.
     """
     chosen, kept = named.training.run, stored.training.run
     run = replace(kept, logger=chosen.logger, logger_project=chosen.logger_project)
@@ -294,11 +274,7 @@ def _with_logger_of(named: Task, stored: Task, checkpoint: Path) -> tuple[Task, 
 
 
 def _check_trust(request: TrainRequest, task: Task, named: Task, checkpoint: Path) -> None:
-    """Refuse stored settings that import code which neither the package nor the named task names, unless they are trusted.
-
-    Raises:
-        CheckpointError: they do.
-    """
+    """Refuse stored settings that import code which neither the package nor the named task names, unless they are trusted."""
     foreign = foreign_functions([task.environment, task.training], [named.environment, named.training])
     if foreign and not request.trust:
         raise CheckpointError(

@@ -1,7 +1,7 @@
 """Keep the last good state of a run of several processes in the host's memory, and write it when one of them is lost.
 
-A GPU that waits for a message from a lost process answers no more, so its memory is copied out after every iteration; the
-copy runs while the next rollout begins.
+A GPU that waits for a message from a lost process answers no more, so its memory is copied out after every iteration; the copy runs while
+the next rollout begins.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Rescue:
             self.keepsake.keep(run.learned(), run.iteration, run.device)
 
     def write(self, error: ProcessLostError, begin: float) -> ProcessLostError:
-        """Write the checkpoint; the first process that is left does it, and returns the error that says so, unless the lost
-        process diverged and has reported that.
+        """Write the checkpoint; the first process that is left does it, and returns the error that says so, unless the lost process
+        diverged and has reported that.
 
         Args:
             error: of the lost process.

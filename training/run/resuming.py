@@ -115,8 +115,8 @@ def resume_run(run: RunState, path: Path) -> None:
     """Continue from a checkpoint as if the run had never stopped.
 
     Episodes start anew, at the point of the schedules and on the levels that the checkpoint knows, where the environment has no
-    ``load_state_dict``, the number of processes is another one, or a process finds no part of its own beside the checkpoint; this
-    is said through the runner's ``message``.
+    ``load_state_dict``, the number of processes is another one, or a process finds no part of its own beside the checkpoint; this is said
+    through the runner's ``message``.
 
     Raises:
         CheckpointError: damaged, of another task, contract, network or number of environments.
@@ -179,8 +179,8 @@ def _table(value: Any) -> Mapping[str, Any]:
 def begin_with(run: RunState, path: Path) -> None:
     """Begin with the averaged networks of another run's checkpoint; optimizers, counters and episodes start anew.
 
-    A policy file without training state gives the student alone; the first ``run.bootstrap_iterations`` then find
-    a teacher and a critic for it. A checkpoint that was written among them has some of them left, which come first here, too.
+    A policy file without training state gives the student alone; the first ``run.bootstrap_iterations`` then find a teacher and a critic
+    for it. A checkpoint that was written among them has some of them left, which come first here, too.
 
     Raises:
         CheckpointError: damaged, of other joints or another observation, or of other networks.
@@ -239,8 +239,8 @@ def _runs_on(run: RunState, local: Mapping[str, Any]) -> bool:
 
 
 def _begin_anew(run: RunState, path: Path, training: Mapping[str, Any], numbers: RunNumbers) -> str:
-    """Begin new episodes where the run was: at its point of the schedules, on the levels of its first process, whose worlds
-    have the same kinds of tiles as any other's.
+    """Begin new episodes where the run was: at its point of the schedules, on the levels of its first process, whose worlds have the same
+    kinds of tiles as any other's.
 
     Returns:
         Where that is, the rest of a sentence; empty for an environment that has neither.

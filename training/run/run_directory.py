@@ -1,7 +1,7 @@
 """The folder that a training run leaves behind, laid out as users of rsl_rl and Isaac Lab know it.
 
-``logs/rsl_rl/<experiment>/<YYYY-MM-DD_HH-MM-SS>[_<run_name>]/`` with ``model_<iteration>.pt``, ``best.pt`` (chosen by
-the gauge's score), ``params/env.yaml`` and ``params/agent.yaml``, ``run.json`` and TensorBoard's event files.
+``logs/rsl_rl/<experiment>/<YYYY-MM-DD_HH-MM-SS>[_<run_name>]/`` with ``model_<iteration>.pt``, ``best.pt`` (chosen by the gauge's score),
+``params/env.yaml`` and ``params/agent.yaml``, ``run.json`` and TensorBoard's event files.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def new_run_directory(root: Path, experiment: str, run_name: str = "", now: date
 def find_checkpoint(
     choice: str, *, experiment: str, task: str = "", root: Path = LOG_ROOT, others: Sequence[str] = ()
 ) -> Path:
-    """Return the checkpoint that ``--resume`` or ``--init-from`` names: ``latest`` (of the experiment), a run directory (its last), or
-    a file; ``others`` are the names that the option takes besides.
+    """Return the checkpoint that ``--resume`` or ``--init-from`` names: ``latest`` (of the experiment), a run directory (its last), or a
+    file; ``others`` are the names that the option takes besides.
 
     Raises:
         CheckpointError: there is none.

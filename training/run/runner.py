@@ -1,7 +1,7 @@
 """Run the training loop: rollouts, updates, checkpoints, orderly stops, and a guard against NaN.
 
-Iterations are counted when they are complete: ``model_500.pt`` is the state after 500 updates, and a run resumed from
-it goes on with the 501st.
+Iterations are counted when they are complete: ``model_500.pt`` is the state after 500 updates, and a run resumed from it goes on with the
+501st.
 """
 
 from __future__ import annotations
@@ -169,9 +169,7 @@ class TrainingRunner(RunState):
     def _guard(
         self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor]:
-        """Take rows that are not finite out of learning: zeros for their numbers and an end to their episode. They
-        are counted.
-        """
+        """Take rows that are not finite out of learning: zeros for their numbers and an end to their episode. They are counted."""
         broken = ~torch.isfinite(rewards)
         for group in obs.keys():  # noqa: SIM118 (iterating a TensorDict goes over its rows)
             # A sum is finite if its terms are, and costs one pass.
@@ -182,11 +180,7 @@ class TrainingRunner(RunState):
         return clean, torch.where(broken, 0.0, rewards), torch.where(broken, torch.ones_like(dones), dones)
 
     def _check_finite(self, losses: Mapping[str, float]) -> None:
-        """Log the number of samples that are not finite.
-
-        Raises:
-            TrainingDivergedError: these, or minibatches with such gradients, are too many.
-        """
+        """Log the number of samples that are not finite."""
         run, iteration = self.configuration.run, self.iteration - 1
         broken = int(self._nonfinite.item())
         samples = run.steps_per_iteration * self.env.num_envs
@@ -206,8 +200,8 @@ class TrainingRunner(RunState):
             )
 
     def _agreed_stop(self, signals: StopSignals, begin: float, max_seconds: float | None) -> str:
-        """Return the reason to stop now, an empty text to go on; it is the same in every process, or they would wait for each
-        other forever.
+        """Return the reason to stop now, an empty text to go on; it is the same in every process, or they would wait for each other
+        forever.
         """
         code = 0
         if max_seconds is not None and time.monotonic() - begin >= max_seconds:

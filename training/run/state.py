@@ -27,8 +27,8 @@ class RunState:
     """The parts of a run and the iterations that they have done.
 
     An environment with schedules has ``progress``, the fraction of the run that they have reached, a scalar tensor; one that can be
-    resumed exactly has ``state_dict()`` (tensors and plain data) and
-    ``load_state_dict(state)``; afterwards ``get_observations()`` must give what it gave before.
+    resumed exactly has ``state_dict()`` (tensors and plain data) and ``load_state_dict(state)``; afterwards ``get_observations()`` must
+    give what it gave before.
     """
 
     def __init__(

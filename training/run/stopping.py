@@ -45,8 +45,8 @@ class Progress:
 
 
 class StopSignals:
-    """While active, SIGTERM, SIGINT and SIGHUP ask for an orderly stop; a second SIGINT interrupts at once. Under ``nohup``, where
-    SIGHUP is ignored, it stays so.
+    """While active, SIGTERM, SIGINT and SIGHUP ask for an orderly stop; a second SIGINT interrupts at once. Under ``nohup``, where SIGHUP
+    is ignored, it stays so.
     """
 
     def __init__(self, message: Callable[[str], None], *, interrupts: bool = True) -> None:

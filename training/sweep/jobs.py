@@ -171,12 +171,7 @@ class Jobs:
         return bool(self._live)
 
     def _launch(self, run: SweepRun, command: Sequence[str], place: str, log: Path, how: str) -> None:
-        """Start a process, which keeps a lock until its end: the next sweep finds it if this one is killed.
-
-        Raises:
-            SweepError: a process that an earlier call left has the lock; or log or lock is a link, which may lead anywhere.
-            OSError: it cannot be started, or its log cannot be written.
-        """
+        """Start a process, which keeps a lock until its end: the next sweep finds it if this one is killed."""
         environment = {**os.environ, **self._places.get(place, ENVIRONMENT)}
         log.parent.mkdir(parents=True, exist_ok=True)
         for path in (log, own := log.with_suffix(".lock")):
@@ -211,11 +206,7 @@ class Jobs:
                 self._take_in(job.run, job.process.returncode, job.log, gauged=job.place == "gauge")
 
     def _take_in(self, run: SweepRun, code: int, log: Path, *, gauged: bool) -> None:
-        """Handle the end of a process.
-
-        Raises:
-            SweepError: it failed.
-        """
+        """Handle the end of a process."""
         if code in _STOPPED and not gauged and run.directory:
             how = signal.Signals(code - 128).name
             self._say(
@@ -232,8 +223,8 @@ class Jobs:
             self._sort(run)
 
     def _stop(self, insisted: Callable[[], bool]) -> None:
-        """Ask what is at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk. Where they take
-        too long, or ``insisted`` says so, they are interrupted, and killed at last.
+        """Ask what is at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk. Where they take too
+        long, or ``insisted`` says so, they are interrupted, and killed at last.
         """
         for number, patience, waits in (
             (signal.SIGTERM, _PATIENCE, lambda: not insisted()),
@@ -250,11 +241,7 @@ class Jobs:
 
 
 def _take(lock: BinaryIO, doing: str) -> None:
-    """Lock a file for this process and for those that inherit it.
-
-    Raises:
-        SweepError: another process has it.
-    """
+    """Lock a file for this process and for those that inherit it."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:

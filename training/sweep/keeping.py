@@ -1,8 +1,8 @@
 """Keep trained runs in a form small enough to carry home and to commit.
 
 ``runs/<entry>/seed-<n>/kept/`` holds ``run.json`` with the settings, ``curves.csv``, ``policy.gauge.pt`` and, where it was gauged,
-``results.json``, a score card of that policy; no checkpoints, no episodes, no machine's name and no command. A sweep does not train
-such a run again: it gauges it where that is left, goes on with the others, and reports on all.
+``results.json``, a score card of that policy; no checkpoints, no episodes, no machine's name and no command. A sweep does not train such
+a run again: it gauges it where that is left, goes on with the others, and reports on all.
 """
 
 from __future__ import annotations

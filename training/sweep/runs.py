@@ -187,8 +187,8 @@ class SweepRun:
         return usual.with_name(f"{policy.stem}-{self.suite_digest[:8]}-{file_digest(str(policy))[:8]}")
 
     def _is_place(self, folder: Path, policy: Path | None) -> bool:
-        """Return True if a folder is free for results of this suite and a policy's file, or has them or began with them; None stands
-        for any.
+        """Return True if a folder is free for results of this suite and a policy's file, or has them or began with them; None stands for
+        any.
         """
         if (folder / RESULTS).is_file():
             card = read_card(folder)
@@ -318,11 +318,7 @@ def _is_trained(run: SweepRun) -> bool:
 
 
 def _check_seeds(seeds: Sequence[int], settings: Sequence[str]) -> None:
-    """Refuse an entry with runs that would not differ.
-
-    Raises:
-        SweepError: it is one.
-    """
+    """Refuse an entry with runs that would not differ."""
     if not seeds or len(set(seeds)) < len(seeds):
         raise SweepError(f"seeds are {shown(list(seeds))}; give at least one, and each once")
     for setting in settings:
@@ -335,8 +331,8 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
     reason.
 
     Args:
-        to_train: whether this machine must be able to train what is left to train, which is noted in their folders. What was
-            trained elsewhere can be gauged and reported on any.
+        to_train: whether this machine must be able to train what is left to train, which is noted in their folders. What was trained
+            elsewhere can be gauged and reported on any.
 
     Raises:
         SuiteError: no such suite.

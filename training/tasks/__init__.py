@@ -179,8 +179,8 @@ _SPRINT_ITERATIONS = 2000
 
 def _sprint() -> Task:
     """Return the paper's fast task: commands of up to 4.5 m/s straight ahead, so that 4 m/s is not at the limit of what was learned.
-    Weights and the order of the stages are the published ones; each stage is a larger fraction of this shorter run. A robot has
-    fallen where its trunk touches level ground.
+    Weights and the order of the stages are the published ones; each stage is a larger fraction of this shorter run. A robot has fallen
+    where its trunk touches level ground.
     """
     environment = EnvironmentConfiguration(
         num_envs=8192,
