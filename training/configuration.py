@@ -37,7 +37,7 @@ Width = Annotated[int, Field(ge=1, le=65_536)]
 
 
 class ConfigurationError(ValueError):
-    """A setting has a value that is not allowed; the message names the setting, the value and what is allowed."""
+    """A setting has a value that is not allowed; the message names the setting, the value and the allowed ones."""
 
 
 def _choose(name: str, value: str, allowed: tuple[str, ...]) -> None:
@@ -137,7 +137,7 @@ class DreamwaqConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmConfiguration:
-    """PPO and what the encoder learns from. Defaults without a remark are the published ones."""
+    """PPO and the encoder's supervision. Defaults without a remark are the published ones."""
 
     method: str = "cts"
     """``cts`` (concurrent teacher and student), ``ac_moe`` (the same with experts in actor and critic), ``mcp`` (with an actor that

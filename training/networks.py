@@ -1,6 +1,6 @@
-"""The networks of a method, and those of concurrent teacher-student learning.
+"""Build the networks of a method, and those of concurrent teacher-student learning.
 
-The student is the very network that is deployed: an architecture of ``policy.networks``, whose actor a teacher borrows. Teacher encoder
+The student is the very network that is deployed: an architecture of ``policy.networks``; a teacher borrows its actor. Teacher encoder
 and critic exist in training only.
 """
 
@@ -62,7 +62,7 @@ def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason
     """Return the arguments of a network of ``policy.networks`` with a plain encoder.
 
     Raises:
-        ConfigurationError: another encoder is asked for; ``reason`` says what of the method does not go with it.
+        ConfigurationError: another encoder is asked for; ``reason`` names the method's part that does not go with it.
     """
     network, method = configuration.network, configuration.algorithm.method
     if network.student_encoder != "mlp":
@@ -116,7 +116,7 @@ def student_architecture(configuration: NetworkConfiguration, widths: Widths) ->
 
 
 class StudentActor(nn.Module):
-    """The deployed network, called student whatever the method, with its exploration noise; methods add what only training needs."""
+    """The deployed network, called student in every method, with its exploration noise; methods add parts for training."""
 
     def __init__(
         self,
@@ -188,7 +188,7 @@ class CtsActor(StudentActor):
 
         Args:
             privileged_width: width of the teacher's input.
-            student: what ``StudentActor`` takes.
+            student: arguments of ``StudentActor``.
         """
         teacher = multilayer_perceptron((privileged_width, *configuration.teacher_hidden, configuration.latent_width))
         super().__init__(configuration, **student)

@@ -18,7 +18,7 @@ Options = TypeVar("Options")
 
 
 class TaskError(ValueError):
-    """An unknown task, key or value; the message names it and what is allowed."""
+    """An unknown task, key or value; the message names it and the allowed ones."""
 
 
 def apply_overrides(configuration: Options, overrides: Iterable[str]) -> Options:

@@ -1,7 +1,7 @@
-"""The processes of one run: one for each GPU, as torchrun starts them, or this one alone; and which GPU each takes.
+"""Join the processes of one run, one for each GPU as torchrun starts them or this one alone, and choose each one's GPU.
 
 CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it instead.
-Whoever waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
+A process that waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Processes:
         """Join the processes that torchrun started, if it did.
 
         Raises:
-            ConfigurationError: what torchrun says in the environment is nonsense, or nobody is there.
+            ConfigurationError: torchrun's variables are wrong, or no process answers.
         """
         here = cls.told()
         if here.several:
@@ -132,7 +132,7 @@ class Processes:
         return shared[0]
 
     def wait_for(self, device: torch.device | str, *, stopping: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a GPU has done what was asked of it, which it cannot while another process is missing.
+        """Wait until a GPU has done its work, which it cannot while another process is missing.
 
         Args:
             device: nothing is waited for on a CPU.

@@ -26,8 +26,8 @@ from .symmetry import half_replaced
 
 
 class CtsLosses(Losses):
-    """The teacher's latents are computed where the policy learns, since it learns with it; where the student learns, the teacher stands
-    still and the student's targets are computed once.
+    """Losses of CTS. The teacher's latents are computed anew while the policy learns, since the teacher learns with it; while the student
+    learns, the teacher stands still, and its latents are computed once.
     """
 
     student_names = ("latent", "load_balance", "largest_expert_share")

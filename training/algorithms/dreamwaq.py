@@ -6,9 +6,8 @@ predicts the next frame from both. Its loss is the error of the velocity, that o
 divergence from the standard normal distribution. The actor sees a sample of the latent where it learns and the mean where it is deployed.
 
 Adaptive bootstrapping: whether the actor is given the true or the estimated velocity is drawn for every sample. The estimate's
-probability is 1 - tanh(deviation / mean) of what the policy earns over the randomized worlds: as long as that differs much, the policy is
-not to learn from an estimate that is no better. What it earns is taken from the returns of the last rollout, which need no episode to
-end.
+probability is 1 - tanh(deviation / mean) of the policy's return over the randomized worlds: as long as returns differ much, the policy
+should not learn from an estimate that is no better. The returns are those of the last rollout, which need no episode to end.
 """
 
 from __future__ import annotations
@@ -104,7 +103,7 @@ class Dreamwaq(EstimatorPPO):
 
     @torch.no_grad()
     def compute_returns(self, obs: Any) -> None:
-        """See ``PPO``; what the rollout earned says how far its estimates are trusted in the next."""
+        """See ``PPO``; the rollout's returns decide how far its estimates are trusted in the next."""
         super().compute_returns(obs)
         returns = self.storage.returns
         spread = returns.std() / returns.mean().abs().clamp_min(1e-6)

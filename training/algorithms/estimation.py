@@ -1,9 +1,9 @@
 """Share the parts of DreamWaQ and HIM: PPO with an estimator.
 
-One network acts everywhere, on the current frame and on what an encoder makes of the history: the base's velocity and a latent. The
+One network acts everywhere, on the current frame and on an encoder's estimate from the history: the base's velocity and a latent. The
 critic sees the true state. PPO trains actor and critic with the estimates that the rollout acted on; nothing of it reaches the encoder.
-Afterwards the encoder learns from the true velocity and from the state one step later, on the same rollout. Samples whose episode ended
-have no next state and count for the velocity alone.
+Afterwards the encoder learns from the true velocity and from the state one step later, on the same rollout. Samples at the end of an
+episode have no next state and count for the velocity alone.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def estimator_arguments(configuration: TrainingConfiguration, widths: Widths) ->
 
 
 class EstimatorActor(StudentActor):
-    """A network that acts on its estimate, with exploration noise; methods add what the encoder learns with."""
+    """A network that acts on its estimate, with exploration noise; methods add helpers of the encoder."""
 
     def frames(self, history: torch.Tensor) -> torch.Tensor:
         """Return frames (N, H, F) of flat histories (N, H·F)."""

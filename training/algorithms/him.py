@@ -4,8 +4,8 @@ description.
 The encoder of the history gives the base's velocity, by regression, and an embedding on the unit sphere, by contrast: it is to fall to
 the same prototype as the embedding that a second encoder gives to the robot's next state, which is the response that the internal model
 predicts. Both encoders and the prototypes learn by swapped prediction (Caron et al., "Unsupervised Learning of Visual Features by
-Contrasting Cluster Assignments", 2020): each embedding's code, made equal in size over a minibatch by Sinkhorn-Knopp, is what the other
-has to predict. The next state is the velocity and the noise-free frame without the command, which is no response of the robot.
+Contrasting Cluster Assignments", 2020): each embedding's code, made equal in size over a minibatch by Sinkhorn-Knopp, is the other's
+target. The next state is the velocity and the noise-free frame without the command, which is no response of the robot.
 """
 
 from __future__ import annotations

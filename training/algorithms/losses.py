@@ -17,7 +17,7 @@ POLICY_LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
 
 
 class Losses:
-    """Computes losses from row indices; what both phases need beside the rollout is prepared once for each.
+    """Computes losses from row indices; tensors that both phases need beside the rollout are prepared once for each.
 
     First the policy learns while the student's encoder stands still, so that the student's latents are those of the rollout; then the
     encoder learns by supervision, which a method adds: ``prepare_student`` and ``student``.
@@ -41,7 +41,7 @@ class Losses:
         """Allocate.
 
         Args:
-            actor: student, exploration noise, and what else learns with them.
+            actor: student, exploration noise, and the networks that learn with them.
             mirror: mirror maps on the storage's device, None without symmetry.
             cached_casts: whether weights in bfloat16 may be kept within a pass; they would outlive the weights in a CUDA graph.
         """
@@ -149,7 +149,7 @@ class Losses:
         elif mirror is not None and augment:
             mean = distribution.deterministic_output(decision)
             asymmetry = (mean[len(rows) :] - mirror.action(mean[: len(rows)].detach())).square().mean()
-            # A mirrored sample counts as drawn from the mirrored policy, whose probability is that of the original.
+            # A mirrored sample counts as drawn from the mirrored policy, with the original's probability.
             distribution.update(decision)
             actions = torch.cat((actions, mirror.action(actions)))
             advantages, old_log_prob, returns, old_values = (

@@ -49,7 +49,7 @@ def take_step(optimizer: torch.optim.Optimizer, gradients: FlatGradients, limit:
     """Step along gathered gradients, their joint norm limited; gradients that are not finite are dropped.
 
     Args:
-        sums: grows by what travelled with the gradients, their norm, and 1.0 if they were dropped, (extra + 2,).
+        sums: grows by the extra numbers, the gradients' norm, and 1.0 if they were dropped, (extra + 2,).
     """
     norm, skipped = gradients.clip(limit)
     optimizer.step()
@@ -57,7 +57,7 @@ def take_step(optimizer: torch.optim.Optimizer, gradients: FlatGradients, limit:
 
 
 def load_moments(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> float:
-    """Take over what an Adam's ``state_dict()`` says of its moments; its settings stay those of this run.
+    """Take over the moments of an Adam's ``state_dict()``; its settings stay those of this run.
 
     Args:
         optimizer: of the same parameters.

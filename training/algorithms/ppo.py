@@ -1,6 +1,6 @@
 """Share PPO on a rollout, then supervised learning of the deployed network's encoder on the same rollout, among all methods.
 
-A method is a class derived from ``PPO``: its networks, what the actor is given of an observation, and the losses (``losses.Losses``) of
+A method is a class derived from ``PPO``: its networks, the actor's inputs, and the losses (``losses.Losses``) of
 the encoder. Nothing in the passes waits for the device.
 """
 
@@ -198,7 +198,7 @@ class PPO:
         self._desired_kl.copy_(desired_kl)
 
     def follow_student(self, iterations: int) -> None:
-        """Spend the next iterations on what a bare policy lacks, while it stands still (see ``bootstrap``)."""
+        """Spend the next iterations on the networks that a bare policy lacks, while it stands still (see ``bootstrap``)."""
         self.bootstrap = self.make_bootstrap(iterations) if iterations > 0 else None
 
     def make_bootstrap(self, iterations: int) -> Bootstrap:
@@ -285,8 +285,8 @@ class PPO:
             wait: called once all work is asked for, to wait for the device.
 
         Returns:
-            Means over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
-            and were dropped.
+            Means over the minibatches, by name; ``skipped_minibatches`` counts those that were dropped because their gradients were not
+            finite.
         """
         storage, settings = self.storage, self.configuration
         storage.step = self.steps = 0
@@ -335,7 +335,7 @@ class PPO:
         return ()
 
     def _prepare_steps(self) -> None:
-        """Make the steps on one minibatch: gradients, their mean over the processes, and what follows from them."""
+        """Make the steps on one minibatch: gradients, their mean over the processes, and the step along them."""
         losses = self.losses
         self._policy_gradients = FlatGradients(self._policy_parameters, extra=len(losses.policy_names))
         self._student_gradients = FlatGradients(self.actor.student_parameters(), extra=len(losses.student_names))
@@ -415,7 +415,7 @@ class PPO:
         }
 
     def load(self, state: Mapping[str, Any], *, optimizers: bool = True) -> None:
-        """Take over what ``save`` returned.
+        """Take over a state of ``save``.
 
         Raises:
             RuntimeError, LookupError, ValueError, TypeError, AttributeError: it does not fit.

@@ -139,7 +139,7 @@ class RolloutStorage:
 
         Returns:
             Teacher rows (M, T·Nt // M), where there is a teacher, and student rows (M, T·Ns // M), int64, both into the
-            storage flattened over time and block-ordered environments; what does not divide evenly is left out.
+            storage flattened over time and block-ordered environments; the remainder of the division is left out.
 
         Raises:
             ConfigurationError: there are fewer student or teacher samples than minibatches.

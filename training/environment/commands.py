@@ -231,7 +231,7 @@ class CommandGenerator:
         way: torch.Tensor,
         remaining: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return uniform linear speeds that are at least what the rest of the episode needs, (N, 2), and yaw rates, (N, 1)."""
+        """Return uniform linear speeds that are at least as fast as the rest of the episode needs, (N, 2), and yaw rates, (N, 1)."""
         magnitude, low, high = uniform["command_magnitude"], ranges.low, ranges.high
         command = low + magnitude * (high - low)
         if not self._configuration.dynamic:

@@ -206,7 +206,7 @@ class ResetConfiguration:
     clearance: float | None = None
     """Height of the base over the highest ground below the robot [m]; None for the robot's ``stand_height``."""
     footprint: tuple[Extent, Extent] = (0.5, 0.4)
-    """Length and width of what counts as below the robot there [m]."""
+    """Length and width of the area below the robot in which ``clearance`` is measured [m]."""
 
     def __post_init__(self) -> None:
         check_rising(self, "joint_scale")
@@ -214,7 +214,7 @@ class ResetConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfiguration:
-    """Ranges of what differs between worlds (paper, domain randomization table), uniform."""
+    """Ranges of the differences between worlds (paper, domain randomization table), uniform."""
 
     friction: tuple[_Friction, _Friction] = (0.2, 1.25)
     """Effective sliding friction, once per world. Published: 0.5 to 1.5; the gauge judges 0.2 to 1.0."""

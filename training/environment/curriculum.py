@@ -141,8 +141,8 @@ def next_level(
 ) -> torch.Tensor:
     """Return the level of the next episode, were this one over.
 
-    Up after leaving the middle of the tile far enough; down after a fall, or with too little of the commanded way made. Who masters the
-    last level starts anywhere again, so that easy tiles are not forgotten.
+    Up after leaving the middle of the tile far enough; down after a fall, or with too little of the commanded way made. A robot that
+    masters the last level starts anywhere again, so that easy tiles are not forgotten.
 
     Args:
         level: present level from 0, (N,) int64.

@@ -42,7 +42,7 @@ class MotorParameters:
         "motor_speed": 1.0,
         "motor_offset": 0.0,
     }
-    """Fields of ``Randomization`` in the order of ``MOTOR_COLUMNS``, as motors are that nobody varies; offsets in rad."""
+    """Fields of ``Randomization`` in the order of ``MOTOR_COLUMNS``, for motors without randomization; offsets in rad."""
 
     def __init__(
         self, ranges: RandomizationConfiguration, num_envs: int, num_joints: int, device: torch.device | str
@@ -64,7 +64,7 @@ class MotorParameters:
         torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
 
     def apply(self, backend: PhysicsBackend) -> None:
-        """Write all worlds' values into the physics, of what varies: an engine need not be able to do the rest.
+        """Write all worlds' values that vary into the physics: an engine need not support the others.
 
         All rows are written every time: selecting the rows of a mask would wait for the device to count them.
         """

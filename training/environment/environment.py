@@ -1,7 +1,7 @@
-"""The training environment: rsl_rl's ``VecEnv`` on any physics backend.
+"""Simulate the training environment: rsl_rl's ``VecEnv`` on any physics backend.
 
 One step, in order: the action becomes joint targets with a drawn latency; the physics advances one control period; rewards, ends,
-curriculum and commands are judged on the new state; worlds whose episode is over are reset and others pushed; observations are made of
+curriculum and commands are judged on the new state; worlds at the end of an episode are reset and others pushed; observations are made of
 the state after that, so that the first observation of an episode is fresh. Nothing in a step waits for the device.
 """
 

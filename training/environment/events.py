@@ -1,7 +1,6 @@
-"""What happens to the physics beside the robot's own doing: starts of episodes, pushes, and late actions.
+"""Change the physics from outside: starts of episodes, pushes, and late actions.
 
-What differs between worlds and is drawn with them is in ``domain_randomization.py``. All draws are functions of uniform numbers, without
-branches on data.
+Differences between worlds are drawn in ``domain_randomization.py``. All draws are functions of uniform numbers, without branches on data.
 """
 
 from __future__ import annotations

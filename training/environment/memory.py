@@ -170,14 +170,14 @@ class EnvironmentMemory:
         )
 
     def turn_commanded_heading(self, period: float) -> None:
-        """Turn it by what the present command asks for in a control period [s]."""
+        """Turn it by the present command's yaw rate over a control period [s]."""
         angle = (self.command[:, 2] * period).masked_fill(self.holds_heading, 0.0)
         cos, sin = torch.cos(angle), torch.sin(angle)
         x, y = self.commanded_heading.unbind(1)
         self.commanded_heading.copy_(torch.stack((cos * x - sin * y, sin * x + cos * y), dim=1))
 
     def remember(self, inputs: StepInputs) -> None:
-        """Keep what the next step compares itself with."""
+        """Keep the tensors that the next step compares itself with."""
         self.previous_action.copy_(self.action)
         self.action.copy_(inputs.action)
         self.joint_acceleration.copy_(inputs.joint_acceleration)
@@ -186,7 +186,7 @@ class EnvironmentMemory:
         self.foot_force.copy_(inputs.state.foot_contact_force_w.norm(dim=-1))
 
     def begin_episode(self, worlds: torch.Tensor) -> None:
-        """Clear what belongs to one episode in the masked worlds, (N,) bool."""
+        """Clear the tensors of one episode in the masked worlds, (N,) bool."""
         self.episode.masked_fill_(worlds[:, None], 0.0)
         self.episode_length.masked_fill_(worlds, 0)
         self.command_extreme.masked_fill_(worlds, False)

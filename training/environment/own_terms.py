@@ -80,8 +80,8 @@ def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> C
     """Return the class at ``module:name``.
 
     Args:
-        base: what it must be derived from.
-        methods: what is called of its instances.
+        base: class that it must be derived from.
+        methods: names of its instances' called methods.
 
     Raises:
         ConfigurationError: as ``resolve``, or it is no such class.
@@ -111,8 +111,8 @@ def resolve_own(
 
     Args:
         taken: names that they cannot have.
-        gives: whether a function's result is what it must be, from its first argument and the result; None where nothing is looked at.
-        rule: how a sentence says that.
+        gives: checks a function's result, from its first argument and the result; None for no check.
+        rule: the check in words.
 
     Raises:
         ConfigurationError: a name is used twice, or a function is not there.
@@ -156,11 +156,12 @@ def guarded(
         where: the beginning of the sentence.
         passed_on: exceptions that stay as they are, as ``ConfigurationError`` does.
     """
+    kept: tuple[type[BaseException], ...] = (ConfigurationError, *passed_on)
 
     def called(*arguments: Any, **named: Any) -> Any:
         try:
             return call(*arguments, **named)
-        except (ConfigurationError, *passed_on):
+        except kept:
             raise
         except (Exception, SystemExit) as error:
             raise ConfigurationError(f"{where}, which {raised(error)}; mend it") from error

@@ -1,4 +1,4 @@
-"""The torch part of an environment step, as a list of its parts: what a step led to, ends, rewards, log, levels, pushes, the next
+"""The torch part of an environment step, as a list of its parts: inputs, ends, rewards, log, levels, pushes, the next
 episodes; and observing.
 
 Two functions without arguments, ``after_physics`` and ``observe``, read fixed tensors (inputs, memory, uniform numbers) and have static

@@ -113,7 +113,7 @@ class StepInputs:
     period: float
     """Control period [s]."""
     state: PhysicsState
-    """The physics, for whatever else a function needs."""
+    """The whole physics."""
     failed: torch.Tensor
     """Episodes that end as a failure, (N,) bool; the terminations write it, so that rewards can read it."""
     base_height_target: float

@@ -1,4 +1,4 @@
-"""Turns the physics after a control step into what rewards and terminations look at."""
+"""Turn the physics after a control step into the inputs of rewards and terminations."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class StepReader:
             scan: points of the height scan about the base [m], (P, 2).
 
         Raises:
-            ConfigurationError: no point of the scan is below the trunk, or joint speeds are judged of motors whose no-load speeds nobody
-                knows.
+            ConfigurationError: no point of the scan is below the trunk, or joint speeds of motors with an unknown no-load speed are
+                judged.
         """
         self._settings, self._rasters = configuration.rewards, rasters
         self._joint_velocity_limit = configuration.termination.joint_velocity
@@ -125,7 +125,7 @@ class StepReader:
 
         Args:
             state: physics after the step.
-            memory: what was before it, and the counters, which are the step's.
+            memory: state before it, and the counters of the step.
             action: raw action of the step, (N, J).
             progress: fraction of the run, scalar.
         """

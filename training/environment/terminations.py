@@ -1,7 +1,5 @@
-"""Ends of episodes. Each rule is a function of ``StepInputs`` and the settings that says which worlds' episode is over; ``TERMINATIONS``
-names them.
-
-An end is a failure, or a time-out, whose missing future the learner bootstraps. A failure lowers the level, unless the physics failed.
+"""End episodes. Each rule is a function of ``StepInputs`` and the settings to a mask of worlds; ``TERMINATIONS`` names them. An end is a
+failure, or a time-out: the learner then bootstraps the missing future. A failure lowers the level, unless the physics failed.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ Rule = Callable[[StepInputs, TerminationConfiguration], torch.Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class Termination:
-    """A rule, and what its end means."""
+    """A rule, and the kind of its end."""
 
     rule: Rule
     """Episodes that are over, (N,) bool."""

@@ -1,4 +1,4 @@
-"""The average of the weights over the later part of a run, which is what is played, gauged and exported.
+"""Average the weights over the later part of a run: these are played, gauged and exported.
 
 Checkpoints at the end of a run differ by chance, and the mean of their weights is better than each of them (Polyak and Juditsky,
 "Acceleration of Stochastic Approximation by Averaging", 1992; Izmailov et al., "Averaging Weights Leads to Wider Optima and Better
@@ -51,7 +51,7 @@ class WeightAverage:
         return {"iterations": self._count, **self._states}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:
-        """Continue from what ``state_dict`` returned; None begins with the present weights.
+        """Continue from a ``state_dict``; None begins with the present weights.
 
         Raises:
             ValueError: weights of another shape.

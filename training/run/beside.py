@@ -21,7 +21,8 @@ class Beside(Generic[Side]):
 
     def __init__(self, run: RunState, side: Side | None) -> None:
         """Begin with nothing asked for."""
-        self._run, self._side = run, side
+        self._run = run
+        self._side: Side | None = side
 
     @property
     def pending(self) -> bool:

@@ -62,7 +62,7 @@ def checkpoint_entries(contract: PolicyContract, network: StoredNetwork, extra: 
 
 
 def _require_plain(name: str, value: Any) -> None:
-    """Refuse what could not be read back without running code."""
+    """Refuse values that could not be read back without running code."""
     if value is None or isinstance(value, bool | int | float | str | torch.Tensor):
         return
     if isinstance(value, Mapping):
@@ -79,7 +79,7 @@ def _require_plain(name: str, value: Any) -> None:
 
 
 def write_checkpoint(path: Path, entries: Mapping[str, Any]) -> None:
-    """Write a file that appears whole or not at all; whatever was there before survives a failure.
+    """Write a file that appears whole or not at all; an earlier file survives a failure.
 
     Raises:
         CheckpointError: the file cannot be written, for example because the disk is full.
@@ -120,10 +120,10 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: s
 
     Args:
         training_state: whether it must hold what training needs to continue; otherwise a policy file will do.
-        purpose: what it is read for, in the sentences on what is wrong.
+        purpose: of reading it, for the sentences on errors.
 
     Raises:
-        CheckpointError: no such file, damaged, no policy of this project, or a policy without what training needs.
+        CheckpointError: no such file, damaged, no policy of this project, or a policy without training state.
     """
     cannot = f"Cannot {purpose} '{one_line(path)}': it"
     entries = _load(Path(path), purpose)
@@ -238,7 +238,7 @@ def student_state(actor: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 
 def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False) -> None:
-    """Write a checkpoint's networks without what only resuming needs: a policy file from which training can begin anew (``--init-from``),
+    """Write a checkpoint's networks without the state for resuming: a policy file from which training can begin anew (``--init-from``),
     with its teacher and its critic.
 
     Args:

@@ -66,5 +66,5 @@ class Filmer:
         return self._side.pending
 
     def close(self) -> None:
-        """Give up what is pending."""
+        """Give up pending videos."""
         self._side.close()

@@ -1,4 +1,4 @@
-"""The last good state of what a run learns, in the host's memory: what is left when another process is lost.
+"""Keep the last good state of a run's networks in the host's memory: it is left when another process is lost.
 
 A GPU that waits for a message from a lost process answers no more, so its memory is copied out after every iteration; the copy runs while
 the next rollout begins.

@@ -29,7 +29,7 @@ def check_logger(name: str) -> None:
     """Refuse a logger that cannot work here.
 
     Raises:
-        ConfigurationError: its package is not installed, or it does not know whose account to use.
+        ConfigurationError: its package is not installed, or it has no account to use.
     """
     if name not in _SERVICES:
         return
@@ -195,8 +195,8 @@ class RunLogger:
         return hasattr(self.writer, "save_model")
 
     def write(self, scalars: Mapping[str, float], iteration: int) -> None:
-        """Write scalars if there is a writer. What comes late, such as a score, is at the present iteration where the service drops what
-        is behind it.
+        """Write scalars if there is a writer. A late figure, such as a score, is written at the present iteration where the service drops
+        earlier ones.
         """
         if self._in_order:
             iteration = self._latest = max(iteration, self._latest)
@@ -213,7 +213,7 @@ class RunLogger:
                 self.writer.save_video(path, max(iteration, self._latest))
 
     def flush(self) -> None:
-        """Bring what was written to the disk."""
+        """Flush the writer to the disk."""
         if self.writer is not None:
             self.writer.flush()
 
@@ -238,7 +238,7 @@ class RunLogger:
         }
 
     def load_state_dict(self, state: Mapping[str, Any], *, running: bool) -> None:
-        """Take over what ``state_dict`` returned.
+        """Take over a ``state_dict``.
 
         Args:
             running: whether the environments' episodes run on; theirs are then taken over too.

@@ -186,7 +186,7 @@ def _check_rollout(task: Task) -> None:
 
 
 def _first_weights(request: TrainRequest, choice: str, task: Task) -> Path:
-    """Return the file with the first networks: a policy that ships with the project, or what ``--resume`` takes."""
+    """Return the file with the first networks: a policy that ships with the project, or a choice as of ``--resume``."""
     shipped = shipped_policies()
     if choice in shipped:
         return find_policy(choice)

@@ -1,4 +1,4 @@
-"""Say what is to be trained. The command line and the Python API are made of these fields."""
+"""Describe a training. The command line and the Python API are made of these fields."""
 
 from __future__ import annotations
 

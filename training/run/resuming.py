@@ -39,7 +39,7 @@ from .state import RunState
 
 
 class TrainingDivergedError(RuntimeError):
-    """Too many numbers are not finite for training to go on; the message says which and what survives."""
+    """Too many numbers are not finite for training to go on; the message names them and the surviving checkpoint."""
 
 
 def intact_checkpoint(run: Path | None) -> str:
@@ -80,7 +80,7 @@ def save_run(run: RunState, path: Path) -> None:
 
 
 def write_learned(run: RunState, path: Path, learned: Mapping[str, Any], local: Mapping[str, Any]) -> None:
-    """Write a checkpoint of what was learned, in the host's memory, and of what this process holds beside it.
+    """Write a checkpoint of learned networks, in the host's memory, and of this process's own state.
 
     Raises:
         TrainingDivergedError: a weight is not finite.
@@ -239,8 +239,8 @@ def _runs_on(run: RunState, local: Mapping[str, Any]) -> bool:
 
 
 def _begin_anew(run: RunState, path: Path, training: Mapping[str, Any], numbers: RunNumbers) -> str:
-    """Begin new episodes where the run was: at its point of the schedules, on the levels of its first process, whose worlds have the same
-    kinds of tiles as any other's.
+    """Begin new episodes where the run was: at its point of the schedules, on the levels of its first process: the worlds of every
+    process have the same kinds of tiles.
 
     Returns:
         Where that is, the rest of a sentence; empty for an environment that has neither.
@@ -302,7 +302,7 @@ def check_network(path: Path, entries: Mapping[str, Any], task: Task, verb: str)
         environments=1,
         frame=contract.frame_width,
         history=task.environment.observations.history_length,
-        privileged=VELOCITY + contract.frame_width,  # seen by what only training has
+        privileged=VELOCITY + contract.frame_width,  # seen by the teacher and the critic alone
         actions=len(contract.joint_names),
         command_entries=command_entries(contract),
     )

@@ -43,7 +43,7 @@ def random_state(device: torch.device | str) -> dict[str, Any]:
 
 
 def restore_random_state(state: Mapping[str, Any], device: torch.device | str) -> None:
-    """Put back what ``random_state`` returned; a missing GPU state leaves that generator as it is.
+    """Put back a ``random_state``; a missing GPU state leaves that generator as it is.
 
     Raises:
         ValueError: NumPy's generator would read outside its own words.

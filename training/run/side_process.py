@@ -105,7 +105,7 @@ class SideProcess:
         try:
             job.output.parent.mkdir(parents=True, exist_ok=True)
             with job.output.open("wb") as out, job.log.open("wb") as log:
-                # A session of its own: Ctrl-C in the terminal is for the training, which decides what becomes of the rest.
+                # A session of its own: Ctrl-C in the terminal is for the training, which decides on the rest.
                 process = subprocess.Popen(
                     list(job.command),
                     stdin=parent_pipe(),

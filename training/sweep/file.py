@@ -1,4 +1,4 @@
-"""The file of a sweep: what is trained, with which seeds, and how it is judged."""
+"""Read the file of a sweep: trainings, seeds and how they are judged."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_RUNS = 1000
 
 
 class SweepError(ValueError):
-    """A sweep cannot be run; the message says what is wrong and what to change."""
+    """A sweep cannot be run; the message names the error and the change."""
 
 
 @dataclass(frozen=True, kw_only=True)

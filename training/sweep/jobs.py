@@ -35,7 +35,7 @@ _STOPPED = tuple(128 + number for number in STOP_SIGNALS)
 _PATIENCE = 120.0
 """Longest wait for processes that were asked to stop [s]: an iteration and its checkpoint."""
 _LAST_PATIENCE = 10.0
-"""Longest wait for processes that were interrupted [s], before they are killed: they end what runs beside them."""
+"""Longest wait for processes that were interrupted [s], before they are killed: they end their side processes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ class Jobs:
             gpus: as ``visible_gpus``, which is the default.
             per_gpu: trainings side by side on each GPU.
             sharing: variables in the environment of trainings on GPUs (``sharing.shared_gpus``).
-            gauging: options of ``evaluate`` on who plays a gauging; None for the threads.
+            gauging: options of ``evaluate`` on the workers of a gauging; None for the threads.
         """
         self._sweep, self._deadline, self._say = sweep, deadline, say
         self._gauging = ("--threads", str(threads)) if gauging is None else gauging
@@ -152,7 +152,7 @@ class Jobs:
                 self._to_gauge.append(run)
 
     def _start(self) -> bool:
-        """Start what there is a place for; whether anything is at work."""
+        """Start jobs in free places; returns True if any job is at work."""
         for run in list(self._to_train):
             taken = {job.place for job in self._live}
             free = [p for p in (self._places if run.on_gpu else ("the CPU",)) if p not in taken]
@@ -199,7 +199,7 @@ class Jobs:
         self._say(f"{run.label} {how}")
 
     def _collect(self) -> None:
-        """Take what has ended and sort it on."""
+        """Take ended jobs and sort their runs on."""
         for job in [j for j in self._live if j.process.poll() is not None]:
             self._live.remove(job)
             with self._failing(job.run):
@@ -223,8 +223,8 @@ class Jobs:
             self._sort(run)
 
     def _stop(self, insisted: Callable[[], bool]) -> None:
-        """Ask what is at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk. Where they take too
-        long, or ``insisted`` says so, they are interrupted, and killed at last.
+        """Ask the jobs at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk. Where they take too
+        long, or at a second signal (``insisted``), they are interrupted, and killed at last.
         """
         for number, patience, waits in (
             (signal.SIGTERM, _PATIENCE, lambda: not insisted()),

@@ -1,4 +1,4 @@
-"""The runs of a sweep: what each is to be, how far it is, and the commands that take it further."""
+"""Describe the runs of a sweep: their settings, their progress, and the commands that take them further."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class SweepRun:
 
         Raises:
             SweepError: another checkpoint was kept than the sweep asks for.
-            CheckpointError, ComparisonError: what was kept is damaged.
+            CheckpointError, ComparisonError: a kept file is damaged.
         """
         run = self.directory
         if run is None:
@@ -166,7 +166,7 @@ class SweepRun:
         """Return the folder of the gauging of its policy; None before it is trained. Results of another suite or policy keep their place.
 
         Raises:
-            SweepError: what was kept is of another checkpoint, or of another suite and without a policy.
+            SweepError: the kept file is of another checkpoint, or of another suite and without a policy.
             CheckpointError, ComparisonError: a file is damaged.
             OSError: its policy cannot be read.
         """
@@ -242,13 +242,13 @@ class SweepRun:
         return [*CHILD_PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
 
     def claim(self, *, option: str = "--out", note: bool = True) -> None:
-        """Check that its folder holds no training with other settings, and ``note`` there what it is trained with.
+        """Check that its folder holds no training with other settings, and ``note`` the present ones there.
 
         Args:
             option: which names the folder, for the sentence.
 
         Raises:
-            DamagedNoteError: what was noted there cannot be read.
+            DamagedNoteError: the note cannot be read.
             SweepError: the folder holds a training with other settings, or cannot be written to.
         """
         mine: Mapping[str, Any] = {
@@ -331,8 +331,8 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
     reason.
 
     Args:
-        to_train: whether this machine must be able to train what is left to train, which is noted in their folders. What was trained
-            elsewhere can be gauged and reported on any.
+        to_train: this machine must be able to train the rest, which is noted in their folders. Runs that were trained elsewhere can be
+            gauged and reported on any.
 
     Raises:
         SuiteError: no such suite.
@@ -372,7 +372,7 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
             if to_train and not all(map(_is_trained, own)):
                 try:
                     on_gpu = prepare(request).device.startswith("cuda")
-                except DeviceError as error:  # what was trained elsewhere can be gauged all the same
+                except DeviceError as error:  # runs that were trained elsewhere can be gauged all the same
                     change = 'device = "cpu"' if device else 'device = "cpu" (slow) or backend = "mujoco"'
                     refused[entry.name] = f"{error.reason}; write {change} in the sweep's file"
                     own = [run for run in own if _is_trained(run)]

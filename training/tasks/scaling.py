@@ -1,5 +1,5 @@
-"""Makes a task that was written for one robot a task for another: lengths, masses, torques and speeds in its settings are scaled by what
-the two robots' models and descriptions say.
+"""Scale a task from one robot to another: lengths, masses, torques and speeds in its settings are scaled by the two robots' models and
+descriptions.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def scaled(
 ) -> tuple[EnvironmentConfiguration, TrainingConfiguration]:
     """Return a task's settings for another robot, which explores by the same angles, in an experiment that is named for it.
 
-    Scaled are the height of the base with what the legs reach; the place to start on with the stance; masses that are added; penalties on
-    torque and power with what the robot must carry; penalties on actions with the angle that an action is; contact forces that teacher
+    Scaled are the height of the base with the legs' reach; the place to start on with the stance; masses that are added; penalties on
+    torque and power with the robot's load; penalties on actions with the angle that an action is; contact forces that teacher
     and critic see; and commands with the robot's own limits. Terrain is not: every robot meets the ground that the gauge has. The
     parameter set is the robot's default one where it has none of the name that the task asks for.
 
