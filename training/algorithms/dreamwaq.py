@@ -21,7 +21,7 @@ from ...policy.networks.architectures import multilayer_perceptron
 from ...policy.networks.estimators import VELOCITY
 from ..configuration import TrainingConfiguration
 from ..networks import Widths
-from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments
+from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO
 
 _LEAST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE = -10.0, 10.0
 
@@ -29,17 +29,13 @@ _LEAST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE = -10.0, 10.0
 class DreamwaqActor(EstimatorActor):
     """The deployed network, the decoder, and how far the estimate of the velocity is trusted."""
 
+    deployed = "dreamwaq"
     trust: torch.Tensor
     """Probability that the actor is given the estimated velocity, ()."""
 
     def __init__(self, configuration: TrainingConfiguration, widths: Widths) -> None:
-        """Build all parts.
-
-        Raises:
-            ConfigurationError: settings that do not fit.
-        """
-        network, arguments = configuration.network, estimator_arguments(configuration, widths)
-        super().__init__(network, architecture="dreamwaq", arguments=arguments)
+        super().__init__(configuration, widths)
+        network = configuration.network
         self.decoder = multilayer_perceptron((VELOCITY + network.latent_width, *network.teacher_hidden, widths.frame))
         self.register_buffer("trust", torch.zeros(()))
 

@@ -43,6 +43,18 @@ def estimator_arguments(configuration: TrainingConfiguration, widths: Widths) ->
 class EstimatorActor(StudentActor):
     """A network that acts on its estimate, with exploration noise; methods add helpers of the encoder."""
 
+    deployed: ClassVar[str]
+    """Name of the deployed network in ``policy.networks``."""
+
+    def __init__(self, configuration: TrainingConfiguration, widths: Widths) -> None:
+        """Build the deployed network; methods add the encoder's helpers.
+
+        Raises:
+            ConfigurationError: settings that do not fit.
+        """
+        arguments = estimator_arguments(configuration, widths)
+        super().__init__(configuration.network, architecture=self.deployed, arguments=arguments)
+
     def frames(self, history: torch.Tensor) -> torch.Tensor:
         """Return frames (N, H, F) of flat histories (N, H·F)."""
         return history.unflatten(-1, self._frames)

@@ -20,22 +20,18 @@ from ...policy.networks.architectures import multilayer_perceptron
 from ...policy.networks.estimators import VELOCITY
 from ..configuration import HimConfiguration, TrainingConfiguration
 from ..networks import Widths
-from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments
+from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO
 
 
 class HimActor(EstimatorActor):
     """The deployed network, the encoder of next states, and the prototypes."""
 
+    deployed = "him"
     response: torch.Tensor
 
     def __init__(self, configuration: TrainingConfiguration, widths: Widths) -> None:
-        """Build all parts.
-
-        Raises:
-            ConfigurationError: settings that do not fit.
-        """
-        network, arguments = configuration.network, estimator_arguments(configuration, widths)
-        super().__init__(network, architecture="him", arguments=arguments)
+        super().__init__(configuration, widths)
+        network = configuration.network
         kept = [i for i in range(VELOCITY + widths.frame) if i - VELOCITY not in widths.command_entries]
         self.register_buffer("response", torch.tensor(kept), persistent=False)
         self.target_encoder = multilayer_perceptron((len(kept), *network.teacher_hidden, network.latent_width))
