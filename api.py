@@ -197,8 +197,8 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
     Raises:
         ArgumentError, TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.
     """
-    from .training.run.launch import prepare
     from .training.run.launch import train as run
+    from .training.run.plan import prepare
     from .training.run.request import TrainRequest
 
     _need("a text", task=task)

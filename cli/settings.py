@@ -21,9 +21,7 @@ _WIDTH = 80
 
 def print_settings_of(request: TrainRequest) -> None:
     """Print the settings of a task as the options beside it change them."""
-    from ..training.run.launch import own_overrides
-
-    print_settings(request.task, own_overrides(request), request.robot)
+    print_settings(request.task, request.own_overrides(), request.robot)
 
 
 def print_settings(task: str, overrides: Sequence[str], robot: str | None = None) -> None:

@@ -23,9 +23,9 @@ from gaitgauge.gauge.result import TerrainScore, read_result
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.overrides import override_keys
-from gaitgauge.training.run.launch import prepare
+from gaitgauge.training.processes import idle_gpus
 from gaitgauge.training.run.logger import make_writer
-from gaitgauge.training.run.processes import idle_gpus
+from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.scoring import Scorer, scores_of
 from gaitgauge.training.run.side_process import PROGRAM

@@ -1,7 +1,7 @@
-"""The processes of one run: one for each GPU, as torchrun starts them, or this one alone; and which GPU each takes.
+"""Join the processes of one run, one for each GPU as torchrun starts them or this one alone, and choose each one's GPU.
 
-CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it
-instead. Whoever waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
+CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it instead.
+A process that waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import distributed
 
-from ...backends.registry import choose_device
-from ...files.parsing import one_line, shown
-from ..configuration import ConfigurationError
+from ..backends.registry import choose_device
+from ..files.parsing import one_line, shown
+from .configuration import ConfigurationError
 
 PATIENCE = 300.0
 """Longest wait for the others [s]; compiling may take one of them a minute longer."""
@@ -27,7 +27,7 @@ PATIENCE_AFTER_SIGNAL = 10.0
 
 
 def told_number(name: str, default: int) -> int:
-    """A number that torchrun tells its processes in their environment.
+    """Return a number that torchrun tells its processes in their environment.
 
     Raises:
         ConfigurationError: it is none.
@@ -47,7 +47,7 @@ class ProcessLostError(RuntimeError):
 
 @dataclass(frozen=True, kw_only=True)
 class Processes:
-    """Where this process stands among those of the run, and how they agree."""
+    """Rank of this process, and messages to the others."""
 
     rank: int = 0
     """Number of this process; the first one speaks, logs and writes."""
@@ -56,7 +56,7 @@ class Processes:
 
     @classmethod
     def told(cls) -> Processes:
-        """What torchrun says in the environment; nobody is joined.
+        """Read the variables that torchrun sets; no process is joined.
 
         Raises:
             ConfigurationError: it is nonsense.
@@ -74,7 +74,7 @@ class Processes:
         """Join the processes that torchrun started, if it did.
 
         Raises:
-            ConfigurationError: what torchrun says in the environment is nonsense, or nobody is there.
+            ConfigurationError: torchrun's variables are wrong, or no process answers.
         """
         here = cls.told()
         if here.several:
@@ -97,7 +97,7 @@ class Processes:
 
     @property
     def several(self) -> bool:
-        """Whether there are others."""
+        """True if there are other processes."""
         return self.count > 1
 
     def average(self, values: torch.Tensor) -> None:
@@ -115,7 +115,7 @@ class Processes:
                     distributed.broadcast(tensor.data, src=0)
 
     def largest(self, number: int) -> int:
-        """The largest of the processes' numbers."""
+        """Return the largest of the processes' numbers."""
         if not self.several:
             return number
         shared = torch.tensor(number)
@@ -124,7 +124,7 @@ class Processes:
         return int(shared)
 
     def firsts(self, value: Any) -> Any:
-        """The first process's value, plain data."""
+        """Return the first process's value, plain data."""
         shared = [value]
         if self.several:
             with _heard():
@@ -132,7 +132,7 @@ class Processes:
         return shared[0]
 
     def wait_for(self, device: torch.device | str, *, stopping: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a GPU has done what was asked of it, which it cannot while another process is missing.
+        """Wait until a GPU has done its work, which it cannot while another process is missing.
 
         Args:
             device: nothing is waited for on a CPU.
@@ -163,7 +163,7 @@ def _heard() -> Iterator[None]:
 
 
 def own_device(asked: str | None, backend: str) -> str:
-    """The torch device of this process.
+    """Return the torch device of this process.
 
     Raises:
         ConfigurationError: there is no such device here.
@@ -178,7 +178,7 @@ def own_device(asked: str | None, backend: str) -> str:
 
 
 def idle_gpus(device: str) -> str:
-    """A sentence on GPUs that no process of a run uses, empty if there are none."""
+    """Return a sentence on GPUs that no process of a run uses, empty if there are none."""
     processes = told_number("LOCAL_WORLD_SIZE", 1)
     gpus = torch.cuda.device_count() if device.startswith("cuda") else 0
     if processes >= gpus:

@@ -7,40 +7,39 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from types import MappingProxyType
 
-from ..files.parsing import one_line, shown
-from ..files.plugins import imported
-from ..robots import load_robot
-from ..robots.loading import robot_digest
-from .configuration import AlgorithmConfiguration, NetworkConfiguration, RunConfiguration, TrainingConfiguration
-from .environment.configuration import (
+from ...files.parsing import one_line, shown
+from ...files.plugins import imported
+from ...robots import load_robot
+from ...robots.loading import robot_digest
+from ..configuration import AlgorithmConfiguration, NetworkConfiguration, Ramp, RunConfiguration, TrainingConfiguration
+from ..environment.configuration import (
     CommandConfiguration,
     CommandStage,
     EnvironmentConfiguration,
-    Ramp,
     RandomizationConfiguration,
-    RewardConfiguration,
     TerminationConfiguration,
 )
-from .environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
-from .overrides import TaskError, apply_overrides
+from ..environment.reward_configuration import RewardConfiguration
+from ..environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
+from ..overrides import TaskError, apply_overrides
 from .scaling import scaled
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What is to be learned, and how."""
+    """Environment and method of a training, under a name."""
 
     name: str
     """Name on the command line."""
     title: str
     """One line for people."""
     environment: EnvironmentConfiguration
-    """Where it is learned."""
+    """Settings of the environment."""
     training: TrainingConfiguration
-    """How it is learned."""
+    """Settings of the method and the run."""
 
     def with_overrides(self, overrides: Iterable[str]) -> Task:
-        """The task with some settings changed: ``environment.…`` and ``training.…`` keys.
+        """Return the task with some settings changed: ``environment.…`` and ``training.…`` keys.
 
         Raises:
             TaskError: a key or value that does not fit.
@@ -49,7 +48,7 @@ class Task:
         return replace(self, environment=settings.environment, training=settings.training)
 
     def for_robot(self, source: str) -> Task:
-        """The task for another robot than its own, a name or the path of a description, scaled by its sizes.
+        """Return the task for another robot than its own, a name or the path of a description, scaled by its sizes.
 
         Raises:
             RobotError: it cannot be found, or is wrong.
@@ -61,7 +60,7 @@ class Task:
         return replace(self, environment=environment, training=training)
 
     def with_horizon(self) -> Task:
-        """The task with schedules spread over exactly the run's own iterations."""
+        """Return the task with schedules spread over exactly the run's own iterations."""
         run = self.training.run
         schedule = replace(self.environment.schedule, horizon_steps=run.iterations * run.steps_per_iteration)
         return replace(self, environment=replace(self.environment, schedule=schedule))
@@ -69,7 +68,7 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class _Settings:
-    """What overrides may change."""
+    """Settings that overrides may change."""
 
     environment: EnvironmentConfiguration
     training: TrainingConfiguration
@@ -122,7 +121,7 @@ _METHODS = (
 
 
 def _on_all_terrains(name: str, method: str, network: NetworkConfiguration, title: str) -> Task:
-    """A method on the environment that all methods share."""
+    """Return the task of a method on the environment that all methods share."""
     return Task(
         name=name,
         title=f"Unitree Go2 on all terrains, {title}",
@@ -142,7 +141,7 @@ _FLAT_ITERATIONS = 380
 
 
 def _flat() -> Task:
-    """Walks within three minutes of an H200: no terrain, and every stage early, since the whole run is a few hundred
+    """Return a task that walks within three minutes of an H200: no terrain, and every stage early, since the whole run is a few hundred
     iterations. Most of them must be spent on the fastest commands, and on the sudden reversals that the gauge asks for.
     """
     environment = EnvironmentConfiguration(
@@ -179,9 +178,9 @@ _SPRINT_ITERATIONS = 2000
 
 
 def _sprint() -> Task:
-    """The paper's fast task: commands of up to 4.5 m/s straight ahead, so that 4 m/s is not at the limit of what was
-    learned. Weights and the order of the stages are the published ones; of the run's stages each is a larger fraction,
-    since the run is shorter. Where the trunk touches level ground the robot has fallen.
+    """Return the paper's fast task: commands of up to 4.5 m/s straight ahead, so that 4 m/s is not at the limit of what was learned.
+    Weights and the order of the stages are the published ones; each stage is a larger fraction of this shorter run. A robot has fallen
+    where its trunk touches level ground.
     """
     environment = EnvironmentConfiguration(
         num_envs=8192,
@@ -233,7 +232,7 @@ TASKS: Mapping[str, Task] = MappingProxyType(
 
 
 def _own_task(path: str) -> Task:
-    """The task at ``module:attribute``, under this name, by which a resumed run finds it again."""
+    """Return the task at ``module:attribute``, under this name, by which a resumed run finds it again."""
     found, (module, _, attribute) = imported(path, f"task {shown(path)}:", TaskError), path.partition(":")
     if not isinstance(found, Task):
         raise TaskError(f"task {shown(path)}: module {shown(module)} has no Task of the name {shown(attribute)}")
@@ -241,7 +240,7 @@ def _own_task(path: str) -> Task:
 
 
 def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = None) -> Task:
-    """A task, for a robot, with settings changed.
+    """Return a task, for a robot, with settings changed.
 
     Schedules are spread over the run's iterations, unless an override sets ``environment.schedule.horizon_steps``.
 

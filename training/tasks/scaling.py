@@ -1,16 +1,16 @@
-"""Makes a task that was written for one robot a task for another: lengths, masses, torques and speeds in its settings are
-scaled by what the two robots' models and descriptions say.
+"""Scale a task from one robot to another: lengths, masses, torques and speeds in its settings are scaled by the two robots' models and
+descriptions.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ..policy.contract import standard_contract
-from ..robots import Robot, load_robot
-from ..robots.body_plan import body_plan
-from .configuration import TrainingConfiguration
-from .environment.configuration import CommandStage, EnvironmentConfiguration, Ramp, Range
+from ...policy.contract import standard_contract
+from ...robots import Robot, load_robot
+from ...robots.body_plan import body_plan
+from ..configuration import Ramp, Range, TrainingConfiguration
+from ..environment.configuration import CommandStage, EnvironmentConfiguration
 
 Triple = tuple[float, float, float]
 
@@ -20,20 +20,20 @@ class Ratios:
     """A robot's sizes over those of the robot that a task was written for."""
 
     length: float
-    """Of stretched legs."""
+    """Ratio of the stretched legs' lengths."""
     height: float
-    """Of the base above the ground on stretched legs."""
+    """Ratio of the base's heights above the ground on stretched legs."""
     stance: tuple[float, float]
-    """Of the length and the width of the rectangle between the feet in the standing pose."""
+    """Ratios of length and width of the rectangle between the feet in the standing pose."""
     mass: float
     action: float
-    """Of the angle that an output of 1 of the network moves a joint's target, the mean of all joints."""
+    """Ratio of the angles by which an output of 1 of the network moves a joint's target, means over all joints."""
     speed: Triple
-    """Of the largest forward, lateral and yaw commands."""
+    """Ratios of the largest forward, lateral and yaw commands."""
 
     @property
     def torque(self) -> float:
-        """Of what a leg must carry: weight times length."""
+        """Return the ratio of the legs' loads: weight times length."""
         return self.mass * self.length
 
 
@@ -60,13 +60,12 @@ def ratios(robot: Robot, reference: Robot) -> Ratios:
 def scaled(
     environment: EnvironmentConfiguration, training: TrainingConfiguration, source: str
 ) -> tuple[EnvironmentConfiguration, TrainingConfiguration]:
-    """A task's settings for another robot, which explores by the same angles, in an experiment that is named for it.
+    """Return a task's settings for another robot, which explores by the same angles, in an experiment that is named for it.
 
-    Scaled are the height of the base with what the legs reach; the place to start on with the stance; masses that are added;
-    penalties on torque and power with what the robot must carry; penalties on actions with the angle that an action is;
-    contact forces that teacher and critic see; and commands with the robot's own limits. Terrain is not: every robot
-    meets the ground that the gauge has. The parameter set is the robot's default one where it has none of the name that
-    the task asks for.
+    Scaled are the height of the base with the legs' reach; the place to start on with the stance; masses that are added; penalties on
+    torque and power with the robot's load; penalties on actions with the angle that an action is; contact forces that teacher
+    and critic see; and commands with the robot's own limits. Terrain is not: every robot meets the ground that the gauge has. The
+    parameter set is the robot's default one where it has none of the name that the task asks for.
 
     Args:
         environment: settings for ``environment.robot``.
@@ -149,7 +148,7 @@ def _action_scale(robot: Robot) -> float:
 
 
 def _limits(limits: Triple, factor: Triple, robot: Robot) -> Triple:
-    """A terrain's limits: faster for a faster robot, but for a slower one only as slow as it is."""
+    """Return a terrain's limits: faster for a faster robot, but for a slower one only as slow as it is."""
     forward, lateral, yaw = (
         max(limit * by, min(limit, own)) for limit, by, own in zip(limits, factor, robot.command_limits, strict=True)
     )
