@@ -38,7 +38,6 @@ def check_start(scene: Scene, start: ResetState, worlds: torch.Tensor | None) ->
 def check_step(
     scene: Scene,
     joint_targets: torch.Tensor | None,
-    *,
     delay: torch.Tensor | None,
     sample_at: torch.Tensor | None,
     worlds: torch.Tensor | None,
@@ -59,7 +58,6 @@ def check_step(
 def check_push(
     scene: Scene,
     worlds: torch.Tensor | None,
-    *,
     linear_velocity_w: torch.Tensor | None,
     angular_velocity_b: torch.Tensor | None,
 ) -> None:
