@@ -110,7 +110,7 @@ def exercise_until_compiled(backend: str, scenes: Sequence[Scene], device: str) 
 
 
 def _exercise_and_reply(reply: Connection, backend: str, scenes: Sequence[Scene], device: str) -> None:
-    """Play, and send the refusal or None, also when nobody waits for the answer any more."""
+    """Play, and send the refusal or None; end quietly where no process waits for the answer any more."""
     refusal = None
     try:
         exercise(backend, scenes, device)
