@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .base import DESCRIPTION_KEYS
 
@@ -39,7 +39,7 @@ class ModelFields:
 
     def describe(self) -> dict[str, list[float]]:
         """Return the fields of ``PhysicsBackend.describe``."""
-        found = {name: np.asarray(value, dtype=np.float64) for name, value in vars(self).items()}
+        found: dict[str, NDArray] = {name: np.asarray(value, np.float64) for name, value in vars(self).items()}
         inertia, limit = found["body_inertia"], found["torque_limit"]
         foot, floor = found["foot_friction"], found["floor_friction"]
         found["body_inertia"] = np.linalg.eigvalsh(inertia) if inertia.ndim == 3 else np.sort(inertia, axis=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from .bench import Bench, Worlds, expect, expect_close
@@ -191,7 +193,7 @@ def step_response(bench: Bench) -> str:
         worlds.step(target)
         for _ in range(9):
             worlds.step()
-        bounds = {"angle": 0.01, "position": 0.003}
+        bounds: dict[str, Any] = {"angle": 0.01, "position": 0.003}
         error = follow_reference(bench, worlds, asked, worlds.read(), seconds=0.2, target=target, **bounds)
     return f"0.2 s after a step of 0.3 rad: {error}"
 
