@@ -22,12 +22,12 @@ SPAN = "Beginning and end of a run"
 SCORES = "Scores while it learns"
 WRITTEN = "What is written"
 LARGEST_SEED = 2**63 - 2**32
-"""Commands count on from a seed."""
+"""Largest first seed: commands count on from it."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """How the command line asks for a value. A request annotates each field that a user may choose with one."""
+    """An option of the command line. A request annotates each field that a user may choose with a ``Choice``."""
 
     help: str
     """One sentence."""
@@ -37,7 +37,7 @@ class Choice:
     """Spelling of the option; empty for the field's own name."""
     metavar: str | None = None
     values: str | tuple[str, ...] = ()
-    """What the shell completes: the values, or the kind of names (a function of ``cli/completion.py``)."""
+    """Values that the shell completes, or the kind of names (a function of ``cli/completion.py``)."""
     argument: bool = False
     """True for a positional argument."""
 
@@ -54,7 +54,7 @@ def choice_of(hint: Any) -> Choice | None:
 
 
 def cpu_threads(asked: int | None) -> int:
-    """Return the number of CPU threads that was asked for; None stands for all cores."""
+    """Return the requested number of CPU threads; None stands for all cores."""
     return asked or os.cpu_count() or 1
 
 
