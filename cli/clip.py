@@ -1,6 +1,4 @@
-"""The film of the robot in a report: made by ``gaitgauge play`` in a process of its own, because MuJoCo chooses how to draw when
-it is imported.
-"""
+"""Film the robot for a report: ``gaitgauge play`` runs in a process of its own, because MuJoCo chooses its renderer on import."""
 
 from __future__ import annotations
 
@@ -15,21 +13,18 @@ from ..gauge.report.page import CLIP
 SECONDS = 6.0
 """Length of the film [s]."""
 _LONGEST = 300.0
-"""How long it may take [s]."""
+"""Longest time that filming may take [s]."""
 _SHOWIEST = ("stairs_fd", "obstacle", "wave", "slope_fd", "stairs_bd", "slope_bd")
-"""Terrains in the order in which they are preferred."""
+"""Terrains in the order of preference."""
 _PACKAGE = __name__.partition(".")[0]
 
 
 def make_clip(folder: Path, results: Mapping[str, Any], options: Sequence[str]) -> str | None:
-    """Write the film beside the results, unless it is there.
+    """Write the film beside the results, unless it is there; return None, or one sentence on why there is no film.
 
     Args:
-        results: what was found: the robot is shown where it was judged, at the level that it reached.
-        options: of ``gaitgauge play``: the policy and what it is played with.
-
-    Returns:
-        None, or why there is no film, in one sentence.
+        results: give terrain, friction and the level that the robot reached.
+        options: of ``gaitgauge play``: the policy and its options.
     """
     clip = folder / CLIP
     if clip.is_file():
@@ -47,13 +42,12 @@ def make_clip(folder: Path, results: Mapping[str, Any], options: Sequence[str]) 
 
 
 def place(results: Mapping[str, Any]) -> list[str]:
-    """Where the robot is shown, as options of ``gaitgauge play``: on the showiest terrain, at the friction in the middle."""
+    """Return options of ``gaitgauge play`` for the place of the film: the showiest terrain, at the middle friction."""
     rows = results["environments"]
     played = [row["terrain"] for row in rows]
     terrain = next((name for name in _SHOWIEST if name in played), played[0])
-    mine = sorted(
-        (row for row in rows if row["terrain"] == terrain), key=lambda row: (abs(row["payload"]), row["friction"])
-    )
+    here = [row for row in rows if row["terrain"] == terrain]
+    mine = sorted(here, key=lambda row: (abs(row["payload"]), row["friction"]))
     unloaded = [row for row in mine if row["payload"] == mine[0]["payload"]]
     row = unloaded[len(unloaded) // 2]
     level = [] if row["level"] is None else ["--level", str(max(1, round(row["level"])))]

@@ -1,6 +1,4 @@
-"""Draws the pictures of a film: here where a GPU does it, in several processes where the processor does, since no picture needs
-another one.
-"""
+"""Draw the pictures of a film: in this process on a GPU, in several processes on the CPU, since pictures are independent."""
 
 from __future__ import annotations
 
@@ -22,25 +20,25 @@ from .picture import PLAIN, Picture, Quality, Tile
 Note = TypeVar("Note")
 
 _MOST = 4
-"""Processes at most."""
+"""Largest number of processes."""
 _WORTH = 50
-"""Pictures for which it is worth to start another process."""
+"""Pictures that are worth another process."""
 _AHEAD = 3
 """Pictures that are asked for ahead of time, for each process."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shot(Generic[Note]):
-    """One picture that is to be drawn."""
+    """Describe one picture that is to be drawn."""
 
     poses: Sequence[tuple[np.ndarray, np.ndarray]]
     """Pose (7 + J,) of each robot, and the point (3,) at which its camera looks."""
     note: Note
-    """Comes back with the picture."""
+    """Returned with the picture."""
 
 
 def processes_for(pictures: int, quality: Quality) -> int:
-    """How many processes draw; 0: this one."""
+    """Return the number of processes that draw; 0: this one."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = min(_MOST, cores, pictures // _WORTH)
     return wanted if quality is PLAIN and wanted > 1 else 0
@@ -49,13 +47,13 @@ def processes_for(pictures: int, quality: Quality) -> int:
 def draw(
     tiles: Sequence[Tile], size: tuple[int, int], shots: Iterable[Shot[Note]], processes: int
 ) -> Generator[tuple[np.ndarray, Note], None, None]:
-    """Pictures of shots, in their order.
+    """Draw shots in their order.
 
     Args:
         tiles: the robots, from left to right.
         size: width and height of each tile [pixels].
-        shots: are taken as they are needed.
-        processes: what ``processes_for`` says.
+        shots: taken as they are needed.
+        processes: as ``processes_for`` returns it.
 
     Yields:
         (height, width of all tiles, 3) uint8, and the shot's note.
@@ -83,15 +81,13 @@ def draw(
         for future, note in waiting:
             yield future.result(), note
     except BrokenProcessPool as error:
-        raise UserError(
-            "a process that draws was ended, perhaps for want of memory; ask for a shorter video"
-        ) from error
+        raise UserError("a drawing process ended, perhaps for want of memory; ask for a shorter video") from error
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 class _Artist:
-    """All tiles of one process."""
+    """Draw all tiles in one process."""
 
     def __init__(self, tiles: Sequence[Tile], size: tuple[int, int]) -> None:
         self._pictures = [Picture(tile, size=size) for tile in tiles]
@@ -106,12 +102,12 @@ class _Artist:
 
 
 _artist: _Artist | None = None
-"""Of this process, where it only draws."""
+"""Set in a process that only draws."""
 
 
 def _begin(tiles: Sequence[Tile], size: tuple[int, int]) -> None:
     global _artist
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's matter
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
     _artist = _Artist(tiles, size)
 
 

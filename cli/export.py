@@ -11,7 +11,7 @@ from ..policy.export.files import PARTS, ExportError, export_policy, export_unit
 from .console import Terminal
 from .errors import UserError
 from .policies import open_policy, policy_file
-from .requests import ExportRequest
+from .requests import LAYOUTS, ExportRequest
 
 FORMATS: Mapping[str, tuple[str, ...]] = {"all": PARTS, **{part: (part,) for part in PARTS}}
 _ABOUT = {
@@ -19,7 +19,6 @@ _ABOUT = {
     ".onnx": "ONNX: stacked observations in, the contract in its metadata",
     ".yaml": "settings of the robot's C++ runtime for policy.onnx",
 }
-LAYOUTS = ("plain", "unitree")
 
 
 def run_export(request: ExportRequest) -> None:

@@ -13,13 +13,12 @@ from .console import Terminal
 from .errors import UserError
 from .picture import choose_renderer
 from .progress import ProgressDisplay
-from .requests import PlayRequest
+from .requests import VIEWERS, PlayRequest
 from .video import CLIP_ENDINGS, VIDEO_ENDINGS, check_film_path
 
 if TYPE_CHECKING:
     from .play_session import PlaySession
 
-VIEWERS = ("native", "viser", "video")
 MOST = 4
 """Policies side by side."""
 _FASTEST = 100.0
@@ -70,8 +69,7 @@ def run_play(asked: PlayRequest) -> None:
             for path in filter(None, (video, asked.gif)):
                 console.say(f"wrote {path}, {seconds:g} s{_events(sessions)}")
         else:
-            from .gamepad import Gamepad
-            from .native_viewer import watch
+            from .native_viewer import Gamepad, watch
 
             pad = Gamepad(sessions[0].limits) if asked.gamepad else None
             if pad is not None:

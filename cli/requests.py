@@ -38,15 +38,12 @@ def resume(what: str) -> Choice:
     return Choice(f"Go on with the {what} in the output folder.", WRITTEN)
 
 
-_VIEWERS = Choice(
-    "native: a window; viser: in a browser; video. Default: a window where there is a display.",
-    WATCHED,
-    ("native", "viser", "video"),
+VIEWERS = ("native", "viser", "video")
+_VIEWER = Choice(
+    "native: a window; viser: in a browser; video. Default: a window where there is a display.", WATCHED, VIEWERS
 )
 _COMMAND = Choice(
-    "Forward, sideways [m/s] and turning [rad/s] speed. Default: to the target, or a tour.",
-    PLAYED,
-    metavar="VX VY YAW",
+    "Forward, sideways [m/s] and turning [rad/s] speed. Default: to the target, or a tour.", PLAYED, metavar="VX VY YAW"
 )
 _SUITE = Choice("Suite whose physics, gains and speeds are played with: a name or a .toml file.", PLAYED, "suites")
 _WATCHED = "Policy files, run directories, or latest, best, pretrained; up to four, side by side."
@@ -54,18 +51,16 @@ _WATCHED = "Policy files, run directories, or latest, best, pretrained; up to fo
 
 @dataclass(frozen=True, kw_only=True)
 class PlayRequest:
-    """Policies, ground, and viewer."""
+    """Hold the options of ``play``."""
 
     policies: Annotated[tuple[str, ...], Choice(_WATCHED, None, "policies", "POLICY...")]
     terrain: Annotated[str, Choice("Terrain, see 'gaitgauge list terrains'.", PLAYED, "terrains")] = "flat"
     level: Annotated[int | None, Choice("Level of the terrain, 1 to 10. Default: 5.", PLAYED)] = None
-    viewer: Annotated[str | None, _VIEWERS] = None
+    viewer: Annotated[str | None, _VIEWER] = None
     out: Annotated[
         Path | None, Choice("Write a video (.mp4); needs no display.", WRITTEN, flags=("--out", "--video"))
     ] = None
-    gif: Annotated[Path | None, Choice("Write a small clip that plays by itself in a page (.gif, .webp).", WRITTEN)] = (
-        None
-    )
+    gif: Annotated[Path | None, Choice("Write a clip that plays by itself in a page (.gif, .webp).", WRITTEN)] = None
     seconds: Annotated[float | None, Choice("How long [s]. Default: 10 for a video, else no end.", PLAYED)] = None
     command: Annotated[tuple[float, float, float] | None, _COMMAND] = None
     friction: Annotated[float, Choice("Friction coefficient of the ground.", PLAYED)] = 0.6
@@ -73,9 +68,7 @@ class PlayRequest:
     backend: EngineName = "mujoco"
     device: DeviceName = None
     port: Annotated[int, Ge(1), Le(65535), Choice("Port of the browser's viewer.", WATCHED)] = 8080
-    host: Annotated[str, Choice("Interface of the browser's viewer; 0.0.0.0 lets other machines in.", WATCHED)] = (
-        "127.0.0.1"
-    )
+    host: Annotated[str, Choice("Interface of the page; 0.0.0.0 lets other machines in.", WATCHED)] = "127.0.0.1"
     gamepad: Annotated[bool, Choice("Steer the window with a gamepad.", WATCHED)] = False
     trust: Trust = False
     robot: RobotName = None
@@ -89,7 +82,7 @@ _EACH = "How long each description is played [s]. Default: 2."
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorRequest:
-    """Options of ``doctor``."""
+    """Hold the options of ``doctor``."""
 
     policy: Annotated[str | None, Choice(_EXAMINED, None, "policies", "POLICY", argument=True)] = None
     contract: Annotated[Path | None, Choice(_CONTRACT, metavar="PATH")] = None
@@ -102,39 +95,38 @@ class DoctorRequest:
 
 
 _EXPORTED = "A checkpoint of the project's own, a run directory, or latest, best, pretrained."
-_LAYOUTS = Choice(
-    "plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'.",
-    values=("plain", "unitree"),
+LAYOUTS = ("plain", "unitree")
+_LAYOUT = Choice(
+    "plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'.", None, LAYOUTS
 )
 _FORMATS = ("torchscript", "onnx", "deploy", "all")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest:
-    """Options of ``export``."""
+    """Hold the options of ``export``."""
 
     policy: Annotated[str, Choice(_EXPORTED, None, "policies", "POLICY")]
     out: Annotated[Path | None, Choice("Output folder. Default: 'exported' in the run directory, or here.")] = None
     form: Annotated[str, Choice("torchscript, onnx, deploy or all.", None, _FORMATS, flags=("--format",))] = "all"
-    layout: Annotated[str, _LAYOUTS] = "plain"
+    layout: Annotated[str, _LAYOUT] = "plain"
     trust: Trust = False
     robot: RobotName = None
 
 
+_TRAINABLE = "Keep teacher and critic of a training checkpoint, for train --init-from."
 _SOURCE = "TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint."
 _CONTRACT_OF = "A contract.toml that says how a TorchScript or ONNX file is to be run, in place of what the file says."
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportRequest:
-    """Options of ``import``."""
+    """Hold the options of ``import``."""
 
     source: Annotated[str, Choice(_SOURCE, None, "policies")]
     destination: Annotated[Path, Choice("File to write, by custom NAME.gauge.pt.")]
     force: Annotated[bool, Choice("Replace the destination if it exists.")] = False
-    trainable: Annotated[bool, Choice("Keep teacher and critic of a training checkpoint, for train --init-from.")] = (
-        False
-    )
+    trainable: Annotated[bool, Choice(_TRAINABLE)] = False
     raw: Annotated[bool, Choice("The same with the weights after the last update, not their average.")] = False
     trust: Trust = False
     contract: Annotated[Path | None, Choice(_CONTRACT_OF)] = None
@@ -147,7 +139,7 @@ _FRESH = "Play with other seeds, made from this number, instead of those that ev
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyRequest:
-    """Options of ``verify``."""
+    """Hold the options of ``verify``."""
 
     card: Annotated[Path, Choice("A score card: results.json, a copy of it, or its folder.", metavar="CARD")]
     policy: Annotated[str | None, Choice("The policy's file, where it is not at the card's path.")] = None
@@ -168,7 +160,7 @@ _KEEP = "Keep what is trained in this folder too, small: policies, curves, resul
 
 @dataclass(frozen=True, kw_only=True)
 class SweepRequest:
-    """Options of ``sweep``."""
+    """Hold the options of ``sweep``."""
 
     file: Annotated[Path, Choice("A list of trainings (.toml), such as benchmarks/sweeps/*.toml.", metavar="FILE")]
     out: Annotated[Path | None, output("results/sweep-<name>")] = None

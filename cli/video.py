@@ -1,4 +1,4 @@
-"""Films: MP4 files, and GIF or WebP files that play by themselves in a page."""
+"""Write films: MP4 files, and GIF or WebP files that play by themselves in a page."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _CODECS: dict[str, tuple[str, str, list[str]]] = {
 
 
 def check_film_path(path: Path, option: str, endings: tuple[str, ...]) -> None:
-    """Refuse a file that cannot be.
+    """Refuse the name of a film that cannot be written.
 
     Raises:
-        UserError: the folder is not there, or the name ends in something else.
+        UserError: the folder does not exist, or the name has another ending.
     """
     if path.suffix.lower() not in endings:
         other = _OPTION_OF.get(path.suffix.lower())
@@ -45,12 +45,12 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
     """Write pictures to a file in the format that its ending names; the file gets its name when it is whole.
 
     Args:
-        path: one that ``check_film_path`` lets pass.
+        path: checked by ``check_film_path``.
         fps: pictures a second.
         size: width and height [pixels].
 
     Yields:
-        What adds a picture (height, width, 3) uint8, or raises ``UserError`` where it cannot be written.
+        A function that adds a picture (height, width, 3) uint8, and raises ``UserError`` where it cannot be written.
     """
     import imageio_ffmpeg
 

@@ -20,8 +20,9 @@ app = typer.Typer()
 
 _CONTESTANTS = Choice(
     "Two or more of: policies, as for evaluate; results folders; results.json files and score cards.",
-    values="policies",
-    metavar="A B...",
+    None,
+    "policies",
+    "A B...",
 )
 _ENGINES = Choice(
     "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005).",
