@@ -1,4 +1,4 @@
-"""The project as a library: judge, train and read policies from Python.
+"""Judge, train and read policies from Python.
 
 Each function does what the command of the same name does, with the same defaults, and raises the same one-sentence
 errors. Heavy packages are imported inside the functions.
@@ -23,55 +23,55 @@ if TYPE_CHECKING:
 
 
 class ResultsError(ValueError):
-    """A folder or file that holds no results; the message says what is wrong."""
+    """Refuse a folder or file that holds no results; the message says what is wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """What an evaluation found: ``results.json`` as it stands, and shortcuts to what is asked for most."""
+    """Hold the results of an evaluation: ``results.json`` as it stands, and shortcuts to its main figures."""
 
     path: Path
-    """Where ``results.json`` lies."""
+    """Path of ``results.json``."""
     data: Mapping[str, Any]
     """Its content; ``docs/results.md`` explains every key."""
 
     @property
     def score(self) -> float | None:
-        """Mean over terrains, 0 to 1; the suite's where ``complete``; None where levels alone were searched."""
+        """Return the mean over terrains, 0 to 1; the suite's score if ``complete``; None where levels alone were searched."""
         value = self.data["score"]
         return None if value is None else float(value)
 
     @property
     def complete(self) -> bool:
-        """Whether the whole suite was played, and nothing else: ``data["coverage"]`` says what was."""
+        """Return whether the whole suite was played, and nothing else; ``data["coverage"]`` names what was played."""
         return bool((self.data.get("coverage") or {}).get("kind") == "complete")
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % interval of the score; None where there is none."""
+        """Return the 95 % interval of the score; None where there is none."""
         ends = self.data.get("score_interval")
         return None if ends is None else (float(ends[0]), float(ends[1]))
 
     @property
     def terrains(self) -> Mapping[str, Mapping[str, Any]]:
-        """Score, interval, level and statistics of each terrain."""
+        """Return score, interval, level and statistics of each terrain."""
         found: Mapping[str, Mapping[str, Any]] = self.data["terrains"]
         return found
 
     @property
     def metrics(self) -> Mapping[str, Mapping[str, Any]]:
-        """Each metric of the suite, weighted by level."""
+        """Return each metric of the suite, weighted by level."""
         found: Mapping[str, Mapping[str, Any]] = self.data["metrics"]
         return found
 
     @property
     def suite(self) -> str:
-        """Name and version of the suite."""
+        """Return name and version of the suite."""
         return f"{self.data['suite']['name']} {self.data['suite']['version']}"
 
 
 class ArgumentError(TypeError):
-    """An argument of another type than it must have; the message names it."""
+    """Refuse an argument of the wrong type; the message names it."""
 
 
 def _need(kind: str, **given: Any) -> None:
@@ -192,12 +192,12 @@ def evaluate(
     watch: Callable[[Any], None] | None = None,
     **options: Any,
 ) -> Results:
-    """Judge a policy, as ``gaitgauge evaluate`` does; writes results, episodes and the report.
+    """Judge a policy, as ``gaitgauge evaluate`` does, and write results, episodes and the report.
 
     Args:
         policy: a file, or ``latest``, ``best`` or ``pretrained``; or a whole request in place of all options.
         out: output folder; None for ``results/<policy>-<suite>-<pipeline>``.
-        resume: go on with what the folder holds.
+        resume: go on with the run in the folder.
         watch: called a few times a second with a ``Status``.
         options: fields of ``gaitgauge.gauge.request.Request``: ``suite``, ``terrains``, ``frictions``, ``threads`` …
 
@@ -219,10 +219,10 @@ def evaluate(
 
 
 def compare(*results: Results | str | Path) -> Comparison:
-    """Which differences between policies are real; ``gaitgauge compare`` without the evaluating.
+    """Return which differences between policies are real, as ``gaitgauge compare`` does, from results that exist.
 
     Args:
-        results: two or more of: what ``evaluate`` returned, results folders, copies of ``results.json``.
+        results: two or more of: objects that ``evaluate`` returned, results folders, copies of ``results.json``.
 
     Raises:
         ComparisonError: results that cannot be read, or were not made alike.
@@ -245,7 +245,7 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
         options: fields of ``gaitgauge.training.run.request.TrainRequest``.
 
     Returns:
-        How it ended, and the run directory.
+        The outcome, and the run directory.
 
     Raises:
         ArgumentError, TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.

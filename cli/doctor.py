@@ -37,7 +37,7 @@ _FREE_MEMORY = 4.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One row of the table."""
+    """Describe one row of the table."""
 
     what: str
     status: str
@@ -59,9 +59,8 @@ def run_doctor(request: DoctorRequest) -> bool:
         return examine_policy(request.policy, request)
     for name in ("contract", "robot", "out", "seconds", "trust"):
         if getattr(request, name):
-            raise UserError(
-                f"--{name} is for the examination of a policy; name one: gaitgauge doctor POLICY --{name} …"
-            )
+            again = f"gaitgauge doctor POLICY --{name} …"
+            raise UserError(f"--{name} is for the examination of a policy; name one: {again}")
     return examine(json_output=request.json_output)
 
 
@@ -95,10 +94,8 @@ def check_python() -> Iterator[Finding]:
         wanted = SpecifierSet(metadata("gaitgauge")["Requires-Python"])
     except PackageNotFoundError:
         wanted = SpecifierSet()
-    if wanted.contains(platform.python_version(), prereleases=True):
-        yield Finding("Python", OK, found)
-    else:
-        yield Finding("Python", PROBLEM, found, f"use Python {wanted}")
+    good = wanted.contains(platform.python_version(), prereleases=True)
+    yield Finding("Python", OK, found) if good else Finding("Python", PROBLEM, found, f"use Python {wanted}")
 
 
 def check_packages() -> Iterator[Finding]:
@@ -160,13 +157,11 @@ def check_gpu() -> Iterator[Finding]:
 
 def _driver() -> str | None:
     """Return the version of the NVIDIA driver, None where there is none."""
-    program = shutil.which("nvidia-smi")
-    if program is None:
+    if (program := shutil.which("nvidia-smi")) is None:
         return None
+    command = [program, "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
-        done = subprocess.run(
-            [program, "--query-gpu=driver_version", "--format=csv,noheader"], capture_output=True, text=True, timeout=20
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.splitlines()[0].strip() if done.returncode == 0 and done.stdout.strip() else None
@@ -233,15 +228,11 @@ def check_rendering() -> Iterator[Finding]:
 
 def check_display() -> Iterator[Finding]:
     """Check that a window can be opened."""
-    if sys.platform in ("darwin", "win32"):
-        yield Finding("display", OK, "the system's own")
-        return
-    if display := os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    own = "the system's own" if sys.platform in ("darwin", "win32") else None
+    if display := own or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         yield Finding("display", OK, display)
     else:
-        advice = (
-            "none is needed but for the viewer's window; in a browser it works without (viser), over ssh use ssh -X"
-        )
+        advice = "only the viewer's window needs one; over ssh use ssh -X, or --viewer viser for a browser"
         yield Finding("display", WARNING, "neither DISPLAY nor WAYLAND_DISPLAY is set", advice)
 
 
@@ -269,8 +260,7 @@ def check_room() -> Iterator[Finding]:
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     advice = "" if free >= _FREE_DISK else f"make room: a training run may write up to {_FREE_DISK:g} GB"
     yield Finding("free disk", WARNING if advice else OK, f"{free:.1f} GB in {Path.cwd()}", advice)
-    memory = _free_memory()
-    if memory is not None:
+    if (memory := _free_memory()) is not None:
         advice = "" if memory >= _FREE_MEMORY else f"close programs: the engines may want {_FREE_MEMORY:g} GB"
         yield Finding("free memory", WARNING if advice else OK, f"{memory:.1f} GB", advice)
     for name in ("logs", "results"):
@@ -297,8 +287,7 @@ def _writable(folder: Path) -> Finding:
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
-        advice = f"make {there} writable, or work in another folder"
-        return Finding(what, PROBLEM, f"{there}: {error.strerror}", advice)
+        return Finding(what, PROBLEM, f"{there}: {error.strerror}", f"make {there} writable, or work in another folder")
     found = "writable" if there == folder.absolute() else "will be created when it is needed"
     return Finding(what, OK, found)
 

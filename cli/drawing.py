@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -18,6 +19,7 @@ from .errors import UserError
 from .picture import PLAIN, Picture, Quality, Tile
 
 Note = TypeVar("Note")
+Poses = Sequence[tuple[np.ndarray, np.ndarray]]
 
 _MOST = 4
 """Largest number of processes."""
@@ -31,7 +33,7 @@ _AHEAD = 3
 class Shot(Generic[Note]):
     """Describe one picture that is to be drawn."""
 
-    poses: Sequence[tuple[np.ndarray, np.ndarray]]
+    poses: Poses
     """Pose (7 + J,) of each robot, and the point (3,) at which its camera looks."""
     note: Note
     """Returned with the picture."""
@@ -62,12 +64,10 @@ def draw(
         UserError: a process that draws was ended from outside.
     """
     if not processes:
-        artist = _Artist(tiles, size)
-        try:
+        with ExitStack() as stack:
+            pictures = [stack.enter_context(closing(Picture(tile, size=size))) for tile in tiles]
             for shot in shots:
-                yield artist.draw(shot.poses), shot.note
-        finally:
-            artist.close()
+                yield _draw_all(pictures, shot.poses), shot.note
         return
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's threads would only be in the way of the other processes
     pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (tiles, size))
@@ -86,31 +86,19 @@ def draw(
         pool.shutdown(cancel_futures=True)
 
 
-class _Artist:
-    """Draw all tiles in one process."""
-
-    def __init__(self, tiles: Sequence[Tile], size: tuple[int, int]) -> None:
-        self._pictures = [Picture(tile, size=size) for tile in tiles]
-
-    def draw(self, poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        drawn = [picture.draw(*pose) for picture, pose in zip(self._pictures, poses, strict=True)]
-        return drawn[0] if len(drawn) == 1 else np.concatenate(drawn, axis=1)
-
-    def close(self) -> None:
-        for picture in self._pictures:
-            picture.close()
+def _draw_all(pictures: Sequence[Picture], poses: Poses) -> np.ndarray:
+    drawn = [picture.draw(*pose) for picture, pose in zip(pictures, poses, strict=True)]
+    return drawn[0] if len(drawn) == 1 else np.concatenate(drawn, axis=1)
 
 
-_artist: _Artist | None = None
-"""Set in a process that only draws."""
+_pictures: list[Picture] = []
+"""Filled in a process that only draws."""
 
 
 def _begin(tiles: Sequence[Tile], size: tuple[int, int]) -> None:
-    global _artist
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
-    _artist = _Artist(tiles, size)
+    _pictures[:] = [Picture(tile, size=size) for tile in tiles]
 
 
-def _draw(poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    assert _artist is not None
-    return _artist.draw(poses)
+def _draw(poses: Poses) -> np.ndarray:
+    return _draw_all(_pictures, poses)

@@ -1,4 +1,4 @@
-"""The command line. Heavy packages are imported inside the commands."""
+"""Assemble the command line. Heavy packages are imported inside the commands."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def main() -> None:
     """Run the ``gaitgauge`` command."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # where the terminal has no such letter
+            stream.reconfigure(errors="backslashreplace")  # where the terminal lacks a letter
     with output_failures():
         check_folder()
         app(args=[_kebab(a) for a in sys.argv[1:]])

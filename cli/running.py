@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import is_dataclass
+from dataclasses import MISSING, is_dataclass
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import typer
 from annotated_types import Ge, Le
 
-from ..files.choices import choice_of, choices, required
+from ..files.choices import choice_of, choices
 from . import completion
 from .errors import report_errors
 
@@ -36,8 +36,8 @@ def command(app: typer.Typer, name: str | None = None) -> Callable[[Command], Co
             hint = hints[parameter.name]
             if isinstance(hint, type) and is_dataclass(hint):
                 requests[parameter.name] = hint
-                for field, (entry, kind) in choices(hint).items():
-                    options[field] = (parameter.empty if required(entry) else entry.default, kind)
+                for field, (default, kind) in choices(hint).items():
+                    options[field] = (parameter.empty if default is MISSING else default, kind)
             else:
                 options[parameter.name] = (parameter.default, hint)
         parameters = [_parameter(option, kind, default) for option, (default, kind) in options.items()]

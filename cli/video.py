@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
 from tempfile import TemporaryFile
 
 import numpy as np
@@ -58,14 +58,9 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
     with replacing(path, UserError, ending=path.suffix) as partial, TemporaryFile() as complaints:
         pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size), "-r", f"{fps:g}", "-i", "-"]
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *pictures, "-an", "-c:v", codec]
-        # A session of its own: Ctrl-C in the terminal is for this command, which ends the film.
-        encoder = subprocess.Popen(
-            [*command, "-pix_fmt", pixels, *options, str(partial)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=complaints,
-            start_new_session=True,
-        )
+        # A session of its own: Ctrl-C in the terminal reaches this command, which ends the film.
+        command += ["-pix_fmt", pixels, *options, str(partial)]
+        encoder = Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=complaints, start_new_session=True)
         assert encoder.stdin is not None
         sent = encoder.stdin
 
@@ -83,7 +78,7 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
 
         try:
             yield add
-            with suppress(OSError):  # it has ended by itself, and says why
+            with suppress(OSError):  # ended by itself; the failure follows
                 sent.close()
             if encoder.wait():
                 raise failure()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Annotated, Any, get_type_hints
 
@@ -47,10 +47,10 @@ class Choice:
     """True for a positional argument with a default."""
 
 
-def choices(request: type) -> Mapping[str, tuple[Field[Any], Any]]:
-    """Return the fields of a request that a user may choose, with their annotated types, by name."""
+def choices(request: type) -> Mapping[str, tuple[Any, Any]]:
+    """Return defaults (``MISSING`` where there is none) and annotated types of a request's fields with a ``Choice``, by name."""
     hints = _hints(request)
-    return {f.name: (f, hints[f.name]) for f in fields(request) if choice_of(hints[f.name]) is not None}
+    return {f.name: (f.default, hints[f.name]) for f in fields(request) if choice_of(hints[f.name]) is not None}
 
 
 def choice_of(hint: Any) -> Choice | None:
@@ -61,11 +61,6 @@ def choice_of(hint: Any) -> Choice | None:
 def cpu_threads(asked: int | None) -> int:
     """Return the number of CPU threads that was asked for; None stands for all cores."""
     return asked or os.cpu_count() or 1
-
-
-def required(field: Field[Any]) -> bool:
-    """Return whether a field has no default."""
-    return field.default is MISSING and field.default_factory is MISSING
 
 
 @cache

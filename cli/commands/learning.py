@@ -35,9 +35,9 @@ def train(
       gaitgauge train go2-moe-cts --resume latest
     """
     if list_settings:
-        from ..settings import print_settings_of
+        from ..settings import print_settings
 
-        print_settings_of(request)
+        print_settings(request)
     else:
         from ..train import run_training
 
