@@ -105,25 +105,21 @@ class _Notices(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self._held: list[str] = []
+        self.held: list[str] = []
         self._process = os.getpid()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Hold a warning, or print it in a worker, which has no command."""
-        self._held.append(record.getMessage())
+        self.held.append(record.getMessage())
         if os.getpid() != self._process:
-            self._held = self._held[-1:]
+            self.held = self.held[-1:]
             self.tell()
 
     def tell(self) -> None:
         """Print the held warnings."""
-        held, self._held = self._held, []
+        held, self.held = self.held, []
         for message in held:
             complain(message)
-
-    def forget(self) -> None:
-        """Drop the held warnings."""
-        self._held = []
 
 
 _notices = _Notices()
@@ -138,7 +134,7 @@ def held_notices() -> Iterator[None]:
         yield
         _notices.tell()
     finally:
-        _notices.forget()
+        _notices.held.clear()
         logger.removeHandler(_notices)
 
 

@@ -22,9 +22,6 @@ _HASH = 12
 """Digits of a contract's hash that are shown in lists; enough to tell policies apart by eye."""
 
 
-# ---- import ---------------------------------------------------------------------------------------------------------
-
-
 def import_file(request: ImportRequest) -> None:
     """Write a foreign policy as the project's own file, and print its contract.
 
@@ -102,9 +99,6 @@ def _numbers(values: Sequence[float]) -> str:
     """Return numbers in short: one where all are equal."""
     shown = [f"{v:g}" for v in values]
     return shown[0] if len(set(shown)) == 1 else "(" + ", ".join(shown) + ")"
-
-
-# ---- list -----------------------------------------------------------------------------------------------------------
 
 
 def list_things(what: str) -> None:

@@ -39,13 +39,9 @@ def resume(what: str) -> Choice:
 
 
 VIEWERS = ("native", "viser", "video")
-_VIEWER = Choice(
-    "native: a window; viser: in a browser; video. Default: a window where there is a display.", WATCHED, VIEWERS
-)
-_COMMAND = Choice(
-    "Forward, sideways [m/s] and turning [rad/s] speed. Default: to the target, or a tour.", PLAYED, metavar="VX VY YAW"
-)
-_SUITE = Choice("Suite whose physics, gains and speeds are played with: a name or a .toml file.", PLAYED, "suites")
+_VIEWER = "native: a window; viser: in a browser; video. Default: a window where there is a display."
+_COMMAND = "Forward, sideways [m/s] and turning [rad/s] speed. Default: to the target, or a tour."
+_SUITE = Choice("Suite of the physics, gains and speeds: a name or a .toml file.", PLAYED, "suites")
 _WATCHED = "Policy files, run directories, or latest, best, pretrained; up to four, side by side."
 
 
@@ -56,13 +52,13 @@ class PlayRequest:
     policies: Annotated[tuple[str, ...], Choice(_WATCHED, None, "policies", "POLICY...")]
     terrain: Annotated[str, Choice("Terrain, see 'gaitgauge list terrains'.", PLAYED, "terrains")] = "flat"
     level: Annotated[int | None, Choice("Level of the terrain, 1 to 10. Default: 5.", PLAYED)] = None
-    viewer: Annotated[str | None, _VIEWER] = None
+    viewer: Annotated[str | None, Choice(_VIEWER, WATCHED, VIEWERS)] = None
     out: Annotated[
         Path | None, Choice("Write a video (.mp4); needs no display.", WRITTEN, flags=("--out", "--video"))
     ] = None
     gif: Annotated[Path | None, Choice("Write a clip that plays by itself in a page (.gif, .webp).", WRITTEN)] = None
     seconds: Annotated[float | None, Choice("How long [s]. Default: 10 for a video, else no end.", PLAYED)] = None
-    command: Annotated[tuple[float, float, float] | None, _COMMAND] = None
+    command: Annotated[tuple[float, float, float] | None, Choice(_COMMAND, PLAYED, metavar="VX VY YAW")] = None
     friction: Annotated[float, Choice("Friction coefficient of the ground.", PLAYED)] = 0.6
     seed: Annotated[int, Ge(0), Le(LARGEST_SEED), Choice("Seed of the robot's heading at each start.", PLAYED)] = 0
     backend: EngineName = "mujoco"
@@ -96,9 +92,7 @@ class DoctorRequest:
 
 _EXPORTED = "A checkpoint of the project's own, a run directory, or latest, best, pretrained."
 LAYOUTS = ("plain", "unitree")
-_LAYOUT = Choice(
-    "plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'.", None, LAYOUTS
-)
+_LAYOUT = "plain: the files side by side; unitree: the folder of the published C++ controller, 'unitree'."
 _FORMATS = ("torchscript", "onnx", "deploy", "all")
 
 
@@ -109,7 +103,7 @@ class ExportRequest:
     policy: Annotated[str, Choice(_EXPORTED, None, "policies", "POLICY")]
     out: Annotated[Path | None, Choice("Output folder. Default: 'exported' in the run directory, or here.")] = None
     form: Annotated[str, Choice("torchscript, onnx, deploy or all.", None, _FORMATS, flags=("--format",))] = "all"
-    layout: Annotated[str, _LAYOUT] = "plain"
+    layout: Annotated[str, Choice(_LAYOUT, None, LAYOUTS)] = "plain"
     trust: Trust = False
     robot: RobotName = None
 

@@ -71,9 +71,8 @@ def _parameter(name: str, hint: Any, default: Any) -> inspect.Parameter:
             details["min"] = limit.ge
         elif isinstance(limit, Le):
             details["max"] = limit.le
-    if choice.values:
-        known = isinstance(choice.values, str)
-        details["autocompletion"] = completion.KINDS[choice.values] if known else completion.of(*choice.values)
+    if values := choice.values:
+        details["autocompletion"] = completion.KINDS[values] if isinstance(values, str) else completion.of(*values)
     argument, flags = choice.argument or default is inspect.Parameter.empty, choice.flags
     if default is False and not flags:
         flags = (f"--{name.replace('_', '-')}",)

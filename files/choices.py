@@ -71,7 +71,7 @@ def _hints(request: type) -> Mapping[str, Any]:
 _FILES = "own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained."
 _ONE, _MORE = f"A policy file ({_FILES}", f"One or more policy files ({_FILES}"
 _CLUSTER = (
-    "Ray cluster whose CPUs play, all that are free or as many as --threads: auto, HOST:PORT or ray://HOST:PORT. "
+    "Ray cluster to play on, with all free CPUs or as many as --threads: auto, HOST:PORT or ray://HOST:PORT. "
     "Results do not depend on it."
 )
 _THREADS = "CPU threads; results do not depend on them. Default: all cores."

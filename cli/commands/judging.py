@@ -18,17 +18,8 @@ from ..running import command
 
 app = typer.Typer()
 
-_CONTESTANTS = Choice(
-    "Two or more of: policies, as for evaluate; results folders; results.json files and score cards.",
-    None,
-    "policies",
-    "A B...",
-)
-_ENGINES = Choice(
-    "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005).",
-    PLACE,
-    "backends",
-)
+_CONTESTANTS = "Two or more of: policies, as for evaluate; results folders; results.json files and score cards."
+_ENGINES = "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005)."
 _COMPARED = "Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
 _TABLES = "The measured table, then one for each simulator (CSV; docs/guides/validate.md)."
 _EXAMPLE = Choice("Tables that ship with the project: paper.", values=("paper",), flags=("--example",))
@@ -57,7 +48,7 @@ def evaluate(
 
 @command(app)
 def compare(
-    contestants: Annotated[tuple[str, ...], _CONTESTANTS],
+    contestants: Annotated[tuple[str, ...], Choice(_CONTESTANTS, None, "policies", "A B...")],
     choices: EvaluationOptions,
     out: Annotated[Path | None, Choice(_COMPARED, WRITTEN)] = None,
     json_output: Tables = False,
@@ -127,7 +118,7 @@ def validate(
 @command(app)
 def consistency(
     request: StudyRequest,
-    backends: Annotated[str, _ENGINES] = "mujoco,mujoco-warp,newton",
+    backends: Annotated[str, Choice(_ENGINES, PLACE, "backends")] = "mujoco,mujoco-warp,newton",
     out: Annotated[Path | None, output("results/<policy>-<suite>-consistency")] = None,
     resume: Annotated[bool, resume("study")] = False,
     json_output: Tables = False,

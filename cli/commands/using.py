@@ -16,9 +16,7 @@ robot = typer.Typer(no_args_is_help=True, help="Describe a robot of your own, an
 
 LISTS = ("robots", "terrains", "backends", "suites", "scenarios", "policies", "tasks")
 """Kinds of names that can be listed."""
-_ARCHITECTURES = Choice(
-    "GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU.", flags=("--arch",)
-)
+_ARCHITECTURES = "GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU."
 _ENGINES = Choice("mujoco-warp or newton; repeatable. Default: mujoco-warp.", values=("mujoco-warp", "newton"))
 _CHECKED = Choice("A robot.toml, its folder, or a robot's name.", values="robots", metavar="PATH")
 
@@ -136,7 +134,7 @@ def doctor(request: DoctorRequest) -> None:
 
 @command(app)
 def warmup(
-    architectures: Annotated[tuple[str, ...], _ARCHITECTURES] = (),
+    architectures: Annotated[tuple[str, ...], Choice(_ARCHITECTURES, flags=("--arch",))] = (),
     backends: Annotated[tuple[str, ...], _ENGINES] = (),
     robot: Annotated[str, Choice("Robot name, or a robot.toml.", None, "robots")] = "go2",
     cache: Annotated[Path | None, Choice("Folder of the kernels. Default: Warp's own, or WARP_CACHE_PATH.")] = None,
