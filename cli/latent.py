@@ -37,8 +37,8 @@ def print_latents(console: Terminal, results: Mapping[str, Any]) -> None:
             console.say(f"{entry['label']} has no experts, so there are no weights of them to show")
         else:
             count = len(next(iter(experts["terrains"].values())))
-            numbers = f"{experts['at_once']:.1f} of {count} experts count at once, {experts['in_all']:.1f} in all"
-            console.say(f"{entry['label']}: {numbers}")
+            shares = f"{experts['at_once']:.1f} of {count} experts count at once, {experts['in_all']:.1f} in all"
+            console.say(f"{entry['label']}: {shares}")
         if entry["falls"]:
             fell = f"{entry['falls']} of {entry['walkers']} robots fell"
             console.say(f"{entry['label']}: {fell}, and were not watched further")
