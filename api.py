@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from .gauge.request import EvaluationOptions, Request
 
 if TYPE_CHECKING:
+    from .gauge.result import Result
     from .policy.base import Policy
     from .studies.compare.comparison import Comparison
     from .training.run.stopping import TrainingOutcome
@@ -24,50 +25,6 @@ if TYPE_CHECKING:
 
 class ResultsError(ValueError):
     """Refuse a folder or file that holds no results; the message says what is wrong."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Results:
-    """Hold the results of an evaluation: ``results.json`` as it stands, and shortcuts to its main figures."""
-
-    path: Path
-    """Path of ``results.json``."""
-    data: Mapping[str, Any]
-    """Its content; ``docs/results.md`` explains every key."""
-
-    @property
-    def score(self) -> float | None:
-        """Return the mean over terrains, 0 to 1; the suite's score if ``complete``; None where levels alone were searched."""
-        value = self.data["score"]
-        return None if value is None else float(value)
-
-    @property
-    def complete(self) -> bool:
-        """Return whether the whole suite was played, and nothing else; ``data["coverage"]`` names what was played."""
-        return bool((self.data.get("coverage") or {}).get("kind") == "complete")
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """Return the 95 % interval of the score; None where there is none."""
-        ends = self.data.get("score_interval")
-        return None if ends is None else (float(ends[0]), float(ends[1]))
-
-    @property
-    def terrains(self) -> Mapping[str, Mapping[str, Any]]:
-        """Return score, interval, level and statistics of each terrain."""
-        found: Mapping[str, Mapping[str, Any]] = self.data["terrains"]
-        return found
-
-    @property
-    def metrics(self) -> Mapping[str, Mapping[str, Any]]:
-        """Return each metric of the suite, weighted by level."""
-        found: Mapping[str, Mapping[str, Any]] = self.data["metrics"]
-        return found
-
-    @property
-    def suite(self) -> str:
-        """Return name and version of the suite."""
-        return f"{self.data['suite']['name']} {self.data['suite']['version']}"
 
 
 class ArgumentError(TypeError):
@@ -97,7 +54,6 @@ _KINDS: Mapping[str, tuple[type, ...]] = {
     "a text": (str,),
     "a text or None": (str, type(None)),
     "several texts": (str,),
-    "a path, or what evaluate returned": (str, os.PathLike, Results),
     "a path, or a request": (str, os.PathLike, EvaluationOptions),
 }
 
@@ -132,7 +88,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def load_results(path: str | Path) -> Results:
+def load_results(path: str | Path) -> Result:
     """Read the results of an evaluation.
 
     Args:
@@ -141,27 +97,10 @@ def load_results(path: str | Path) -> Results:
     Raises:
         ResultsError: there are none, or the file is damaged.
     """
-    from .files.parsing import edited, one_line, read_results
+    from .gauge.result import read_result
 
     _need("a path", path=path)
-    file = Path(path)
-    try:
-        file = file / "results.json" if file.is_dir() else file
-        there = file.exists()
-    except OSError as error:
-        raise ResultsError(f"'{one_line(path)}' cannot be read: {error.strerror}") from error
-    if not there:
-        raise ResultsError(f"there are no results at '{one_line(path)}'; give a folder that 'gaitgauge evaluate' wrote")
-    data = read_results(file, "results", ResultsError)
-    if not {"suite", "score", "terrains", "metrics"} <= data.keys():
-        raise ResultsError(f"'{file}' holds no results of an evaluation; give the results.json that it wrote")
-    found = Results(path=file, data=data)
-    with edited(f"'{file}'", ResultsError):
-        for table in (found.terrains, found.metrics):
-            if not all(isinstance(row, Mapping) for row in table.values()):
-                raise ResultsError(f"'{file}' was edited or is damaged: a terrain or metric is no table")
-        _ = found.score, found.interval, found.suite, found.complete  # what is asked for later is there
-    return found
+    return read_result(Path(path), ResultsError, words=" was edited or is damaged")
 
 
 def load_policy(policy: str | Path, *, robot: str | None = None, trust: bool = False) -> Policy:
@@ -191,7 +130,7 @@ def evaluate(
     resume: bool = False,
     watch: Callable[[Any], None] | None = None,
     **options: Any,
-) -> Results:
+) -> Result:
     """Judge a policy, as ``gaitgauge evaluate`` does, and write results, episodes and the report.
 
     Args:
@@ -213,13 +152,13 @@ def evaluate(
     request = policy if isinstance(policy, Request) else _request(policy=policy, **options)
     usual = run_folders([request.policy], Path("results"), suite=request.suite, pipeline=request.pipeline)[0]
     folder = usual if out is None else Path(out)
-    run(request, folder, resume=resume, watch=watch)
+    result = run(request, folder, resume=resume, watch=watch)
     write_report(folder)
-    return load_results(folder)
+    return result
 
 
-def compare(*results: Results | str | Path) -> Comparison:
-    """Return which differences between policies are real, as ``gaitgauge compare`` does, from results that exist.
+def compare(*results: Result | str | Path) -> Comparison:
+    """Compare policies as ``gaitgauge compare`` does, without the evaluating.
 
     Args:
         results: two or more of: objects that ``evaluate`` returned, results folders, copies of ``results.json``.
@@ -227,12 +166,20 @@ def compare(*results: Results | str | Path) -> Comparison:
     Raises:
         ComparisonError: results that cannot be read, or were not made alike.
     """
+    from .files.parsing import shown
+    from .gauge.result import Result
+    from .gauge.result_figures import check_figures
+    from .studies.compare.comparison import ComparisonError, load_result
     from .studies.compare.comparison import compare as run
-    from .studies.compare.comparison import load_result
 
+    found = []
     for result in results:
-        _need("a path, or what evaluate returned", result=result)
-    return run([load_result(r.path if isinstance(r, Results) else Path(r)) for r in results])
+        if isinstance(result, Result):
+            check_figures(result, f"the results of '{result.policy.path}'", ComparisonError)
+        elif not isinstance(result, str | os.PathLike):
+            raise ArgumentError(f"result is {shown(result)}; it must be a path, or what evaluate returned")
+        found.append(result if isinstance(result, Result) else load_result(Path(result)))
+    return run(found)
 
 
 def train(task: str, *settings: str, seconds: float | None = None, **options: Any) -> tuple[TrainingOutcome, Path]:
@@ -250,8 +197,8 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
     Raises:
         ArgumentError, TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.
     """
-    from .training.run.launch import prepare
     from .training.run.launch import train as run
+    from .training.run.plan import prepare
     from .training.run.request import TrainRequest
 
     _need("a text", task=task)

@@ -1,4 +1,4 @@
-"""What does the world do next? The physics contract and one module per engine."""
+"""Simulate worlds: the physics contract and one package per engine."""
 
 from .base import (
     BackendError,

@@ -1,4 +1,4 @@
-"""What every engine refuses alike, before anything changes: masks, shapes, terrains and substeps that the contract does not know."""
+"""Refuse wrong masks, shapes, terrains and numbers of substeps for every engine alike, before anything changes."""
 
 from __future__ import annotations
 
@@ -10,34 +10,24 @@ from .base import BackendError, Randomization, ResetState, Scene
 
 
 def check_worlds(scene: Scene, worlds: torch.Tensor | None) -> None:
-    """Refuse what is no mask of a scene's worlds, (N,) bool or None.
-
-    Raises:
-        BackendError: says what it is instead.
-    """
+    """Raise ``BackendError`` unless ``worlds`` is None or a mask of the scene's worlds, (N,) bool."""
     if worlds is not None and (worlds.dtype != torch.bool or worlds.shape != (scene.num_worlds,)):
-        raise BackendError(
-            f"the mask of worlds must be {scene.num_worlds} booleans, not {tuple(worlds.shape)} of {worlds.dtype}"
-        )
+        found = f"{tuple(worlds.shape)} of {worlds.dtype}"
+        raise BackendError(f"the mask of worlds must be {scene.num_worlds} booleans, not {found}")
 
 
 def check_start(scene: Scene, start: ResetState, worlds: torch.Tensor | None) -> None:
-    """Refuse arguments of ``PhysicsBackend.reset``. Terrains on a GPU are not looked at, which would mean to wait for it.
+    """Raise ``BackendError`` for a wrong mask or shape of ``PhysicsBackend.reset``, or an unknown terrain of a masked world.
 
-    Raises:
-        BackendError: mask, a field's shape, or the terrain of a masked world.
+    Terrains on a GPU are not checked, because the check would wait for the GPU.
     """
     check_worlds(scene, worlds)
-    n, joints = scene.num_worlds, scene.robot.num_joints
-    _check_shape("base_position", start.base_position, (n, 3))
-    _check_shape("base_quaternion", start.base_quaternion, (n, 4))
-    _check_shape("base_linear_velocity", start.base_linear_velocity, (n, 3))
-    _check_shape("base_angular_velocity", start.base_angular_velocity, (n, 3))
-    _check_shape("joint_position", start.joint_position, (n, joints))
-    _check_shape("joint_velocity", start.joint_velocity, (n, joints))
-    _check_shape("held_target", start.held_target, (n, joints))
+    columns: dict[str, tuple[int, ...]] = {"base_quaternion": (4,), "terrain_index": ()}
+    for item in fields(ResetState):
+        joints = (scene.robot.num_joints,) if item.name.startswith(("joint_", "held_")) else (3,)
+        shape = (scene.num_worlds, *columns.get(item.name, joints))
+        _check_shape(item.name, getattr(start, item.name), shape)
     index = start.terrain_index
-    _check_shape("terrain_index", index, (n,))
     if index is None or any(each is not None and each.device.type != "cpu" for each in (index, worlds)):
         return
     chosen = index if worlds is None else index[worlds]
@@ -48,20 +38,12 @@ def check_start(scene: Scene, start: ResetState, worlds: torch.Tensor | None) ->
 def check_step(
     scene: Scene,
     joint_targets: torch.Tensor | None,
-    *,
     delay: torch.Tensor | None,
     sample_at: torch.Tensor | None,
     worlds: torch.Tensor | None,
     substeps: int | None,
 ) -> int:
-    """Refuse arguments of ``PhysicsBackend.step``.
-
-    Returns:
-        The number of substeps to take.
-
-    Raises:
-        BackendError: mask, shape, or less than one substep.
-    """
+    """Return the number of substeps of ``PhysicsBackend.step``; raise ``BackendError`` for a wrong mask or shape, or no substep."""
     check_worlds(scene, worlds)
     n = scene.num_worlds
     _check_shape("joint_targets", joint_targets, (n, scene.robot.num_joints))
@@ -76,34 +58,24 @@ def check_step(
 def check_push(
     scene: Scene,
     worlds: torch.Tensor | None,
-    *,
     linear_velocity_w: torch.Tensor | None,
     angular_velocity_b: torch.Tensor | None,
 ) -> None:
-    """Refuse arguments of ``PhysicsBackend.push``.
-
-    Raises:
-        BackendError: mask or shape.
-    """
+    """Raise ``BackendError`` for a wrong mask or shape of ``PhysicsBackend.push``."""
     check_worlds(scene, worlds)
     _check_shape("linear_velocity_w", linear_velocity_w, (scene.num_worlds, 3))
     _check_shape("angular_velocity_b", angular_velocity_b, (scene.num_worlds, 3))
 
 
 def check_force(scene: Scene, force_w: torch.Tensor) -> None:
-    """Refuse arguments of ``PhysicsBackend.apply_force``.
-
-    Raises:
-        BackendError: the shape.
-    """
+    """Raise ``BackendError`` for a wrong shape of ``PhysicsBackend.apply_force``."""
     _check_shape("force_w", force_w, (scene.num_worlds, 3))
 
 
 def check_randomization(scene: Scene, randomization: Randomization, worlds: torch.Tensor | None) -> None:
-    """Refuse arguments of ``PhysicsBackend.randomize``, but for the number of rows, which only looking at the mask tells.
+    """Raise ``BackendError`` for a wrong mask of ``PhysicsBackend.randomize`` or a wrong shape of a field's rows.
 
-    Raises:
-        BackendError: mask, or what a field has for each world.
+    The number of rows is not checked here, because it depends on the mask's values.
     """
     check_worlds(scene, worlds)
     joints, bodies = scene.robot.num_joints, len(scene.robot.collision_bodies)
@@ -113,9 +85,8 @@ def check_randomization(scene: Scene, randomization: Randomization, worlds: torc
         row = columns.get(item.name, (joints,))
         if value is not None and (value.dim() == 0 or value.shape[1:] != row):
             wanted = ", ".join(("W", *map(str, row))) + ("" if row else ",")
-            raise BackendError(
-                f"Randomization.{item.name} has shape {tuple(value.shape)}, but must be ({wanted}), a row for each of W worlds"
-            )
+            shape = f"shape {tuple(value.shape)}, but must be ({wanted})"
+            raise BackendError(f"Randomization.{item.name} has {shape}, a row for each of W worlds")
 
 
 def _check_shape(name: str, value: torch.Tensor | None, shape: tuple[int, ...]) -> None:

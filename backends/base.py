@@ -1,8 +1,8 @@
 """The physics contract: N worlds of one robot, each on its own terrain, stepped together.
 
-Frames and units hold for every engine: world frame ``_w`` (x forward, y left, z up), body frame ``_b`` (that of the robot's base),
-SI units, quaternions wxyz. All tensors are torch tensors on the backend's device, first axis N (worlds). Floating point is float64 on
-an engine that computes in it and float32 elsewhere.
+Every engine has the same frames and units: world frame ``_w`` (x forward, y left, z up), body frame ``_b`` (that of the robot's
+base), SI units, quaternions wxyz. All tensors are torch tensors on the backend's device, first axis N (worlds). Floating point is
+float64 in an engine that computes in it and float32 elsewhere.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..robots.base import JointParameters, Robot
 from ..terrains.base import Terrain
 
 if TYPE_CHECKING:
-    import torch  # only named here: what lists engines, suites and tasks need not wait for it
+    import torch  # for annotations alone: lists of engines, suites and tasks must not wait for torch
 
 
 _Iterations = Annotated[int, Field(ge=1, le=10_000)]
@@ -35,15 +35,15 @@ def _known_dimension(value: int) -> int:
 _ContactDimension = Annotated[int, AfterValidator(_known_dimension)]
 
 SMALLEST_BASE_MASS = 0.01
-"""A base never gets lighter than this [kg]; see ``Randomization.base_mass_offset``."""
+"""Smallest mass of a base [kg]; see ``Randomization.base_mass_offset``."""
 
 
 class BackendError(RuntimeError):
-    """An engine cannot do what it was asked for; the message says what, why and what to change."""
+    """A request that an engine cannot meet; the message says which, why and what to change."""
 
 
 class DeviceError(BackendError):
-    """An engine cannot run where it is to; ``reason`` is the message without what to change on the command line."""
+    """A device that an engine cannot run on; ``reason`` is the message without the advice for the command line."""
 
     def __init__(self, reason: str, change: str) -> None:
         super().__init__(reason, change)
@@ -55,7 +55,7 @@ class DeviceError(BackendError):
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
-    """How the world is simulated."""
+    """Options of the simulation."""
 
     timestep: Annotated[float, Field(gt=0.0, le=0.1)] = 0.002
     """Length of one physics step (a substep of the control period) [s]."""
@@ -74,24 +74,24 @@ class PhysicsOptions:
     foot_condim: _ContactDimension | None = None
     """Contact dimension of the feet (3 sliding, 4 with torsion, 6 with rolling too); None keeps the robot file's."""
     self_collision: bool = True
-    """Whether the robot's own parts meet each other."""
+    """True where the robot's own parts collide."""
     torque_limits: bool = True
-    """Whether motor torque is clipped to the parameter set's ``torque_limit``."""
+    """True where motor torque is clipped to the parameter set's ``torque_limit``."""
     torque_speed_limit: bool = False
-    """Whether these limits follow the joint's speed: the torque in the direction of motion falls from the speed of full torque to
-    zero at the no-load speed. Needs ``torque_limits`` and a parameter set that knows its motors' speeds."""
+    """True where these limits follow the joint's speed: the torque in the direction of motion falls from the speed of full torque
+    to zero at the no-load speed. Needs ``torque_limits`` and a parameter set with its motors' speeds."""
     watch_tilt: Annotated[float, Field(gt=0.0, le=3.1416)] | None = None
-    """Tilt of the base's z axis against the world's [rad] whose first substep is recorded in ``PhysicsState.tilt_substep``."""
+    """Watched tilt of the base's z axis against the world's [rad]; ``PhysicsState.tilt_substep`` records its first substep."""
     watch_penetration: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
-    """Depth of the robot in the terrain, floor and walls not counted [m], recorded in ``PhysicsState.penetration_substep``."""
+    """Watched depth of the robot in the terrain without floor and walls [m], recorded in ``PhysicsState.penetration_substep``."""
     contacts_per_world: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Contact capacity of a world in engines with fixed buffers; None lets the engine choose."""
     deterministic: bool = False
-    """Ask for run-to-run identical results on a GPU."""
+    """True for run-to-run identical results on a GPU."""
 
     @property
     def control_period(self) -> float:
-        """Length of a control period [s]."""
+        """Return the length of a control period [s]."""
         return self.timestep * self.substeps
 
 
@@ -114,7 +114,7 @@ engines to it."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """What a backend is built from."""
+    """The input of a backend: robot, terrains and physics."""
 
     robot: Robot
     parameters: JointParameters
@@ -130,19 +130,14 @@ class Scene:
             self.check_terrains(min(self.terrain_index), max(self.terrain_index))
 
     def check_terrains(self, first: int, last: int) -> None:
-        """Refuse terrains that the palette does not have.
-
-        Raises:
-            BackendError: the smallest or the largest index of some worlds is none of its.
-        """
+        """Raise ``BackendError`` unless the smallest and the largest index of some worlds are in the palette."""
         if first < 0 or last >= len(self.terrains):
-            raise BackendError(
-                f"terrain_index holds {first} to {last}, but the terrains are 0 to {len(self.terrains) - 1}"
-            )
+            count = len(self.terrains)
+            raise BackendError(f"terrain_index holds {first} to {last}, but the terrains are 0 to {count - 1}")
 
     @property
     def num_worlds(self) -> int:
-        """Number of worlds."""
+        """Return the number of worlds."""
         return len(self.terrain_index)
 
 
@@ -150,8 +145,8 @@ class Scene:
 class PhysicsState:
     """State of all worlds after a step. Forces and torques are those of the last substep; poses and velocities those after it.
 
-    N worlds, J joints, F feet, B collision bodies, in the robot's orders. A backend may hand out views of its own memory: they
-    change with the next call; ``clone()`` what must last.
+    N worlds, J joints, F feet, B collision bodies, in the robot's orders. A backend may return views of its own memory, which
+    change with the next call; ``clone()`` a state that must last.
     """
 
     time: torch.Tensor
@@ -183,7 +178,7 @@ class PhysicsState:
     body_contact_force_w: torch.Tensor
     """Net force of the ground on each collision body without its foot geom [N], (N, B, 3)."""
     trunk_contact_force_w: torch.Tensor
-    """Net force of the ground on the robot's trunk shapes, which the base's entry above holds too [N], (N, 3)."""
+    """Net force of the ground on the robot's trunk shapes, included in the base's entry above [N], (N, 3)."""
     ground_force_w: torch.Tensor
     """Net force of all ground contacts on the robot [N], (N, 3)."""
     ground_moment_w: torch.Tensor
@@ -208,7 +203,7 @@ class PhysicsState:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ResetState:
-    """The state into which worlds are put. N worlds, J joints."""
+    """State of worlds after a reset. N worlds, J joints."""
 
     base_position: torch.Tensor
     """World frame [m], (N, 3)."""
@@ -230,13 +225,13 @@ class ResetState:
 
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
-    """Per-world changes of the model; a field left None stays as it is. W worlds are those passed along with it."""
+    """Per-world changes of the model; a field left None stays as it is. W is the number of masked worlds."""
 
     friction: torch.Tensor | None = None
     """Sliding friction coefficient that acts in every contact of the world, (W,)."""
     base_mass_offset: torch.Tensor | None = None
     """Mass added to the base body's nominal mass [kg], (W,); inertia and centre of mass stay (a point load at the centre of mass).
-    A base keeps ``SMALLEST_BASE_MASS``, whatever is taken from it."""
+    The sum is at least ``SMALLEST_BASE_MASS``."""
     link_mass_scale: torch.Tensor | None = None
     """Factor on each collision body's nominal mass and inertia except the base's, (W, B); the base's entry is ignored."""
     base_com_offset: torch.Tensor | None = None
@@ -248,13 +243,13 @@ class Randomization:
     motor_strength: torch.Tensor | None = None
     """Factor on the motor torque after its limit, (W, J)."""
     motor_speed: torch.Tensor | None = None
-    """Factor on the speeds at which a motor's torque falls and ends, (W, J); without a limit by speed it does nothing."""
+    """Factor on the speeds at which a motor's torque falls and ends, (W, J); no effect without a limit by speed."""
     motor_offset: torch.Tensor | None = None
-    """Added to the position error inside the motor law [rad], (W, J)."""
+    """Offset of the position error inside the motor law [rad], (W, J)."""
 
 
 class Support(Enum):
-    """How well an engine does a thing."""
+    """An engine's support of a capability."""
 
     EXACT = "exact"
     APPROXIMATE = "approximate"
@@ -263,63 +258,35 @@ class Support(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Capability:
-    """One thing that an engine may do, and how."""
+    """One capability of an engine, with a note on its limits."""
 
     support: Support
     note: str = ""
 
 
-# Everything a backend declares, in the order in which the documentation lists it.
+# Everything that a backend declares, in the documentation's order: terrain, randomization, actions, model, reports.
 CAPABILITY_NAMES: tuple[str, ...] = (
-    "plane",
-    "boxes",
-    "height_field",
-    "per_world_terrain",
-    "friction",
-    "base_mass",
-    "link_mass",
-    "base_com",
-    "gains",
-    "motor_strength",
-    "motor_speed",
-    "motor_offset",
-    "latency",
-    "push",
-    "external_force",
-    "torque_limits",
-    "torque_speed_limit",
-    "joint_friction",
-    "elliptic_cone",
-    "foot_condim_6",
-    "self_collision",
-    "contact_forces",
-    "penetration",
-    "deterministic",
-    "gpu",
-)
+    "plane", "boxes", "height_field", "per_world_terrain",
+    "friction", "base_mass", "link_mass", "base_com", "gains", "motor_strength", "motor_speed", "motor_offset",
+    "latency", "push", "external_force",
+    "torque_limits", "torque_speed_limit", "joint_friction", "elliptic_cone", "foot_condim_6", "self_collision",
+    "contact_forces", "penetration", "deterministic", "gpu",
+)  # fmt: skip
 
 
-# What ``PhysicsBackend.describe`` may say, in the order in which reports list it.
+# Keys of ``PhysicsBackend.describe``, in the order of reports.
 DESCRIPTION_KEYS: tuple[str, ...] = (
-    "total_mass",
-    "body_mass",
-    "body_inertia",
-    "joint_range",
-    "joint_armature",
-    "joint_damping",
-    "joint_friction_loss",
-    "stiffness",
-    "damping",
-    "torque_limit",
-    "contact_friction",
-)
+    "total_mass", "body_mass", "body_inertia",
+    "joint_range", "joint_armature", "joint_damping", "joint_friction_loss",
+    "stiffness", "damping", "torque_limit", "contact_friction",
+)  # fmt: skip
 
 
 class PhysicsBackend(ABC):
     """N worlds of one robot. See the module docstring for frames and units.
 
-    Arguments that are none (a mask, shape, terrain or number of substeps that cannot be) raise ``BackendError`` before anything
-    changes; ``arguments.py`` holds these checks for all engines.
+    A wrong mask, shape, terrain or number of substeps raises ``BackendError`` before anything changes; ``arguments.py`` holds
+    these checks for all engines.
     """
 
     name: ClassVar[str]
@@ -328,24 +295,27 @@ class PhysicsBackend(ABC):
     scene: Scene
     device: torch.device
     dtype: torch.dtype
+    parallel_processes: ClassVar[bool] = False
+    """True for an engine on the CPU that plays faster as one process a core than as one process with threads. Several processes may
+    then build worlds at the same time, here and on a cluster; results may not depend on their number."""
     state_stays: ClassVar[bool] = False
-    """Whether ``state`` is the same tensors for good, numbers in float32, which every call changes in place."""
+    """True where ``state`` is always the same tensors, in float32, which every call changes in place."""
     engine_seconds: float | None = None
     """Wall-clock time spent inside the engine's own stepping so far [s]; None where it is not measured."""
     eventful: bool = True
     """False where the engine knows that ``tilt_substep``, ``penetration_substep``, ``diverged`` and ``overflowed`` are zero in
-    all worlds of the last step, so that nobody has to look."""
+    all worlds of the last step, so that callers may skip the check."""
 
     @classmethod
     @abstractmethod
     def capabilities(cls) -> Mapping[str, Capability]:
-        """One entry for each of ``CAPABILITY_NAMES``."""
+        """Return one entry for each of ``CAPABILITY_NAMES``."""
 
     @classmethod
     def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
-        """Which of the solver's options act when a scene asks for ``physics``, by name; for a run's results.
+        """Return the solver options in force, by name, for the results of a run with ``physics``.
 
-        An engine that uses other values than it was asked for, or none, says so here. The defaults act as asked.
+        An engine that changes or ignores options overrides this method.
         """
         names = ("cone", "impratio", "iterations", "ls_iterations", "tolerance")
         return {name: getattr(physics, name) for name in names}
@@ -355,23 +325,23 @@ class PhysicsBackend(ABC):
         """Build the worlds; every world starts at the origin in the default pose and must be reset before its first step.
 
         Raises:
-            BackendError: the engine cannot do what the scene asks for.
+            BackendError: the scene needs a capability that the engine lacks.
         """
 
     @property
     def num_worlds(self) -> int:
-        """Number of worlds N."""
+        """Return the number of worlds N."""
         return self.scene.num_worlds
 
     @property
     @abstractmethod
     def state(self) -> PhysicsState:
-        """State after the last call."""
+        """Return the state after the last call."""
 
     @property
     @abstractmethod
     def sample(self) -> PhysicsState:
-        """State snapshot asked for with ``step(sample_at=…)``; rows of worlds that asked for none are stale."""
+        """Return the state snapshot of ``step(sample_at=…)``; rows of worlds without a request are stale."""
 
     @abstractmethod
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
@@ -385,7 +355,7 @@ class PhysicsBackend(ABC):
         """
 
     def standing(self) -> ResetState:
-        """For ``reset``: every robot upright at its standing height over the origin, in the default pose, which the motors hold."""
+        """Return a start for ``reset``: robots upright at standing height over the origin; the motors hold the default pose."""
         import torch
 
         robot, n = self.scene.robot, self.num_worlds
@@ -415,7 +385,7 @@ class PhysicsBackend(ABC):
 
     @abstractmethod
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
-        """Change the model of some worlds. ``worlds`` is a mask (N,) bool, None for all; the fields have as many rows as it selects."""
+        """Change the model of some worlds. ``worlds`` is a mask (N,) bool, None for all; each field has a row per masked world."""
 
     @abstractmethod
     def push(
@@ -429,10 +399,10 @@ class PhysicsBackend(ABC):
 
     @abstractmethod
     def apply_force(self, force_w: torch.Tensor) -> None:
-        """External force on the base's centre of mass [N], (N, 3), that acts until changed or the world is reset."""
+        """Apply an external force to the base's centre of mass [N], (N, 3), until the next call or the world's reset."""
 
     def describe(self) -> Mapping[str, list[float]] | None:
-        """The first world's model as the engine holds it at present, randomization included; None where it cannot say.
+        """Return the first world's model as the engine holds it at present, randomization included; None where unknown.
 
         Returns:
             Some of ``DESCRIPTION_KEYS``: ``total_mass`` [kg] (1); ``body_mass`` [kg] (B) and ``body_inertia``, the principal
@@ -444,9 +414,9 @@ class PhysicsBackend(ABC):
         return None
 
     def close(self) -> None:  # noqa: B027  (an engine may have nothing to free)
-        """Free what the engine holds. A closed backend must not be used again."""
+        """Free the engine's resources. A closed backend must not be used again."""
 
 
 def unsupported(needed: Sequence[str], capabilities: Mapping[str, Capability]) -> list[str]:
-    """Those names of ``needed`` that the engine does not support at all."""
+    """Return the names in ``needed`` that the engine does not support at all."""
     return [n for n in needed if capabilities[n].support is Support.NONE]

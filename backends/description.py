@@ -1,4 +1,4 @@
-"""What engines say of the model that they hold: the same fields, whatever the engine keeps them in."""
+"""Describe the model that an engine holds, with the same fields for every engine."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from .base import DESCRIPTION_KEYS
 
 UNLIMITED = 1e5
-"""Torque from which a limit counts as none [N·m]."""
+"""Smallest torque that counts as no limit [N·m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,29 +38,13 @@ class ModelFields:
     """Priority of each foot's coefficient over the floor's; the larger coefficient acts where it is 0, (F,)."""
 
     def describe(self) -> dict[str, list[float]]:
-        """As ``PhysicsBackend.describe`` says."""
-        inertia = _array(self.body_inertia)
-        moments = np.linalg.eigvalsh(inertia) if inertia.ndim == 3 else np.sort(inertia, axis=1)
-        limit = _array(self.torque_limit)
-        foot, priority = _array(self.foot_friction), np.asarray(self.foot_priority)
-        acting = np.where(
-            priority > 0, foot, np.where(priority < 0, self.floor_friction, np.maximum(foot, self.floor_friction))
-        )
-        fields = {
-            "total_mass": np.array([self.total_mass]),
-            "body_mass": _array(self.body_mass),
-            "body_inertia": moments,
-            "joint_range": _array(self.joint_range),
-            "joint_armature": _array(self.joint_armature),
-            "joint_damping": _array(self.joint_damping),
-            "joint_friction_loss": _array(self.joint_friction_loss),
-            "stiffness": _array(self.stiffness),
-            "damping": _array(self.damping),
-            "torque_limit": np.where(limit >= UNLIMITED, np.inf, limit),
-            "contact_friction": acting,
-        }
-        return {name: [float(v) for v in values.ravel()] for name, values in fields.items()}
-
-
-def _array(values: ArrayLike) -> Floats:
-    return np.asarray(values, dtype=np.float64)
+        """Return the fields of ``PhysicsBackend.describe``."""
+        found: dict[str, NDArray] = {name: np.asarray(value, np.float64) for name, value in vars(self).items()}
+        inertia, limit = found["body_inertia"], found["torque_limit"]
+        foot, floor = found["foot_friction"], found["floor_friction"]
+        found["body_inertia"] = np.linalg.eigvalsh(inertia) if inertia.ndim == 3 else np.sort(inertia, axis=1)
+        found["torque_limit"] = np.where(limit >= UNLIMITED, np.inf, limit)
+        first = found["foot_priority"]
+        larger = np.maximum(foot, floor)
+        found["contact_friction"] = np.where(first > 0, foot, np.where(first < 0, floor, larger))
+        return {name: [float(v) for v in found[name].ravel()] for name in DESCRIPTION_KEYS}

@@ -1,4 +1,4 @@
-"""Which device an engine computes on."""
+"""Find the device that an engine computes on."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from .base import BackendError, DeviceError
 
 
 def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
-    """The torch device of that name, with its number where it is a GPU.
+    """Return the torch device of a name, with its number for a GPU.
 
     Args:
         name: ``cpu``, ``cuda`` or ``cuda:N``.
         backend: the engine that asks, for the message.
-        gpu: whether the engine runs on GPUs.
+        gpu: True where the engine runs on GPUs.
 
     Raises:
-        BackendError: no device is called so.
+        BackendError: no device has this name.
         DeviceError: the machine has no such device, or the engine does not run on it.
     """
     try:
@@ -39,6 +39,5 @@ def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
     try:
         return torch.device("cuda", torch.cuda.current_device())
     except (AssertionError, RuntimeError) as error:  # a torch for the CPU alone asserts
-        raise DeviceError(
-            f"the GPU of device '{name}' cannot be used: {one_line(error)}", "use --device cpu"
-        ) from error
+        reason = f"the GPU of device '{name}' cannot be used: {one_line(error)}"
+        raise DeviceError(reason, "use --device cpu") from error

@@ -9,25 +9,25 @@ from typing import Generic, TypeVar
 import torch
 
 WARM_UP = 3
-"""Calls before a function is recorded: what the device loads at first use must not be loaded while recording."""
+"""Calls before a recording: modules that the device loads at first use must be there by then."""
 
 Result = TypeVar("Result")
 
 
 class RecordedFunction(Generic[Result]):
-    """A function of tensors whose first calls run as they are, and whose later ones replay a CUDA graph.
+    """A function of tensors: its first calls run plainly, later calls replay a CUDA graph.
 
-    The function must have static shapes, read and write only its arguments and tensors that stay where they are, draw no
-    random numbers and never wait for the device. No call is made twice. From the first replay on every call returns the
-    same tensors with new contents.
+    The function must have static shapes, read and write only its arguments and tensors at fixed addresses, draw no random
+    numbers and never wait for the device. No call runs twice. From the first replay on every call returns the same tensors
+    with new contents.
     """
 
     def __init__(self, function: Callable[..., Result], device: torch.device | str, *, warm_up: int = WARM_UP) -> None:
         """Keep the function; nothing runs yet.
 
         Args:
-            device: the GPU that it runs on, whichever is torch's current one.
-            warm_up: calls that run as they are, on a stream of their own, as recording asks for.
+            device: the GPU of the function; it need not be torch's current one.
+            warm_up: calls that run plainly, on a stream of their own, as recording needs.
         """
         self._function = function
         self._device = torch.device(device)
@@ -36,18 +36,18 @@ class RecordedFunction(Generic[Result]):
         self._graph: torch.cuda.CUDAGraph | None = None
         self._result: Result
         self.recordings = 0
-        """How often it was recorded."""
+        """Number of recordings."""
 
     @property
     def due(self) -> bool:
-        """Whether the next call records."""
+        """Return whether the next call records."""
         return self._graph is None and self._left == 0
 
     def __call__(self, *arguments: torch.Tensor) -> Result:
-        """Run the function with these arguments, which are copied; or record and replay it.
+        """Run the function with copies of these arguments, or record and replay it.
 
         Raises:
-            RuntimeError: it cannot be recorded. It has not run then, and the next call tries again.
+            RuntimeError: recording failed; the function has not run, and the next call tries again.
         """
         if self._graph is None:
             with torch.cuda.device(self._device) if self._device.type == "cuda" else nullcontext():
@@ -61,7 +61,7 @@ class RecordedFunction(Generic[Result]):
         return self._result
 
     def forget(self) -> None:
-        """Record anew at the next call: tensors that the function uses have moved."""
+        """Record anew at the next call, for a function with moved tensors."""
         self._graph = None
 
     def _run(self, arguments: tuple[torch.Tensor, ...]) -> Result:
@@ -77,7 +77,7 @@ class RecordedFunction(Generic[Result]):
     def _record(self, arguments: tuple[torch.Tensor, ...]) -> torch.cuda.CUDAGraph:
         self._inputs = tuple(argument.clone() for argument in arguments)
         graph = torch.cuda.CUDAGraph()
-        # torch's own stream for it belongs to the first GPU that recorded; other threads may talk to the device meanwhile
+        # torch's own recording stream belongs to the first GPU that recorded; other threads may use the device meanwhile
         stream = torch.cuda.Stream() if self._device.type == "cuda" else None
         with (
             _drawing_afterwards(self._device),
@@ -90,7 +90,7 @@ class RecordedFunction(Generic[Result]):
 
 @contextmanager
 def _drawing_afterwards(device: torch.device) -> Iterator[None]:
-    """Put the device's random generator back where a recording fails: torch leaves it unable to draw, as if it still recorded."""
+    """Restore the device's random generator after a failed recording, since torch leaves it in recording mode, unable to draw."""
     generators = [torch.cuda.default_generators[torch.cuda.current_device()]] if device.type == "cuda" else []
     before = [generator.clone_state() for generator in generators]
     try:

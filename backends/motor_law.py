@@ -1,4 +1,4 @@
-"""The motor law, for engines that compute it in NumPy or torch; ``warp.motors.motor_torque`` is the same for kernels.
+"""The motor law for engines that compute it in NumPy or torch; ``warp.motors.motor_torque`` is the same law for kernels.
 
 Torque = kp (target + offset − q) − kd q̇, clipped to limits, then multiplied by the motor strength. With
 ``PhysicsOptions.torque_speed_limit`` the limits follow the joint's speed: in the direction of motion a motor gives its
@@ -20,26 +20,22 @@ from .base import BackendError, Scene
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotorLimits:
-    """Torque limits of the joints. Arrays (J,), NumPy float64 or whatever ``to`` made of them."""
+    """Torque limits of the joints. Arrays (J,), NumPy float64 or tensors made by ``to``."""
 
     torque: Any
     """Largest torque [N·m]; infinity for none."""
     driving: Any
     """Largest torque in the direction of motion [N·m]."""
     no_load_speed: Any
-    """Speed from which a motor drives no more [rad/s]; infinity where the speed does not matter."""
+    """Speed beyond which a motor does not drive [rad/s]; infinity where the speed does not matter."""
     fall: Any
-    """How far below it the driving torque begins to fall [rad/s]."""
+    """Width of the range below that speed in which the driving torque falls [rad/s]."""
     by_speed: bool
-    """Whether the speed matters."""
+    """True where the speed matters."""
 
     @classmethod
     def of(cls, scene: Scene) -> MotorLimits:
-        """The limits that a scene asks for.
-
-        Raises:
-            BackendError: a limit by speed without data of the motors, or without torque limits.
-        """
+        """Return a scene's limits; raise ``BackendError`` for a limit by speed without the motors' data or without torque limits."""
         constants, physics = scene.parameters, scene.physics
         torque = np.asarray(constants.torque_limit, dtype=np.float64)
         if not physics.torque_limits:
@@ -49,7 +45,7 @@ class MotorLimits:
             return cls(torque=torque, driving=torque, **still, by_speed=False)
         if not physics.torque_limits:
             raise BackendError(
-                "PhysicsOptions.torque_speed_limit is on while torque_limits is off; turn both on, or neither"
+                "PhysicsOptions.torque_speed_limit is on without torque_limits; turn both on, or neither"
             )
         full, none = constants.full_torque_speed, constants.no_load_speed
         if full is None or none is None:
@@ -58,22 +54,17 @@ class MotorLimits:
                 "say how fast its motors turn; add full_torque_speed and no_load_speed to robot.toml, or turn it off"
             )
         driving = torque if constants.driving_torque_limit is None else np.asarray(constants.driving_torque_limit)
-        return cls(
-            torque=torque,
-            driving=driving,
-            no_load_speed=np.asarray(none),
-            fall=np.asarray(none) - np.asarray(full),
-            by_speed=True,
-        )
+        end = np.asarray(none)
+        return cls(torque=torque, driving=driving, no_load_speed=end, fall=end - np.asarray(full), by_speed=True)
 
     def to(self, *, device: torch.device, dtype: torch.dtype) -> MotorLimits:
-        """The same limits as torch tensors."""
+        """Return the limits as torch tensors."""
         names = ("torque", "driving", "no_load_speed", "fall")
         tensors = {name: torch.as_tensor(getattr(self, name), device=device, dtype=dtype) for name in names}
         return MotorLimits(**tensors, by_speed=self.by_speed)
 
     def bounds(self, velocity: Any) -> tuple[Any, Any]:
-        """Least and largest torque [N·m] at joint velocities [rad/s], (…, J)."""
+        """Return the least and largest torque [N·m] at joint velocities [rad/s], (…, J)."""
         if not self.by_speed:
             return -self.torque, self.torque
         where = torch.where if isinstance(velocity, torch.Tensor) else np.where
@@ -84,7 +75,7 @@ class MotorLimits:
 def motor_torque(
     error: Any, velocity: Any, *, stiffness: Any, damping: Any, strength: Any, limits: MotorLimits, speed: Any = 1.0
 ) -> Any:
-    """Torque of the motors [N·m], (…, J); NaN where an argument is.
+    """Return the torque of the motors [N·m], (…, J); NaN where an argument is.
 
     Args:
         error: target + offset − position [rad].

@@ -1,6 +1,6 @@
-"""Finds engines by name: the project's own, and any installed under the entry-point group ``gaitgauge.backends``.
+"""Find engines by name: the project's own, and plug-ins of the entry-point group ``gaitgauge.backends``.
 
-A name may carry a variant after a colon (``newton:steel``); the variant is handed to the engine as ``solver``.
+A name may carry a variant after a colon (``newton:steel``), which selects the engine's solver.
 """
 
 from __future__ import annotations
@@ -24,41 +24,35 @@ _OWN = {
 
 @dataclass(frozen=True, kw_only=True)
 class BackendListing:
-    """What can be said about an engine without importing it."""
+    """Facts about an engine that need no import of it."""
 
     name: str
     """Registry name."""
     device: str
-    """Where it is meant to run: ``CPU``, ``GPU``, or ``?`` where only the engine knows."""
+    """Device that the engine is made for: ``CPU``, ``GPU``, or ``?`` where only the engine knows."""
     note: str
     """One line for people."""
     missing: tuple[str, ...]
-    """Packages that it needs and that are not installed."""
+    """Packages that the engine needs and that are not installed."""
 
 
+_SLOW = "runs on the CPU slowly (--device cpu)"
+_OTHER_SOLVER = "newton:SOLVER runs another one (newton:steel)"
 # Device, packages and note of the project's own engines.
 _ABOUT: dict[str, tuple[str, tuple[str, ...], str]] = {
     "mujoco": ("CPU", ("mujoco",), "MuJoCo on a thread pool, float64, the same on any number of threads; the judge"),
-    "mujoco-warp": (
-        "GPU",
-        ("mujoco_warp", "warp"),
-        "MuJoCo's equations on the GPU, float32; trains; runs on the CPU slowly (--device cpu)",
-    ),
-    "newton": (
-        "GPU",
-        ("newton", "mujoco_warp", "warp"),
-        "Newton with its MuJoCo solver; newton:SOLVER runs another one (newton:steel)",
-    ),
+    "mujoco-warp": ("GPU", ("mujoco_warp", "warp"), f"MuJoCo's equations on the GPU, float32; trains; {_SLOW}"),
+    "newton": ("GPU", ("newton", "mujoco_warp", "warp"), f"Newton with its MuJoCo solver; {_OTHER_SOLVER}"),
 }
 
 
 def backend_names() -> list[str]:
-    """Names of all engines that can be asked for, the project's own first."""
+    """Return the names of all engines, the project's own first."""
     return list(_OWN) + sorted(set(plugins(GROUP)) - set(_OWN))
 
 
 def list_backends() -> list[BackendListing]:
-    """What is known of each of ``backend_names()``, quickly: no engine is imported."""
+    """Return a listing for each of ``backend_names()`` without importing any engine."""
     found = plugins(GROUP)
     listings = []
     for name in backend_names():
@@ -73,11 +67,7 @@ def list_backends() -> list[BackendListing]:
 
 
 def backend_class(name: str) -> type[PhysicsBackend]:
-    """The engine's class.
-
-    Raises:
-        BackendError: unknown name, or the engine's package is not installed.
-    """
+    """Import the engine's class; raise ``BackendError`` for an unknown name or a missing package."""
     engine = name.partition(":")[0]
     try:
         if engine in _OWN:
@@ -90,25 +80,23 @@ def backend_class(name: str) -> type[PhysicsBackend]:
                 raise BackendError(f"unknown backend '{one_line(name, 80)}'; choose one of: {known}")
             found = load_plugin(plugin, BackendError)
             if not (isinstance(found, type) and issubclass(found, PhysicsBackend)):
-                raise BackendError(
-                    f"{origin(plugin)} gave {shown(type(found).__name__)}; it must be a subclass of PhysicsBackend"
-                )
+                gave = shown(type(found).__name__)
+                raise BackendError(f"{origin(plugin)} gave {gave}; it must be a subclass of PhysicsBackend")
             guarded(plugin, BackendError, found.capabilities)
     except ImportError as error:
-        raise BackendError(
-            f"backend '{name}' needs the package '{error.name}', which is not installed: pip install {error.name}"
-        ) from error
+        missing = f"needs the package '{error.name}', which is not installed: pip install {error.name}"
+        raise BackendError(f"backend '{name}' {missing}") from error
     return found
 
 
 def find_backend(name: str, device: str) -> type[PhysicsBackend]:
-    """The class that ``make_backend`` builds, variant and device checked, without building anything.
+    """Return the class that ``make_backend`` builds, with variant and device checked.
 
     Raises:
         BackendError: unknown engine, variant or device, or a missing package.
-        DeviceError: a device that is not there or that the engine cannot use.
+        DeviceError: the machine lacks the device, or the engine cannot use it.
     """
-    from .devices import find_device  # listing engines must not wait for torch
+    from .devices import find_device  # lists of engines must not wait for torch
 
     found = engine_class(name)
     find_device(device, found.name, gpu=_can_use_gpu(found))
@@ -116,11 +104,11 @@ def find_backend(name: str, device: str) -> type[PhysicsBackend]:
 
 
 def choose_device(name: str, asked: str | None = None) -> str:
-    """Where an engine runs: the device asked for, else a GPU where it can use one, else the CPU.
+    """Return the device of an engine: the device asked for, else a GPU where the engine can use one, else the CPU.
 
     Raises:
         BackendError: as ``find_backend``.
-        DeviceError: so, too, or an engine that is made for a GPU on a machine without one.
+        DeviceError: as ``find_backend``, or an engine made for a GPU on a machine without one.
     """
     from torch import cuda
 
@@ -129,10 +117,8 @@ def choose_device(name: str, asked: str | None = None) -> str:
         return asked
     made_for_gpu = _ABOUT.get(name.partition(":")[0], ("", (), ""))[0] == "GPU"
     if made_for_gpu and not cuda.is_available():
-        raise DeviceError(
-            f"backend '{name}' wants a GPU and this machine has none",
-            "add --device cpu (slow), or use --backend mujoco",
-        )
+        change = "add --device cpu (slow), or use --backend mujoco"
+        raise DeviceError(f"backend '{name}' wants a GPU and this machine has none", change)
     plugin = name.partition(":")[0] not in _OWN
     return "cuda" if made_for_gpu or (plugin and _can_use_gpu(found) and cuda.is_available()) else "cpu"
 
@@ -145,7 +131,7 @@ def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int =
     """Build the worlds of ``scene`` in the engine ``name`` (``mujoco``, ``newton:steel`` …).
 
     Raises:
-        BackendError: unknown engine, missing package, or something the engine cannot do.
+        BackendError: unknown engine, missing package, or a scene that the engine cannot simulate.
     """
     found, plugin = engine_class(name), plugins(GROUP).get(name.partition(":")[0])
     build = partial(found, scene, device=device, threads=threads)
@@ -153,14 +139,13 @@ def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int =
 
 
 def engine_class(name: str) -> type[PhysicsBackend]:
-    """The engine's class, with the solver that the name asks for; raises as ``backend_class`` does."""
+    """Return the engine's class with the named solver; raise as ``backend_class`` does."""
     found = backend_class(name)
     variant = name.partition(":")[2]
     if not variant:
         return found
     with_variant = getattr(found, "with_solver", None)
     if with_variant is None:
-        raise BackendError(
-            f"backend '{found.name}' has no solvers to choose from, so '{name}' cannot be built; use '{found.name}'"
-        )
+        problem = f"backend '{found.name}' has no solvers to choose from, so '{name}' cannot be built"
+        raise BackendError(f"{problem}; use '{found.name}'")
     return with_variant(variant)

@@ -85,17 +85,17 @@ def measured(options: argparse.Namespace, threads: int | None, cluster: str | No
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         with ProcessorTimes() as processor_times:
-            results = evaluate(request, Path(folder) / "run")
+            result = evaluate(request, Path(folder) / "run")
         seconds = time.perf_counter() - began
         rows = (Path(folder) / "run" / "episodes.csv").read_text(encoding="utf-8")
-    provenance = results.pop("provenance")
+    found = {name: value for name, value in result.to_data().items() if name != "provenance"}
     return {
-        "workers": provenance["processes"],
+        "workers": result.provenance.processes,
         "seconds": seconds,
         "processor_seconds": sum(processor_times.seconds),
         "busiest_seconds": max(processor_times.seconds),
-        "score": results["score"],
-        "outcome": json.dumps(results, sort_keys=True) + rows,
+        "score": result.score,
+        "outcome": json.dumps(found, sort_keys=True) + rows,
     }
 
 

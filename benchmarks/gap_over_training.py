@@ -188,17 +188,17 @@ def _toml(value: Any) -> str:
 
 def score(request: Request, folder: Path, engine: str) -> Row:
     """Gauge a checkpoint on an engine; the row's columns of that engine."""
-    results = evaluate(request, folder, resume=True, command=["gap_over_training.py", *sys.argv[1:]])
-    prefix, health = engine.replace("-", "_"), results["health"]
+    result = evaluate(request, folder, resume=True, command=["gap_over_training.py", *sys.argv[1:]])
+    prefix, health = engine.replace("-", "_"), result.health
     row = {f"{prefix}_{name}": "" for name in SCORE_FIELDS}
-    if results["score"] is not None:
-        row[f"{prefix}_score"] = f"{results['score']:.4f}"
-        if results["score_interval"] is not None:  # one seed has none
-            low, high = results["score_interval"]
+    if result.score is not None:
+        row[f"{prefix}_score"] = f"{result.score:.4f}"
+        if result.score_interval is not None:  # one seed has none
+            low, high = result.score_interval
             row |= {f"{prefix}_low": f"{low:.4f}", f"{prefix}_high": f"{high:.4f}"}
-        row[f"{prefix}_fallen"] = f"{health['falls'] / max(health['episodes'], 1):.3f}"
-    if results["level"] is not None:
-        row[f"{prefix}_level"] = f"{results['level']:.2f}"
+        row[f"{prefix}_fallen"] = f"{health.falls / max(health.episodes, 1):.3f}"
+    if result.level is not None:
+        row[f"{prefix}_level"] = f"{result.level:.2f}"
     return row
 
 

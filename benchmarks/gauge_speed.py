@@ -40,10 +40,10 @@ def run(arguments: argparse.Namespace, policy: str, threads: int) -> dict[str, f
     )
     with tempfile.TemporaryDirectory() as folder:
         began, used = time.perf_counter(), processor_seconds()
-        results = evaluate(request, Path(folder) / "run")
+        result = evaluate(request, Path(folder) / "run")
         seconds = time.perf_counter() - began
-    provenance = results["provenance"]
-    steps, processes, engine = provenance["physics_steps"], provenance["processes"], provenance["engine_seconds"]
+    provenance = result.provenance
+    steps, processes, engine = provenance.physics_steps, provenance.processes, provenance.engine_seconds or 0.0
     return {
         "threads": threads,
         "seconds": seconds,
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace, policy: str, threads: int) -> dict[str, f
         "physics_steps": steps,
         "microseconds_per_step_and_core": engine * (threads // processes) / steps * 1e6,
         "stepping_share": engine / processes / seconds,
-        "score": results["score"],
+        "score": result.score,
     }
 
 

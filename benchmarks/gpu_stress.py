@@ -239,8 +239,8 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
     outcome: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         try:
-            results = evaluation.evaluate(request, Path(folder) / "run")
-            outcome = {"finished": True, "score": results["score"], "health": results["health"]}
+            result = evaluation.evaluate(request, Path(folder) / "run")
+            outcome = {"finished": True, "score": result.score, "health": result.health.to_data()}
         except OutOfTimeError:
             outcome = {"finished": False}
         ended = perf_counter()

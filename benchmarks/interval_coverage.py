@@ -16,18 +16,28 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gaitgauge.files.writing import write_atomically
-from gaitgauge.gauge.chance.intervals import Chance, ChanceRules, Evidence
+from gaitgauge.gauge.chance.intervals import Chance, Evidence
 from gaitgauge.gauge.chance.level_chance import bisect
 from gaitgauge.gauge.chance.level_curve import expected_levels, follow
+from gaitgauge.gauge.episodes import QUALITY
 from gaitgauge.gauge.evaluate import Request, evaluate
-from gaitgauge.gauge.result_check import chance_rules_of
-from gaitgauge.gauge.results import SCHEMA, environment_weights
+from gaitgauge.gauge.result import (
+    ChanceRules,
+    EnvironmentRow,
+    PolicyName,
+    Provenance,
+    Result,
+    Run,
+    SuiteName,
+    TerrainScore,
+)
+from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.studies.compare.comparison import ComparisonError, compare
 from numpy.typing import NDArray
@@ -57,13 +67,12 @@ frictions = [0.6]
 seeds = {seeds}
 search_seeds = {search_seeds}
 """
-Results = dict[str, Any]
 
 
 # ---- recorded -------------------------------------------------------------------------------------------------------
 
 
-def record(count: int, policy: str, folder: Path, threads: int) -> list[Results]:
+def record(count: int, policy: str, folder: Path, threads: int) -> list[Result]:
     """Play whole evaluations with fresh seeds, and keep what intervals and comparisons read."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
@@ -72,28 +81,32 @@ def record(count: int, policy: str, folder: Path, threads: int) -> list[Results]
         seeds = [10 * index + s for s in range(5)]
         suite.write_text(SUITE.format(index=index, seeds=seeds[:3], search_seeds=seeds))
         request = Request(policy=policy, suite=str(suite), threads=threads)
-        results = evaluate(request, folder / f"run-{index}", resume=True)
-        print(f"{index}: {results['score']:.4f}", flush=True)
-        found.append(trimmed(results))
+        result = evaluate(request, folder / f"run-{index}", resume=True)
+        print(f"{index}: {result.score:.4f}", flush=True)
+        found.append(trimmed(result))
     return found
 
 
-def trimmed(results: Mapping[str, Any]) -> Results:
-    """What intervals and comparisons read, without sub-commands. Suites that differ in seeds alone count as one."""
-    rows = [
-        {k: row[k] for k in ("terrain", "friction", "payload", "level", "score", "trials")}
-        | {"runs": {s: {**run, "commands": {}} for s, run in row["runs"].items()}}
-        for row in results["environments"]
-    ]
-    kept = ("schema", "score", "level", "groups", "group_metrics", "chance", "pipeline", "backend", "robot")
-    return {k: results[k] for k in kept} | {
-        "score_interval": None,  # follows from the rows, by the code of today
-        "metrics": {m: {"mean50": v["mean50"]} for m, v in results["metrics"].items()},
-        "terrains": {t: {"score": v["score"], "level": v["level"]} for t, v in results["terrains"].items()},
-        "suite": {"name": "repeated", "version": results["suite"]["version"], "digest": ""},
-        "policy": {k: results["policy"][k] for k in ("path", "file_sha256")},
-        "environments": rows,
+def trimmed(result: Result) -> Result:
+    """Return the parts that intervals and comparisons read, without sub-commands. Suites that differ in seeds alone count as one."""
+    rows = tuple(
+        replace(row, runs={seed: replace(run, commands={}) for seed, run in row.runs.items()}, runs_by_level={})
+        for row in result.environments
+    )
+    suite = SuiteName(name="repeated", version=result.suite.version, digest="recorded")
+    # the interval follows from the rows, by the code of today
+    return replace(result, suite=suite, environments=rows, score_interval=None, provenance=Provenance())
+
+
+def restored(data: Mapping[str, Any]) -> Result:
+    """Return an evaluation of the recorded ones, which state nothing that intervals and comparisons do not read."""
+    whole = {
+        **data,
+        "suite": {**data["suite"], "digest": "recorded"},
+        "provenance": {},
+        "metrics": {name: {"mean": 0.0, "mean25": 0.0} | values for name, values in data["metrics"].items()},
     }
+    return Result.from_data(whole, "a recorded evaluation", ComparisonError)
 
 
 # ---- synthetic ------------------------------------------------------------------------------------------------------
@@ -142,8 +155,8 @@ def make_policy(generator: np.random.Generator, terrains: Sequence[str], frictio
     )
 
 
-def synthetic(policy: Known, rules: ChanceRules, generator: np.random.Generator) -> Results:
-    """One evaluation of a policy whose chances are known."""
+def synthetic(policy: Known, rules: ChanceRules, generator: np.random.Generator) -> Result:
+    """Return one evaluation of a policy whose chances are known."""
     common = rules.shared_noise
     luck, shared = policy.luck * common, policy.shared * common
     lucky = np.sqrt(luck) * generator.standard_normal(len(rules.search_seeds))
@@ -151,43 +164,43 @@ def synthetic(policy: Known, rules: ChanceRules, generator: np.random.Generator)
     needed = round(rules.pass_rate * len(rules.search_seeds))
     rows = []
     for at, (terrain, friction) in enumerate(policy.environments):
-        row: dict[str, Any] = {"terrain": terrain, "friction": friction, "payload": 0.0, "level": None}
-        if terrain != "flat":
+        row = EnvironmentRow(terrain=terrain, friction=friction, payload=0.0)
+        if not row.flat:
             draws = np.sqrt(1.0 - luck) * generator.standard_normal((10, len(rules.search_seeds))) + lucky
             reached = draws < _quantile(policy.success[at])[:, None]
             if rules.level == "curve":
-                row["level"], row["trials"] = _expected(reached, rules)
+                level, trials = _expected(reached, rules)
             else:
-                row["level"] = int(bisect(reached.sum(1) >= needed))
-                row["trials"] = dict(_trials(reached, rules, needed))
-        level = row["level"] or 0
-        if terrain == "flat" or level:
+                level, trials = int(bisect(reached.sum(1) >= needed)), dict(_trials(reached, rules, needed))
+            row = replace(row, level=level, trials=trials)
+        if row.flat or row.level:
             own = np.sqrt(1.0 - shared) * generator.standard_normal(len(rules.seeds))
-            runs = np.interp(max(level, 1), _LEVELS, policy.quality[at]) + policy.spread * (noise + own)
-            row["runs"] = {str(s): {"quality": q, "commands": {}} for s, q in zip(rules.seeds, runs, strict=True)}
+            runs = np.interp(max(row.reached, 1), _LEVELS, policy.quality[at]) + policy.spread * (noise + own)
+            row = replace(row, runs={s: Run(columns={QUALITY: q}) for s, q in zip(rules.seeds, runs, strict=True)})
         rows.append(row)
     evidence = Evidence(rows, rules)
-    names = np.array([row["terrain"] for row in rows])
+    names = np.array([row.terrain for row in rows])
     weights = environment_weights(names.tolist())
     score = evidence.value(weights)
     scores = {t: evidence.value((names == t) / (names == t).sum()) for t in policy.terrains}
-    levels = [row["level"] for row in rows if row["level"] is not None]
-    return {
-        "schema": SCHEMA,
-        "suite": {"name": "synthetic", "version": "1", "digest": ""},
-        "policy": {"path": "synthetic.pt", "file_sha256": ""},
-        "chance": asdict(rules),
-        "score": score,
-        "score_interval": evidence.chance(weights).interval(score),
-        "level": float(np.mean(levels)) if levels else None,
-        "terrains": {terrain: {"score": value} for terrain, value in scores.items()},
-        "metrics": {},
-        "group_metrics": {},
-        "environments": rows,
-    }
+    levels = [row.level for row in rows if row.level is not None]
+    return Result(
+        suite=SuiteName(name="synthetic", version="1", digest="synthetic"),
+        policy=PolicyName(path="synthetic.pt", file_sha256="synthetic"),
+        chance=rules,
+        score=score,
+        score_interval=evidence.chance(weights).interval(score),
+        level=float(np.mean(levels)) if levels else None,
+        terrains={terrain: TerrainScore(score=value) for terrain, value in scores.items()},
+        environments=tuple(rows),
+        pipeline="stress",
+        backend="mujoco",
+        robot="go2",
+        provenance=Provenance(),
+    )
 
 
-def _trials(reached: NDArray[np.bool_], rules: ChanceRules, needed: int) -> Iterator[tuple[str, dict[str, bool]]]:
+def _trials(reached: NDArray[np.bool_], rules: ChanceRules, needed: int) -> Iterator[tuple[int, dict[int, bool]]]:
     """The trials that a search plays: levels on its way, in rounds that end as soon as the outcome is certain."""
     low, high = 0, rules.levels
     while low < high:
@@ -195,17 +208,17 @@ def _trials(reached: NDArray[np.bool_], rules: ChanceRules, needed: int) -> Iter
         played: list[bool] = []
         while sum(played) < needed <= len(rules.search_seeds) - played.count(False):
             played += reached[level - 1, len(played) : len(played) + needed - sum(played)].tolist()
-        yield str(level), {str(s): o for s, o in zip(rules.search_seeds, played, strict=False)}
+        yield level, dict(zip(rules.search_seeds, played, strict=False))
         low, high = (level, high) if sum(played) >= needed else (low, level - 1)
 
 
-def _expected(reached: NDArray[np.bool_], rules: ChanceRules) -> tuple[float, dict[str, dict[str, bool]]]:
+def _expected(reached: NDArray[np.bool_], rules: ChanceRules) -> tuple[float, dict[int, dict[int, bool]]]:
     """The expected level, and the trials that its design plays."""
     seeds = rules.search_seeds
     found = follow(lambda level: [bool(o) for o in reached[level - 1]], 10, len(seeds), rules.bracket_seeds)
     assert found.level is not None
     trials = {
-        str(level): {str(s): bool(o) for s, o in zip(seeds[:count], reached[level - 1], strict=False)}
+        level: {s: bool(o) for s, o in zip(seeds[:count], reached[level - 1], strict=False)}
         for level, count in found.seeds.items()
     }
     return found.level, trials
@@ -284,7 +297,7 @@ def coverage(kind: str, count: int, seed: int = 0) -> float:
     hits = 0
     for _ in range(count):
         policy = make_policy(generator, terrains, frictions)
-        low, high = synthetic(policy, rules, generator)["score_interval"]
+        low, high = synthetic(policy, rules, generator).score_interval or (0.0, 0.0)
         hits += low <= expected_score(policy, rules) <= high
     return hits / count
 
@@ -301,7 +314,7 @@ def false_alarms(kind: str, count: int, seed: int = 1) -> tuple[float, float]:
     return float(alarms[0] / count), float(alarms[1] / count)
 
 
-def alarm(pair: Sequence[Results]) -> NDArray[np.float64]:
+def alarm(pair: Sequence[Result]) -> NDArray[np.float64]:
     """Whether a comparison finds the score real, and any detail."""
     found = compare(pair, ["first", "second"]).differences
     return np.array([any(d.real for d in found if (d.kind == "score") is s) for s in (True, False)], dtype=float)
@@ -313,7 +326,7 @@ def alarm(pair: Sequence[Results]) -> NDArray[np.float64]:
 Figures = tuple[float, float, float, float]
 
 
-def judge(recorded: Sequence[Results]) -> dict[str, Figures]:
+def judge(recorded: Sequence[Result]) -> dict[str, Figures]:
     """Of each quantity: mean, 1.96 σ over the evaluations, median half width of the intervals, share that holds the mean."""
 
     def figures(pairs: Sequence[tuple[float, Any]]) -> Figures:
@@ -321,45 +334,42 @@ def judge(recorded: Sequence[Results]) -> dict[str, Figures]:
         held = (ends[:, 0] <= values.mean()) & (values.mean() <= ends[:, 1])
         return values.mean(), 1.96 * values.std(ddof=1), float(np.median(np.ptp(ends, axis=1) / 2)), held.mean()
 
-    evidence = [Evidence(r["environments"], chance_rules_of(r, "results", ComparisonError)) for r in recorded]
-    terrains = [row["terrain"] for row in recorded[0]["environments"]]
+    evidence = [Evidence(r.environments, r.chance) for r in recorded]
+    terrains = [row.terrain for row in recorded[0].environments]
     even = environment_weights(terrains)
 
-    def measured(value: Callable[[Results], float], chance: Callable[[Evidence], Chance], most: float = 1.0) -> Figures:
+    def measured(value: Callable[[Result], float], chance: Callable[[Evidence], Chance], most: float = 1.0) -> Figures:
         values = [value(r) for r in recorded]
         return figures([(v, chance(e).interval(v, (0.0, most))) for v, e in zip(values, evidence, strict=True)])
 
-    found = {"score": measured(lambda r: r["score"], lambda e: e.chance(even))}
-    found["level"] = measured(lambda r: r["level"], lambda e: e.level_chance(even), 10.0)
+    found = {"score": measured(lambda r: r.score or 0.0, lambda e: e.chance(even))}
+    found["level"] = measured(lambda r: r.level or 0.0, lambda e: e.level_chance(even), 10.0)
     for at, terrain in enumerate(terrains):
         one = np.eye(len(terrains))[at]
-        found[terrain] = measured(lambda r, t=terrain: r["terrains"][t]["score"], lambda e, w=one: e.chance(w))
-        level = measured(lambda r, t=terrain: r["terrains"][t]["level"], lambda e, w=one: e.level_chance(w), 10.0)
+        found[terrain] = measured(lambda r, t=terrain: r.terrains[t].score, lambda e, w=one: e.chance(w))
+        level = measured(lambda r, t=terrain: r.terrains[t].level, lambda e, w=one: e.level_chance(w), 10.0)
         found[f"{terrain}, level"] = level
-    for metric in recorded[0]["metrics"]:
-        found[metric] = measured(
-            lambda r, m=metric: r["metrics"][m]["mean50"], lambda e, m=metric: e.chance(even, (m,))
-        )
+    for metric in recorded[0].metrics:
+        found[metric] = measured(lambda r, m=metric: r.metrics[m].mean50, lambda e, m=metric: e.chance(even, (m,)))
     return found
 
 
-def fixed_levels(recorded: Sequence[Results]) -> int:
+def fixed_levels(recorded: Sequence[Result]) -> int:
     """How many intervals of the score would hold the mean score if the levels found were taken for certain."""
-    mean, held = np.mean([r["score"] for r in recorded]), 0
-    for results in recorded:
-        rows = [{k: v for k, v in row.items() if k != "trials"} for row in results["environments"]]
-        rules = chance_rules_of(results, "results", ComparisonError)
-        chance = Evidence(rows, rules).chance(environment_weights([r["terrain"] for r in rows]))
-        low, high = chance.interval(results["score"]) or (0.0, 1.0)
+    mean, held = np.mean([r.score for r in recorded]), 0
+    for result in recorded:
+        rows = [replace(row, trials={}) for row in result.environments]
+        chance = Evidence(rows, result.chance).chance(environment_weights([r.terrain for r in rows]))
+        low, high = chance.interval(result.score or 0.0) or (0.0, 1.0)
         held += low <= mean <= high
     return held
 
 
-def quality_by_level(recorded: Sequence[Results]) -> dict[str, float]:
+def quality_by_level(recorded: Sequence[Result]) -> dict[str, float]:
     """Mean quality of all runs on a terrain at a level."""
     found: dict[str, list[float]] = {}
-    for row in (row for results in recorded for row in results["environments"]):
-        found.setdefault(f"{row['terrain']} {row['level']}", []).extend(r["quality"] for r in row["runs"].values())
+    for row in (row for result in recorded for row in result.environments):
+        found.setdefault(f"{row.terrain} {row.level}", []).extend(r.columns[QUALITY] for r in row.runs.values())
     return {place: float(np.mean(values)) for place, values in sorted(found.items())}
 
 
@@ -377,8 +387,9 @@ def main() -> None:
         if arguments.folder is None:
             parser.error("--record needs a --folder to play in")
         recorded = record(arguments.record, arguments.policy, arguments.folder, arguments.threads)
-        write_atomically(arguments.data, json.dumps(recorded, separators=(",", ":")) + "\n", StoreError)
-    recorded = json.loads(arguments.data.read_text())
+        text = json.dumps([result.to_data() for result in recorded], separators=(",", ":"))
+        write_atomically(arguments.data, text + "\n", StoreError)
+    recorded = [restored(data) for data in json.loads(arguments.data.read_text())]
     print(f"{len(recorded)} whole evaluations with fresh seeds\n")
     print(f"{'':24}{'mean':>9}{'1.96 σ':>9}{'printed':>9}{'covered':>9}")
     for name, (mean, reach, printed, held) in judge(recorded).items():

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.robots import load_robot
-from gaitgauge.training.algorithms.methods import METHODS
+from gaitgauge.training.algorithms.methods import find_method
 from gaitgauge.training.algorithms.symmetry import build_mirror
 from gaitgauge.training.configuration import TrainingConfiguration
 from gaitgauge.training.environment.configuration import ObservationConfiguration
@@ -64,7 +64,7 @@ def measure(configuration: TrainingConfiguration, *, num_envs: int, repeat: int,
     mirror = build_mirror(ObservationConfiguration(), contract=standard_contract(robot), robot=robot)
     groups = {name: torch.randn(num_envs, width, device=device) for name, width in WIDTHS.items()}
     observations = TensorDict(groups, batch_size=[num_envs])
-    algorithm = METHODS[configuration.algorithm.method].build(
+    algorithm = find_method(configuration.algorithm.method).build(
         observations,
         configuration,
         num_actions=robot.num_joints,

@@ -110,18 +110,21 @@ def play(suite: Suite, index: int, arguments: argparse.Namespace) -> dict[str, A
     found = evaluate(request, folder, resume=True)
     figures = {
         **wanted,
-        "seeds": found["chance"]["seeds"],
-        "search_seeds": found["chance"]["search_seeds"],
-        "score": found["score"],
-        "interval": found["score_interval"],
-        "level": found["level"],
-        "terrains": {t: {k: row[k] for k in ("score", "level", "interval")} for t, row in found["terrains"].items()},
+        "seeds": found.chance.seeds,
+        "search_seeds": found.chance.search_seeds,
+        "score": found.score,
+        "interval": found.score_interval,
+        "level": found.level,
+        "terrains": {
+            t: {"score": row.score, "level": row.level, "interval": row.interval} for t, row in found.terrains.items()
+        },
         "environments": [
-            {k: row[k] for k in ("terrain", "friction", "payload", "level", "score")} for row in found["environments"]
+            {k: getattr(row, k) for k in ("terrain", "friction", "payload", "level", "score")}
+            for row in found.environments
         ],
         "control_steps": control_steps(folder),
-        "coverage": found["coverage"]["text"],
-        "provenance": {k: found["provenance"][k] for k in ("versions", "processor", "date")},
+        "coverage": found.coverage.text,
+        "provenance": {k: getattr(found.provenance, k) for k in ("versions", "processor", "date")},
     }
     write_atomically(kept, json_text(figures), StoreError)
     return figures

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,10 @@ import import_public_cts
 import make_trot_policy
 import numpy as np
 import torch
-from gaitgauge.files.provenance import without_place
 from gaitgauge.files.writing import json_text, write_atomically
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.report.page import write_report
+from gaitgauge.gauge.result import Result
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.finding import shipped_policies
@@ -65,33 +66,32 @@ def save_constant(path: Path, action: list[float], *, kind: str) -> None:
     save_policy(path, contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=state))
 
 
-def card_of(
-    results: dict[str, Any], name: str, repeated: dict[str, Any] | None, commit: str | None = None
-) -> dict[str, Any]:
-    """A card that names no folder and no machine, with the figures of repeated evaluations by the same rules if there are any.
+def card_of(result: Result, name: str, repeated: dict[str, Any] | None, commit: str | None = None) -> dict[str, Any]:
+    """Return a card that names no folder and no machine, with the figures of repeated evaluations by the same rules if there are any.
 
     Args:
-        results: content of ``results.json``.
         name: the policy's.
         repeated: what ``benchmarks/repeatability.py`` wrote.
         commit: the one that played, where the results do not know.
     """
     path = name if name in shipped_policies() else f"{name}.gauge.pt"
-    suite = results["suite"]["name"]
-    provenance = without_place(results["provenance"])
-    provenance["command"] = f"gaitgauge evaluate {path} --suite {suite}"
-    provenance["host"] = ""
-    provenance["commit"] = provenance.get("commit") or commit
-    band = tolerance_band(results["score"], results["score_interval"])
-    card = {**results, "policy": {**results["policy"], "path": path}, "provenance": provenance, "tolerance": band}
-    if repeated and repeated["suite"]["digest"] == results["suite"]["digest"]:
+    provenance = replace(
+        result.provenance,
+        command=f"gaitgauge evaluate {path} --suite {result.suite.name}",
+        host="",
+        commit=result.provenance.commit or commit,
+        lacking=frozenset(),
+    )
+    named = replace(result, policy=replace(result.policy, path=path), provenance=provenance)
+    card = named.to_data() | {"tolerance": tolerance_band(result.score, result.score_interval)}
+    if repeated and repeated["suite"]["digest"] == result.suite.digest:
         figures = ("sigma", "interval", "by_environments", "mean", "coverage", "control_steps", "cost", "policy")
         card["repeatability"] = {k: repeated[k] for k in figures} | {"evaluations": len(repeated["evaluations"])}
     return card
 
 
-def play(name: str, suite: str, run: Path, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Evaluate a policy on a suite; returns the content of ``results.json``."""
+def play(name: str, suite: str, run: Path, arguments: argparse.Namespace) -> Result:
+    """Evaluate a policy on a suite."""
     policy = name
     if name not in shipped_policies():
         path = arguments.folder / f"{name}-{suite}.gauge.pt"
@@ -104,9 +104,9 @@ def play(name: str, suite: str, run: Path, arguments: argparse.Namespace) -> dic
         terrains=tuple(arguments.terrain),
         frictions=tuple(arguments.friction),
     )
-    results = evaluate(request, run, resume=True)
+    result = evaluate(request, run, resume=True)
     write_report(run)
-    return results
+    return result
 
 
 def main() -> None:
@@ -136,12 +136,12 @@ def main() -> None:
     for name in arguments.only:
         for suite in arguments.suite:
             run = arguments.folder / f"{name}-{suite}"
-            results = load_result(run) if arguments.made else play(name, suite, run, arguments)
-            card = card_of(results, name, repeated, arguments.commit)
+            result = load_result(run) if arguments.made else play(name, suite, run, arguments)
+            card = card_of(result, name, repeated, arguments.commit)
             write_atomically(arguments.out / f"{run.name}.json", json_text(json.loads(json.dumps(card))), StoreError)
             low, high = card["tolerance"] or (float("nan"),) * 2
-            where = f" ({card['coverage']['text']})" if card["coverage"]["kind"] != "complete" else ""
-            print(f"{name} {suite}: {card['score']:.4f}, a replay within {low:.4f} to {high:.4f}{where}", flush=True)
+            where = "" if result.complete else f" ({result.coverage.text})"
+            print(f"{name} {suite}: {result.score:.4f}, a replay within {low:.4f} to {high:.4f}{where}", flush=True)
 
 
 if __name__ == "__main__":

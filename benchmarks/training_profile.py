@@ -28,7 +28,8 @@ from typing import Any
 import environment_throughput
 import torch
 import warp_profile
-from gaitgauge.training.run.launch import prepare, train
+from gaitgauge.training.run.launch import train
+from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.stopping import Progress

@@ -4,32 +4,35 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from ..gauge.report.page import CLIP
+from ..gauge.result import Result
 
 SECONDS = 6.0
 """Length of the film [s]."""
 _LONGEST = 300.0
-"""Longest time that filming may take [s]."""
+"""Longest time to make it [s]."""
 _SHOWIEST = ("stairs_fd", "obstacle", "wave", "slope_fd", "stairs_bd", "slope_bd")
 """Terrains in the order of preference."""
 _PACKAGE = __name__.partition(".")[0]
 
 
-def make_clip(folder: Path, results: Mapping[str, Any], options: Sequence[str]) -> str | None:
-    """Write the film beside the results, unless it is there; return None, or one sentence on why there is no film.
+def make_clip(folder: Path, result: Result, options: Sequence[str]) -> str | None:
+    """Write the film beside the results, unless it is there.
 
     Args:
-        results: give terrain, friction and the level that the robot reached.
-        options: of ``gaitgauge play``: the policy and its options.
+        result: the robot is shown where it was judged, at the level that it reached.
+        options: of ``gaitgauge play``: the policy and what it is played with.
+
+    Returns:
+        None, or why there is no film, in one sentence.
     """
     clip = folder / CLIP
     if clip.is_file():
         return None
-    command = [sys.executable, "-m", f"{_PACKAGE}.cli.main", "play", *options, *place(results)]
+    command = [sys.executable, "-m", f"{_PACKAGE}.cli.main", "play", *options, *place(result)]
     command += ["--seconds", f"{SECONDS:g}", "--gif", str(clip)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST, check=False)
@@ -41,14 +44,13 @@ def make_clip(folder: Path, results: Mapping[str, Any], options: Sequence[str]) 
     return f"no clip of the robot: {said[-1].removeprefix('gaitgauge: ')}"
 
 
-def place(results: Mapping[str, Any]) -> list[str]:
-    """Return options of ``gaitgauge play`` for the place of the film: the showiest terrain, at the middle friction."""
-    rows = results["environments"]
-    played = [row["terrain"] for row in rows]
+def place(result: Result) -> list[str]:
+    """Return where the robot is shown, as options of ``gaitgauge play``: on the showiest terrain, at the friction in the middle."""
+    rows = result.environments
+    played = [row.terrain for row in rows]
     terrain = next((name for name in _SHOWIEST if name in played), played[0])
-    here = [row for row in rows if row["terrain"] == terrain]
-    mine = sorted(here, key=lambda row: (abs(row["payload"]), row["friction"]))
-    unloaded = [row for row in mine if row["payload"] == mine[0]["payload"]]
+    mine = sorted((row for row in rows if row.terrain == terrain), key=lambda row: (abs(row.payload), row.friction))
+    unloaded = [row for row in mine if row.payload == mine[0].payload]
     row = unloaded[len(unloaded) // 2]
-    level = [] if row["level"] is None else ["--level", str(max(1, round(row["level"])))]
-    return ["--terrain", terrain, *level, "--friction", f"{row['friction']:g}"]
+    level = [] if row.level is None else ["--level", str(max(1, round(row.level)))]
+    return ["--terrain", terrain, *level, "--friction", f"{row.friction:g}"]

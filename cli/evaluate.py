@@ -5,17 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
 
 from rich.text import Text
 
-from ..gauge.coverage import COMPLETE, coverage_of, coverage_words, notes, score_label, suite_label
+from ..gauge.coverage import notes, score_label, suite_label
 from ..gauge.evaluate import Status, evaluate, prepare
 from ..gauge.report.page import write_report
 from ..gauge.request import Request
+from ..gauge.result import Result
 from ..gauge.results import ALL
 from ..gauge.suite import Suite
 from ..policy.contract import PolicyContract
@@ -35,29 +35,29 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
     quiet = redirect_stdout(io.StringIO() if request.cluster else sys.stdout)
     with resumable(console, "gauging", folder, "--resume") as display, quiet:
         command = ["gaitgauge", *sys.argv[1:]]
-        results = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display))
+        result = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display))
     report = write_report(folder)
     if clip:
         from .clip import make_clip
 
         options = [request.policy, "--suite", request.suite] + ["--trust"] * request.trust
         options += ["--robot", request.robot] if request.robot else []
-        if sentence := make_clip(folder, results, options):
+        if sentence := make_clip(folder, result, options):
             console.say(sentence)
         else:
             report = write_report(folder)
     if json_output:
-        print_json(results)
+        print_json(result.to_data())
         return
     console = Terminal()
-    print_results(console, results)
+    print_results(console, result)
     if sentence := doubtful_assumptions(prepared.policy.contract, prepared.suite, folder):
         console.say(sentence)
     console.say(f"results  {folder / 'results.json'}\nepisodes {folder / 'episodes.csv'}\nreport   {report}")
 
 
 def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -> str | None:
-    """What to do where the robot fell at once in most episodes."""
+    """Return advice where the robot fell at once in most episodes."""
     at_once = AT_ONCE + suite.settling.longest
     with (folder / "episodes.csv").open(encoding="utf-8", newline="") as file:
         whole = [row for row in csv.DictReader(file) if row["command"] == ALL]
@@ -69,7 +69,7 @@ def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -
 
 
 def shower(display: ProgressDisplay) -> Callable[[Status], None]:
-    """What an evaluation is watched with."""
+    """Return the function that shows the progress of an evaluation."""
 
     def show(status: Status) -> None:
         seconds = status.seconds_left
@@ -83,47 +83,44 @@ def shower(display: ProgressDisplay) -> Callable[[Status], None]:
     return show
 
 
-def print_results(console: Terminal, results: Mapping[str, Any]) -> None:
-    """Tables of terrains and metrics, then the score."""
-    title = f"{suite_label(results)}, {results['pipeline']}, on {results['backend']}"
+def print_results(console: Terminal, result: Result) -> None:
+    """Print tables of terrains and metrics, then the score."""
+    title = f"{suite_label(result)}, {result.pipeline}, on {result.backend}"
     table = make_table(title, "terrain", "level", "mean", "mean@25", "mean@50", "95 % interval", numbers=True)
-    for name, row in results["terrains"].items():
-        level = "" if row["level"] is None else f"{row['level']:.2f}".rstrip("0").rstrip(".")
-        if "score" in row:
-            table.add_row(
-                name, level, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), _interval(row["interval"])
-            )
-        else:
-            table.add_row(name, level, "", "", "", "")
+    for name, row in result.terrains.items():
+        level = "" if row.level is None else f"{row.level:.2f}".rstrip("0").rstrip(".")
+        scored = row.score is not None
+        values = (f"{v:.4f}" if scored else "" for v in (row.mean, row.mean25, row.mean50))
+        table.add_row(name, level, *values, _interval(row.interval) if scored else "")
     console.print(table)
-    if results["metrics"]:
+    if result.metrics:
         columns = ("metric", "mean", "mean@25", "mean@50", "95 % interval")
         table = make_table("metrics, weighted by level", *columns, numbers=True)
-        for name, row in results["metrics"].items():
-            table.add_row(name, *(f"{row[k]:.4f}" for k in ("mean", "mean25", "mean50")), _interval(row["interval"]))
+        for name, metric in result.metrics.items():
+            values = (f"{v:.4f}" for v in (metric.mean, metric.mean25, metric.mean50))
+            table.add_row(name, *values, _interval(metric.interval))
         console.print(table)
-        console.say("  ".join(f"{k} {v:.4f}" for k, v in results["groups"].items()))
-    for note in notes(results):
+        console.say("  ".join(f"{k} {v:.4f}" for k, v in result.groups.items()))
+    for note in notes(result):
         console.say(note)
-    health = results["health"]
-    falls = "fall" if health["falls"] == 1 else "falls"
-    counts = {falls: health["falls"], **{k: health[k] for k in ("diverged", "overflowed")}}
+    health = result.health
+    falls = "fall" if health.falls == 1 else "falls"
+    counts = {falls: health.falls, "diverged": health.diverged, "overflowed": health.overflowed}
     troubles = [f"{count} {what}" for what, count in counts.items() if count]
-    if health.get("self_contact"):
-        troubles.append(f"parts of the robot touch each other in {100 * health['self_contact']:.1f} % of the samples")
+    if health.self_contact:
+        troubles.append(f"parts of the robot touch each other in {100 * health.self_contact:.1f} % of the samples")
     if troubles:
-        episodes = "quality episode" if health["episodes"] == 1 else "quality episodes"
-        console.say(f"in {health['episodes']} {episodes}: {', '.join(troubles)}")
-    if results["score"] is not None:
-        interval = results["score_interval"]
-        note = f"95 % interval {_interval(interval)}" if interval else results["chance"]["note"]
-        console.say(Text.assemble((f"{score_label(results)} {results['score']:.4f}", "bold"), f"  ({note})"))
-    elif results["level"] is not None:
-        interval = results["level_interval"]
+        episodes = "quality episode" if health.episodes == 1 else "quality episodes"
+        console.say(f"in {health.episodes} {episodes}: {', '.join(troubles)}")
+    if result.score is not None:
+        interval = result.score_interval
+        note = f"95 % interval {_interval(interval)}" if interval else str(result.chance.note)
+        console.say(Text.assemble((f"{score_label(result)} {result.score:.4f}", "bold"), f"  ({note})"))
+    elif result.level is not None:
+        interval = result.level_interval
         note = f"  (95 % interval {_interval(interval, 2)})" if interval else ""
-        covered = coverage_of(results)
-        note += "" if covered["kind"] == COMPLETE else f"  {coverage_words(covered)}"
-        console.say(Text.assemble((f"mean level {results['level']:.2f}", "bold"), note))
+        note += "" if result.complete else f"  {result.coverage.words}"
+        console.say(Text.assemble((f"mean level {result.level:.2f}", "bold"), note))
 
 
 def _interval(found: Sequence[float] | None, digits: int = 4) -> str:

@@ -25,9 +25,7 @@ def print_settings(request: TrainRequest) -> None:
     Raises:
         TaskError: no such task, or a key or value that does not fit.
     """
-    from ..training.run.launch import own_overrides
-
-    chosen = find_task(request.task, own_overrides(request), robot=request.robot)
+    chosen = find_task(request.task, request.own_overrides(), robot=request.robot)
     console = Terminal()
 
     def say(text: str, indent: int, style: str = "") -> None:

@@ -13,8 +13,9 @@ import typer
 
 from ..files.parsing import one_line
 from ..training.configuration import RunConfiguration
-from ..training.run.launch import TrainPlan, prepare, train
-from ..training.run.processes import Processes, told_number
+from ..training.processes import Processes, told_number
+from ..training.run.launch import train
+from ..training.run.plan import TrainPlan, prepare
 from ..training.run.request import TrainRequest
 from ..training.run.stopping import Progress
 from .console import Terminal, shell_command

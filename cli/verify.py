@@ -38,7 +38,7 @@ def run_verification(
         policy=policy,
         beside=place if place.is_dir() else place.parent,
         suite=suite,
-        device=choose_device(content["backend"], device),
+        device=choose_device(content.backend, device),
         threads=threads,
         quick=quick,
         fresh=fresh,

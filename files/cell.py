@@ -1,5 +1,4 @@
-"""Locks a process up for good, so that it can work on a stranger's file: no file to write, no other program, no network, little
-memory.
+"""Lock a process before it works on a stranger's file: no file to write, no other program, no network, little memory.
 
 Landlock and seccomp do this on Linux, each as far as the kernel has it; limits on resources hold on every Unix.
 """
@@ -25,10 +24,10 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 MEMORY = 2**30
-"""Memory that a process may take beyond what it has when it is locked [bytes]."""
-# A forked process has all modules at once; elsewhere system libraries do not bear being forked.
+"""Memory that a locked process may take beyond its memory at the time of locking [bytes]."""
+# A forked process has all modules at once; outside Linux, system libraries do not survive a fork.
 CONTEXT: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
-"""Starts processes that are to be locked."""
+"""Context that starts the processes to be locked."""
 
 _PR_SET_NO_NEW_PRIVS, _PR_SET_SECCOMP, _SECCOMP_FILTER = 38, 22, 2
 _LANDLOCK_CREATE, _LANDLOCK_ADD, _LANDLOCK_RESTRICT = 444, 445, 446
@@ -40,7 +39,7 @@ _NETWORK_RIGHTS, _SCOPES = 0b11, 0b11
 
 _OPENING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 _CLONE_THREAD = 0x10000
-# Numbers of system calls: those with flags to look at, then those that fail whatever they are given. These change files or
+# Numbers of system calls: first calls with flags to check, then calls that always fail. The latter change files or
 # their names and rights, start programs, open sockets, and reach into other processes or the kernel.
 # fmt: off
 _CALLS: dict[str, tuple[dict[int, tuple[int, int]], tuple[int, ...], int]] = {
@@ -65,15 +64,15 @@ _FIRST_FOREIGN_CALL = 0x40000000  # numbers of x86's other set of calls
 
 
 def enclose(kept: int, owner: int, readable: Iterable[Path] = ()) -> tuple[str, ...]:
-    """``lock`` a process that has just been started by its owner, and whose life it is to work for that one.
+    """Lock a process that its owner has just started and that works for this owner alone.
 
-    It ends when its owner does, hears no Ctrl-C (the owner ends it), and has nothing open of what its owner has.
+    The process ends with its owner, ignores Ctrl-C (the owner ends it), and keeps none of the owner's files open.
 
     Args:
         kept: descriptor of the connection with its owner.
         readable: as for ``lock``.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it reaches all processes of a terminal
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     _close_all_but(kept)
     held = lock(readable)
@@ -82,14 +81,14 @@ def enclose(kept: int, owner: int, readable: Iterable[Path] = ()) -> tuple[str, 
 
 
 def _watch(owner: int) -> None:
-    """End with the owner, whoever else holds its connection."""
+    """End this process with its owner, even while others hold the connection."""
     while os.getppid() == owner:
         time.sleep(1.0)
     os._exit(0)
 
 
 def _close_all_but(kept: int) -> None:
-    """Files, sockets and devices that the owner has open are none of a stranger's business."""
+    """Close the files, sockets and devices that the owner has open."""
     if sys.platform == "win32":
         return
     os.closerange(3, kept)
@@ -107,7 +106,7 @@ def lock(readable: Iterable[Path] = ()) -> tuple[str, ...]:
         readable: folders that may be read, beside those of Python and the system's libraries.
 
     Returns:
-        What holds it: of ``limits``, ``landlock`` and ``seccomp`` those that this system has.
+        The locks in force: of ``limits``, ``landlock`` and ``seccomp`` those that this system has.
     """
     held = []
     if resource is not None:
@@ -121,13 +120,13 @@ def lock(readable: Iterable[Path] = ()) -> tuple[str, ...]:
             if _seccomp(libc):
                 held.append("seccomp")
     if resource is not None and len(held) == 1:
-        # Neither is there: then no further file is opened at all.
+        # Neither landlock nor seccomp is there: then no further file is opened at all.
         resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
     return tuple(held)
 
 
 def allow_seconds(seconds: int) -> None:
-    """Let this process compute for so long from now; it is ended when the time is up."""
+    """Let this process compute for so many seconds from now; the system ends it when they are over."""
     if resource is not None:
         used = resource.getrusage(resource.RUSAGE_SELF)
         hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
@@ -145,18 +144,10 @@ def _limit() -> None:
 
 
 def _libraries() -> list[Path]:
-    """Where Python, its packages and the system's libraries lie: modules may be loaded late."""
-    system = (
-        "/usr/lib",
-        "/usr/lib64",
-        "/lib",
-        "/lib64",
-        "/etc/ld.so.cache",
-        "/proc/self",
-        "/proc/cpuinfo",
-        "/sys/devices/system",
-    )
-    return [Path(p) for p in (sys.prefix, sys.base_prefix, *system, "/dev/null", "/dev/urandom", *sys.path) if p]
+    """Return the folders of Python, its packages and the system's libraries: modules may be loaded late."""
+    libraries = ("/usr/lib", "/usr/lib64", "/lib", "/lib64", "/etc/ld.so.cache")
+    devices = ("/proc/self", "/proc/cpuinfo", "/sys/devices/system", "/dev/null", "/dev/urandom")
+    return [Path(p) for p in (sys.prefix, sys.base_prefix, *libraries, *devices, *sys.path) if p]
 
 
 def _landlock(libc: ctypes.CDLL, readable: list[Path]) -> bool:
@@ -199,7 +190,7 @@ def _seccomp(libc: ctypes.CDLL) -> bool:
         (load, 0, 0, 0),
         (at_least, 0, 1, _FIRST_FOREIGN_CALL),
         (give, 0, 0, deny),
-        # the C library takes the older call where this one does not exist, and of that the flags can be seen
+        # the C library falls back to the older call, where flags can be checked, if this one does not exist
         (equal, 0, 1, _CLONE3),
         (give, 0, 0, absent),
     ]

@@ -22,7 +22,7 @@ SPAN = "Beginning and end of a run"
 SCORES = "Scores while it learns"
 WRITTEN = "What is written"
 LARGEST_SEED = 2**63 - 2**32
-"""Commands count on from a seed."""
+"""Largest first seed: commands count on from it."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def choice_of(hint: Any) -> Choice | None:
 
 
 def cpu_threads(asked: int | None) -> int:
-    """Return the number of CPU threads that was asked for; None stands for all cores."""
+    """Return the requested number of CPU threads; None stands for all cores."""
     return asked or os.cpu_count() or 1
 
 

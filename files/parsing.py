@@ -1,7 +1,7 @@
-"""From text to frozen dataclasses: files are read with limits, and every field is checked against its annotation.
+"""Turn text into frozen dataclasses: files are read with limits, and every field is checked against its annotation.
 
-Ranges are declared where a field is (``Annotated[float, Field(gt=0)]``) and checked here alone, by pydantic. Whatever is wrong
-ends in one sentence with the file, the path of the field, its value and what is allowed.
+Ranges are declared at the field (``Annotated[float, Field(gt=0)]``) and checked here alone, by pydantic. Every error is one
+sentence with the file, the path of the field, its value and the allowed values.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from types import GenericAlias
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
@@ -25,17 +25,17 @@ from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, Validati
 Kind = TypeVar("Kind")
 
 LARGEST = 1_000_000
-"""Size of a file that describes something [bytes]."""
+"""Largest size of a file that describes something [bytes]."""
 LARGEST_RESULTS = 100_000_000
-"""Size of a file of results [bytes]."""
+"""Largest size of a file of results [bytes]."""
 _DEEPEST, _MOST = 32, 100_000
-"""Of nested tables and lists, and of entries in all."""
+"""Deepest nesting of tables and lists, and largest number of entries in all."""
 _SHOWN = 80
-"""Characters of a value in a sentence."""
+"""Most characters of a value in a sentence."""
 
 _NAME, _LINE = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*$", r"^[^\x00-\x1f\x7f]*$"
 Name = Annotated[str, StringConstraints(pattern=_NAME, max_length=100)]
-"""What may become the name of a file or folder."""
+"""Text that may become the name of a file or folder."""
 Text = Annotated[str, StringConstraints(min_length=1, max_length=1000, pattern=_LINE)]
 """One line for people, or a name inside another file."""
 _WORDS = {
@@ -57,11 +57,9 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, lt=2**53)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
-_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
-
 
 def shown(value: object) -> str:
-    """A value as it stands in a sentence: shortened, control characters escaped."""
+    """Return a value as a sentence shows it: shortened, control characters escaped."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = _SHOWN
     text = " ".join(short.repr(value).splitlines())
@@ -69,7 +67,7 @@ def shown(value: object) -> str:
 
 
 def one_line(text: object, longest: int = 300) -> str:
-    """Somebody else's words in a sentence of ours: one line, shortened, control characters escaped."""
+    """Return foreign text for a sentence: one line, shortened, control characters escaped."""
     words = " ".join(str(text).split())
     if not words.isprintable():
         words = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in words)
@@ -77,17 +75,13 @@ def one_line(text: object, longest: int = 300) -> str:
 
 
 def bare_name(path: object) -> str:
-    """The name of a policy, a suite or a card without folder and kind: ``pretrained-robogauge-1.1`` of its ``.json``."""
-    return re.sub(
-        r"(\.gauge)?\.(pt|pth|onnx|npz|toml|json)$", "", re.split(r"[/\\]", str(path).rstrip("/\\"))[-1], flags=re.I
-    )
+    """Return the name of a policy, a suite or a card without folder and ending: ``pretrained-robogauge-1.1`` of its ``.json``."""
+    last = re.split(r"[/\\]", str(path).rstrip("/\\"))[-1]
+    return re.sub(r"(\.gauge)?\.(pt|pth|onnx|npz|toml|json)$", "", last, flags=re.I)
 
 
 def did_you_mean(word: object, known: Collection[str]) -> str:
-    """``; did you mean 'a' or 'b'?`` for words of ``known`` close to ``word``, else an empty string.
-
-    Where the sentence goes on, it is joined as ``f"{did_you_mean(word, known) or ';'} choose one of …"``.
-    """
+    """Return ``; did you mean 'a' or 'b'?`` for words of ``known`` close to ``word``, else an empty string."""
     close = get_close_matches(str(word)[:_SHOWN], list(known), n=3)
     return "; did you mean " + " or ".join(f"'{c}'" for c in close) + "?" if close else ""
 
@@ -96,11 +90,7 @@ def did_you_mean(word: object, known: Collection[str]) -> str:
 
 
 def read_text(path: Path, what: str, error: type[Exception], *, largest: int = LARGEST) -> str:
-    """The text of a file.
-
-    Args:
-        what: what it is, for the sentence (``suite file``).
-        largest: size that is not exceeded [bytes].
+    """Return the text of a file, ``what`` in the sentence (``suite file``), of at most ``largest`` bytes.
 
     Raises:
         error: no such file, too large, not readable or not UTF-8.
@@ -122,11 +112,7 @@ def read_text(path: Path, what: str, error: type[Exception], *, largest: int = L
 
 
 def parse_toml(text: str, source: str, error: type[Exception]) -> dict[str, Any]:
-    """Plain data of TOML text.
-
-    Raises:
-        error: no valid TOML, or nested too deep.
-    """
+    """Return the plain data of TOML text; raise ``error`` where it is no valid TOML or nested too deep."""
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as problem:
@@ -135,11 +121,7 @@ def parse_toml(text: str, source: str, error: type[Exception]) -> dict[str, Any]
 
 
 def parse_json(text: str | bytes, source: str, error: type[Exception], *, most: int = _MOST) -> Any:
-    """Plain data of JSON text, with no more entries than ``most``.
-
-    Raises:
-        error: no valid JSON, or nested too deep.
-    """
+    """Return the plain data of JSON text; raise ``error`` where it is no valid JSON, nested too deep or over ``most`` entries long."""
     try:
         data = json.loads(text)
     except (ValueError, RecursionError) as problem:
@@ -148,7 +130,7 @@ def parse_json(text: str | bytes, source: str, error: type[Exception], *, most: 
 
 
 def read_results(path: Path, what: str, error: type[Exception]) -> dict[str, Any]:
-    """The table of a JSON file that this package wrote, which may be large, and which anybody may have changed since.
+    """Read the table of a JSON file that this package wrote and that may be large or edited since.
 
     Raises:
         error: no such file, too large, not readable, no valid JSON, or no table.
@@ -162,11 +144,11 @@ def read_results(path: Path, what: str, error: type[Exception]) -> dict[str, Any
 
 @contextmanager
 def edited(source: str, error: type[Exception], *others: type[Exception]) -> Iterator[None]:
-    """Around code that takes for granted what a file holds: where something else stands in it, that is one sentence.
+    """Turn failed lookups and arithmetic on a file's content into one sentence: the file was edited or is damaged.
 
     Args:
         source: the file, the beginning of the sentence.
-        others: errors, beside those of Python's own lookups and arithmetic, that mean the same.
+        others: further classes of errors with the same meaning.
     """
     caught: tuple[type[Exception], ...] = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, *others)
     try:
@@ -179,11 +161,7 @@ def edited(source: str, error: type[Exception], *others: type[Exception]) -> Ite
 
 
 def parse_yaml(text: str, source: str, error: type[Exception]) -> Any:
-    """Plain data of YAML text, without tags of any language's own.
-
-    Raises:
-        error: no valid YAML, nested too deep, or with merge keys.
-    """
+    """Return the plain data of YAML text without tags; raise ``error`` where it is no valid YAML, nested too deep or has merge keys."""
     try:
         data = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, OverflowError, AttributeError, TypeError, RecursionError) as problem:
@@ -192,7 +170,7 @@ def parse_yaml(text: str, source: str, error: type[Exception]) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """Merging tables multiplies their size at each level; nothing that describes a policy does it."""
+    """A loader without merge keys, which multiply the size of tables at each level and which no policy needs."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         for key, _ in node.value:
@@ -205,12 +183,12 @@ def _reason(problem: BaseException) -> str:
 
 
 def plain(data: Any, source: str, error: type[Exception], *, most: int = _MOST) -> Any:
-    """A copy of plain data (tables, lists, texts, numbers, true, false, null) of bounded depth and size.
+    """Copy plain data (tables, lists, texts, numbers, true, false, null) of bounded depth and size.
 
     Halves of surrogate pairs, which no text file can hold, become their escape sequence.
 
     Raises:
-        error: anything else is in it, a key that is no text, or too much.
+        error: the data hold anything else, a key that is no text, or too much.
     """
     left = most
 
@@ -241,7 +219,7 @@ def plain(data: Any, source: str, error: type[Exception], *, most: int = _MOST) 
 
 
 def _path(steps: Iterable[str | int]) -> str:
-    """The way to a value: ``tables[2].key``."""
+    """Return the path of a value: ``tables[2].key``."""
     path = ""
     for step in steps:
         if isinstance(step, int):
@@ -255,28 +233,40 @@ def _path(steps: Iterable[str | int]) -> str:
 
 
 def build(kind: type[Kind], data: object, source: str, error: type[Exception], *, false_is_none: bool = False) -> Kind:
-    """A (nested) frozen dataclass from plain data.
+    """Build a (nested) frozen dataclass from plain data.
 
     Args:
         kind: the dataclass; its annotations are the rules.
-        data: what a parser above gave; lists stand for tuples.
-        source: where the data come from, the beginning of every sentence.
+        data: result of a parser above; lists stand for tuples.
+        source: origin of the data, the beginning of every sentence.
         false_is_none: ``false`` stands for None where a field may be None, and sentences say so: TOML has no null.
 
     Raises:
-        error: an unknown or missing field, a value of another type or out of range, or what ``__post_init__`` refuses.
+        error: an unknown or missing field, a value of another type or out of range, or a refusal of ``__post_init__``.
     """
+    return _built(kind, data, source, error, false_is_none=false_is_none)
+
+
+def _built(
+    kind: type[Kind],
+    data: object,
+    source: str,
+    error: type[Exception],
+    *,
+    false_is_none: bool = False,
+    extra: Literal["forbid", "ignore"] = "forbid",
+) -> Kind:
     data = plain(data, source, error)
     text = json.dumps([_none_for_false(kind, data) if false_is_none else data])
     try:
-        checker: TypeAdapter[tuple[Kind]] = _adapter(kind)  # type: ignore[arg-type]
+        checker: TypeAdapter[tuple[Kind]] = _adapter(kind, extra)  # type: ignore[arg-type]
         return checker.validate_json(text)[0]
     except ValidationError as problem:
         raise _error(problem, kind, source, error, "false" if false_is_none else "") from problem
 
 
 def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
-    """A dataclass from the entries of a table that bear its fields' names.
+    """Return a dataclass from the entries of a table that bear its fields' names, and so for the tables in it.
 
     Raises:
         error: as ``build``.
@@ -284,12 +274,11 @@ def take(kind: type[Kind], data: object, source: str, error: type[Exception]) ->
     if not isinstance(data, Mapping):
         raise error(f"{source} is {shown(data)}; it must be a table")
     own = {f.name: data[f.name] for f in fields(kind) if f.name in data}  # type: ignore[arg-type]
-    return build(kind, own, source, error)
+    return _built(kind, own, source, error, extra="ignore")
 
 
 def check_fields(instance: Any, source: str, error: type[Exception]) -> None:
-    """Check the fields of a frozen dataclass that Python code made, in its ``__post_init__``: numbers become floats and lists
-    tuples, as their annotations say.
+    """Check the fields of a frozen dataclass in its ``__post_init__``; numbers become floats and lists tuples, as annotated.
 
     Raises:
         error: a value of another type or out of range.
@@ -303,7 +292,7 @@ def check_fields(instance: Any, source: str, error: type[Exception]) -> None:
 
 
 def from_text(hint: Any, text: str, key: str, error: type[Exception]) -> Any:
-    """One setting of the command line as the annotated type; ``none`` where it may be None, commas between a tuple's entries.
+    """Convert a setting of the command line to the annotated type; ``none`` stands for None, commas separate a tuple's entries.
 
     Raises:
         error: the text does not fit; the sentence names the key.
@@ -326,22 +315,22 @@ def from_text(hint: Any, text: str, key: str, error: type[Exception]) -> Any:
 
 
 @cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    # The tuple carries the configuration, which dataclasses of the standard library have no place for.
-    return TypeAdapter(tuple[kind], config=_CONFIG)
+def _adapter(kind: Any, extra: Literal["forbid", "ignore"]) -> TypeAdapter[Any]:
+    # The tuple carries the configuration, because dataclasses of the standard library cannot.
+    return TypeAdapter(tuple[kind], config=ConfigDict(extra=extra, allow_inf_nan=False, strict=True))
 
 
 @cache
 def _field_adapters(kind: Any) -> dict[str, TypeAdapter[Any]]:
     config = ConfigDict(extra="forbid", allow_inf_nan=False)
     hints: dict[str, Any] = get_type_hints(kind, include_extras=True)
-    # The table carries the configuration, and the field's name into the path.
+    # The table carries the configuration and the field's name, which the path of an error needs.
     tables: dict[str, Any] = {name: GenericAlias(dict, (str, hint)) for name, hint in hints.items()}
     return {name: TypeAdapter(table, config=config) for name, table in tables.items()}
 
 
 def _none_for_false(hint: Any, data: Any) -> Any:
-    """Plain data in which None stands where ``false`` does and may."""
+    """Replace ``false`` by None in plain data, where a field may be None."""
     if isinstance(data, dict):
         return {key: _none_for_false(_hint_at(hint, [key]), value) for key, value in data.items()}
     if isinstance(data, list):
@@ -350,13 +339,11 @@ def _none_for_false(hint: Any, data: Any) -> Any:
 
 
 def _error(problem: ValidationError, kind: Any, source: str, error: type[Exception], none: str = "") -> Exception:
-    """An error of the class asked for; one that a dataclass raised itself stays as it is."""
+    """Return an error of the requested class; an error that a dataclass raised itself stays."""
     own = problem.errors(include_url=False)[0].get("ctx", {}).get("error")
-    return (
-        own
-        if isinstance(own, error) and str(own).startswith(source)
-        else error(f"{source}: {_sentence(problem, kind, none)}")
-    )
+    if isinstance(own, error) and str(own).startswith(source):
+        return own
+    return error(f"{source}: {_sentence(problem, kind, none)}")
 
 
 @cache
@@ -364,16 +351,16 @@ def _text_adapter(hint: Any) -> TypeAdapter[Any]:
     return TypeAdapter(hint, config=None if is_dataclass(hint) else ConfigDict(allow_inf_nan=False))
 
 
-_MEMBER = re.compile(r"(float|int|str|bool|constrained-\w+|(tuple|dict|function|nullable)[^\w.]*\[.*)$")
-"""How pydantic names the members of a union in a path."""
+_MEMBER = re.compile(r"(float|int|str|bool|constrained-\w+|(tuple|dict|function|nullable)[-\w]*\[.*)$")
+"""Pydantic's names for the members of a union in a path."""
 
 
 def _sentence(problem: ValidationError, kind: Any, none: str) -> str:
-    """The first of the errors, a misspelt field before one that is missing for it; ``none`` is how None is written, if it can be."""
+    """Describe the first of the errors, a misspelt field before the missing one; ``none`` is the spelling of None, if allowed."""
     errors = problem.errors(include_url=False)
     order = ("unexpected_keyword_argument", "missing")
     first = min(errors, key=lambda e: order.index(e["type"]) if e["type"] in order else len(order))
-    steps: tuple[int | str, ...] = first["loc"][first["loc"][0] == 0 :]  # a number: the place in the tuple around it
+    steps: tuple[int | str, ...] = first["loc"][first["loc"][0] == 0 :]  # without the place in the adapter's tuple
     path = _path(step for step in steps if isinstance(step, int) or not _MEMBER.match(step))
     if first["type"] == "missing" and isinstance(first["loc"][-1], int):
         return f"{path.rpartition('[')[0]} is {shown(first['input'])}; more entries are needed"
@@ -392,7 +379,7 @@ def _sentence(problem: ValidationError, kind: Any, none: str) -> str:
 
 
 def _rule(error: Mapping[str, Any]) -> str:
-    """Pydantic's words as the end of a sentence."""
+    """Return pydantic's words as the end of a sentence."""
     if error["type"] == "string_pattern_mismatch":
         return _PATTERNS[error["ctx"]["pattern"]]
     words = re.sub(r"^(Input|String|Tuple|Dictionary) should", "it must", str(error["msg"]))
@@ -403,7 +390,7 @@ def _rule(error: Mapping[str, Any]) -> str:
 
 
 def _without_ranges(hint: Any) -> Any:
-    """The type below ``Annotated``, for a look at what it is; ranges of tuples and unions are inside them."""
+    """Return the tuple below ``Annotated``, else the hint; ranges of tuples and unions are inside them."""
     inner = get_args(hint)[0] if get_origin(hint) is Annotated else hint
     return inner if get_origin(inner) is tuple else hint
 
@@ -412,7 +399,7 @@ _hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
 
 
 def _hint_at(hint: Any, steps: Iterable[int | str]) -> Any:
-    """The annotation of what lies at a path; None for an unknown field."""
+    """Return the annotation at a path; None for an unknown field."""
     for step in steps:
         hint = _without_none(hint)
         if is_dataclass(hint):
@@ -427,5 +414,5 @@ def _may_be_none(hint: Any) -> bool:
 
 
 def _without_none(hint: Any) -> Any:
-    """The dataclass of which there may be none; any other annotation as it is."""
+    """Return the dataclass of an optional dataclass; any other annotation as it is."""
     return next((k for k in get_args(hint) if is_dataclass(k)), hint) if _may_be_none(hint) else hint

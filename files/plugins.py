@@ -1,4 +1,4 @@
-"""Installed plug-ins: somebody else's code, which may do anything when it is loaded, and must then break nothing but itself."""
+"""Load installed plug-ins: foreign code that may fail in any way and must then break nothing but itself."""
 
 from __future__ import annotations
 
@@ -15,25 +15,17 @@ Kind = TypeVar("Kind")
 
 
 def plugins(group: str) -> dict[str, EntryPoint]:
-    """Installed entry points of a group by name."""
+    """Return the installed entry points of a group by name."""
     return {entry.name: entry for entry in entry_points(group=group)}
 
 
 def load_plugin(entry: EntryPoint, error: type[Exception]) -> Any:
-    """What an entry point refers to.
-
-    Raises:
-        error: it cannot be loaded; the sentence names it.
-    """
+    """Load the object of an entry point; raise ``error`` with the entry point's name where that fails."""
     return guarded(entry, error, entry.load)
 
 
 def guarded(entry: EntryPoint, error: type[Exception], call: Callable[..., Kind], *arguments: Any) -> Kind:
-    """Call a plug-in's code. Whatever it raises, and its wish to end the program, becomes one sentence.
-
-    Raises:
-        error: anything went wrong; the sentence names the entry point.
-    """
+    """Call a plug-in's code; raise ``error`` with one sentence that names the entry point for any error and ``SystemExit``."""
     try:
         return call(*arguments)
     except error:
@@ -44,18 +36,14 @@ def guarded(entry: EntryPoint, error: type[Exception], call: Callable[..., Kind]
 
 
 def raised(error: BaseException) -> str:
-    """What went wrong in somebody's code, and where: ``raised KeyError: 'x' (rewards.py, line 12)``."""
+    """Describe an error of foreign code and its place: ``raised KeyError: 'x' (rewards.py, line 12)``."""
     frames = [f for f in traceback.extract_tb(error.__traceback__)[1:] if not f.filename.startswith("<frozen")]
     place = f" ({one_line(Path(frames[-1].filename).name, 80)}, line {frames[-1].lineno})" if frames else ""
     return f"raised {type(error).__name__}: {one_line(error, 200)}".rstrip(": ") + place
 
 
 def imported(path: str, where: str, error: type[Exception]) -> Any:
-    """What stands at ``module:name``, None where the module has no such name.
-
-    Raises:
-        error: importing it fails; ``where`` is the beginning of the sentence.
-    """
+    """Import ``module:name``, None where the module has no such name; raise ``error``, which begins with ``where``, on failure."""
     module, _, name = path.partition(":")
     try:
         found: Any = import_module(module)
@@ -69,6 +57,6 @@ def imported(path: str, where: str, error: type[Exception]) -> Any:
 
 
 def origin(entry: EntryPoint) -> str:
-    """How a sentence names a plug-in."""
+    """Return a plug-in's name for a sentence."""
     package = f" of {entry.dist.name}" if entry.dist else ""
     return f"plug-in {shown(entry.name)} ({one_line(entry.value, 80)}{package})"

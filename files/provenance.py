@@ -1,4 +1,4 @@
-"""Where a result comes from: programs, machine, command and digests of what was read."""
+"""Record the origin of a result: programs, machine, command and digests of the files that were read."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def provenance(
     digests: Mapping[str, str] | None = None,
     **measured: Any,
 ) -> dict[str, Any]:
-    """Where a result comes from, as plain data.
+    """Return the origin of a result as plain data.
 
     Args:
-        digests: SHA-256 by what it is of (``policy``, ``robot``, ``suite``).
+        digests: SHA-256 by the name of its file's role (``policy``, ``robot``, ``suite``).
         measured: entries of the caller's own, such as ``seconds``.
     """
     return {
@@ -52,13 +52,13 @@ def provenance(
 
 
 def without_place(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Provenance that names no machine and, since commands hold paths, no command: what may be given to everybody."""
+    """Return provenance for publication: without the machine's name and, since commands hold paths, without the command."""
     return {name: value for name, value in found.items() if name not in ("host", "command")}
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of the programs that decide about results."""
+    """Return the versions of the programs that results depend on."""
     found = {"python": platform.python_version(), "gaitgauge": __version__}
     for package in PACKAGES:
         try:
@@ -70,13 +70,13 @@ def versions() -> dict[str, str]:
 
 @cache
 def source_digest() -> str:
-    """SHA-256, hexadecimal, over the source of all packages that a score depends on."""
+    """Return the SHA-256, hexadecimal, over the source of all packages that a score depends on."""
     return digest(path for package in _JUDGING for path in sorted((_ROOT / package).rglob("*.py")))
 
 
 @cache
 def commit() -> str | None:
-    """Commit of the source that runs, with ``-dirty`` if it was changed since; None for an installed package."""
+    """Return the commit of the running source, with ``-dirty`` after changes; None for an installed package."""
     if not (_ROOT / ".git").exists():
         return None
     ask = ["git", "-C", str(_ROOT), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
@@ -88,7 +88,7 @@ def commit() -> str | None:
 
 @cache
 def plugins() -> dict[str, str]:
-    """Installed plug-ins: ``value (distribution version)`` by ``group:name``."""
+    """Return the installed plug-ins: ``value (distribution version)`` by ``group:name``."""
     found = {
         f"{entry.group}:{entry.name}": f"{entry.value} ({package.metadata['Name']} {package.version})"
         for package in distributions()
@@ -100,7 +100,7 @@ def plugins() -> dict[str, str]:
 
 @cache
 def processor() -> str:
-    """The CPU's model, as the system names it."""
+    """Return the CPU's model, as the system names it."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
             if line.startswith("model name"):
@@ -111,7 +111,7 @@ def processor() -> str:
 
 
 def device_name(device: str) -> str:
-    """A torch device's name for people."""
+    """Return a torch device's name for people."""
     if device.startswith("cuda"):
         import torch
 
@@ -120,11 +120,7 @@ def device_name(device: str) -> str:
 
 
 def digest(paths: Iterable[Path], *more: str) -> str:
-    """SHA-256 over the contents of files in their order, and over texts, hexadecimal.
-
-    Raises:
-        OSError: a file cannot be read.
-    """
+    """Return the SHA-256, hexadecimal, over the contents of files in order and texts; raise ``OSError`` where a file is unreadable."""
     total = hashlib.sha256()
     for path in paths:
         with path.open("rb") as file:

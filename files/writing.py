@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and folders that one process writes to at a time."""
+"""Write files whole or not at all, and keep folders for one process at a time."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from .parsing import one_line, shown
 
 LOCK = ".lock"
 _PATIENCE = 3.0
-"""How long a lock is waited for [s]: the workers of a process that was killed need a moment to notice."""
+"""Longest wait for a lock [s]: the workers of a killed process need a moment to notice."""
 
 
 @contextmanager
 def replacing(path: Path, error: type[Exception], *, durable: bool = True, ending: str = ".partial") -> Iterator[Path]:
-    """A path to write to in place of ``path``, which gets its name at the end; at an error it goes, and ``path`` stays as it was.
+    """Yield a temporary path that is renamed to ``path`` at the end; at an error it is removed, and ``path`` stays.
 
     Args:
-        durable: wait until the disk has it; otherwise it survives the end of the process, not that of the machine.
-        ending: of the name, for libraries that go by it.
+        durable: wait until the disk has the file; otherwise it survives the end of the process, not that of the machine.
+        ending: end of the temporary name, for libraries that go by it.
 
     Raises:
-        error: it cannot be written: the disk is full, read-only …; or there is something that is no file.
+        error: the file cannot be written (the disk is full, read-only …), or ``path`` is no file.
     """
     if (other := _no_file(path)) is not None:
         raise error(f"cannot write '{one_line(path)}': {other}; choose another place")
-    # Of one's own: two processes never share it. Without the name: that may be as long as a name can be.
+    # Random, so that two processes never share it; without path's own name, which may have the greatest length already.
     partial = path.with_name(f".{secrets.token_hex(8)}.partial{ending.removeprefix('.partial')}")
     try:
         yield partial
@@ -54,33 +54,25 @@ def replacing(path: Path, error: type[Exception], *, durable: bool = True, endin
 
 
 def is_half_written(name: str) -> bool:
-    """Whether a file's name is one that ``replacing`` gives: sixteen digits of chance, which no user's file has."""
+    """Return whether ``replacing`` made a file's name: sixteen random digits, which no user's file has."""
     return re.match(r"\.[0-9a-f]{16}\.partial", name) is not None
 
 
 def write_atomically(path: Path, data: str | bytes | memoryview, error: type[Exception]) -> None:
-    """Write a file, all or nothing.
-
-    Raises:
-        error: it cannot be written.
-    """
+    """Write a whole file or, raising ``error``, nothing."""
     with replacing(path, error) as partial:
         partial.write_bytes(data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
 
 
 def same_file(path: str | Path, other: str | Path) -> bool:
-    """Whether two paths lead to one file, by links, too; no where either leads nowhere."""
+    """Return whether two paths lead to one file, links followed; False where either leads nowhere."""
     with suppress(OSError):
         return os.path.samefile(path, other)
     return False
 
 
 def make_folder(folder: Path, error: type[Exception], *, option: str = "--out") -> None:
-    """Create a folder and those above it, where it is not there.
-
-    Raises:
-        error: it cannot be created; the sentence names the ``option`` that says where it is to be.
-    """
+    """Create a folder and its parents where missing; raise ``error``, which names the ``option`` for the place, on failure."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
@@ -90,10 +82,7 @@ def make_folder(folder: Path, error: type[Exception], *, option: str = "--out") 
 
 
 def _no_file(path: Path) -> str | None:
-    """What a path names that is not to be replaced by a file; None for a file, and for nothing.
-
-    A new file takes the place of whatever has its name: for root that could be one of the system's devices.
-    """
+    """Describe a path that no file may replace, such as a folder or, for root, a device; None for a file and for nothing."""
     try:
         if path.is_dir():
             return "it is a folder"
@@ -108,7 +97,7 @@ def _no_file(path: Path) -> str | None:
 
 
 def write_failure(path: Path, problem: OSError, hint: str = "choose another place") -> str:
-    """One sentence on why a file cannot be written; ``hint`` says what to do where the disk is not full."""
+    """Return the sentence for a file that cannot be written; ``hint`` says what to do where the disk is not full."""
     reason = (problem.strerror or one_line(problem)).lower()
     if problem.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         hint = "free some space and run again; what was written before is intact"
@@ -116,7 +105,7 @@ def write_failure(path: Path, problem: OSError, hint: str = "choose another plac
 
 
 def json_text(data: Any) -> str:
-    """JSON of plain data, whatever is in it: what JSON cannot hold (NaN, infinity, halves of surrogate pairs) is written as text."""
+    """Return plain data as JSON; values outside of JSON (NaN, infinity, halves of surrogate pairs) become text."""
     return json.dumps(_writable(data), indent=1, allow_nan=False) + "\n"
 
 
@@ -133,7 +122,7 @@ def _writable(value: Any) -> Any:
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Rows as CSV text. A text that a spreadsheet would run as a formula gets an apostrophe before it."""
+    """Return rows as CSV text. A text that a spreadsheet would run as a formula gets an apostrophe before it."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([f"'{value}" if _is_formula(value) else value for value in row] for row in rows)
@@ -151,7 +140,7 @@ def _is_formula(value: object) -> bool:
 
 
 def lock_folder(folder: Path, error: type[Exception]) -> FileLock:
-    """Keep a folder for this process, until ``release()`` or its end, and remove what a process that was killed left half written.
+    """Keep a folder for this process until ``release()`` or its end, and remove half-written files of killed processes.
 
     Raises:
         error: another process has it, or the folder cannot be written to.
@@ -160,9 +149,8 @@ def lock_folder(folder: Path, error: type[Exception]) -> FileLock:
     try:
         lock.acquire()
     except Timeout as problem:
-        raise error(
-            f"another process is writing to '{one_line(folder)}'; wait until it has ended, or choose another folder"
-        ) from problem
+        busy = f"another process is writing to '{one_line(folder)}'; wait until it has ended, or choose another folder"
+        raise error(busy) from problem
     except OSError as problem:
         raise error(write_failure(folder / LOCK, problem)) from problem
     for partial in _strays(folder):
@@ -172,7 +160,7 @@ def lock_folder(folder: Path, error: type[Exception]) -> FileLock:
 
 
 def _strays(folder: Path) -> Iterator[Path]:
-    """Half written files of a folder, but not those of folders below that another process may have locked."""
+    """Yield the half-written files of a folder, but not those of folders below that another process may have locked."""
     for place, below, names in os.walk(folder):
         if LOCK in names and Path(place) != folder:
             below.clear()
@@ -181,7 +169,7 @@ def _strays(folder: Path) -> Iterator[Path]:
 
 
 def _flush(path: Path) -> None:
-    """Wait until the disk has a file, or the names in a folder."""
+    """Wait until the disk holds a file, or the names in a folder."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

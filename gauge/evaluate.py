@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 
-from ..backends.mujoco import MujocoBackend
 from ..backends.registry import choose_device, find_backend, make_backend
 from ..files.choices import cpu_threads
 from ..files.parsing import one_line, shown
@@ -44,17 +43,18 @@ from .play.progress import ProgressMeter, Status
 from .play.segments import count_segments
 from .play.workers import Job, local_workers, start_workers
 from .request import Request
+from .result import ClusterName, Motors, PolicyName, Provenance, Result
 from .results import fold, health, rows_csv
 from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
 
 _WORLDS = 24
-"""Worlds of a worker on the CPU: more share the loop's cost, fewer keep more workers busy to the end."""
+"""Worlds of a worker on the CPU: more worlds amortize the loop's overhead; fewer balance the load at the end."""
 _GPU_WORLDS = 4096
 """Largest number of worlds on a GPU."""
 GPU_SPECULATION = Speculation(at_work=_GPU_WORLDS, test_probability=0.02, quality_probability=0.25)
-"""A GPU plays nearly every level of every search at once, and quality while the last level tests run: what lasts is the number of
-control steps in a row, and at the end most worlds have nothing to do."""
+"""A GPU plays nearly every level of every search at once, and quality while the last level tests run: the number
+of control steps in a row dominates the run time, and at the end most worlds have nothing to do."""
 _EARLY = 16
 """Episodes of a worker on the CPU up to which it plays others speculatively: more of them slow those that are required."""
 _WATCH_INTERVAL = 0.2
@@ -63,7 +63,7 @@ _WATCH_INTERVAL = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """A request that can be carried out, and what it names."""
+    """A request that can be carried out, with the suite, robot and policy that it names."""
 
     request: Request
     suite: Suite
@@ -75,7 +75,7 @@ class Prepared:
 
     @property
     def rules(self) -> PlanRules:
-        """What plans depend on."""
+        """The rules that plans depend on."""
         return PlanRules(suite=self.suite, seeds=self.seeds, quality=self.request.pipeline != "level")
 
 
@@ -90,13 +90,13 @@ def prepare(request: Request) -> Prepared:
     # None with a cluster stands for all of its processors
     threads = request.threads if request.cluster is not None else cpu_threads(request.threads)
     request = replace(request, device=device, threads=threads)
-    find_backend(request.backend, device)
+    engine = find_backend(request.backend, device)
     if request.cluster is not None:
         check_address(request.cluster)
-        if request.backend != MujocoBackend.name:
+        if not engine.parallel_processes or torch.device(request.device).type != "cpu":
             raise ClusterError(
-                f"a cluster plays with backend '{MujocoBackend.name}' on CPUs, not with '{request.backend}'; leave out --cluster "
-                "or --backend"
+                f"a cluster plays with an engine that runs as several processes on CPUs, which backend '{request.backend}' on "
+                f"'{request.device}' does not; leave out --cluster, --backend or --device"
             )
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:
@@ -136,14 +136,14 @@ def prepare(request: Request) -> Prepared:
 
 
 def _robot_and_policy(request: Request) -> tuple[Robot, FilePolicy]:
-    """What is gauged, on which robot: foreign files take their contract from the robot that is asked for."""
+    """Return robot and policy: foreign files take their contract from the robot that is asked for."""
     asked = None if request.robot is None else load_robot(request.robot)
     policy = load_policy(request.policy, asked, trust=request.trust)
     return robot_for(policy.contract, request.robot), policy
 
 
 def _terrains(request: Request, suite: Suite) -> list[str]:
-    """The terrains of a request, in the suite's order."""
+    """Return the terrains of a request, in the suite's order."""
     if request.pipeline not in PIPELINES:
         raise SuiteError(
             f"there is no pipeline '{one_line(request.pipeline, 80)}'; choose one of {', '.join(PIPELINES)}"
@@ -174,7 +174,7 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
 
 
 def identity(prepared: Prepared) -> dict[str, Any]:
-    """What decides about the results: a folder that holds another run is refused."""
+    """Return what decides about the results: a folder that holds another run is refused."""
     request = prepared.request
     return common_identity(prepared.suite, prepared.policy.digest, prepared.robot, request.device, prepared.seeds) | {
         "pipeline": request.pipeline,
@@ -187,7 +187,7 @@ def identity(prepared: Prepared) -> dict[str, Any]:
 
 
 def common_identity(suite: Suite, policy: str, robot: Robot, device: str, seeds: Sequence[int]) -> dict[str, Any]:
-    """The part of it that every run of episodes has; ``policy`` is its digest."""
+    """Return the part of it that every run of episodes has; ``policy`` is its digest."""
     return {
         "suite": f"{suite.name} {suite.version}",
         "suite_digest": suite.digest,
@@ -207,7 +207,7 @@ def evaluate(
     resume: bool = False,
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
-) -> dict[str, Any]:
+) -> Result:
     """Evaluate a policy; every finished episode is on disk at once, so that nothing is lost when the process is killed.
 
     Args:
@@ -216,9 +216,6 @@ def evaluate(
         resume: go on with what the folder holds.
         command: the command line, for the provenance.
         watch: called a few times a second.
-
-    Returns:
-        The content of ``results.json``.
 
     Raises:
         SuiteError, RobotError, PolicyError, ContractError, BackendError, WorkerError, ClusterError, StoreError, RecordError: one
@@ -240,54 +237,58 @@ def evaluate(
             effort = play(planners, store.records, store.put, workers, speculation=speculation, watch=on_progress)
         outcomes = [environment_result(environment, store.records, rules) for environment in prepared.environments]
         counted = [record for outcome in outcomes for record in (*outcome.trials, *outcome.records)]
-        results = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
-        results["policy"] = {
-            "path": prepared.policy.path,
-            "contract_hash": prepared.policy.contract.hash,
-            "file_sha256": prepared.policy.file_sha256,
-            "observations": [term.name for term in prepared.policy.contract.observation],
-            "kind_of_observations": kind_of_observations(prepared.policy.contract),
-            "provenance": without_copy(prepared.policy.contract.provenance),
-        }
-        results["coverage"] = coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline)
-        results["pipeline"] = request.pipeline
-        results["backend"] = request.backend
-        results["robot"] = prepared.robot.name
-        motors = joint_parameters(suite, prepared.robot, prepared.policy.contract)
-        results["motors"] = {
-            "stiffness": list(motors.stiffness),
-            "damping": list(motors.damping),
-            "note": gains_note(suite, prepared.robot, prepared.policy.contract),
-        }
-        results["health"] = health([record for outcome in outcomes for record in outcome.records])
-        results["solver"] = dict(find_backend(request.backend, request.device).solver_settings(suite.physics))
-        results["provenance"] = provenance(
-            command=command,
-            device=request.device,
-            threads=request.threads or count,
-            digests={
-                "policy": prepared.policy.digest,
-                "robot": robot_digest(prepared.robot),
-                "suite": suite.digest,
-                "source": source_digest(),
-            },
-            seconds=round(time.perf_counter() - began, 2),
-            physics_steps=effort.physics_steps,
-            processes=count,
-            set_aside=[path.name for path in store.damaged],
+        scores = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
+        contract = prepared.policy.contract
+        motors = joint_parameters(suite, prepared.robot, contract)
+        result = Result(
+            **vars(scores),
+            policy=PolicyName(
+                path=prepared.policy.path,
+                contract_hash=contract.hash,
+                file_sha256=prepared.policy.file_sha256,
+                observations=tuple(term.name for term in contract.observation),
+                kind_of_observations=kind_of_observations(contract),
+                provenance=without_copy(contract.provenance),
+            ),
+            coverage=coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline),
+            pipeline=request.pipeline,
+            backend=request.backend,
+            robot=prepared.robot.name,
+            motors=Motors(
+                stiffness=motors.stiffness, damping=motors.damping, note=gains_note(suite, prepared.robot, contract)
+            ),
+            health=health([record for outcome in outcomes for record in outcome.records]),
+            solver=dict(find_backend(request.backend, request.device).solver_settings(suite.physics)),
+            provenance=Provenance(
+                **provenance(
+                    command=command,
+                    device=request.device,
+                    threads=request.threads or count,
+                    digests={
+                        "policy": prepared.policy.digest,
+                        "robot": robot_digest(prepared.robot),
+                        "suite": suite.digest,
+                        "source": source_digest(),
+                    },
+                ),
+                seconds=round(time.perf_counter() - began, 2),
+                physics_steps=effort.physics_steps,
+                processes=count,
+                set_aside=tuple(path.name for path in store.damaged),
+                cluster=None
+                if request.cluster is None or not isinstance(workers, ClusterWorkers)
+                else ClusterName(address=request.cluster, processors=tuple(sorted(workers.processors))),
+                engine_seconds=None if effort.engine_seconds is None else round(effort.engine_seconds, 2),
+            ),
         )
-        if isinstance(workers, ClusterWorkers):
-            results["provenance"]["cluster"] = {"address": request.cluster, "processors": sorted(workers.processors)}
-        if effort.engine_seconds is not None:
-            results["provenance"]["engine_seconds"] = round(effort.engine_seconds, 2)
         write_atomically(folder / "episodes.csv", rows_csv(counted), StoreError)
-        write_atomically(folder / "results.json", json_text(results), StoreError)
+        write_atomically(folder / "results.json", json_text(result.to_data()), StoreError)
         store.discard_all_but([record.episode for record in counted])
-    return results
+    return result
 
 
 def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None) -> tuple[Job, int, Speculation]:
-    """What to play with, how many workers play, and what they play speculatively."""
+    """Return the job of the workers, their number, and the rule by which they play speculatively."""
     request, suite = prepared.request, prepared.suite
     places = [
         (e.terrain, level)
@@ -329,7 +330,7 @@ def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None)
 def _watcher(
     prepared: Prepared, watch: Callable[[Status], None] | None, began: float
 ) -> Callable[[Dispatcher], None] | None:
-    """Tells ``watch`` now and then how far playing is."""
+    """Return the function that tells ``watch`` now and then how far playing is."""
     if watch is None:
         return None
     meter = ProgressMeter(prepared.suite, began)

@@ -1,4 +1,4 @@
-"""The three goals: what speed is commanded when (paper table of goals; gauge protocol §3.2 and §3.4)."""
+"""The three goals and their commands over time (paper table of goals; gauge protocol §3.2 and §3.4)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SUB_COMMANDS: dict[str, list[tuple[int, int, int]]] = {
     "max_velocity": [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)],
     "target_pos_velocity": [(0, 0, 0)],
 }
-# What the second phase of a sub-command does with the first one's command.
+# Factor of the second phase of a sub-command on the command of the first one.
 _SECOND_PHASE = {"diagonal_velocity": -1.0, "max_velocity": 0.0}
 
 TARGET = "target_pos_velocity"
@@ -30,7 +30,7 @@ _AXES = ("x", "y", "yaw")
 
 
 def command_name(goal: str, part: int) -> str:
-    """Name of a goal's sub-command for readers: ``max_velocity -x``, ``diagonal_velocity +x+y``, of one's own ``slalom 1``."""
+    """Return the name of a goal's sub-command for readers: ``max_velocity -x``, ``diagonal_velocity +x+y``, of one's own ``slalom 1``."""
     if goal not in SUB_COMMANDS:
         return f"{goal} {part + 1}"
     signs = SUB_COMMANDS[goal][part]
@@ -39,12 +39,12 @@ def command_name(goal: str, part: int) -> str:
 
 
 def count_sub_commands(suite: Suite, goal: str) -> int:
-    """How many sub-commands a suite's goal has; one for the goal that ends at its target."""
+    """Return the number of sub-commands of a suite's goal; one for the goal that ends at its target."""
     return len(SUB_COMMANDS[goal]) if goal in SUB_COMMANDS else len(suite.goal(goal).sub_commands)
 
 
 class Schedule:
-    """What every goal of a suite commands at every control step, worked out in advance.
+    """The commands of every goal of a suite at every control step, worked out in advance.
 
     A sub-command runs from one reset to the next. A goal's clock runs through its sub-commands, starts with one
     control period at the first commanded step, stands still while the robot settles, and adds up rounding errors in double
@@ -68,7 +68,7 @@ class Schedule:
             for g in suite.goals
         }
         """Commands of each sub-command of each goal, one for each step, as multiples of the limits; none for the target goal."""
-        # One long table: zeros for the target goal, whose commands follow from the state, then every sub-command, each after a row
+        # One long table: zeros for the target goal (its commands follow from the state), then every sub-command, each after a row
         # of zeros for the time in which the robot settles.
         zero = (0.0, 0.0, 0.0)
         rows: list[Command] = [zero] * (1 + max(self.target_steps.values(), default=0))
@@ -80,11 +80,11 @@ class Schedule:
         self._rows = torch.tensor(rows, device=device, dtype=dtype)
 
     def first_row(self, goal: str, sub_command: int) -> int:
-        """Where a sub-command begins in the table that ``commands`` reads."""
+        """Return the first row of a sub-command in the table that ``commands`` reads."""
         return self._first[goal, sub_command]
 
     def commands(self, row: torch.Tensor, limits: torch.Tensor) -> torch.Tensor:
-        """Commands of the velocity goals, zero for the target goal: forward, lateral [m/s] and yaw [rad/s], (N, 3).
+        """Return the commands of the velocity goals, zero for the target goal: forward, lateral [m/s] and yaw [rad/s], (N, 3).
 
         Args:
             row: ``first_row`` of each sub-command, plus the number of the commanded step from 1 on, or 0 while settling, (N,) int64.
@@ -96,7 +96,7 @@ class Schedule:
 def _velocity_commands(
     name: str, phases: tuple[float, ...], period: float, early: float
 ) -> tuple[tuple[Command, ...], ...]:
-    """Commands of a velocity goal's sub-commands, step by step. The clock ends the last one, which may be a step short.
+    """Return the commands of a velocity goal's sub-commands, step by step. The clock ends the last one, which may be a step short.
 
     Args:
         phases: length of both phases of a sub-command [s].
@@ -126,7 +126,7 @@ def check_terrain(suite: Suite, terrain: Terrain, *, searched: bool) -> None:
 
     Args:
         terrain: any level of it.
-        searched: whether its target is to be reached.
+        searched: the target is to be reached.
 
     Raises:
         SuiteError: a start, the target, or the suite's speed and time for its family is missing.
@@ -149,7 +149,7 @@ def check_terrain(suite: Suite, terrain: Terrain, *, searched: bool) -> None:
 
 
 def target_offset(state: PhysicsState, target: torch.Tensor, frame: str) -> torch.Tensor:
-    """Target minus base position, (N, 2): in the base's own x-y plane (``body``), or the yawed horizontal one (``horizontal``)."""
+    """Return the target minus base position, (N, 2): in the plane of the base (``body``) or the yawed horizontal one (``horizontal``)."""
     offset = target - state.base_position_w
     if frame == "body":
         return rotate_inverse(state.base_quaternion_w, offset)[:, :2]
@@ -161,13 +161,13 @@ def target_offset(state: PhysicsState, target: torch.Tensor, frame: str) -> torc
 def target_command(
     offset: torch.Tensor, backward: torch.Tensor, speed: torch.Tensor, yaw_limit: torch.Tensor
 ) -> torch.Tensor:
-    """Command that leads to the target: proportional turning and side-stepping, full speed ahead once it is in sight.
+    """Return a command that leads to the target: proportional turning and side-stepping, full speed ahead once it is in sight.
 
     Returns forward, lateral [m/s] and yaw [rad/s], (N, 3).
 
     Args:
         offset: see ``target_offset``, (N, 2).
-        backward: whether the robot is to walk backwards, (N,) bool.
+        backward: robots that walk backwards, (N,) bool.
         speed: forward speed [m/s], (N,).
         yaw_limit: largest yaw rate [rad/s], (N,).
     """

@@ -1,28 +1,43 @@
-"""What is measured of a motion at one instant. Every metric is 1 for a perfect motion and falls with the error; nothing is clamped.
+"""The metrics of a motion at one instant, and their table, which plug-ins extend.
 
-Paper table ``Metrics for the RoboGauge Framework`` and its appendix ``Stability Metric``; gauge protocol §6.2 and §6.5.
+Every metric is 1 for a perfect motion and falls with the error; nothing is clamped. Paper table ``Metrics for the RoboGauge
+Framework`` and its appendix ``Stability Metric``; gauge protocol §6.2 and §6.5.
+
+A plug-in is an entry point of the group ``gaitgauge.metrics``. Its name is that of the metric, its value refers to a ``Metric``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 
 from ..backends.base import PhysicsState
+from ..files.parsing import did_you_mean, shown
+from ..files.plugins import guarded, load_plugin, origin, plugins
 from ..robots.base import Robot
 from ..robots.body_plan import LEG_PARTS, body_plan, joint_ranges, stance_span
 from ..robots.rotation import projected_gravity, rotate_inverse
-from .suite import Metrics, SuiteError
+from .metric_rules import Metrics
+
+GROUP = "gaitgauge.metrics"
+
+
+class MetricError(ValueError):
+    """A metric that does not exist, cannot be loaded, or cannot be measured on a robot; the message is one sentence."""
+
+
+# ---- functions ----------------------------------------------------------------------------------------------------------
 
 
 def linear_velocity(
     quaternion: torch.Tensor, velocity_w: torch.Tensor, command: torch.Tensor, scale: torch.Tensor, kind: str
 ) -> torch.Tensor:
-    """1 - ‖v - v*‖ / scale, with v in the body frame (Lin. Velocity Error), (N,).
+    """Return 1 - ‖v - v*‖ / scale, with v in the body frame (Lin. Velocity Error), (N,).
 
     Args:
         quaternion: base orientation wxyz, (N, 4).
@@ -41,7 +56,7 @@ def linear_velocity(
 def angular_velocity(
     quaternion: torch.Tensor, velocity_b: torch.Tensor, command: torch.Tensor, scale: torch.Tensor, kind: str
 ) -> torch.Tensor:
-    """1 - ‖ω - ω*‖ / scale (Ang. Velocity Error), (N,).
+    """Return 1 - ‖ω - ω*‖ / scale (Ang. Velocity Error), (N,).
 
     Args:
         quaternion: base orientation wxyz, (N, 4).
@@ -59,7 +74,7 @@ def angular_velocity(
 
 
 def joint_limits(position: torch.Tensor, low: torch.Tensor, high: torch.Tensor, full: torch.Tensor) -> torch.Tensor:
-    """1 - RMS over joints of the overshoot outside [low, high] as a share of the full range (Dof Limits).
+    """Return 1 - RMS over joints of the overshoot outside [low, high] as a share of the full range (Dof Limits).
 
     ``position`` (N, W) [rad]; ``low``, ``high``, ``full`` (W,) [rad]; returns (N,).
     """
@@ -68,17 +83,17 @@ def joint_limits(position: torch.Tensor, low: torch.Tensor, high: torch.Tensor, 
 
 
 def joint_power(torque: torch.Tensor, velocity: torch.Tensor, scale: float) -> torch.Tensor:
-    """1 - RMS over joints of |τ q̇| / scale (Dof Power). ``torque`` [N·m], ``velocity`` [rad/s], (N, J); ``scale`` [W]; (N,)."""
+    """Return 1 - RMS over joints of |τ q̇| / scale (Dof Power), (N,). ``torque`` [N·m], ``velocity`` [rad/s], (N, J); ``scale`` [W]."""
     return 1.0 - torch.sqrt(((torque * velocity) ** 2).mean(1)) / scale
 
 
 def orientation(quaternion: torch.Tensor) -> torch.Tensor:
-    """1 - |lateral component of the gravity direction in the body frame| (Orientation Stability): roll alone. (N, 4) to (N,)."""
+    """Return 1 - |lateral component of gravity's direction in the body frame| (Orientation Stability), roll alone: (N, 4) to (N,)."""
     return 1.0 - projected_gravity(quaternion)[:, 1].abs()
 
 
 def torque_smoothness(torque: torch.Tensor, before: torch.Tensor, known: torch.Tensor, scale: float) -> torch.Tensor:
-    """1 - RMS over joints of τ - τ_before, over scale (Torque Smoothness); 1 where no torque before is known.
+    """Return 1 - RMS over joints of τ - τ_before, over scale (Torque Smoothness); 1 where no torque before is known.
 
     ``torque``, ``before`` (N, J) [N·m], ``known`` (N,) bool, ``scale`` [N·m]; returns (N,).
     """
@@ -87,7 +102,7 @@ def torque_smoothness(torque: torch.Tensor, before: torch.Tensor, known: torch.T
 
 
 def zmp_margin(moment: torch.Tensor, force: torch.Tensor, span: float) -> torch.Tensor:
-    """max(0, 1 - ‖(x, y)‖ / span), the zero moment point's distance from the centre of the active contacts (appendix, ZMP Margin).
+    """Return max(0, 1 - d / span) with d = ‖(x, y)‖, the zero moment point's distance from the centre of the contacts (appendix).
 
     By Newton and Euler the inertial and gravitational wrench of all bodies is the opposite of the contact wrench, so the
     paper's x = -M_y/F_z, y = M_x/F_z follow from the contacts alone.
@@ -104,7 +119,7 @@ def zmp_margin(moment: torch.Tensor, force: torch.Tensor, span: float) -> torch.
 
 
 def friction_margin(normal: torch.Tensor, tangential: torch.Tensor, friction: torch.Tensor) -> torch.Tensor:
-    """Normal-force-weighted slack to the friction cone over the feet's contacts (appendix, Coulomb Friction Margin).
+    """Return the normal-force-weighted slack to the friction cone over the feet's contacts (appendix, Coulomb Friction Margin).
 
     With weights f_n/Σf_n the weighted mean of 1 - f_t/(μ f_n) is 1 - Σf_t / (μ Σf_n).
 
@@ -121,7 +136,7 @@ def friction_margin(normal: torch.Tensor, tangential: torch.Tensor, friction: to
 
 
 def quality(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """Weighted geometric mean of the metrics of a sample, each clamped to [1e-9, 1] (gauge protocol §6.3).
+    """Return the weighted geometric mean of the metrics of a sample, each clamped to [1e-9, 1] (gauge protocol §6.3).
 
     Metrics that are not defined (NaN) drop out of the product and of the sum of weights. ``values`` (N, M), ``weights``
     (M,); returns (N,).
@@ -132,13 +147,13 @@ def quality(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
 
 
 def fill_flight(values: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
-    """The metrics of a segment without gaps: where one is not defined stands its mean over the instants that count.
+    """Return the metrics of a segment without gaps: the mean over the instants that count stands where a metric is not defined.
 
-    So flight neither raises nor lowers what contacts say of a motion. Zero where no instant defines the metric.
+    Flight then neither raises nor lowers the contact metrics of a motion. The mean is zero where no instant defines the metric.
 
     Args:
         values: (T, M), NaN where a metric is not defined; clamped to [0, 1] before they are averaged.
-        keep: whether the instant counts, (T,) bool.
+        keep: instants that count, (T,) bool.
     """
     defined = ~torch.isnan(values)
     told = torch.where(defined & keep[:, None], torch.clamp(values, 0.0, 1.0), torch.zeros_like(values))
@@ -146,118 +161,289 @@ def fill_flight(values: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
     return torch.where(defined, values, mean)
 
 
+# ---- the input of a metric ----------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, kw_only=True)
+class MetricConstants:
+    """The values that are the same for all instants of a robot in a suite."""
+
+    rules: Metrics
+    robot: Robot
+    weight: float
+    """Weight of the robot [N]."""
+    device: torch.device
+    dtype: torch.dtype
+
+    @cached_property
+    def limits(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return indices, lower and upper soft limits, and full ranges [rad] of the watched joints, (W,) each.
+
+        ``soft_limit_joints`` names these joints by parts of legs (``LEG_PARTS``), or by parts of their names.
+
+        Raises:
+            MetricError: no such joint has limits.
+        """
+        rules, robot, plan, bounds = self.rules, self.robot, body_plan(self.robot), joint_ranges(self.robot)
+        watched = [
+            j
+            for j, name in enumerate(robot.joint_names)
+            if any(plan.part(j) == part if part in LEG_PARTS else part in name for part in rules.soft_limit_joints)
+            and np.isfinite(bounds[j]).all()
+        ]
+        if not watched:
+            raise MetricError(
+                f"the metric 'dof_limits' watches {', '.join(rules.soft_limit_joints)}, of which robot '{robot.name}' has no "
+                "joint with limits; give its joints a range in the model"
+            )
+        ranges = torch.tensor(bounds[watched], device=self.device, dtype=self.dtype)
+        middle, full = ranges.mean(1), ranges[:, 1] - ranges[:, 0]
+        soft = 0.5 * rules.soft_limit * full
+        return torch.tensor(watched, device=self.device), middle - soft, middle + soft, full
+
+    @cached_property
+    def span(self) -> float:
+        """Return the diagonal stance span [m]."""
+        return stance_span(self.robot) if self.rules.zmp_span is None else self.rules.zmp_span
+
+
 class SampledState:
-    """The part of ``PhysicsState`` that metrics look at, of T samples, in the same frames and units."""
+    """The columns of ``PhysicsState`` that the metrics of a suite need, of N samples, in the same shapes, frames and units."""
 
-    base_quaternion_w: torch.Tensor
-    base_linear_velocity_w: torch.Tensor
-    base_angular_velocity_b: torch.Tensor
-    joint_position: torch.Tensor
-    joint_velocity: torch.Tensor
-    joint_torque: torch.Tensor
-    ground_moment_w: torch.Tensor
-    ground_force_w: torch.Tensor
-    foot_normal_force: torch.Tensor
-    foot_tangential_force: torch.Tensor
+    def __init__(self, columns: Mapping[str, torch.Tensor]) -> None:
+        self._columns = columns
+
+    def __getattr__(self, name: str) -> torch.Tensor:
+        try:
+            return self.__dict__["_columns"][name]
+        except KeyError:
+            raise MetricError(f"a metric reads {shown(name)} of the state; name it in the metric's 'state'") from None
 
 
-def _joints_of(robot: Robot, parts: tuple[str, ...]) -> list[int]:
-    """Joints that a suite names by parts of legs (``LEG_PARTS``), or by parts of their names."""
-    plan = body_plan(robot)
-    return [
-        j
-        for j, name in enumerate(robot.joint_names)
-        if any(plan.part(j) == part if part in LEG_PARTS else part in name for part in parts)
-    ]
+@dataclass(frozen=True, kw_only=True)
+class Instants:
+    """N instants of one robot's motion: the input of a metric."""
+
+    state: SampledState | PhysicsState
+    command: torch.Tensor
+    """Commanded velocities, forward, lateral [m/s] and yaw [rad/s], (N, 3)."""
+    limits: torch.Tensor
+    """Limits of the commands, (N, 3)."""
+    friction: torch.Tensor
+    """Friction coefficient, (N,)."""
+    torque_before: torch.Tensor
+    """Joint torque at the instant before [N·m], (N, J)."""
+    torque_known: torch.Tensor
+    """Instants with a torque before, (N,) bool."""
+    constants: MetricConstants
+
+    def with_contact(self, force: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return values, (N,), with NaN where ``force`` [N], (N,), is too small a share of the weight (``contact_share``)."""
+        carried = force > self.constants.rules.contact_share * self.constants.weight
+        return torch.where(carried, values, torch.full_like(values, math.nan))
+
+
+# ---- the table ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """One entry of the table."""
+
+    function: Callable[[Instants], torch.Tensor]
+    """Values of N instants, (N,): 1 for a perfect motion, smaller for a worse one, NaN where the metric is not defined."""
+    state: tuple[str, ...]
+    """Fields of ``PhysicsState`` that the function reads."""
+    label: str
+    """Name in a report."""
+    short_label: str = ""
+    """Name at the head of a column; the same as ``label`` if empty."""
+    group: str = ""
+    """Group in ``gaitgauge validate``: ``tracking``, ``safety``, ``quality`` or another; none if empty. In a score, the suite groups."""
+    prepare: Callable[[MetricConstants], object] | None = None
+    """Called before anything is played: works out constants from the robot's files, which may be gone later, and raises
+    ``MetricError`` if the metric cannot be measured on the robot."""
+
+
+def _linear_velocity(at: Instants) -> torch.Tensor:
+    scale, kind = torch.hypot(at.limits[:, 0], at.limits[:, 1]), at.constants.rules.linear_velocity
+    return linear_velocity(at.state.base_quaternion_w, at.state.base_linear_velocity_w, at.command, scale, kind)
+
+
+def _angular_velocity(at: Instants) -> torch.Tensor:
+    scale, kind = at.limits[:, 2], at.constants.rules.angular_velocity
+    return angular_velocity(at.state.base_quaternion_w, at.state.base_angular_velocity_b, at.command, scale, kind)
+
+
+def _joint_limits(at: Instants) -> torch.Tensor:
+    joints, *limits = at.constants.limits
+    return joint_limits(at.state.joint_position[:, joints], *limits)
+
+
+def _zmp_margin(at: Instants) -> torch.Tensor:
+    force = at.state.ground_force_w
+    return at.with_contact(force[:, 2], zmp_margin(at.state.ground_moment_w, force, at.constants.span))
+
+
+def _friction_margin(at: Instants) -> torch.Tensor:
+    normal = at.state.foot_normal_force
+    return at.with_contact(normal.sum(1), friction_margin(normal, at.state.foot_tangential_force, at.friction))
+
+
+METRICS: Mapping[str, Metric] = {
+    "lin_vel_err": Metric(
+        function=_linear_velocity,
+        state=("base_quaternion_w", "base_linear_velocity_w"),
+        label="linear velocity tracking",
+        short_label="linear velocity",
+        group="tracking",
+    ),
+    "ang_vel_err": Metric(
+        function=_angular_velocity,
+        state=("base_quaternion_w", "base_angular_velocity_b"),
+        label="angular velocity tracking",
+        short_label="angular velocity",
+        group="tracking",
+    ),
+    "dof_limits": Metric(
+        function=_joint_limits,
+        state=("joint_position",),
+        label="joint limits",
+        group="safety",
+        prepare=lambda constants: constants.limits,
+    ),
+    "dof_power": Metric(
+        function=lambda at: joint_power(at.state.joint_torque, at.state.joint_velocity, at.constants.rules.power_scale),
+        state=("joint_torque", "joint_velocity"),
+        label="joint power",
+        group="safety",
+    ),
+    "orientation_stability": Metric(
+        function=lambda at: orientation(at.state.base_quaternion_w),
+        state=("base_quaternion_w",),
+        label="orientation stability",
+        short_label="orien\u00adtation",
+        group="quality",
+    ),
+    "torque_smoothness": Metric(
+        function=lambda at: torque_smoothness(
+            at.state.joint_torque, at.torque_before, at.torque_known, at.constants.rules.torque_scale
+        ),
+        state=("joint_torque",),
+        label="torque smoothness",
+        short_label="smooth\u00adness",
+        group="quality",
+    ),
+    "zmp_margin": Metric(
+        function=_zmp_margin,
+        state=("ground_moment_w", "ground_force_w"),
+        label="ZMP margin",
+        group="quality",
+        prepare=lambda constants: constants.span,
+    ),
+    "friction_margin": Metric(
+        function=_friction_margin,
+        state=("foot_normal_force", "foot_tangential_force"),
+        label="friction margin",
+        group="quality",
+    ),
+}
+"""The metrics of the project."""
+
+
+def metric_names() -> list[str]:
+    """Return the names of all metrics that a suite can weigh, the project's own first."""
+    return list(METRICS) + sorted(set(plugins(GROUP)) - set(METRICS))
+
+
+def find_metric(name: str) -> Metric:
+    """Return a metric by its name.
+
+    Raises:
+        MetricError: no such metric, or a plug-in that cannot be loaded or gives no proper ``Metric``.
+    """
+    if name in METRICS:
+        return METRICS[name]
+    plugin = plugins(GROUP).get(name)
+    if plugin is None:
+        known = metric_names()
+        hint = did_you_mean(name, known) or ";"
+        raise MetricError(f"metrics.weights has the unknown metric {shown(name)}{hint} choose from {', '.join(known)}")
+    metric = load_plugin(plugin, MetricError)
+    if not isinstance(metric, Metric):
+        raise MetricError(f"{origin(plugin)} gave {shown(type(metric).__name__)}; it must be a Metric")
+    columns = [field.name for field in fields(PhysicsState)]
+    if missing := [column for column in metric.state if column not in columns]:
+        raise MetricError(f"{origin(plugin)} reads the state {shown(missing[0])}; choose from {', '.join(columns)}")
+    prepare = metric.prepare and partial(guarded, plugin, MetricError, metric.prepare)
+    return replace(metric, function=partial(guarded, plugin, MetricError, metric.function), prepare=prepare)
+
+
+def metric_label(name: str, *, short: bool = False) -> str:
+    """Return a metric's name for readers; a metric that is not installed here, or broken, goes by its own name."""
+    try:
+        metric = find_metric(name)
+    except MetricError:
+        return name.replace("_", " ")
+    return (short and metric.short_label) or metric.label
+
+
+def metric_groups(names: Collection[str]) -> dict[str, list[str]]:
+    """Return those metrics that have a group, by group; any other names are left out."""
+    groups: dict[str, list[str]] = {}
+    for name in metric_names():
+        if name in names and (group := find_metric(name).group):
+            groups.setdefault(group, []).append(name)
+    return groups
 
 
 class MetricEvaluator:
     """All metrics of a suite for N instants at once."""
 
-    def __init__(self, metrics: Metrics, robot: Robot, weight: float, device: torch.device, dtype: torch.dtype) -> None:
-        """Prepare the constants; ``weight`` is that of the robot [N]."""
-        self.names = tuple(metrics.weights)
-        self.needs_contacts = not {"zmp_margin", "friction_margin"}.isdisjoint(self.names)
-        self._metrics = metrics
-        self._weight = weight
-        self._weights = torch.tensor([metrics.weights[n] for n in self.names], device=device, dtype=dtype)
-        bounds = joint_ranges(robot)
-        watched = [j for j in _joints_of(robot, metrics.soft_limit_joints) if np.isfinite(bounds[j]).all()]
-        if not watched and "dof_limits" in self.names:
-            raise SuiteError(
-                f"the metric 'dof_limits' watches {', '.join(metrics.soft_limit_joints)}, of which robot '{robot.name}' has no "
-                "joint with limits; give its joints a range in the model"
-            )
-        ranges = torch.tensor(bounds[watched].reshape(-1, 2), device=device, dtype=dtype)
-        middle, self._full = ranges.mean(1), ranges[:, 1] - ranges[:, 0]
-        self._low, self._high = (
-            middle - 0.5 * metrics.soft_limit * self._full,
-            middle + 0.5 * metrics.soft_limit * self._full,
-        )
-        self._watched = torch.tensor(watched, device=device)
-        self._span = stance_span(robot) if metrics.zmp_span is None else metrics.zmp_span
+    def __init__(self, rules: Metrics, robot: Robot, weight: float, device: torch.device, dtype: torch.dtype) -> None:
+        """Find the metrics; ``weight`` is that of the robot [N].
 
-    def evaluate(
-        self,
-        state: SampledState | PhysicsState,
-        command: torch.Tensor,
-        limits: torch.Tensor,
-        friction: torch.Tensor,
-        torque_before: torch.Tensor,
-        torque_known: torch.Tensor,
-    ) -> torch.Tensor:
-        """Metrics of one instant, (N, M), NaN where a metric is not defined.
-
-        Args:
-            state: N instants; contacts are looked at only if ``needs_contacts``.
-            command: commanded velocities, (N, 3).
-            limits: command limits, (N, 3): their norm and the yaw limit scale the tracking errors.
-            friction: friction coefficient, (N,).
-            torque_before: torque to compare with [N·m], (N, J).
-            torque_known: whether there is one, (N,) bool.
+        Raises:
+            MetricError: a metric cannot be loaded, or not be measured on the robot.
         """
-        m, columns = self._metrics, []
-        for name in self.names:
-            if name == "lin_vel_err":
-                scale = torch.hypot(limits[:, 0], limits[:, 1])
-                value = linear_velocity(
-                    state.base_quaternion_w, state.base_linear_velocity_w, command, scale, m.linear_velocity
+        self.names = tuple(rules.weights)
+        self.constants = MetricConstants(rules=rules, robot=robot, weight=weight, device=device, dtype=dtype)
+        self._metrics = {name: find_metric(name) for name in self.names}
+        needed = {column for metric in self._metrics.values() for column in metric.state}
+        self.columns = tuple(field.name for field in fields(PhysicsState) if field.name in needed)
+        """Fields of ``PhysicsState`` that the metrics read."""
+        self._weights = torch.tensor([rules.weights[n] for n in self.names], device=device, dtype=dtype)
+        for metric in self._metrics.values():
+            if metric.prepare is not None:
+                metric.prepare(self.constants)
+
+    def evaluate(self, instants: Instants) -> torch.Tensor:
+        """Return the metrics of N instants, (N, M), NaN where a metric is not defined.
+
+        Raises:
+            MetricError: a plug-in fails, or gives values of another shape.
+        """
+        columns = []
+        for name, metric in self._metrics.items():
+            value, like = metric.function(instants), instants.friction
+            if not isinstance(value, torch.Tensor) or value.shape != like.shape:
+                found = list(value.shape) if isinstance(value, torch.Tensor) else shown(type(value).__name__)
+                raise MetricError(
+                    f"metric {shown(name)} gave {found}; it must give a tensor of shape {list(like.shape)}"
                 )
-            elif name == "ang_vel_err":
-                value = angular_velocity(
-                    state.base_quaternion_w, state.base_angular_velocity_b, command, limits[:, 2], m.angular_velocity
-                )
-            elif name == "dof_limits":
-                value = joint_limits(state.joint_position[:, self._watched], self._low, self._high, self._full)
-            elif name == "dof_power":
-                value = joint_power(state.joint_torque, state.joint_velocity, m.power_scale)
-            elif name == "orientation_stability":
-                value = orientation(state.base_quaternion_w)
-            elif name == "torque_smoothness":
-                value = torque_smoothness(state.joint_torque, torque_before, torque_known, m.torque_scale)
-            elif name == "zmp_margin":
-                value = zmp_margin(state.ground_moment_w, state.ground_force_w, self._span)
-                carried = state.ground_force_w[:, 2] > m.contact_share * self._weight
-                value = torch.where(carried, value, torch.full_like(value, math.nan))
-            else:
-                assert name == "friction_margin"  # the last of METRIC_NAMES
-                value = friction_margin(state.foot_normal_force, state.foot_tangential_force, friction)
-                carried = state.foot_normal_force.sum(1) > m.contact_share * self._weight
-                value = torch.where(carried, value, torch.full_like(value, math.nan))
-            columns.append(value)
+            columns.append(value.to(like.dtype))
         return torch.stack(columns, dim=1)
 
     def with_quality(self, values: torch.Tensor, keep: torch.Tensor, counts: Sequence[int]) -> torch.Tensor:
-        """The metrics, and the quality of each instant as their last column, (N, M + 1).
+        """Return the metrics, and the quality of each instant as their last column, (N, M + 1).
 
         Args:
             values: metrics of the instants of some segments, one after the other, (N, M).
-            keep: whether each counts, (N,) bool.
+            keep: instants that count, (N,) bool.
             counts: number of instants of each segment.
         """
         seen = values
-        if self.needs_contacts and self._metrics.flight == "filled":
+        if self.constants.rules.flight == "filled":
             pieces = zip(values.split(list(counts)), keep.split(list(counts)), strict=True)
             seen = torch.cat([fill_flight(*piece) for piece in pieces])
         return torch.cat((values, quality(seen, self._weights)[:, None]), dim=1)

@@ -1,4 +1,4 @@
-"""Folds the records of a finished plan into ``results.json``: scores, groups, terrains, metrics, environments, with intervals."""
+"""Fold the records of a finished plan into scores: of groups, terrains, metrics and environments, with intervals."""
 
 from __future__ import annotations
 
@@ -6,25 +6,37 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
-from .chance.intervals import CONFIDENCE, ChanceRules, Evidence
+from .chance.intervals import Evidence
 from .chance.level_curve import bracketing_levels, fitted_curve
-from .episodes import Record
+from .episodes import QUALITY, Record
 from .goals import command_name, count_sub_commands
 from .plan import EnvironmentResult
+from .result import (
+    FLAT,
+    ChanceRules,
+    EnvironmentRow,
+    Health,
+    Interval,
+    MetricScore,
+    Run,
+    Scores,
+    Statistics,
+    SuiteName,
+    TerrainScore,
+)
 from .scoring import STATISTICS, Array, command_statistics, group_values, level_score, rounded, run_statistics
 from .suite import Suite
 
-SCHEMA = 2
 ONE_SEED = "no interval: one seed"
 
 
 def chance_rules(suite: Suite, seeds: Sequence[int]) -> ChanceRules:
-    """What a suite says about chance, with the quality seeds that were played."""
+    """Return the rules of a suite that decide about chance, with the quality seeds that were played."""
     scoring = suite.scoring
     return ChanceRules(
         level_weight=scoring.level_weight,
@@ -42,132 +54,120 @@ def chance_rules(suite: Suite, seeds: Sequence[int]) -> ChanceRules:
 
 def fold(
     suite: Suite, environments: Sequence[EnvironmentResult], columns: Sequence[str], *, evaluated: bool | None = None
-) -> dict[str, Any]:
-    """Everything of ``results.json`` but the policy and the provenance.
+) -> Scores:
+    """Return the scores of an evaluation.
 
     Args:
         environments: all of them with their level, and their quality episodes where these were played.
         columns: the metrics, then ``quality``.
-        evaluated: whether quality was asked for, and not the level alone; None: if any environment has quality episodes. Where
+        evaluated: True where quality was asked for, and not the level alone; None: if any environment has quality episodes. Where
             it was and no level is passed anywhere, the score is 0 and not absent.
 
     Returns:
-        Plain data. Scores rest on mean@50: an environment's is its quality's (``scoring.level_score``), a terrain's the mean over
+        Scores that rest on mean@50: an environment's is its quality's (``scoring.level_score``), a terrain's the mean over
         its environments, the benchmark's the mean over terrains. Intervals are those of ``intervals``: what other seeds would
-        have changed, the levels included; null where one seed shows no spread.
+        have changed, the levels included; None where one seed shows no spread.
     """
-    scoring, metrics = suite.scoring, list(columns[:-1])
-    rows: list[dict[str, Any]] = []
-    values: dict[str, dict[str, Array]] = {}
-    for environment in environments:
-        row, statistics = _environment(suite, environment, list(columns))
-        rows.append(row)
-        values[environment.key] = statistics
+    scoring, levels = suite.scoring, (0.0, float(suite.scoring.levels))
+    folded = [_environment(suite, environment, list(columns)) for environment in environments]
+    rows, values = tuple(row for row, _ in folded), [statistics for _, statistics in folded]
     if evaluated is None:
         evaluated = any(e.records for e in environments)
     played = next((dict.fromkeys(r.episode.seed for r in e.records) for e in environments if e.records), None)
-    seeds = list(suite.matrix.seeds if played is None else played)
-    rules = chance_rules(suite, seeds)
+    rules = chance_rules(suite, suite.matrix.seeds if played is None else list(played))
     evidence = Evidence(rows, rules)
-    weights = environment_weights([e.terrain for e in environments])
-    levelled = np.array([e.terrain != "flat" for e in environments], dtype=np.float64)
-    result: dict[str, Any] = {
-        "schema": SCHEMA,
-        "suite": {"name": suite.name, "version": suite.version, "title": suite.title, "digest": suite.digest},
-        "chance": {"confidence": CONFIDENCE, **asdict(rules), "note": None},
-        "score": None,
-        "score_interval": None,
-        "groups": {},
-        "group_metrics": {g: list(names) for g, names in scoring.groups.items()},
-        "level": _mean_level(environments) if levelled.any() else None,
-        "level_interval": None,
-        "terrains": {},
-        "metrics": {},
-        "environments": rows,
-    }
-    if any(e.searched for e in environments):
-        chance = evidence.level_chance(levelled / levelled.sum())
-        result["level_interval"] = _interval(chance.interval(result["level"], (0.0, scoring.levels)))
-    per_terrain: dict[str, Array] = {}
+
+    def level_interval(level: float | None, weights: Array) -> Interval | None:
+        return None if level is None else _interval(evidence.level_chance(weights).interval(level, levels))
+
+    def interval(value: float, weights: Array, columns: Sequence[str] = (QUALITY,)) -> Interval | None:
+        return _interval(evidence.chance(weights, columns).interval(value))
+
+    terrains, scores = {}, []
     for terrain in dict.fromkeys(e.terrain for e in environments):
         group = [e for e in environments if e.terrain == terrain]
-        mine = np.array([e.terrain == terrain for e in environments]) / len(group)
-        item: dict[str, Any] = {"level": None, "level_interval": None}
-        if terrain != "flat":
-            item["level"] = _mean_level(group)
-        if any(e.searched for e in group):
-            chance = evidence.level_chance(mine)
-            item["level_interval"] = _interval(chance.interval(item["level"], (0.0, scoring.levels)))
+        mine = np.array([e.terrain == terrain for e in environments])
+        weights, level = mine / len(group), None if terrain == FLAT else _mean_level(group)
+        found = TerrainScore(
+            level=level, level_interval=level_interval(level, weights) if any(e.searched for e in group) else None
+        )
         if evaluated:
-            per_terrain[terrain] = np.mean([values[e.key]["score"] for e in group], axis=0)
-            score = _number(per_terrain[terrain][2])
-            item = {"score": score, "interval": _interval(evidence.chance(mine).interval(score)), **item}
-            item |= {s: _number(v) for s, v in zip(STATISTICS, per_terrain[terrain], strict=True)}
-        result["terrains"][terrain] = item
+            statistics = np.mean([v["score"] for v, own in zip(values, mine, strict=True) if own], axis=0)
+            scores.append(statistics[2])
+            score = _number(statistics[2])
+            found = replace(found, score=score, interval=interval(score, weights), **_named(statistics))
+        terrains[terrain] = found
+    levelled = np.array([e.terrain != FLAT for e in environments], dtype=np.float64)
+    level = _mean_level(environments) if levelled.any() else None
+    searched = any(e.searched for e in environments)
+    whole = Scores(
+        suite=SuiteName(name=suite.name, version=suite.version, title=suite.title, digest=suite.digest),
+        chance=rules,
+        score=None,
+        group_metrics={g: tuple(names) for g, names in scoring.groups.items()},
+        level=level,
+        level_interval=level_interval(level, levelled / levelled.sum()) if searched else None,
+        terrains=terrains,
+        environments=rows,
+    )
     if not evaluated:
-        return result
-    for at, row in enumerate(rows):
-        alone = np.eye(len(rows))[at]
-        row["interval"] = _interval(evidence.chance(alone).interval(row["score"]))
-    result["score"] = _number(np.mean([v[2] for v in per_terrain.values()]))
-    overall = evidence.chance(weights)
-    result["score_interval"] = _interval(overall.interval(result["score"]))
-    result["chance"]["note"] = None if overall.known else ONE_SEED
-    weighted: dict[str, Array] = {}
-    even = np.full(len(rows), 1.0 / len(rows))
-    for metric in metrics:
-        weighted[metric] = np.mean([values[e.key][metric] for e in environments], axis=0)
-        chance = evidence.chance(even, (metric,))
-        result["metrics"][metric] = {s: _number(v) for s, v in zip(STATISTICS, weighted[metric], strict=True)}
-        result["metrics"][metric]["interval"] = _interval(chance.interval(float(weighted[metric][2])))
+        return whole
+    score, weights = _number(np.mean(scores)), environment_weights([e.terrain for e in environments])
+    even, each = np.full(len(rows), 1.0 / len(rows)), np.eye(len(rows))
+    weighted = {m: np.mean([v[m] for v in values], axis=0) for m in columns[:-1]}
     groups = group_values({m: float(v[2]) for m, v in weighted.items()}, scoring)
-    result["groups"] = {g: _number(v) for g, v in groups.items()}
-    result["groups_interval"] = {
-        g: _interval(evidence.chance(even, names).interval(groups[g])) for g, names in scoring.groups.items()
-    }
-    return result
+    return replace(
+        whole,
+        chance=replace(rules, note=None if evidence.chance(weights).known else ONE_SEED),
+        score=score,
+        score_interval=interval(score, weights),
+        groups={g: _number(v) for g, v in groups.items()},
+        metrics={m: MetricScore(**_named(v), interval=interval(float(v[2]), even, (m,))) for m, v in weighted.items()},
+        environments=tuple(
+            replace(row, interval=interval(row.score or 0.0, alone)) for row, alone in zip(rows, each, strict=True)
+        ),
+        groups_interval={g: interval(groups[g], even, names) for g, names in scoring.groups.items()},
+    )
 
 
 def environment_weights(terrains: Sequence[str]) -> Array:
-    """Weight of each environment in the benchmark's score: terrains count the same, and so do the environments of one, (E,)."""
+    """Return the weight of each environment in the benchmark's score, (E,): terrains count the same, and so do the environments
+    of one.
+    """
     counts = Counter(terrains)
     return np.array([1.0 / (len(counts) * counts[t]) for t in terrains])
 
 
 def _level(found: float | None) -> float | None:
-    """A level as results have it: a whole number as such."""
+    """Return a level as results have it: a whole number as such."""
     return None if found is None else int(found) if found == int(found) else _number(found)
 
 
 def _mean_level(environments: Sequence[EnvironmentResult]) -> float:
-    return float(np.mean([e.level or 0 for e in environments if e.terrain != "flat"]))
+    return float(np.mean([e.level or 0 for e in environments if e.terrain != FLAT]))
 
 
 def _environment(
     suite: Suite, environment: EnvironmentResult, columns: list[str]
-) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Row of one environment, and its level-weighted statistics by column and ``score``."""
-    scoring, flat, level = suite.scoring, environment.terrain == "flat", environment.level or 0
+) -> tuple[EnvironmentRow, dict[str, Array]]:
+    """Return the row of one environment, and its level-weighted statistics by column and ``score``."""
+    scoring, flat, level = suite.scoring, environment.terrain == FLAT, environment.level or 0
     statistics = {n: np.zeros(3) for n in [*columns[:-1], "score"]}
-    row: dict[str, Any] = {
-        "terrain": environment.terrain,
-        "friction": environment.friction,
-        "payload": environment.payload,
-        "level": None if flat else _level(environment.level),
-        "quality": None,
-        "score": None,
-        "interval": None,
-    }
+    row = EnvironmentRow(
+        terrain=environment.terrain,
+        friction=environment.friction,
+        payload=environment.payload,
+        level=None if flat else _level(environment.level),
+        score=0.0 if environment.level == 0 and not flat else None,
+    )
     if environment.search is not None:
-        row["search"] = {str(level): passed for level, passed in sorted(environment.search.items())}
-        row["trials"] = {str(level): {} for level in sorted({t.episode.level for t in environment.trials})}
+        trials: dict[int, dict[int, bool]] = {at: {} for at in sorted({t.episode.level for t in environment.trials})}
         for trial in sorted(environment.trials, key=lambda t: t.episode):
-            row["trials"][str(trial.episode.level)][str(trial.episode.seed)] = bool(trial.success)
+            trials[trial.episode.level][trial.episode.seed] = bool(trial.success)
+        row = replace(row, search=dict(sorted(environment.search.items())), trials=trials)
         if scoring.level == "curve":
-            fit = fitted_curve({int(at): list(found.values()) for at, found in row["trials"].items()})
-            row["curve"] = {str(at): _number(share) for at, share in fit.items()}
-    if environment.level == 0 and not flat:
-        row["score"] = 0.0
+            fit = fitted_curve({at: list(found.values()) for at, found in trials.items()})
+            row = replace(row, curve={at: _number(share) for at, share in fit.items()})
     if not environment.records:
         return row, statistics
     weights = {0: 1.0} if flat else bracketing_levels(level)
@@ -175,46 +175,56 @@ def _environment(
     for record in environment.records:
         of_seed.setdefault(record.episode.seed, []).append((weights[record.episode.level], record))
     plain: dict[str, Array] = {}
-    row["runs"] = {str(seed): {} for seed in of_seed}
+    measured: dict[int, dict[str, float]] = {seed: {} for seed in of_seed}
     for index, column in enumerate(columns):
         runs = [
             rounded(np.sum([weight * run_statistics(r, index) for weight, r in found], axis=0), scoring)
             for found in of_seed.values()
         ]
-        mean = rounded(np.mean(runs, axis=0), scoring)
-        plain[column] = mean
+        plain[column] = rounded(np.mean(runs, axis=0), scoring)
         name = column if index < len(columns) - 1 else "score"
         # the reference rounds every run's score before it averages
         weighted = [rounded(np.asarray(level_score(v, level, scoring, flat=flat)), scoring) for v in runs]
         statistics[name] = rounded(np.mean(weighted, axis=0), scoring)
-        for run, values in zip(row["runs"].values(), runs, strict=True):
+        for run, values in zip(measured.values(), runs, strict=True):
             run[column] = _number(values[2])
-    for seed, found in of_seed.items():
-        row["runs"][str(seed)]["commands"] = _commands(suite, found, len(columns) - 1)
-    if len(weights) > 1:
-        row["runs_by_level"] = {str(at): _runs_at(suite, environment, at, columns) for at in weights}
-    row["quality"] = {s: _number(v) for s, v in zip(STATISTICS, plain[columns[-1]], strict=True)}
-    row["score"] = _number(statistics["score"][2])
-    row["metrics"] = {c: {s: _number(v) for s, v in zip(STATISTICS, plain[c], strict=True)} for c in columns[:-1]}
-    row["falls"] = sum(r.falls for r in environment.records)
-    for name in ("diverged", "overflowed", "restarted"):
-        row[name] = sum(bool(getattr(r, name)) for r in environment.records)
-    row["self_contact"] = self_contact(environment.records)
-    return row, statistics
+    return replace(
+        row,
+        quality=Statistics(**_named(plain[columns[-1]])),
+        score=_number(statistics["score"][2]),
+        runs={
+            seed: Run(columns=measured[seed], commands=_commands(suite, found, len(columns) - 1))
+            for seed, found in of_seed.items()
+        },
+        runs_by_level={at: _runs_at(suite, environment, at, columns) for at in weights} if len(weights) > 1 else {},
+        metrics={c: Statistics(**_named(plain[c])) for c in columns[:-1]},
+        falls=sum(r.falls for r in environment.records),
+        diverged=sum(bool(r.diverged) for r in environment.records),
+        overflowed=sum(bool(r.overflowed) for r in environment.records),
+        restarted=sum(bool(r.restarted) for r in environment.records),
+        self_contact=self_contact(environment.records),
+    ), statistics
 
 
-def _runs_at(suite: Suite, environment: EnvironmentResult, level: int, columns: Sequence[str]) -> dict[str, Any]:
-    """The runs at one of the two levels beside an expected one, as ``runs`` has them in between."""
-    runs: dict[str, Any] = {}
-    for record in environment.records:
-        if record.episode.level == level:
-            run = {column: _number(run_statistics(record, index)[2]) for index, column in enumerate(columns)}
-            runs[str(record.episode.seed)] = run | {"commands": _commands(suite, [(1.0, record)], len(columns) - 1)}
-    return runs
+def _named(values: Array) -> dict[str, Any]:
+    """Return the statistics of a column by name."""
+    return {name: _number(value) for name, value in zip(STATISTICS, values, strict=True)}
+
+
+def _runs_at(suite: Suite, environment: EnvironmentResult, level: int, columns: Sequence[str]) -> dict[int, Run]:
+    """Return the runs at one of the two levels beside an expected one, as ``runs`` has them in between."""
+    return {
+        record.episode.seed: Run(
+            columns={column: _number(run_statistics(record, index)[2]) for index, column in enumerate(columns)},
+            commands=_commands(suite, [(1.0, record)], len(columns) - 1),
+        )
+        for record in environment.records
+        if record.episode.level == level
+    }
 
 
 def _commands(suite: Suite, found: Sequence[tuple[float, Record]], column: int) -> dict[str, float]:
-    """Mean@50 of a column in each sub-command of a run, from its records at one or two levels and their weights."""
+    """Return mean@50 of a column in each sub-command of a run, from its records at one or two levels and their weights."""
     values: dict[str, float] = {}
     for weight, record in found:
         played = command_statistics(record, column)
@@ -230,8 +240,8 @@ def _number(value: float | np.floating) -> float:
     return float(round(float(value), 6))
 
 
-def _interval(found: tuple[float, float] | None) -> list[float] | None:
-    return None if found is None else [_number(found[0]), _number(found[1])]
+def _interval(found: tuple[float, float] | None) -> Interval | None:
+    return None if found is None else (_number(found[0]), _number(found[1]))
 
 
 ALL = "all"
@@ -239,7 +249,7 @@ ALL = "all"
 
 
 def rows_csv(records: Sequence[Record]) -> str:
-    """Episodes as CSV text: a row for each (``command`` is ``all``), then one for each of its sub-commands that was played.
+    """Return episodes as CSV text: a row for each (``command`` is ``all``), then one for each of its sub-commands that was played.
 
     Every metric and the quality have three columns, ``_mean``, ``_mean25`` and ``_mean50``, as measured and without the weight of
     the level: of the whole episode as its score takes them, averaged over goals; of a sub-command over its samples. They are empty
@@ -276,23 +286,23 @@ def rows_csv(records: Sequence[Record]) -> str:
 
 
 def _numbers(names: Sequence[str], values: Sequence[Array]) -> dict[str, float]:
-    """The statistics of all columns under their names; nothing where there are no values."""
+    """Return the statistics of all columns under their names; nothing where there are no values."""
     return dict(zip(names, (_number(v) for v in np.ravel(np.asarray(values))), strict=bool(values)))
 
 
 def self_contact(records: Collection[Record]) -> float | None:
-    """Share of the samples in which parts of the robot touch each other; None where there are none, or a record does not say."""
+    """Return the share of the samples in which parts of the robot touch each other; None where there are none, or a record does not say."""
     touching = [r.touching for r in records if len(r.samples)]
     known = [t for t in touching if t is not None]
     return _number(np.concatenate(known).mean()) if known and len(known) == len(touching) else None
 
 
-def health(records: Collection[Record]) -> dict[str, float | None]:
-    """How many episodes there are, how many of them fell, diverged or dropped contacts, and how often parts of the robot touched."""
-    return {
-        "episodes": len(records),
-        "falls": sum(r.falls for r in records),
-        "diverged": sum(r.diverged for r in records),
-        "overflowed": sum(r.overflowed for r in records),
-        "self_contact": self_contact(records),
-    }
+def health(records: Collection[Record]) -> Health:
+    """Return how many quality episodes there are, fell, diverged or dropped contacts, and how often parts of the robot touched."""
+    return Health(
+        episodes=len(records),
+        falls=sum(r.falls for r in records),
+        diverged=sum(r.diverged for r in records),
+        overflowed=sum(r.overflowed for r in records),
+        self_contact=self_contact(records),
+    )

@@ -1,4 +1,4 @@
-"""What a score depends on, as versioned data: one TOML file for each suite in ``gauge/suites/``."""
+"""The rules that a score depends on, as versioned data: one TOML file for each suite in ``gauge/suites/``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from ..backends.base import PhysicsOptions
 from ..files.parsing import (
     Name,
     NotNegative,
-    Positive,
     Seed,
     Share,
     Text,
@@ -28,6 +27,7 @@ from ..files.parsing import (
 )
 from ..terrains.registry import terrain_names
 from .commands import Phase
+from .metric_rules import Metrics
 
 SUITE_FOLDER = Path(__file__).parent / "suites"
 
@@ -44,19 +44,8 @@ Friction = Annotated[float, Field(gt=0.0, le=MOST_FRICTION)]
 Payload = Annotated[float, Field(ge=LEAST_PAYLOAD, le=MOST_PAYLOAD)]
 """Mass added to the base [kg]."""
 GoalName = Literal["diagonal_velocity", "max_velocity", "target_pos_velocity"]
-"""The paper's goals, whose commands are written in ``goals.py``: the reference's clock and its rounding errors are part of them."""
+"""The paper's goals. Their commands are code (``goals.py``), with the reference's clock and its rounding errors."""
 _AIMED = "target_pos_velocity"
-METRIC_NAMES = (
-    "lin_vel_err",
-    "ang_vel_err",
-    "dof_limits",
-    "dof_power",
-    "orientation_stability",
-    "torque_smoothness",
-    "zmp_margin",
-    "friction_margin",
-)
-"""What ``metrics.py`` measures."""
 
 
 class SuiteError(ValueError):
@@ -68,13 +57,13 @@ class Goal:
     """One kind of motion, made of sub-commands. The robot goes back to the spawn after each of them."""
 
     name: Name
-    """One of ``GoalName``, whose commands are the paper's, or any other for a goal that is all data."""
+    """One of ``GoalName``, with the paper's commands, or any other for a goal that is all data."""
     phases: tuple[_Time, ...] = ()
     """Length of each phase of a sub-command of the paper's goals [s]; empty for the one that ends at its target."""
     sub_commands: Annotated[
         tuple[Annotated[tuple[Phase, ...], Field(min_length=1, max_length=100)], ...], Field(max_length=100)
     ] = ()
-    """What a goal of one's own commands: its sub-commands, each a row of phases."""
+    """Sub-commands of a goal of one's own, each a row of phases."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +130,7 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class Events:
-    """What interrupts an episode."""
+    """Events that interrupt an episode."""
 
     fall_tilt: _Tilt
     """Tilt of the base that counts as a fall [rad]."""
@@ -153,7 +142,7 @@ class Events:
 
 @dataclass(frozen=True, kw_only=True)
 class Settling:
-    """How an episode waits for the robot to stand after a reset."""
+    """The time after a reset until the robot stands."""
 
     speed: NotNegative
     """Base speed below which the robot stands [m/s]."""
@@ -162,45 +151,12 @@ class Settling:
     longest: Annotated[float, Field(ge=0.0, le=60.0)]
     """[s] since the reset."""
     sampled: bool
-    """Whether samples taken meanwhile count."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Metrics:
-    """Which metrics count, and how they are taken."""
-
-    weights: Annotated[Mapping[str, Annotated[float, Field(gt=0.0, le=1000.0)]], Field(min_length=1)]
-    """Exponent of each metric in the quality of a sample; its keys are the suite's metrics."""
-    interval: Annotated[int, Field(ge=1, le=100_000)]
-    """Substeps between samples."""
-    clock: Literal["run", "reset"]
-    """``run``: samples on a grid that runs through resets; ``reset``: the grid starts anew at every reset."""
-    angular_velocity: Literal["twice-rotated", "body", "commanded"]
-    """``twice-rotated``: the reference's three components; ``body``: the same in the body frame; ``commanded``: yaw alone."""
-    linear_velocity: Literal["body", "commanded"]
-    """``body``: three components in the body frame; ``commanded``: the two commanded ones, forward and lateral."""
-    smoothness: Literal["samples", "control-steps"]
-    """Torque difference between ``samples``, or between consecutive ``control-steps``."""
-    power_scale: Positive
-    """RMS joint power that scores zero [W]."""
-    torque_scale: Positive
-    """RMS torque difference that scores zero [N·m]."""
-    soft_limit: Annotated[float, Field(gt=0.0, le=1.0)]
-    """Share of each joint range, around its middle, inside which no limit is exceeded."""
-    soft_limit_joints: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
-    """The joints that the limit metric watches: ``hip``, ``thigh`` and ``calf`` by their place in the leg, else parts of names."""
-    zmp_span: Positive | None = None
-    """Diagonal stance span that normalizes the ZMP distance [m]; None: that of the robot's default pose."""
-    contact_share: Share = 0.05
-    """Share of the weight that the ground must carry for the contact metrics to be defined."""
-    flight: Literal["left-out", "filled"] = "left-out"
-    """What stands for a contact metric in the quality of a sample without contact: nothing (``left-out``), or the metric's mean
-    over the sub-command's other samples (``filled``; zero where there are none)."""
+    """True: samples taken meanwhile count."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scoring:
-    """How samples become scores."""
+    """The rules by which samples become scores."""
 
     level_weight: Share
     """Score of each level passed before the last (0.09)."""
@@ -228,7 +184,7 @@ class Push:
     """A sudden lateral push: a force on the base's centre of mass, to the left or right of its heading, chance says which."""
 
     goal: Name
-    """Velocity goal of whose sub-commands each has a push."""
+    """Velocity goal; each of its sub-commands has a push."""
     after: tuple[_Time, _Time]
     """Earliest and latest beginning, from the first commanded control step on, all between equally likely [s]."""
     duration: _Time
@@ -257,13 +213,13 @@ class Suite:
     metrics: Metrics
     scoring: Scoring
     gains: Literal["suite", "contract"] = "suite"
-    """Whose motor gains kp and kd every policy is played with: those of ``parameters``, or those of its own contract."""
+    """Motor gains kp and kd of every policy: those of ``parameters``, or those of the policy's own contract."""
     push: Push | None = None
     """None: nothing pushes."""
 
     @property
     def digest(self) -> str:
-        """SHA-256 over every rule, hexadecimal: two suites of one name and different rules differ in it."""
+        """Return the SHA-256 over every rule, hexadecimal: two suites of one name and different rules differ in it."""
         rules = asdict(self)
         for goal in rules["goals"]:
             if not goal["sub_commands"]:
@@ -276,11 +232,11 @@ class Suite:
         return hashlib.sha256(json.dumps(rules, sort_keys=True).encode()).hexdigest()
 
     def goal(self, name: str) -> Goal:
-        """The goal of that name."""
+        """Return the goal of that name."""
         return next(g for g in self.goals if g.name == name)
 
     def command_limits(self, family: str) -> Limits:
-        """Command limits on a terrain family."""
+        """Return the command limits on a terrain family."""
         return self.commands.flat if family == "flat" else self.commands.levelled
 
 
@@ -298,7 +254,7 @@ _ADDED: Mapping[str, Any] = {
 
 
 def suite_names() -> list[str]:
-    """Names of the suites that ship with the project."""
+    """Return the names of the suites that ship with the project."""
     return sorted(p.stem for p in SUITE_FOLDER.glob("*.toml"))
 
 
@@ -311,8 +267,17 @@ def load_suite(name: str) -> Suite:
     path, data = _tables(name, ())
     source = f"suite file {one_line(path)}"
     suite = build(Suite, data, source, SuiteError, false_is_none=True)
+    own = path.resolve().parent != SUITE_FOLDER.resolve()
+    if own:
+        from .metrics import MetricError, find_metric  # listing the project's suites must not wait for torch
+
+        try:
+            for metric in suite.metrics.weights:
+                find_metric(metric)
+        except MetricError as error:
+            raise SuiteError(f"{source}: {error}") from error
     _check(suite, source)
-    if path.resolve().parent != SUITE_FOLDER.resolve() and suite.name in suite_names():
+    if own and suite.name in suite_names():
         raise SuiteError(f"{source} is called '{suite.name}' as a suite that ships with the project; {_OWN_NAME}")
     return suite
 
@@ -321,7 +286,7 @@ _OWN_NAME = "give it a 'name' of its own, so that results are not taken for that
 
 
 def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
-    """A suite's file and its tables, laid over those of the suite that it extends; the files ``behind`` extend it."""
+    """Return a suite's file and its tables, laid over those of the suite that it extends; the files ``behind`` extend it."""
     own = name.endswith(".toml")
     path = Path(name) if own else SUITE_FOLDER / f"{name}.toml"
     if own and behind:
@@ -357,7 +322,7 @@ _LONGEST_CHAIN = 10
 
 
 def _goal_rules(suite: Suite) -> dict[str, bool]:
-    """Sentences on goals, and whether each rule is kept."""
+    """Return sentences on goals, each with True if the rule is kept."""
     paper, goals = get_args(GoalName), [g.name for g in suite.goals]
     rules = {
         f"goals must differ in their first word, which names files; they are {', '.join(goals)}": (
@@ -385,7 +350,7 @@ def _goal_rules(suite: Suite) -> dict[str, bool]:
 
 
 def _check(suite: Suite, source: str) -> None:
-    """Refuse what each field alone allows and all of them together do not.
+    """Refuse values that are allowed one by one and not together.
 
     Raises:
         SuiteError: one sentence.
@@ -442,11 +407,6 @@ def _check(suite: Suite, source: str) -> None:
             f"matrix.terrains has the unknown terrain {shown(name)}{did_you_mean(name, grounds) or ';'} choose from "
             f"{', '.join(grounds)}"
         ] = name in grounds
-    for name in metrics.weights:
-        rules[
-            f"metrics.weights has the unknown metric {shown(name)}{did_you_mean(name, METRIC_NAMES) or ';'} choose from "
-            f"{', '.join(METRIC_NAMES)}"
-        ] = name in METRIC_NAMES
     for rule, kept in rules.items():
         if not kept:
             raise SuiteError(f"{source}: {rule}")

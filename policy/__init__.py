@@ -1,4 +1,4 @@
-"""What turns observations into actions: the policy contract, the observation builder, networks and policy files.
+"""Turns observations into actions: the policy contract, the observation builder, networks and policy files.
 
 Only the contract is imported here, so that reading one does not wait for torch.
 """

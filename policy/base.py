@@ -1,4 +1,4 @@
-"""What a policy is to the packages that run it."""
+"""Defines the interface of a policy to the packages that run it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LONGEST_MESSAGE = 1000
 
 
 class PolicyError(ValueError):
-    """A policy cannot be loaded or run; the message says which file, what is wrong and what is allowed.
+    """Say that a policy cannot be loaded or run: which file, what is wrong and what is allowed.
 
     Words of the file itself may be part of it: what a terminal would act on is escaped, what is long is cut.
     """
@@ -37,11 +37,11 @@ class PolicySession(ABC):
 
     @abstractmethod
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
-        """Raw network output (N, J) float32, in the contract's joint order, for observations (N,
+        """Return the raw network output (N, J) float32, in the contract's joint order, for observations (N,
         ``contract.observation_width``) float32.
 
-        ``rows`` are the indices of the episodes whose action matters, None for all: a session may save itself the others,
-        whose actions are then arbitrary. Observations of all episodes enter their memories either way.
+        ``rows`` are the indices of the episodes that need an action, None for all; the actions of the others are then
+        arbitrary. Observations of all episodes enter their memories either way.
 
         The output is not checked: a policy may return NaN, and the caller decides what that means.
 
@@ -51,10 +51,10 @@ class PolicySession(ABC):
 
 
 class RowwiseSession(PolicySession):
-    """Every episode goes through the network alone: slower, and the same in every row."""
+    """Send every episode through the network alone: slower, and the same in every row."""
 
     def __init__(self, begin: Callable[[int], PolicySession], num_episodes: int) -> None:
-        """``begin`` starts a session of so many episodes."""
+        """Begin one session for each episode with ``begin``, which starts a session of a given number of episodes."""
         self._sessions = [begin(1) for _ in range(num_episodes)]
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
@@ -73,7 +73,7 @@ class Policy(ABC):
 
     contract: PolicyContract
     path: str
-    """Where it was loaded from, as given by the user."""
+    """Path or name that the user gave."""
 
     @abstractmethod
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
@@ -90,7 +90,7 @@ PROBE_TOLERANCE = 1e-5
 
 
 def act_alike(alone: PolicySession, together: PolicySession, width: int) -> bool:
-    """Whether ``PROBE_EPISODES`` that are played together go as they go alone: random observations (N, ``width``) from a reset, with
+    """Return whether ``PROBE_EPISODES`` played together act as they do alone: random observations (N, ``width``) from a reset, with
     one episode reset again on the way.
     """
     generator = torch.Generator().manual_seed(0)
@@ -121,7 +121,7 @@ def check_observation(observation: torch.Tensor, rows: int, contract: PolicyCont
 
 
 def checked_action(action: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> torch.Tensor:
-    """A network's output as a fresh float32 tensor (rows, J). A batch of one may lack its batch axis.
+    """Return a network's output as a fresh float32 tensor (rows, J). A batch of one may lack its batch axis.
 
     Raises:
         PolicyError: the output has another shape.

@@ -23,7 +23,7 @@ class BlockSession(PolicySession):
     """Episodes in blocks of ``ROWS`` rows, the last one filled up."""
 
     def __init__(self, policy: Policy, num_episodes: int, *, fewer: bool) -> None:
-        """``fewer``: multiples of eight rows give the same as all of a block."""
+        """Begin the blocks; with ``fewer``, multiples of eight rows act as a whole block does."""
         self._num_episodes = num_episodes
         self._blocks = [policy.session(ROWS) for _ in range(-(-num_episodes // ROWS))]
         self._padding = len(self._blocks) * ROWS - num_episodes
@@ -49,13 +49,13 @@ class BlockSession(PolicySession):
 
 
 def steady_session(policy: Policy, num_episodes: int) -> tuple[PolicySession, bool]:
-    """A session on the CPU in which rows do not matter.
+    """Return a session on the CPU in which rows do not matter.
 
     Returns:
         The session, and whether it may also be asked for the actions of any multiple of eight rows.
     """
     if not _same(policy, ROWS):
-        if not getattr(policy, "not_rebuilt", ""):  # else that was said when it was loaded
+        if not getattr(policy, "row_by_row", False):  # else the warning came when the policy was loaded
             logging.getLogger(__name__).warning("'%s' goes through its network row by row, which is slow", policy.path)
         return policy.rowwise_session(num_episodes), False
     fewer = all(_same(policy, count) for count in range(8, ROWS, 8))
@@ -65,7 +65,7 @@ def steady_session(policy: Policy, num_episodes: int) -> tuple[PolicySession, bo
 
 
 def _same(policy: Policy, count: int) -> bool:
-    """Whether ``count`` rows of a block, in any order and beside any others, get the actions that they get among all."""
+    """Return whether a smaller batch, in any order and beside any rows, gives bit-identical actions."""
     generator = torch.Generator().manual_seed(0)
     observations = torch.randn(_TRIALS, ROWS, policy.contract.observation_width, generator=generator)
     others = torch.randn(_TRIALS, ROWS, policy.contract.observation_width, generator=generator)

@@ -17,26 +17,15 @@ from pydantic import Field
 
 from ..files.parsing import LARGEST, Text, build, check_fields, parse_json, shown
 from ..robots.base import Angle, Damping, Robot, Speed, Stiffness
+from .observation_table import OBSERVATIONS, STANDARD, ObservationError, observation
 
 SCHEMA_VERSION: Literal[1] = 1
 HistoryOrder = Literal["frame-major", "term-major", "frame-major-newest-first"]
 
-# Width of each observation term for a robot with J joints; None stands for J.
-TERM_WIDTH: Mapping[str, int | None] = {
-    "base_linear_velocity_b": 3,
-    "base_angular_velocity_b": 3,
-    "projected_gravity_b": 3,
-    "command": 3,
-    "joint_position": None,
-    "joint_velocity": None,
-    "last_action": None,
-}
-
-
 PER_JOINT = ("default_joint_position", "action_scale", "stiffness", "damping", "target_range")
 """Fields of a contract with a value for each joint."""
-PRIVILEGED_TERMS = ("base_linear_velocity_b",)
-"""Observation terms that no sensor of a robot measures."""
+PRIVILEGED_TERMS = tuple(each.name for each in OBSERVATIONS.values() if each.privileged)
+"""The project's own observation terms that no sensor of a robot measures."""
 
 
 class ContractError(ValueError):
@@ -59,7 +48,7 @@ class ObservationTerm:
     """
 
     name: Text
-    """A key of ``TERM_WIDTH``."""
+    """Name of an observation of ``observation_table``."""
     scale: Annotated[tuple[_Factor, ...], Field(min_length=1, max_length=_MOST)]
     """Factor per entry; one entry stands for all."""
     clip: _Clip | Annotated[tuple[_Clip, ...], Field(min_length=1, max_length=_MOST)] | None = None
@@ -67,9 +56,10 @@ class ObservationTerm:
 
     def __post_init__(self) -> None:
         check_fields(self, "contract", ContractError)
-        if self.name not in TERM_WIDTH:
-            known = ", ".join(TERM_WIDTH)
-            raise ContractError(f"contract: unknown observation term {shown(self.name)}; choose from: {known}")
+        try:
+            observation(self.name)
+        except ObservationError as error:
+            raise ContractError(f"contract: {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +75,7 @@ class History:
     frames of the first term, oldest first, then the next term.
     """
     start: Literal["zeros", "repeat"] = "zeros"
-    """What fills the frames before the first one: ``zeros``, as in the published training, or ``repeat`` for copies of
+    """Content of the frames before the first one: ``zeros``, as in the published training, or ``repeat`` for copies of
     the first frame, as the robot's own controller does it."""
 
     def __post_init__(self) -> None:
@@ -123,7 +113,7 @@ class PolicyContract:
     command_limits: tuple[Speed, Speed, Speed]
     """Largest forward, lateral [m/s] and yaw [rad/s] command the policy was made for."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    """Where the policy comes from (training run, file, adapter); not part of the hash."""
+    """Origin of the policy (training run, file, adapter); not part of the hash."""
     schema_version: Literal[1] = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
@@ -153,26 +143,26 @@ class PolicyContract:
 
     @cached_property
     def num_joints(self) -> int:
-        """Number of joints, which is the width of an action."""
+        """Return the number of joints, which is the width of an action."""
         return len(self.joint_names)
 
     @cached_property
     def term_widths(self) -> tuple[int, ...]:
-        """Width of each observation term."""
-        return tuple(TERM_WIDTH[term.name] or self.num_joints for term in self.observation)
+        """Return the width of each observation term."""
+        return tuple(observation(term.name).width or self.num_joints for term in self.observation)
 
     @cached_property
     def frame_width(self) -> int:
-        """Width of one observation frame."""
+        """Return the width of one observation frame."""
         return sum(self.term_widths)
 
     @cached_property
     def observation_width(self) -> int:
-        """Width of the network's input."""
+        """Return the width of the network's input."""
         return self.frame_width * self.history.length
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, ready for JSON."""
+        """Return plain data, ready for JSON."""
         return asdict(self)
 
     @classmethod
@@ -196,20 +186,20 @@ class PolicyContract:
         return cls.from_dict(parse_json(text, "the contract", ContractError))
 
     def to_json(self) -> str:
-        """JSON text in full precision."""
+        """Return the JSON text in full precision."""
         return json.dumps(self.to_dict(), indent=2)
 
     @property
     def hash(self) -> str:
-        """SHA-256 over everything but the provenance, hexadecimal."""
+        """Return the SHA-256 over everything but the provenance, hexadecimal."""
         data = self.to_dict()
         del data["provenance"]
         return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def kind_of_observations(contract: PolicyContract) -> Literal["measurable", "privileged"]:
-    """Whether a robot can measure all that a policy is told."""
-    return "privileged" if any(t.name in PRIVILEGED_TERMS for t in contract.observation) else "measurable"
+    """Return whether a robot's sensors can measure every observation of a policy."""
+    return "privileged" if any(observation(t.name).privileged for t in contract.observation) else "measurable"
 
 
 def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
@@ -235,7 +225,7 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
 
 
 def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyContract:
-    """The contract with its joints in another order; every value per joint goes with its joint.
+    """Return the contract with its joints in another order; every value per joint goes with its joint.
 
     Args:
         joint_names: the contract's joints, each once.
@@ -246,7 +236,7 @@ def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyCon
         return tuple(values[i] for i in index) if isinstance(values, tuple) and len(values) == len(index) else values
 
     terms = tuple(
-        term if TERM_WIDTH[term.name] else replace(term, scale=moved(term.scale), clip=moved(term.clip))
+        term if observation(term.name).width else replace(term, scale=moved(term.scale), clip=moved(term.clip))
         for term in contract.observation
     )
     values = {name: moved(getattr(contract, name)) for name in PER_JOINT}
@@ -254,14 +244,14 @@ def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyCon
 
 
 def other_width(contract: PolicyContract, width: int) -> str:
-    """What a contract says of its observation's width, for a sentence on a network that takes another one, and which history it fits."""
+    """Return a contract's observation width as part of a sentence on a network with another width, and the history that would fit."""
     frames, rest = divmod(width, contract.frame_width)
     fits = f"; {frames} frames are {width}: history = {{ length = {frames} }}" if frames and not rest else ""
     return f"but its contract's observation has {contract.observation_width}{fits}"
 
 
 def difference(a: PolicyContract, b: PolicyContract) -> str:
-    """What differs between two contracts, one line per field (``field: value in a -> value in b``); empty if they are
+    """Return the differences between two contracts, one line per field (``field: value in a -> value in b``); empty if they are
     equal.
 
     The provenance does not count.
@@ -291,7 +281,7 @@ def _flat(contract: PolicyContract) -> dict[str, str]:
 def standard_contract(
     robot: Robot, *, history: History | None = None, provenance: Mapping[str, Any] | None = None
 ) -> PolicyContract:
-    """The interface that the CTS family of policies for the Unitree Go2 shares (paper, section on observations).
+    """Return the interface that the CTS family of policies for the Unitree Go2 shares (paper, section on observations).
 
     Angular velocity, gravity, command, joint positions, joint velocities and the last action make 45 entries; an action
     moves the target around the standing pose by the robot's action scale, 0.25 rad per unit for the Go2, every 0.02 s.
@@ -309,14 +299,7 @@ def standard_contract(
         stiffness=motors.stiffness,
         damping=motors.damping,
         control_period=0.02,
-        observation=(
-            ObservationTerm(name="base_angular_velocity_b", scale=(0.25,)),
-            ObservationTerm(name="projected_gravity_b", scale=(1.0,)),
-            ObservationTerm(name="command", scale=(2.0, 2.0, 0.25)),
-            ObservationTerm(name="joint_position", scale=(1.0,)),
-            ObservationTerm(name="joint_velocity", scale=(0.05,)),
-            ObservationTerm(name="last_action", scale=(1.0,)),
-        ),
+        observation=tuple(ObservationTerm(name=name, scale=OBSERVATIONS[name].scale) for name in STANDARD),
         history=history or History(),
         command_limits=robot.command_limits,
         provenance=provenance or {},

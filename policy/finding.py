@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 LOG_ROOT = Path("logs/rsl_rl")
-"""Where training runs lie: ``<LOG_ROOT>/<experiment>/<run>/``."""
+"""Folder of training runs: ``<LOG_ROOT>/<experiment>/<run>/``."""
 SHIPPED = Path(__file__).parent / "pretrained"
 """The folder of the policies that ship with the project, ``<name>.gauge.pt``."""
 PRETRAINED = SHIPPED / "go2.gauge.pt"
@@ -16,18 +16,18 @@ _ENDING = ".gauge.pt"
 
 
 def shipped_policies() -> dict[str, Path]:
-    """The files that ship, by name: ``pretrained``, and ``pretrained-<name>`` for every other file of the folder."""
+    """Return the files that ship, by name: ``pretrained``, and ``pretrained-<name>`` for every other file of the folder."""
     others = sorted(path for path in SHIPPED.glob(f"*{_ENDING}") if path != PRETRAINED)
     return {"pretrained": PRETRAINED} | {f"pretrained-{path.name.removesuffix(_ENDING)}": path for path in others}
 
 
 def policy_names() -> tuple[str, ...]:
-    """What ``find_policy`` takes beside paths."""
+    """Return the names that ``find_policy`` takes beside paths."""
     return (*_OF_RUNS, *shipped_policies())
 
 
 def find_policy(path_or_name: str | Path) -> Path:
-    """The file behind a path or a name. A file that exists wins over a name.
+    """Return the file behind a path or a name. A file that exists wins over a name.
 
     Args:
         path_or_name: a file; or ``latest`` (last checkpoint of the last training run), ``best`` (the last run's best
@@ -67,13 +67,13 @@ def find_policy(path_or_name: str | Path) -> Path:
 
 
 def latest_checkpoint(run: Path) -> Path | None:
-    """The ``model_<iteration>.pt`` of the highest iteration in a run directory, None if there is none."""
+    """Return the ``model_<iteration>.pt`` of the highest iteration in a run directory, None if there is none."""
     numbered = [(int(m.group(1)), f) for f in run.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", f.name))]
     return max(numbered)[1] if numbered else None
 
 
 def _of_runs(name: str) -> Path | None:
-    """The last or the best checkpoint of the last run that has one."""
+    """Return the last or the best checkpoint of the last run that has one."""
     # Runs are named by their time, so the name's order is that of time.
     runs = sorted((r for r in LOG_ROOT.glob("*/*") if r.is_dir()), key=lambda r: r.name, reverse=True)
     found = (latest_checkpoint(r) if name == "latest" else r / "best.pt" for r in runs)

@@ -1,4 +1,4 @@
-"""Watches the inside of a policy at work: what its encoder makes of the history, and how its experts are weighed."""
+"""Watches the inside of a policy at work: its encoder's latent, and the weights of its experts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from .native import NativePolicy, NativeSession, StoredNetwork
 
 
 class WatchedNetwork:
-    """A network of ``networks.py`` that acts as ever and keeps what its ``encode`` gave last."""
+    """Act as a network of ``architectures.py`` does, and keep the last result of its ``encode``."""
 
     latent: torch.Tensor | None = None
-    """What the actor was given of the history, (N, L); None where there is no encoder, or one of no width."""
+    """The actor's input from the history, (N, L); None where there is no encoder, or one of no width."""
     weights: torch.Tensor | None = None
     """The gate's weights, (N, K); None where there are no experts."""
     history: torch.Tensor
-    """What it was given, (N, H, F)."""
+    """The network's input, (N, H, F)."""
 
     def __init__(self, network: Any) -> None:
         """Watch a network that has ``encode`` and no memory of its own."""
@@ -26,7 +26,7 @@ class WatchedNetwork:
         self._network = network
 
     def __call__(self, history: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for ``history`` (N, H, F)."""
+        """Return actions (N, J) for ``history`` (N, H, F)."""
         self.history = history
         found = self._network.encode(history)
         self.latent, self.weights = (part if part is not None and part.shape[1] else None for part in found)
@@ -35,14 +35,14 @@ class WatchedNetwork:
 
 
 def watched_session(policy: Policy, num_episodes: int) -> tuple[NativeSession, WatchedNetwork]:
-    """A session of ``num_episodes`` episodes on the CPU, and the network at work in it, to be looked at after each step.
+    """Return a session of ``num_episodes`` episodes on the CPU, and the network at work in it, to be looked at after each step.
 
     Raises:
         PolicyError: the policy is a foreign program that cannot be looked into, or has neither encoder nor experts.
     """
     if not isinstance(policy, NativePolicy) or not isinstance(policy.stored, StoredNetwork):
         raise PolicyError(
-            f"'{policy.path}' is a program of another format, whose inside cannot be watched; give the policy as a file of "
+            f"'{policy.path}' is a program of another format, and its inside cannot be watched; give the policy as a file of "
             "the project's own or as an rsl_rl checkpoint"
         )
     if not hasattr(policy.network, "encode"):

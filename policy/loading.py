@@ -24,7 +24,6 @@ from .foreign.adapters import (
     mjlab_contract,
     sidecar_contract,
 )
-from .foreign.batched_policy import rebuilt
 from .foreign.fence.archive import archive_names, read_limited
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 
@@ -63,7 +62,7 @@ def load_policy(
     data = read_limited(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
     contract = None if contract_file is None else described_contract(contract_file, stand_in)
-    policy = rebuilt(_load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract))
+    policy = _load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract)
     policy.file_sha256 = hashlib.sha256(data).hexdigest()
     if sentence := assumptions(policy.contract):
         _say(policy.path, sentence)
@@ -75,14 +74,14 @@ def load_policy(
 def restore_policy(
     stored: StoredNetwork | ForeignFile, contract: PolicyContract, path: str, robot: Robot
 ) -> FilePolicy:
-    """A policy that was loaded elsewhere, out of what a ``FilePolicy`` has; a program in it was trusted there.
+    """Return a policy that another process loaded, from the fields of its ``FilePolicy``; a program in it was trusted there.
 
     Raises:
         PolicyError: the network does not fit its contract, or a program cannot be run here.
     """
     if isinstance(stored, StoredNetwork):
         return NativePolicy(contract, stored, path=path)
-    return rebuilt(_foreign(stored, Path(path), path, robot, contract=contract))
+    return _foreign(stored, Path(path), path, robot, contract=contract)
 
 
 @cache  # once, and not again in each process that is forked from this one
@@ -149,7 +148,7 @@ def _foreign(
 def _foreign_contract(
     child: Child, kind: str, metadata: Mapping[str, str], path: Path, source: str, robot: Robot
 ) -> PolicyContract:
-    """The contract beside the file, in it, of an ONNX file that of its deploy.yaml or of what mjlab wrote into it, or else the
+    """Return the contract beside the file or in it, an ONNX file's deploy.yaml or mjlab metadata, or else the
     standard one with as many frames as the input is wide.
     """
     contract = sidecar_contract(path)
@@ -175,7 +174,7 @@ def _stored_contract(text: str, source: str) -> PolicyContract:
 
 
 def file_kind(data: bytes, source: str) -> str:
-    """What a file's content is: ``torchscript``, ``onnx`` or ``torch`` (a ``torch.save`` archive).
+    """Return the kind of a file's content: ``torchscript``, ``onnx`` or ``torch`` (a ``torch.save`` archive).
 
     Raises:
         PolicyError: anything else; a plain pickle is refused without being opened.

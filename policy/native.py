@@ -1,4 +1,4 @@
-"""The project's own policy file, and policies whose network is built from it.
+"""The project's own policy file, and policies with a network built from it.
 
 The file is what ``torch.save`` writes of a dictionary of plain data and tensors; it is only ever read with
 ``torch.load(weights_only=True)``, which cannot run code.
@@ -7,7 +7,7 @@ The file is what ``torch.save`` writes of a dictionary of plain data and tensors
 ``format``      ``gaitgauge-policy``
 ``version``     of the layout, a whole number
 ``contract``    the policy contract as JSON text
-``network``     ``kind``, ``architecture`` and ``arguments`` (JSON text) for a network of ``networks.py``;
+``network``     ``kind``, ``architecture`` and ``arguments`` (JSON text) for a network of ``ARCHITECTURES``;
                 ``kind`` (``torchscript`` or ``onnx``) and ``bytes`` (uint8 tensor) for a foreign file carried inside
 ``state_dict``  tensors of the network; absent for a foreign file
 ``checksum``    SHA-256 over contract, network and state_dict (``checksum``); files from before it was written lack it
@@ -55,14 +55,14 @@ _PLAIN_CALLS |= {"collections OrderedDict", "builtins set", "__builtin__ set", "
 _PLAIN_NAMES = re.compile(r"torch (\w+Storage|u?int\d+|float\d+|bfloat16|complex\d+|bool)")
 
 PROGRAM_ERRORS = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, MemoryError)
-"""What goes wrong inside torch where things do not fit together."""
+"""Errors inside torch where shapes, types or names do not fit together."""
 LOAD_ERRORS = (*PROGRAM_ERRORS, torch.jit.Error, pickle.UnpicklingError, EOFError, OSError, AssertionError)
 """The same for damaged or foreign data, from the archive down to the tensors."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredNetwork:
-    """A network of ``networks.py`` as data."""
+    """Hold a network of ``architectures.py`` as data."""
 
     architecture: str
     """A key of ``ARCHITECTURES``."""
@@ -81,12 +81,12 @@ class ForeignFile:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line that says anything of an error's message, for messages of one sentence."""
+    """Return the first line that says anything of an error's message, for messages of one sentence."""
     return said_lines(error)[0].partition(". ")[0].rstrip(".")[:200]
 
 
 def said_lines(error: BaseException) -> list[str]:
-    """The lines of an error's message that say anything, or its name."""
+    """Return the lines of an error's message that say anything, or its name."""
     return [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
 
 
@@ -112,7 +112,7 @@ def save_policy(path: str | Path, contract: PolicyContract, network: StoredNetwo
 
 
 def policy_entries(contract: PolicyContract, network: StoredNetwork | ForeignFile) -> dict[str, Any]:
-    """What a policy file holds, but for its checksum."""
+    """Return the entries of a policy file without its checksum."""
     entries: dict[str, Any] = {"format": FORMAT, "version": VERSION, "contract": contract.to_json()}
     if isinstance(network, StoredNetwork):
         arguments = json.dumps(dict(network.arguments))
@@ -124,7 +124,7 @@ def policy_entries(contract: PolicyContract, network: StoredNetwork | ForeignFil
 
 
 def checksum(entries: Mapping[str, Any]) -> str:
-    """SHA-256 over a policy file's contract, network and weights, hexadecimal.
+    """Return the SHA-256 over a policy file's contract, network and weights, hexadecimal.
 
     A text counts as its UTF-8 bytes, a tensor as its type, shape and content, each after its name.
     """
@@ -146,13 +146,13 @@ def checksum(entries: Mapping[str, Any]) -> str:
 
 
 def is_policy(entries: Mapping[str, Any]) -> bool:
-    """Whether a loaded file's dictionary is of the project's own format."""
+    """Return whether a loaded file's dictionary is of the project's own format."""
     name = entries.get("format")
     return isinstance(name, str) and name == FORMAT
 
 
 def read_policy(entries: Mapping[str, Any], *, source: str) -> tuple[PolicyContract, StoredNetwork | ForeignFile]:
-    """Contract and network out of a loaded file's dictionary.
+    """Return the contract and network from a loaded file's dictionary.
 
     Args:
         entries: the dictionary; its ``format`` has been checked.
@@ -294,14 +294,14 @@ class FilePolicy(Policy):
 
     stored: StoredNetwork | ForeignFile
     """Its network, for ``save_policy``."""
-    not_rebuilt: str = ""
-    """Why a foreign file's own code is run in each step, which is slow; empty where it is not."""
+    row_by_row: bool = False
+    """A foreign file's program takes one robot at a time, which is slow; the user was told when it was loaded."""
     file_sha256: str = ""
     """SHA-256 of the file's bytes as they were loaded, hexadecimal, as ``sha256sum`` prints it; empty where it came out of none."""
 
     @property
     def digest(self) -> str:
-        """SHA-256, hexadecimal, over the contract and the whole network.
+        """Return the SHA-256, hexadecimal, over the contract and the whole network.
 
         A file's own digest would not do: weights may lie beside an ONNX file, gains in a ``deploy.yaml``, and the activation of a
         checkpoint in an ``agent.yaml``.
@@ -319,7 +319,7 @@ class FilePolicy(Policy):
 
 
 class NativePolicy(FilePolicy):
-    """A policy whose network is one of ``networks.py``."""
+    """Play a policy with a network of ``architectures.py``."""
 
     def __init__(self, contract: PolicyContract, stored: StoredNetwork, *, path: str) -> None:
         """Build the network.
@@ -349,18 +349,18 @@ class FrozenNetwork:
     """A network without a memory of its own as one recorded sequence of operations: layers cost little more than their work."""
 
     def __init__(self, recorded: Any, network: Any) -> None:
-        """``recorded`` does what ``network`` does."""
+        """Keep ``recorded``, which acts as ``network`` does."""
         self.history_length, self.frame_width = network.history_length, network.frame_width
         self._recorded = recorded
 
     def __call__(self, history: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for ``history`` (N, H, F)."""
+        """Return actions (N, J) for ``history`` (N, H, F)."""
         action: torch.Tensor = self._recorded(history)
         return action
 
 
 def frozen(network: Any, num_episodes: int) -> Any:
-    """The network as a ``FrozenNetwork`` where that gives the same actions to the last bit, else the network itself."""
+    """Return the network as a ``FrozenNetwork`` where that gives the same actions to the last bit, else the network itself."""
     if hasattr(network, "initial_state"):
         return network
     network.eval()
@@ -381,7 +381,7 @@ def frozen(network: Any, num_episodes: int) -> Any:
 
 
 class NativeSession(PolicySession):
-    """Runs a network of ``networks.py`` and keeps its history and state."""
+    """Run a network of ``architectures.py`` and keep its history and state."""
 
     def __init__(
         self, network: Any, num_episodes: int, contract: PolicyContract, device: torch.device, source: str

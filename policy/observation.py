@@ -8,17 +8,8 @@ import torch
 
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
-from ..robots.rotation import projected_gravity, rotate_inverse
 from .contract import ContractError, ObservationTerm, PolicyContract, check_robot
-
-NOISE_TERMS = (
-    "base_linear_velocity_b",
-    "base_angular_velocity_b",
-    "projected_gravity_b",
-    "joint_position",
-    "joint_velocity",
-)
-_NOISY = frozenset(NOISE_TERMS)
+from .observation_table import OBSERVATIONS, Observation, observation
 
 
 class ObservationBuilder:
@@ -35,7 +26,7 @@ class ObservationBuilder:
         """Prepare buffers and index maps.
 
         Args:
-            robot: the robot whose joint order the physics uses.
+            robot: the robot; the physics uses its joint order.
             num_episodes: number of rows N.
             device: where the physics' tensors live.
 
@@ -46,6 +37,9 @@ class ObservationBuilder:
         self.contract = contract
         self.num_episodes = num_episodes
         self.device = torch.device(device)
+        self._observations = [observation(term.name) for term in contract.observation]
+        # a noise stream also draws for what this policy does not observe
+        self._noisy = {each.name for each in OBSERVATIONS.values() if each.noise is not None}
         widths = contract.term_widths
         identity = tuple(range(contract.num_joints))
         # An identity map is left out: indexing costs a kernel per term and step.
@@ -83,7 +77,7 @@ class ObservationBuilder:
         last_action: torch.Tensor,
         noise: Mapping[str, torch.Tensor] | None = None,
     ) -> torch.Tensor:
-        """Observations of all episodes. With a history, each call adds one frame to it: call once per control step.
+        """Return observations of all episodes. With a history, each call adds one frame to it: call once per control step.
 
         Commands are not clipped here: which limits hold depends on the terrain, and the caller knows them.
 
@@ -99,15 +93,12 @@ class ObservationBuilder:
 
         Raises:
             ContractError: noise for something that is not measured.
+            ObservationError: an observation of a plug-in fails.
         """
         noise = noise or {}
-        if not noise.keys() <= _NOISY:
-            unknown = ", ".join(sorted(noise.keys() - _NOISY))
-            raise ContractError(f"no noise can be added to '{unknown}'; choose from: {', '.join(NOISE_TERMS)}")
-        blocks = [
-            self._value(term.name, state, command, last_action, noise.get(term.name))
-            for term in self.contract.observation
-        ]
+        if not noise.keys() <= self._noisy:
+            _refuse_noise(noise.keys() - self._noisy)
+        blocks = [self._value(each, state, command, last_action, noise.get(each.name)) for each in self._observations]
         frame = torch.cat(blocks, dim=-1).to(torch.float32) * self._scale
         if self._limit is not None:
             frame = torch.clamp(frame, -self._limit, self._limit)
@@ -117,32 +108,19 @@ class ObservationBuilder:
 
     def _value(
         self,
-        name: str,
+        made: Observation,
         state: PhysicsState,
         command: torch.Tensor,
         last_action: torch.Tensor,
         noise: torch.Tensor | None,
     ) -> torch.Tensor:
-        """One term in physical units, joints in the policy's order."""
-        if name == "command":
-            return command
-        if name == "last_action":
-            return last_action
-        if name == "base_linear_velocity_b":
-            value = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)
-        elif name == "base_angular_velocity_b":
-            value = state.base_angular_velocity_b
-        elif name == "projected_gravity_b":
-            value = projected_gravity(state.base_quaternion_w)
-        elif name == "joint_position":
-            value = state.joint_position
-        else:
-            value = state.joint_velocity
+        """Return one term in physical units, joints in the policy's order."""
+        value = made.build(state, command, last_action)
         if noise is not None:
             value = value + noise
-        if name in ("joint_position", "joint_velocity") and self._robot_joint is not None:
+        if made.width is None and not made.policy_order and self._robot_joint is not None:
             value = value[:, self._robot_joint]
-        return value - self._default if name == "joint_position" else value
+        return value - self._default if made.about_default_pose else value
 
     def _with_history(self, frame: torch.Tensor) -> torch.Tensor:
         frames = torch.cat((self._frames[:, 1:], frame[:, None]), dim=1)
@@ -158,7 +136,7 @@ class ObservationBuilder:
         return frames.reshape(self.num_episodes, -1)
 
     def targets(self, action: torch.Tensor) -> torch.Tensor:
-        """Joint targets [rad] of raw actions, both (N, J): actions in the policy's joint order, targets in the robot's.
+        """Return joint targets [rad] of raw actions, both (N, J): actions in the policy's joint order, targets in the robot's.
 
         NaN stays NaN.
         """
@@ -171,10 +149,15 @@ class ObservationBuilder:
 
 
 def term_major_order(contract: PolicyContract, frames: int) -> torch.Tensor:
-    """Position in a term-major history of each entry of the frame-major one, (frames * F,) int64; both oldest first."""
+    """Return the position in a term-major history of each entry of the frame-major one, (frames * F,) int64; both oldest first."""
     entries = torch.arange(frames * contract.frame_width)
     blocks = entries.split([frames * width for width in contract.term_widths])
     return torch.cat([block.view(frames, -1) for block in blocks], dim=1).flatten()
+
+
+def _refuse_noise(names: set[str]) -> None:
+    noisy = ", ".join(each.name for each in OBSERVATIONS.values() if each.noise is not None)
+    raise ContractError(f"no noise can be added to '{', '.join(sorted(names))}'; choose from: {noisy}")
 
 
 def _clip(term: ObservationTerm) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Which robot a policy runs on: the one that is asked for, else the one that it remembers."""
+"""Chooses the robot that a policy runs on: the one that is asked for, else the one that the policy remembers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ REMEMBERED = "robot"
 
 
 def robot_for(contract: PolicyContract, asked: str | None = None) -> Robot:
-    """The robot to run a policy on. Where it is not as the policy remembers it, a notice says so.
+    """Return the robot to run a policy on; a notice says where it differs from the robot that the policy remembers.
 
     Args:
         asked: name of a robot, or the path of its ``robot.toml``; None for the policy's own.
@@ -48,7 +48,7 @@ def robot_for(contract: PolicyContract, asked: str | None = None) -> Robot:
 
 
 def without_copy(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """A contract's provenance for results, which say which robot it was and need not hold its files."""
+    """Return a contract's provenance for results: it names the robot without its files."""
     found = dict(provenance)
     if isinstance(remembered := found.get(REMEMBERED), Mapping):
         found[REMEMBERED] = {k: v for k, v in remembered.items() if k not in ("description", "files")}

@@ -1,6 +1,4 @@
-"""A stranger's robot is tried in a process of its own first: MuJoCo compiles what its files say, and that may take all memory, all
-time, or MuJoCo itself down.
-"""
+"""Try a foreign robot in a process of its own: compiling its files may take all memory, all time, or crash MuJoCo."""
 
 from __future__ import annotations
 
@@ -15,25 +13,25 @@ from ..files.parsing import one_line
 from .loading import RobotError, model_files
 
 COMPUTING_SECONDS = 10
-"""Longest that compiling and checking a robot may compute."""
+"""Most CPU time for compiling and checking a robot [s]."""
 _WAITING_SECONDS = 6 * COMPUTING_SECONDS
-"""Longest that is waited for that, on a machine that has other things to do."""
+"""Longest wait for that on a busy machine [s]."""
 _LONGEST_TEXT = 1_000_000
 _SOUND = b"\0"
-"""Before what a work returned; no sentence begins so."""
+"""Prefix of a result; no error's sentence begins so."""
 
 
 def run_apart(work: Callable[[], str | None], mjcf: Path) -> str:
-    """Do something with a robot's model where it can do no harm.
+    """Work on a robot's model where it can do no harm, and return the text that ``work`` returns.
 
     Args:
-        work: raises ``RobotError`` for what is wrong, or returns a text.
+        work: raises ``RobotError`` for a fault, or returns a text.
         mjcf: the model; folders of the files that it names can be read.
 
     Raises:
-        RobotError: as ``work``, or it takes too much time or memory, or MuJoCo crashes.
+        RobotError: as ``work``; or the work takes too much time or memory, or MuJoCo crashes.
     """
-    import mujoco  # noqa: F401  (once, and not again in each process that is forked from this one)
+    import mujoco  # noqa: F401  (once here, not again in each forked process)
 
     ours, theirs = CONTEXT.Pipe(duplex=False)
     folders = sorted({file.resolve().parent for file in model_files(mjcf)} | {mjcf.parent})
@@ -46,7 +44,7 @@ def run_apart(work: Callable[[], str | None], mjcf: Path) -> str:
             if ours.poll(_WAITING_SECONDS):
                 verdict = ours.recv_bytes(_LONGEST_TEXT)
         except (OSError, EOFError):
-            process.join(2.0)  # it has ended, or is about to
+            process.join(2.0)  # the process has ended, or is about to
         finally:
             process.kill()
             process.join(5.0)
@@ -59,15 +57,13 @@ def _how_it_ended(code: int | None) -> str:
     if code is not None and -code == getattr(signal, "SIGXCPU", 0):
         return f"takes over {COMPUTING_SECONDS} s of computing to be compiled; make its model smaller"
     if code is not None and code < 0 and -code != signal.SIGKILL:
-        return (
-            f"brought MuJoCo down ({signal.Signals(-code).name}); it may need over {MEMORY // 2**20} MiB of memory: make its model "
-            "smaller"
-        )
+        crash = f"brought MuJoCo down ({signal.Signals(-code).name})"
+        return f"{crash}; it may need over {MEMORY // 2**20} MiB of memory: make its model smaller"
     return f"was not compiled and checked within {_WAITING_SECONDS} s; make its model smaller"
 
 
 def _run(work: Callable[[], str | None], connection: Connection, folders: list[Path], owner: int) -> None:
-    """The process's whole life."""
+    """Run in the process, from its start to its end."""
     enclose(connection.fileno(), owner, folders)
     allow_seconds(COMPUTING_SECONDS)
     try:
@@ -75,10 +71,8 @@ def _run(work: Callable[[], str | None], connection: Connection, folders: list[P
     except RobotError as error:
         verdict = str(error).encode("utf-8", "backslashreplace")
     except MemoryError:
-        verdict = (
-            f"the robot needs over {MEMORY // 2**20} MiB of memory to be compiled; make its model smaller".encode()
-        )
-    except Exception as error:  # noqa: BLE001  (whatever it is, the owner has to hear of it)
+        verdict = f"the robot needs over {MEMORY // 2**20} MiB of memory to compile; make its model smaller".encode()
+    except Exception as error:  # noqa: BLE001  (the owner has to hear of every error)
         verdict = f"the robot cannot be checked: {type(error).__name__}: {one_line(error)}".encode(errors="replace")
     connection.send_bytes(verdict[:_LONGEST_TEXT])
-    os._exit(0)  # nothing of what the owner would do at its end
+    os._exit(0)  # without the owner's exit handlers

@@ -1,4 +1,4 @@
-"""What a robot is: a MuJoCo model file and the data that the other packages need to know about it."""
+"""A robot as data: a MuJoCo model file and the values that the other packages need to know about it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pydantic import Field
 from ..files.parsing import Name, Text
 
 Angle = Annotated[float, Field(strict=True, ge=-12.6, le=12.6)]
-"""Of a joint [rad]."""
+"""A joint's angle [rad]."""
 Speed = Annotated[float, Field(strict=True, ge=0.0, le=100.0)]
 """A command's limit [m/s, rad/s]."""
 Stiffness = Annotated[float, Field(strict=True, ge=0.0, le=10_000.0)]
 """kp [N·m/rad]."""
 Damping = Annotated[float, Field(strict=True, ge=0.0, le=1_000.0)]
-"""kd, or of a joint itself [N·m·s/rad]."""
+"""A motor's kd, or damping of the joint itself [N·m·s/rad]."""
 Torque = Annotated[float, Field(strict=True, ge=0.0, le=10_000.0)]
 """[N·m]."""
 Inertia = Annotated[float, Field(strict=True, ge=0.0, le=100.0)]
-"""Of a rotor, seen at the joint [kg·m²]."""
+"""A rotor's inertia, seen at the joint [kg·m²]."""
 _ActionScale = Annotated[float, Field(ge=0.0, le=100.0)]
 _JointSpeed = Annotated[float, Field(ge=0.0, le=1_000.0)]
 _Names = Annotated[tuple[Text, ...], Field(min_length=1, max_length=1000)]
@@ -50,16 +50,16 @@ class JointParameters:
     friction_loss: tuple[Torque, ...]
     """Dry friction of the joint [N·m]."""
     driving_torque_limit: tuple[Torque, ...] | None = None
-    """Largest motor torque in the direction of motion [N·m]; None where it is ``torque_limit``, as against it."""
+    """Largest motor torque in the direction of motion [N·m]; None for ``torque_limit``, the limit against the motion."""
     full_torque_speed: tuple[_JointSpeed, ...] | None = None
-    """Joint speed up to which the driving torque is there [rad/s]; None where it is not known."""
+    """Largest joint speed with the whole driving torque [rad/s]; None where it is not known."""
     no_load_speed: tuple[_JointSpeed, ...] | None = None
-    """Joint speed from which the motor drives no more [rad/s]; None where it is not known."""
+    """Joint speed beyond which the motor does not drive [rad/s]; None where it is not known."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """A legged robot as data. Joint, foot and body orders given here hold in every room of the project."""
+    """A legged robot as data. Joint, foot and body orders given here hold in all packages."""
 
     name: Name
     title: Text
@@ -72,12 +72,11 @@ class Robot:
     base_body: Text
     """Body that carries the free joint; its origin is the base position."""
     foot_names: _Names
-    """Name of each foot; its collision geom, whose centre is the foot's position, bears it where ``foot_shapes`` does not say
-    otherwise."""
+    """Name of each foot, and of its collision geom where ``foot_shapes`` is None; the geom's centre is the foot's position."""
     collision_bodies: _Names
-    """Bodies whose contacts with the ground are reported one by one; foot geoms are reported apart."""
+    """Bodies with contacts of their own in the state; foot geoms are reported apart."""
     trunk_shapes: _Names
-    """Collision geoms of the base body that are its trunk, without head or sensors: what must not touch the ground."""
+    """Collision geoms of the base body that form its trunk, without head or sensors, and must not touch the ground."""
     imu_site: Text | None = None
     """Site on the base where the gyroscope sits; None where the model has none."""
     stand_height: Annotated[float, Field(gt=0.0, le=10.0)]
@@ -89,19 +88,18 @@ class Robot:
     command_limits: tuple[Speed, Speed, Speed]
     """Largest commanded forward, lateral [m/s] and yaw [rad/s] speed that the robot is meant for."""
     sdk_joint_names: _Names | None = None
-    """The joints in the order in which the maker's SDK numbers the motors, which a ``deploy.yaml`` refers to; None where it
-    is not known."""
+    """Joints in the motor order of the maker's SDK, which a ``deploy.yaml`` refers to; None where it is not known."""
     action_scale: Annotated[tuple[_ActionScale, ...], Field(min_length=1)] | None = None
-    """How far an output of 1 of a standard policy moves a joint's target [rad]; None for 0.25."""
+    """Change of a joint's target for an output of 1 of a standard policy [rad]; None for 0.25."""
     foot_shapes: _Names | None = None
-    """Collision geom of each foot; None where they bear the feet's names."""
+    """Collision geom of each foot; None where the geoms bear the feet's names."""
 
     @property
     def num_joints(self) -> int:
-        """Number of actuated joints."""
+        """Return the number of actuated joints."""
         return len(self.joint_names)
 
     @property
     def foot_geoms(self) -> tuple[str, ...]:
-        """Name of each foot's collision geom."""
+        """Return the name of each foot's collision geom."""
         return self.foot_shapes or self.foot_names

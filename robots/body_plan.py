@@ -1,6 +1,6 @@
-"""How a legged robot is built, read off its MuJoCo model in the default pose: legs, mirror images, sizes, joint ranges, mass.
+"""Read a legged robot's build off its MuJoCo model in the default pose: legs, mirror images, sizes, joint ranges, mass.
 
-Nothing here goes by names. Frames are the base's: x forward, y left, z up, origin at the base.
+Nothing depends on names. Frames are the base's: x forward, y left, z up, origin at the base.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ALIGNED = 0.999
 
 @dataclass(frozen=True, kw_only=True)
 class MirrorImage:
-    """What becomes of joints and feet when the robot is mirrored at its sagittal plane (y to −y)."""
+    """Joints and feet of the robot mirrored at its sagittal plane (y to −y)."""
 
     joint: tuple[int, ...]
     """Counterpart of each joint, an index in the robot's joint order."""
@@ -48,7 +48,7 @@ class BodyPlan:
     abduction: tuple[int, ...]
     """Joint of each leg that swings it sideways, the first about the x axis; legs without one are left out."""
     limb_bodies: tuple[int, ...]
-    """Which of ``collision_bodies`` are thighs, calves and what hangs on them: moved by more than an abduction joint."""
+    """Indices of the ``collision_bodies`` that joints other than abduction move: thighs, calves and bodies below."""
     foot_position: NDArray[np.float64]
     """Centres of the feet in the default pose [m], (F, 3)."""
     standing_height: float
@@ -62,14 +62,12 @@ class BodyPlan:
 
     @property
     def stance(self) -> tuple[float, float]:
-        """Length and width of the rectangle around the feet's centres in the default pose [m]."""
+        """Return length and width of the rectangle around the feet's centres in the default pose [m]."""
         length, width, _ = np.ptp(self.foot_position, axis=0)
         return float(length), float(width)
 
     def part(self, joint: int) -> str:
-        """What a joint moves, in the words of ``LEG_PARTS``: the last of a leg its calf, abduction its hip, any other its
-        thigh; empty for a joint of no leg.
-        """
+        """Return the leg part of a joint: ``calf`` for a leg's last, ``hip`` for abduction, else ``thigh``; empty for no leg's."""
         for leg in self.legs:
             if joint in leg:
                 return "hip" if joint in self.abduction else "calf" if joint == leg[-1] else "thigh"
@@ -77,11 +75,7 @@ class BodyPlan:
 
 
 def body_plan(robot: Robot) -> BodyPlan:
-    """Read legs and sizes off a robot's model.
-
-    Raises:
-        RobotError: a foot does not hang on the base by joints of ``joint_names``.
-    """
+    """Read legs and sizes off a robot's model; raise ``RobotError`` where joints of ``joint_names`` do not move a foot."""
     model, data = default_pose(robot)
     order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
     base = model.body(robot.base_body).id
@@ -113,11 +107,7 @@ def body_plan(robot: Robot) -> BodyPlan:
 
 
 def mirror_image(robot: Robot) -> MirrorImage:
-    """Find the counterparts of joints and feet, by where they are and how they turn in the default pose.
-
-    Raises:
-        RobotError: a joint or foot has no mirror image.
-    """
+    """Find counterparts of joints and feet by place and axis in the default pose; raise ``RobotError`` where one has none."""
     model, data = default_pose(robot)
     joints = [model.joint(name).id for name in robot.joint_names]
     anchors, axes = data.xanchor[joints], data.xaxis[joints]
@@ -157,40 +147,40 @@ def _no_image(robot: Robot, kind: str, name: str, image: NDArray[np.float64]) ->
 
 
 def joint_ranges(robot: Robot) -> NDArray[np.float64]:
-    """Lower and upper limit of every joint in the robot's order [rad], (J, 2); infinite where a joint has none."""
+    """Return the lower and upper limit of every joint in the robot's order [rad], (J, 2); infinite where a joint has none."""
     model = robot_model(robot)
     ids = [model.joint(name).id for name in robot.joint_names]
     return np.where(model.jnt_limited[ids, None], model.jnt_range[ids], [-np.inf, np.inf])
 
 
 def model_joint_order(robot: Robot) -> list[int]:
-    """The robot's joints in the order in which the model has them behind the free joint: indices into ``joint_names``."""
+    """Return the model's joint order behind the free joint, as indices into ``joint_names``."""
     model = robot_model(robot)
     address = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
     return sorted(range(robot.num_joints), key=address.__getitem__)
 
 
 def stance_span(robot: Robot) -> float:
-    """Largest horizontal distance between two feet in the default pose [m]: the diagonal stance span."""
+    """Return the largest horizontal distance between two feet in the default pose [m]: the diagonal stance span."""
     _, data = default_pose(robot)
     feet = [data.geom(name).xpos[:2] for name in robot.foot_geoms]
     return float(max(np.linalg.norm(a - b) for a, b in combinations(feet, 2)))
 
 
 def total_mass(robot: Robot) -> float:
-    """Mass of the whole robot [kg]."""
+    """Return the mass of the whole robot [kg]."""
     return float(robot_model(robot).body_mass.sum())
 
 
 def robot_model(robot: Robot) -> mujoco.MjModel:
-    """The robot's compiled model."""
+    """Compile the robot's model."""
     import mujoco
 
     return mujoco.MjModel.from_xml_path(str(robot.mjcf))
 
 
 def default_pose(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The robot's model, and its kinematics in the default pose with the base at the origin, level and unturned."""
+    """Return the robot's model and its kinematics in the default pose, the base at the origin, level and unturned."""
     import mujoco
 
     model = robot_model(robot)
@@ -204,7 +194,7 @@ def default_pose(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 def joint_chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
-    """Joints that move a body against the base, from the base outwards."""
+    """Return the joints that move a body against the base, from the base outwards."""
     joints: list[int] = []
     while body not in (base, 0):
         first = int(model.body_jntadr[body])
@@ -214,19 +204,19 @@ def joint_chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
 
 
 def sideways_and_swinging(data: mujoco.MjData, chain: Sequence[int]) -> tuple[int | None, list[int]]:
-    """The first joint of a leg that turns more about the x axis than about any other, if there is one, and the others, or all."""
+    """Return a leg's first joint that turns mainly about the x axis, None without one, and the others, or all if none is left."""
     sideways = next((j for j in chain if int(np.abs(data.xaxis[j]).argmax()) == 0), None)
     return sideways, [j for j in chain if j != sideways] or list(chain)
 
 
 def stretched_length(data: mujoco.MjData, joints: list[int], foot: int) -> float:
-    """Length of the links from the first of a leg's joints to its foot, a geom [m]; what lies along a hinge is width."""
+    """Return the length of the links from a leg's first joint to its foot, a geom [m]; parts along a hinge do not count."""
     links = np.diff([*data.xanchor[joints], data.geom_xpos[foot]], axis=0)
     return sum(float(np.linalg.norm(d - a * (d @ a))) for d, a in zip(links, data.xaxis[joints], strict=True))
 
 
 def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Height of the lowest point of a geom, of its box for what is no sphere [m]."""
+    """Return the height of a geom's lowest point, or that of its bounding box for other shapes than spheres [m]."""
     import mujoco
 
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:

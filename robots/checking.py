@@ -1,4 +1,4 @@
-"""Compares a robot's description with its MuJoCo model. MuJoCo is imported only when a robot is checked."""
+"""Compare a robot's description with its MuJoCo model. MuJoCo is imported only when a robot is checked."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import mujoco
 
 DEPTH_TOLERANCE = 1e-3
-"""Depth to which a robot that is put on the ground may reach into it, and its parts into each other [m]."""
+"""Largest depth of a placed robot in the ground, and of its parts in each other [m]."""
 _GRAVITY = (0.0, 0.0, -9.81)
 _COUNTS = {"joint": "njnt", "body": "nbody", "geom": "ngeom", "site": "nsite"}
 _checked: set[str] = set()
@@ -24,16 +24,14 @@ _checked: set[str] = set()
 
 
 def check_robot(robot: Robot, *, foreign: bool = False) -> None:
-    """Compile the robot's MuJoCo model and check that it has everything that the description names, and nothing that would
-    carry the robot.
+    """Compile the robot's MuJoCo model and check that it has everything that the description names and nothing that carries it.
 
-    That is: the free base and nothing outside it; no welds, forces or options that spare it its weight; the joints with
-    one motor each, if it has any; the feet's geoms; the collision bodies and the trunk's shapes, which must meet
-    the ground; the imu site; that the default pose is within the joint ranges; that nothing is in the ground at
-    ``stand_height``. A robot whose files have not changed is checked once in a process.
+    The model needs: a free base and nothing outside it; no welds, forces or options that take weight off the robot; the joints
+    with one motor each or no motors; the feet's geoms; collision bodies and trunk shapes that meet the ground; the imu site; a
+    default pose within the joint ranges; nothing in the ground at ``stand_height``. A process checks unchanged files once.
 
     Args:
-        foreign: somebody else wrote it: it is compiled and checked in a process of its own, with limits of time and memory.
+        foreign: compile and check the robot in a process of its own, with limits of time and memory.
 
     Raises:
         RobotError: the first disagreement found.
@@ -49,18 +47,14 @@ def check_robot(robot: Robot, *, foreign: bool = False) -> None:
 
 
 def _inspect(robot: Robot) -> None:
-    """Compile and check, here."""
+    """Compile and check in this process."""
     checks = ModelChecks(robot)
     for name in ModelChecks.ORDER:
         getattr(checks, name)()
 
 
 def compiled(mjcf: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """A MuJoCo model's file.
-
-    Raises:
-        RobotError: MuJoCo cannot compile it.
-    """
+    """Compile a MuJoCo model's file; raise ``RobotError`` where MuJoCo cannot."""
     import mujoco
 
     try:
@@ -68,18 +62,18 @@ def compiled(mjcf: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
         return spec, spec.compile()
     except (ValueError, RuntimeError, TypeError, MemoryError, OSError, mujoco.FatalError) as error:
         reason = one_line(error)
-        if "unknown exception" in reason:  # all that MuJoCo says where there is no memory
+        if "unknown exception" in reason:  # MuJoCo's only words for a lack of memory
             reason = "it may need more memory than there is, or than it may use; make it smaller"
         raise RobotError(f"'{one_line(mjcf)}' is not a model that MuJoCo can compile: {reason}") from error
 
 
 def solid(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether a geom meets the ground, whose contype and conaffinity are 1."""
+    """Return whether a geom meets the ground, which has contype and conaffinity 1."""
     return bool((model.geom_contype[geom] | model.geom_conaffinity[geom]) & 1)
 
 
 class ModelChecks:
-    """The single checks. Each says in a sentence what it found, or raises ``RobotError``."""
+    """The single checks. Each returns its finding as a sentence, or raises ``RobotError``."""
 
     ORDER = ("size", "base", "weight", "joints", "motors", "feet", "bodies_and_sites", "standing_pose")
 
@@ -94,7 +88,7 @@ class ModelChecks:
         return RobotError(f"robot '{self.robot.name}': {one_line(problem, 400)}")
 
     def _require(self, names: Iterable[str], key: str, kind: str) -> list[int]:
-        """Ids of named model objects (``joint``, ``body``, ``geom``, ``site``); those of ``key`` must all exist."""
+        """Return the ids of the model objects (``joint``, ``body``, ``geom``, ``site``) that the field ``key`` names; all must exist."""
         view = getattr(self.model, kind)
         known = {view(i).name: i for i in range(getattr(self.model, _COUNTS[kind]))}
         for name in names:
@@ -104,7 +98,7 @@ class ModelChecks:
         return [known[name] for name in names]
 
     def size(self) -> str:
-        """A few lines of XML can stand for a million parts, each of which every world would simulate."""
+        """Limit the number of parts: a few lines of XML can stand for a million, which every world would simulate."""
         model = self.model
         counts = {"bodies": model.nbody, "geoms": model.ngeom, "sites": model.nsite, "degrees of freedom": model.nv}
         for kind, count in counts.items():
@@ -113,24 +107,22 @@ class ModelChecks:
         return f"MuJoCo compiles {self.robot.mjcf.name}: {model.nbody - 1} bodies, {model.ngeom} geoms, {model.nv} degrees of freedom"
 
     def base(self) -> str:
-        """The base is free, and nothing is in the file beside the robot."""
-        model, robot = self.model, self.robot
+        """Check that the base is free and that the file holds nothing beside the robot."""
+        model, robot, file = self.model, self.robot, self.robot.mjcf.name
         (base,) = self._require([robot.base_body], "base_body", "body")
         free = [j for j in range(model.njnt) if model.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_FREE]
         if [model.jnt_bodyid[j] for j in free] != [base]:
-            raise self._error(f"{robot.mjcf.name} must have one free joint, on the base_body '{robot.base_body}'")
+            raise self._error(f"{file} must have one free joint, on the base_body '{robot.base_body}'")
         if any(model.geom_bodyid == 0) or any(model.site_bodyid == 0):
-            raise self._error(f"{robot.mjcf.name} has geoms or sites in its worldbody; it must hold the robot alone")
+            raise self._error(f"{file} has geoms or sites in its worldbody; it must hold the robot alone")
         outside = [i for i in range(1, model.nbody) if model.body_rootid[i] != base]
         if outside:
             name = model.body(outside[0]).name or f"body {outside[0]}"
-            raise self._error(
-                f"{robot.mjcf.name} has the body '{name}' outside '{robot.base_body}'; it must hold the robot alone"
-            )
+            raise self._error(f"{file} has the body '{name}' outside '{robot.base_body}'; it must hold the robot alone")
         return f"'{robot.base_body}' is free, and there is nothing beside the robot"
 
     def weight(self) -> str:
-        """Nothing but the ground may carry the robot."""
+        """Check that nothing but the ground carries the robot."""
         model, option, file = self.model, self.model.opt, self.robot.mjcf.name
         free = slice(0, 6)  # the base's joint comes first: it is the root of the only tree
         passive = model.dof_damping[free].any() or model.dof_frictionloss[free].any() or model.dof_armature[free].any()
@@ -157,12 +149,12 @@ class ModelChecks:
         return f"nothing but the ground carries its {model.body_mass.sum():.3f} kg"
 
     def _body_of(self, equality: int, thing: int) -> int:
-        """The body at one end of an equality; 0 is the world."""
+        """Return the body at one end of an equality; 0 is the world."""
         site = int(self.model.eq_objtype[equality]) == int(self.mujoco.mjtObj.mjOBJ_SITE)
         return int(self.model.site_bodyid[thing]) if site else int(thing)
 
     def joints(self) -> str:
-        """Joints are hinges, all named, with the default pose within their ranges."""
+        """Check that joints are hinges, all named, with the default pose within their ranges."""
         model, robot = self.model, self.robot
         ids = self._require(robot.joint_names, "joint_names", "joint")
         for name, joint in zip(robot.joint_names, ids, strict=True):
@@ -184,8 +176,8 @@ class ModelChecks:
         return f"{len(ids)} hinges, all named, with the default pose within their ranges"
 
     def motors(self) -> str:
-        """A model with motors has one on each joint."""
-        model, robot = self.model, self.robot
+        """Check that a model with motors has one on each joint."""
+        model, robot, file = self.model, self.robot, self.robot.mjcf.name
         if not model.nu:
             return "the model has no motors; the engines bring their own"
         ids = self._require(robot.joint_names, "joint_names", "joint")
@@ -196,17 +188,13 @@ class ModelChecks:
         ]
         for name, joint in zip(robot.joint_names, ids, strict=True):
             if driven.count(joint) != 1:
-                raise self._error(
-                    f"{robot.mjcf.name} has {driven.count(joint)} actuators on '{name}'; it must have one"
-                )
+                raise self._error(f"{file} has {driven.count(joint)} actuators on '{name}'; it must have one")
         if model.nu != len(ids):
-            raise self._error(
-                f"{robot.mjcf.name} has {model.nu} actuators for {len(ids)} joints; it must have one for each"
-            )
+            raise self._error(f"{file} has {model.nu} actuators for {len(ids)} joints; it must have one for each")
         return "one motor for each joint"
 
     def feet(self) -> str:
-        """Feet have shapes that meet the ground."""
+        """Check that feet have shapes that meet the ground."""
         model, robot = self.model, self.robot
         for geom in self._require(robot.foot_geoms, "foot_shapes" if robot.foot_shapes else "foot_names", "geom"):
             if not solid(model, geom):
@@ -215,44 +203,35 @@ class ModelChecks:
         return f"{len(robot.foot_names)} feet that meet the ground: {', '.join(robot.foot_names)}"
 
     def bodies_and_sites(self) -> str:
-        """Bodies, trunk shapes and the gyroscope's site are where they must be."""
-        (base,) = self._require([self.robot.base_body], "base_body", "body")
-        model = self.model
-        bodies = self._require(self.robot.collision_bodies, "collision_bodies", "body")
+        """Check the places of bodies, trunk shapes and the gyroscope's site."""
+        model, robot = self.model, self.robot
+        (base,) = self._require([robot.base_body], "base_body", "body")
+        bodies = self._require(robot.collision_bodies, "collision_bodies", "body")
         if base not in bodies:
-            raise self._error(f"collision_bodies lacks the base_body '{self.robot.base_body}'; add it")
-        for name, body in zip(self.robot.collision_bodies, bodies, strict=True):
+            raise self._error(f"collision_bodies lacks the base_body '{robot.base_body}'; add it")
+        for name, body in zip(robot.collision_bodies, bodies, strict=True):
             first = model.body_geomadr[body]
             if not any(solid(model, g) for g in range(first, first + model.body_geomnum[body])):
-                raise self._error(
-                    f"no geom of the body '{name}' (collision_bodies) meets the ground; give one contype 1"
-                )
-        shapes = self._require(self.robot.trunk_shapes, "trunk_shapes", "geom")
-        for name, geom in zip(self.robot.trunk_shapes, shapes, strict=True):
+                raise self._error(f"no geom of body '{name}' (collision_bodies) meets the ground; give one contype 1")
+        shapes = self._require(robot.trunk_shapes, "trunk_shapes", "geom")
+        for name, geom in zip(robot.trunk_shapes, shapes, strict=True):
             if model.geom_bodyid[geom] != base:
-                raise self._error(
-                    f"trunk_shapes names '{name}', which is not on the base_body '{self.robot.base_body}'"
-                )
+                raise self._error(f"trunk_shapes names '{name}', which is not on the base_body '{robot.base_body}'")
             if not solid(model, geom):
-                raise self._error(
-                    f"the trunk shape '{name}' does not meet the ground; give it contype or conaffinity 1"
-                )
+                raise self._error(f"trunk shape '{name}' does not meet the ground; give it contype or conaffinity 1")
         found = f"{len(bodies)} bodies and {len(shapes)} trunk shapes meet the ground"
-        if self.robot.imu_site is None:
+        if robot.imu_site is None:
             return f"{found}; no site of a gyroscope is named"
-        (imu,) = self._require([self.robot.imu_site], "imu_site", "site")
-        if self.model.site_bodyid[imu] != base:
-            raise self._error(f"imu_site '{self.robot.imu_site}' must be on the base_body '{self.robot.base_body}'")
-        return f"{found}; the gyroscope sits at '{self.robot.imu_site}'"
+        (imu,) = self._require([robot.imu_site], "imu_site", "site")
+        if model.site_bodyid[imu] != base:
+            raise self._error(f"imu_site '{robot.imu_site}' must be on the base_body '{robot.base_body}'")
+        return f"{found}; the gyroscope sits at '{robot.imu_site}'"
 
     def standing_pose(self) -> str:
         """Put the robot on a floor at ``stand_height``: nothing may be in it."""
-        robot, height = self.robot, self.robot.stand_height
-        spec = self.spec
-        spec.worldbody.add_geom(
-            type=self.mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1, margin=0.0
-        )
-        model = spec.compile()
+        robot, height, plane = self.robot, self.robot.stand_height, self.mujoco.mjtGeom.mjGEOM_PLANE
+        self.spec.worldbody.add_geom(type=plane, size=[0, 0, 1], contype=1, conaffinity=1, margin=0.0)
+        model = self.spec.compile()
         data = self.mujoco.MjData(model)
         data.qpos[:7] = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
         for name, angle in zip(robot.joint_names, robot.default_joint_position, strict=True):

@@ -1,4 +1,4 @@
-"""Writes a first ``robot.toml`` for any MuJoCo model of a legged robot: what the model says is read, the rest guessed and said."""
+"""Write a first ``robot.toml`` for any MuJoCo model of a legged robot: read the model, guess the rest, and say so."""
 
 from __future__ import annotations
 
@@ -26,10 +26,9 @@ _CLEARANCE = 0.02
 """Height above the ground at which an episode is to start [m]."""
 _GUESSED = "guessed"
 _STIFFER = (1.0, 2.0, 4.0, 8.0)
-"""Factors of the stiffness with which the robot is tried."""
+"""Factors of the guessed stiffness that are tried in turn."""
 _LOWEST, _MOST_TILT = 0.75, 0.2
-"""Share of its height to which a robot may sink, and tilt to which it may lean [rad], with a stiffness that is guessed: less than what
-``robot check`` lets pass."""
+"""Smallest share of its height and largest tilt [rad] of a robot that stands with a guessed stiffness; ``robot check`` allows more."""
 _LINE = 100
 """Longest line of a list [characters]."""
 
@@ -39,10 +38,10 @@ class Entry:
     """A line of the description."""
 
     key: str
-    """Name; with a dot before it that of its table."""
+    """Name, with its table's before a dot."""
     value: Any
     remark: str = ""
-    """Where the value comes from."""
+    """Origin of the value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +51,11 @@ class Draft:
     name: str
     entries: tuple[Entry, ...]
     model: str
-    """The model as MJCF, with names for what the description has to name and spheres for feet that it lacks; empty where the file
-    itself has them."""
+    """The model as MJCF with added names and feet that the description needs; empty where the file itself has them."""
 
     @property
     def guesses(self) -> list[str]:
-        """What was guessed, as sentences."""
+        """Return the guesses as sentences."""
         return [
             f"{e.key} = {' '.join(_toml(e.value).split())} ({e.remark})"
             for e in self.entries
@@ -65,7 +63,7 @@ class Draft:
         ]
 
     def text(self, mjcf: str) -> str:
-        """The ``robot.toml``, whose model lies at ``mjcf`` relative to it."""
+        """Return the text of the ``robot.toml``; ``mjcf`` is the model's path relative to it."""
         lines = [
             f"# A first description of {self.name}, made from its model: go through what is guessed. SI units and radians.",
             "# A value per joint is one number for all joints, a list in the order of `joint_names`, or a table whose keys",
@@ -85,24 +83,20 @@ class Draft:
 
 
 def draft_robot(model: Path, name: str | None = None, *, folder: Path | None = None) -> Draft:
-    """Read a model, in a process of its own, and guess what it does not say.
+    """Read a model in a process of its own, and guess the values that it lacks.
 
     Args:
         model: MJCF of the robot alone.
         name: of the robot; None for the model's.
-        folder: where the description, and a model with names, are to lie; None for the model's folder.
+        folder: for the description and a model with names; None for the model's folder.
 
     Raises:
-        RobotError: MuJoCo cannot compile it, or it is no legged robot on a free base.
+        RobotError: MuJoCo cannot compile the model, or it is no legged robot on a free base.
     """
     if not model.is_file():
         raise RobotError(f"there is no model '{one_line(model)}'; give the MJCF file of the robot")
-    return build(
-        Draft,
-        parse_json(run_apart(partial(_draft, model, name, folder or model.parent), model), "the draft", RobotError),
-        "the draft",
-        RobotError,
-    )
+    text = run_apart(partial(_draft, model, name, folder or model.parent), model)
+    return build(Draft, parse_json(text, "the draft", RobotError), "the draft", RobotError)
 
 
 def _draft(path: Path, name: str | None, home: Path) -> str:
@@ -120,10 +114,8 @@ def _draft(path: Path, name: str | None, home: Path) -> str:
     order = f"{_GUESSED} order: leg by leg, the front left one first, from the base outwards"
     feet = f"{_GUESSED}: the shape at the end of each leg, legs in the same order"
     if survey.added_feet:
-        feet += (
-            f"; {survey.added_feet} are small spheres added at the ends of shapes that are a whole shank, since a foot's position is the "
-            "centre of its shape"
-        )
+        spheres = f"{survey.added_feet} are small spheres added at the ends of shapes that are a whole shank"
+        feet += f"; {spheres}, since a foot's position is the centre of its shape"
     trunk = f"{_GUESSED}: the largest shape of the base; others count as head and sensors"
     above = f"{_GUESSED}: {_CLEARANCE:g} m above where the feet touch the ground in the default pose"
     commands = f"{_GUESSED} from legs of {length:.3f} m: forward, sideways [m/s], turning [rad/s]"
@@ -150,7 +142,7 @@ def _draft(path: Path, name: str | None, home: Path) -> str:
         for kind in ("meshdir", "texturedir"):
             setattr(spec, kind, str(path.parent.resolve() / getattr(spec, kind)))
         text = spec.to_xml()
-        for assets in {spec.meshdir, spec.texturedir}:  # MuJoCo had to find them from here, and will have to from there
+        for assets in {spec.meshdir, spec.texturedir}:  # absolute for this process, relative to the folder in the draft
             text = text.replace(f'dir="{assets}', f'dir="{os.path.relpath(assets, home.resolve())}')
     return json.dumps(asdict(Draft(name=entries[0].value, entries=tuple(entries), model=text)))
 
@@ -158,7 +150,7 @@ def _draft(path: Path, name: str | None, home: Path) -> str:
 def _standing_motors(
     survey: Survey, pose: Mapping[int, float], joints: list[int], length: float
 ) -> dict[str, Remarked]:
-    """Constants of the joints; a stiffness that is guessed is doubled until the placed robot stands."""
+    """Return constants of the joints; a guessed stiffness is doubled until the placed robot stands."""
     first = survey.motors(joints, length)
     guess, remark = first["stiffness"]
     if not remark.startswith(_GUESSED):
@@ -171,24 +163,20 @@ def _standing_motors(
         stances.append(stand_still(survey.spec.copy(), angles, JointParameters(**constants), height))
         if stances[-1].stands(lowest=_LOWEST, most_tilt=_MOST_TILT):
             if stiffer > 1.0:
-                motors["stiffness"] = (
-                    motors["stiffness"][0],
-                    f"{remark}, and raised from {guess:g}, with which it does not stand well",
-                )
+                raised = f"{remark}, and raised from {guess:g}, with which it does not stand well"
+                motors["stiffness"] = (motors["stiffness"][0], raised)
             return motors
         if stances[-1].apart_after is not None:
             break
     how = "it flies apart" if stances[0].apart_after is not None else str(stances[0])
-    first["stiffness"] = (
-        guess,
-        f"{remark}; it does not stand well with it, nor with up to {motors['stiffness'][0]:g}: {how}; mend default_joint_position, "
-        "torque_limit and stiffness until robot check passes",
-    )
+    weak = f"it does not stand well with it, nor with up to {motors['stiffness'][0]:g}: {how}"
+    mend = "mend default_joint_position, torque_limit and stiffness until robot check passes"
+    first["stiffness"] = (guess, f"{remark}; {weak}; {mend}")
     return first
 
 
 def _toml(value: Any) -> str:
-    """A value as TOML; equal numbers of a list become one."""
+    """Return a value as TOML; equal numbers of a list become one."""
     if isinstance(value, list):
         if len(value) > 3 and len(set(value)) == 1 and not isinstance(value[0], str):
             return _toml(value[0])

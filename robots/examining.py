@@ -1,4 +1,4 @@
-"""Looks a robot over for its owner: every check, as a sentence, whether it holds or not; and how it stands with its gains."""
+"""Examine a robot for its owner: the finding of every check as a sentence, and the stance with its gains."""
 
 from __future__ import annotations
 
@@ -23,33 +23,30 @@ if TYPE_CHECKING:
     import mujoco
 
 STANDING_SECONDS = 2.0
-"""How long the robot is left standing [s]."""
+"""Duration of standing [s]."""
 _TIMESTEP = 0.002
 _TRAINING_TIMESTEP = 0.005
 _MOST_TILT = 0.3
-"""Tilt beyond which a robot does not stand [rad]."""
+"""Largest tilt of a standing robot [rad]."""
 _LOWEST = 0.7
-"""Share of its standing height below which a robot does not stand."""
+"""Smallest height of a standing robot, as a share of its first one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What came of one check."""
+    """Result of one check."""
 
     check: str
     """Its name."""
     passed: bool
     sentence: str
-    """What was found, or what is wrong and what to change."""
+    """The finding, or the fault and the remedy."""
     needed_for: str
-    """What does not work where it fails: ``everything``, or a part of the project."""
+    """Part of the project that fails with the check, or ``everything``."""
 
 
 def examine(robot: Robot) -> list[Finding]:
-    """Check a robot's model, in a process of its own, and say what every check found.
-
-    A check that needs what an earlier one found missing is left out.
-    """
+    """Check a robot's model in a process of its own; checks that need a part found missing are left out."""
     try:
         text = run_apart(partial(_findings, robot), robot.mjcf)
     except RobotError as error:
@@ -62,11 +59,10 @@ def _findings(robot: Robot) -> str:
 
     def note(check: str, look: Callable[[], str], needed_for: str = "everything") -> None:
         try:
-            finding = Finding(check=check, passed=True, sentence=look(), needed_for=needed_for)
+            passed, sentence = True, look()
         except RobotError as error:
-            sentence = str(error).removeprefix(f"robot '{robot.name}': ")
-            finding = Finding(check=check, passed=False, sentence=sentence, needed_for=needed_for)
-        found.append(finding)
+            passed, sentence = False, str(error).removeprefix(f"robot '{robot.name}': ")
+        found.append(Finding(check=check, passed=passed, sentence=sentence, needed_for=needed_for))
 
     checks = ModelChecks(robot)
     for name in ModelChecks.ORDER:
@@ -86,15 +82,12 @@ def _findings(robot: Robot) -> str:
 
 def _legs(robot: Robot) -> str:
     plan = body_plan(robot)
-    sideways = f"{len(plan.abduction)} of them with a joint that swings it sideways"
-    return (
-        f"{len(plan.legs)} legs of {plan.leg_length:.3f} m, {sideways}; the base stands {plan.standing_height:.3f} m high in the "
-        "default pose"
-    )
+    legs = f"{len(plan.legs)} legs of {plan.leg_length:.3f} m, {len(plan.abduction)} of them with a joint that swings it sideways"
+    return f"{legs}; the base stands {plan.standing_height:.3f} m high in the default pose"
 
 
 def _foot_shapes(robot: Robot) -> str:
-    """The centre of a foot's shape is the foot's position, and must not be in the middle of a shank."""
+    """Check that the centre of a foot's shape, which is the foot's position, is not in the middle of a shank."""
     model, data = default_pose(robot)
     base, heights = model.body(robot.base_body).id, []
     for name, shape in zip(robot.foot_names, robot.foot_geoms, strict=True):
@@ -111,7 +104,7 @@ def _foot_shapes(robot: Robot) -> str:
 
 
 def _parts(robot: Robot) -> str:
-    """Parts that MuJoCo lets meet must not be inside each other in the default pose."""
+    """Check that colliding parts are not inside each other in the default pose."""
     import mujoco
 
     model, data = default_pose(robot)
@@ -127,18 +120,19 @@ def _parts(robot: Robot) -> str:
 
 
 def _part(model: mujoco.MjModel, geom: int) -> str:
-    """What a geom is, in words."""
+    """Describe a geom in words."""
     name, body = model.geom(geom).name, model.body(int(model.geom_bodyid[geom]))
     shape = f"the geom '{name}'" if name else "a geom"
     return f"{shape} of the body '{body.name or body.id}'"
 
 
 def stand(robot: Robot) -> str:
-    """Let a robot stand in its default pose with the gains of its default parameters, and say how it stands. Its parts meet, as in
-    training and in the suites.
+    """Let a robot stand in its default pose with the gains of its default parameters, and describe its stance.
+
+    Its parts meet, as in training and in the suites.
 
     Raises:
-        RobotError: it falls, sinks or flies apart.
+        RobotError: the robot falls, sinks or flies apart.
     """
     import mujoco
 
@@ -163,7 +157,7 @@ def stand(robot: Robot) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Stance:
-    """How a robot stands that was left standing in a pose."""
+    """Stance of a robot that was left standing in a pose."""
 
     height: float
     """Of its base at the end [m]."""
@@ -174,10 +168,10 @@ class Stance:
     torque: float
     """Largest share of a motor's torque limit at the end."""
     apart_after: float | None = None
-    """When it flew apart [s]."""
+    """Time at which the robot flew apart [s]; None where it did not."""
 
     def stands(self, *, lowest: float = _LOWEST, most_tilt: float = _MOST_TILT) -> bool:
-        """Whether it has neither flown apart nor sunk below a share of its first height nor leans further than that [rad]."""
+        """Return whether the robot is whole, at least ``lowest`` of its first height high, and tilted by ``most_tilt`` [rad] at most."""
         return self.apart_after is None and self.tilt <= most_tilt and self.height >= lowest * self.start
 
     def __str__(self) -> str:
@@ -188,7 +182,7 @@ def stand_still(spec: mujoco.MjSpec, pose: Mapping[str, float], motors: JointPar
     """Leave a robot standing on level ground.
 
     Args:
-        spec: the robot alone; it is given ground, and its actuators are switched off.
+        spec: the robot alone; ground is added, and its actuators are switched off.
         pose: the angle that each joint is to keep [rad].
         motors: of the joints, in the order of ``pose``.
         height: of the base at the beginning [m].
@@ -235,17 +229,17 @@ def _mirror(robot: Robot) -> str:
 
 
 def _ranges(robot: Robot) -> str:
-    free = [
-        n for n, bounds in zip(robot.joint_names, joint_ranges(robot), strict=True) if not np.isfinite(bounds).all()
-    ]
+    ranges = zip(robot.joint_names, joint_ranges(robot), strict=True)
+    free = [name for name, bounds in ranges if not np.isfinite(bounds).all()]
     if free:
         raise RobotError(f"{len(free)} joints have no range in the model ('{free[0]}' …); give them one")
     return "every joint has a range"
 
 
 def damped_share(robot: Robot, motors: JointParameters) -> float:
-    """Largest share of a motion of the joints in the default pose that the explicit motor law takes away in a step of training's
-    physics, by damping or along the line on which torque falls with speed; from 2 on the joints swing ever further.
+    """Return the largest share of joint speed that the explicit motor law removes in one training step in the default pose.
+
+    The law acts by damping, or along the line on which torque falls with speed; from 2 on joints swing ever further.
     """
     import mujoco
 
@@ -255,7 +249,7 @@ def damped_share(robot: Robot, motors: JointParameters) -> float:
     mujoco.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
-    inertia[at, at] += _TRAINING_TIMESTEP * np.array(motors.joint_damping)  # what is passive is integrated implicitly
+    inertia[at, at] += _TRAINING_TIMESTEP * np.array(motors.joint_damping)  # passive damping is integrated implicitly
     slope = np.array(motors.damping)
     if motors.full_torque_speed is not None and motors.no_load_speed is not None:
         driving = np.array(motors.driving_torque_limit or motors.torque_limit)
@@ -279,9 +273,7 @@ def _motor_law(robot: Robot) -> str:
 
 def _parameters(robot: Robot) -> str:
     if "gauge" not in robot.parameters:
-        raise RobotError(
-            f"there is no parameter set 'gauge', which suites ask for; it has {', '.join(robot.parameters)}"
-        )
+        raise RobotError(f"suites need the parameter set 'gauge'; the robot has {', '.join(robot.parameters)}")
     return f"parameter sets: {', '.join(robot.parameters)}"
 
 

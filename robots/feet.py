@@ -1,4 +1,4 @@
-"""Where a leg ends whose foot is a whole shank: a foot's position is the centre of its shape, which there is no place to stand on."""
+"""Find the end of a leg that has a whole shank for a foot: the centre of such a shape is no place to stand on."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     import mujoco
 
 _LONG = 2.0
-"""Length over width from which a shape that lies along the shank is taken for it."""
+"""Smallest length over width of a shape that counts as a shank."""
 _ALONG = 0.7
-"""Smallest cosine between a shape that lies along the shank and the line from the knee to its end."""
+"""Smallest cosine between a shank's shape and the line from the knee to its end."""
 _WIDER = 1.25
 """Radius of a sphere at the end of a shape over that of what it covers: the sphere alone meets the ground."""
 _TIP = 0.1
-"""Share of a mesh's length whose points are its end."""
+"""Share of a mesh's length that counts as its end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +34,11 @@ class ShankEnd:
 
 
 def shank_end(model: mujoco.MjModel, data: mujoco.MjData, geom: int, knee: NDArray[np.float64]) -> ShankEnd | None:
-    """The end of a foot's shape that is a whole shank; None for what is a foot.
+    """Return the end of a foot's shape, a geom, that is a whole shank; None for a foot.
 
     Args:
-        model: the robot.
-        data: its kinematics.
-        geom: the foot's shape.
-        knee: where the last joint above it is, world frame [m].
+        data: the robot's kinematics.
+        knee: place of the last joint above the foot, world frame [m].
     """
     import mujoco
 
@@ -51,7 +49,7 @@ def shank_end(model: mujoco.MjModel, data: mujoco.MjData, geom: int, knee: NDArr
     across = [i for i in range(3) if i != long]
     if half[long] < _LONG * half[across].max():
         return None
-    # in the shape's own frame; its end is what is further from the knee
+    # in the shape's own frame; the end is the side further from the knee
     turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
     from_knee = turn.T @ (knee - place)
     outwards = 1.0 if from_knee[long] < middle[long] else -1.0
@@ -70,7 +68,7 @@ def shank_end(model: mujoco.MjModel, data: mujoco.MjData, geom: int, knee: NDArr
         width = float(np.linalg.norm(half[across]))
     else:
         width = float(half[across].max())
-    # round a capsule's end, which an ellipsoid's is within; at a flat end half a width back, from where its rim is 1.12 widths away
+    # the sphere's centre: that of a capsule's round end, which encloses an ellipsoid's; half a width behind a flat end
     end[long] -= outwards * width * (1.0 if kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_ELLIPSOID) else 0.5)
     body = model.geom_bodyid[geom]
     center = data.xmat[body].reshape(3, 3).T @ (place + turn @ end - data.xpos[body])
@@ -78,7 +76,7 @@ def shank_end(model: mujoco.MjModel, data: mujoco.MjData, geom: int, knee: NDArr
 
 
 def add_foot(body: mujoco.MjsBody, name: str, end: ShankEnd, shank: mujoco.MjsGeom) -> None:
-    """Add a sphere without a mass to the end of a shank, to meet the ground as the shank does."""
+    """Add a massless sphere to the end of a shank, with the shank's contact properties."""
     import mujoco
 
     foot = body.add_geom(

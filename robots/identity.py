@@ -1,8 +1,7 @@
-"""Which robot a policy is for: what every policy remembers of it, and how it is found again.
+"""Remember the robot that a policy is for, and find it again.
 
-An installed robot is remembered by its name, one that was given as a file by the file's path and by a copy of the
-description and of the model's files, so that a policy can be played where the file is not. Digests say whether what is
-found is what was meant.
+A policy remembers an installed robot by its name; a robot given as a file by the file's path and a copy of the description
+and the model's files, so that the policy can be played without the file. Digests tell whether the robot found is the same.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ from .loading import LARGEST_MODEL, RobotError, model_files, robot_digest
 from .registry import load_robot, robot_names
 
 LARGEST_COPY = 400_000
-"""Largest copy of a robot in a policy [characters]; a model with more than this in its meshes is remembered by its path."""
+"""Largest copy of a robot in a policy [characters]; a larger model is remembered by its path alone."""
 _LARGEST_UNPACKED = 50_000_000
-"""Size of the files of a copy once they are unpacked [bytes]."""
+"""Largest size of a copy's unpacked files [bytes]."""
 _Digest = Annotated[str, Field(min_length=64, max_length=64)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotIdentity:
-    """What a policy remembers of its robot."""
+    """Data that a policy remembers of its robot."""
 
     name: Name
     digest: _Digest
@@ -43,16 +42,13 @@ class RobotIdentity:
     source: Text | None = None
     """Absolute path of its description; None for an installed robot."""
     description: Mapping[Text, Any] | None = None
-    """Fields of ``Robot``; ``mjcf`` is a name in ``files``. None where nothing is carried along."""
+    """Fields of ``Robot``; ``mjcf`` is a name in ``files``. None where the policy carries no copy."""
     files: Mapping[Text, str] | None = None
-    """Files of the model by their path among each other, compressed (zlib) in base64."""
+    """Files of the model by relative path, compressed (zlib) in base64."""
 
 
 def identify(robot: Robot, source: str) -> dict[str, Any]:
-    """What a policy is to remember of a robot, as plain data.
-
-    Args:
-        source: how it was asked for: a name or a path.
+    """Return the data for a policy to remember of a robot, which the user named by ``source``, a name or a path.
 
     Raises:
         RobotError: a file of the model cannot be read.
@@ -65,17 +61,12 @@ def identify(robot: Robot, source: str) -> dict[str, Any]:
 
 
 def packed(robot: Robot) -> RobotIdentity:
-    """A robot with all its files, for a machine that may have none of them; ``unpacked`` makes it a robot there.
-
-    Raises:
-        RobotError: a file of the model cannot be read.
-    """
-    copy = _copy(robot, LARGEST_MODEL)
-    return RobotIdentity(name=robot.name, digest=robot_digest(robot), **copy)
+    """Pack a robot with all its files for another machine's ``unpacked``; raise ``RobotError`` where a file cannot be read."""
+    return RobotIdentity(name=robot.name, digest=robot_digest(robot), **_copy(robot, LARGEST_MODEL))
 
 
 def _copy(robot: Robot, largest: int) -> dict[str, Any]:
-    """Description and files as in ``RobotIdentity``; nothing if they are larger than so many characters."""
+    """Return description and files as in ``RobotIdentity``; nothing if they have more than ``largest`` characters."""
     paths = [path.resolve() for path in model_files(robot.mjcf)]
     folder = Path(os.path.commonpath([path.parent for path in paths]))
     files: dict[str, str] = {}
@@ -91,16 +82,16 @@ def _copy(robot: Robot, largest: int) -> dict[str, Any]:
 
 
 def recall(remembered: Any) -> tuple[Robot, str | None]:
-    """The robot that a policy remembers, checked against its model.
+    """Find the robot that a policy remembers, and check it against its model.
 
     Args:
-        remembered: what ``identify`` returned, as it comes back from a file that anybody may have written.
+        remembered: result of ``identify``, read back from a file that anybody may have written.
 
     Returns:
-        The robot, and a sentence where it is not the one that the policy was made for or comes from the policy itself.
+        The robot, and a sentence where the robot has changed since or comes from the policy itself.
 
     Raises:
-        RobotError: it is not there any more, or what is remembered is malformed.
+        RobotError: the robot is gone, or the data are malformed.
     """
     known = build(RobotIdentity, remembered, "the robot that the policy remembers", RobotError)
     if known.source is None:
@@ -116,13 +107,12 @@ def recall(remembered: Any) -> tuple[Robot, str | None]:
         )
     folder = Path(tempfile.mkdtemp(prefix="gaitgauge-robot-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return unpacked(
-        known, folder
-    ), f"'{one_line(known.source)}' is not there; the robot is the copy that the policy carries"
+    said = f"'{one_line(known.source)}' is not there; the robot is the copy that the policy carries"
+    return unpacked(known, folder), said
 
 
 def changed(robot: Robot, digest: str, what: str) -> str | None:
-    """A sentence if a robot is not the one of a digest."""
+    """Return a sentence where a robot has another digest, else None."""
     found = robot_digest(robot)
     if found == digest:
         return None
@@ -133,14 +123,14 @@ def changed(robot: Robot, digest: str, what: str) -> str | None:
 
 
 def unpacked(known: RobotIdentity, folder: Path, *, largest: int = _LARGEST_UNPACKED) -> Robot:
-    """Write a robot's files into an empty folder, where they have to stay while the robot is read.
+    """Write a robot's files into an empty folder, where they must stay while the robot is in use.
 
     Args:
-        known: the robot, perhaps a stranger's.
-        largest: their size once they are unpacked, at most [bytes].
+        known: the robot, perhaps a foreign one.
+        largest: most unpacked size [bytes].
 
     Raises:
-        RobotError: they are damaged, lead out of the folder, or are not what the digest says.
+        RobotError: the files are damaged, lead out of the folder, or have another digest.
     """
     assert known.files is not None and known.description is not None
     source = f"the copy of the robot '{known.name}' that the policy carries"
@@ -163,7 +153,7 @@ def unpacked(known: RobotIdentity, folder: Path, *, largest: int = _LARGEST_UNPA
             raise
         raise RobotError(f"{source} cannot be unpacked: {one_line(error)}") from error
     mjcf = folder / str(known.description.get("mjcf"))
-    model_files(mjcf, within=folder)  # refused before any other file is read
+    model_files(mjcf, within=folder)  # refuse other files before any is read
     robot = build(Robot, {**known.description, "mjcf": str(mjcf)}, source, RobotError)
     if robot_digest(robot) != known.digest:
         raise RobotError(f"{source} is damaged: its digest is not the one that the policy remembers; give --robot")

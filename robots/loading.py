@@ -1,9 +1,9 @@
-"""Reads a robot from a ``robot.toml``.
+"""Read a robot from a ``robot.toml``.
 
-The file's keys are the fields of ``Robot`` and, in ``[parameters.NAME]`` tables, those of ``JointParameters``; all must
-be there but those that have a default. ``mjcf`` is relative to the file. A value per joint is one number for all joints,
-a list in the order of ``joint_names``, or a table whose keys are joint names or their endings (``calf`` fits ``FL_calf``
-and ``FL_calf_joint``); the longest fitting key wins.
+The file's keys are the fields of ``Robot`` and, in ``[parameters.NAME]`` tables, of ``JointParameters``; keys with a default may
+be absent. ``mjcf`` is relative to the file. A value per joint is one number for all joints, a list in the order of
+``joint_names``, or a table by joint names or their endings (``calf`` fits ``FL_calf`` and ``FL_calf_joint``); the longest
+fitting key wins.
 """
 
 from __future__ import annotations
@@ -23,28 +23,26 @@ from .base import JointParameters, Robot
 
 ROBOT_FILE = "robot.toml"
 LARGEST_XML = 4_000_000
-"""Size of one file of a model [bytes]."""
+"""Largest size of one file of a model [bytes]."""
 LARGEST_MODEL, MOST_FILES = 512 * 2**20, 2_000
-"""Size of a model with all that it names, meshes and textures [bytes], and number of these files."""
+"""Largest size of a model with its meshes and textures [bytes], and largest number of its files."""
 MOST_PARTS = 2_000
-"""Of each kind; robots have some hundred."""
+"""Most parts of each kind; robots have some hundred."""
 _PARTS = {"body": "bodies", "geom": "geoms", "site": "sites", "joint": "joints"}
 _MOST_ELEMENTS, _MOST_CELLS = 10_000, 4_000_000
-"""Elements of all files, and points of a height field, a texture or a mesh that MuJoCo makes itself."""
+"""Most elements of all files, and most points of a height field, a texture or a mesh that MuJoCo makes itself."""
 _CELLS = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "mesh": ("params",)}
 _JOINT_ENDING = "_joint"
 _ADDED_LATER = ("foot_shapes", "action_scale", "imu_site")
-"""Fields that count for a robot's digest only where they are set, so that those of older descriptions stay."""
+"""Fields that count for a robot's digest only where set, so that digests of older descriptions stay."""
 
 
 class RobotError(ValueError):
-    """A robot cannot be found, or its description is wrong; the message says what, where and what to change."""
+    """A robot that cannot be found or has a wrong description; the message says what is wrong, where, and what to change."""
 
 
 def load_robot_file(path: str | Path) -> Robot:
-    """Read a robot from its description file.
-
-    Only the file itself is checked; ``check_robot`` compares it with the MuJoCo model.
+    """Read a robot from its description file and check that; ``check_robot`` compares it with the MuJoCo model.
 
     Args:
         path: a ``robot.toml`` (any file name), or a folder that holds one.
@@ -77,18 +75,14 @@ def load_robot_file(path: str | Path) -> Robot:
 
 
 def checked_fields(robot: Robot, source: str) -> Robot:
-    """A robot that Python code made, its fields checked as those of a file are.
-
-    Raises:
-        RobotError: a value of the wrong type or out of range.
-    """
+    """Check the fields of a robot that Python code made; raise ``RobotError`` for a wrong type or a value out of range."""
     robot = build(Robot, asdict(robot) | {"mjcf": str(robot.mjcf)}, source, RobotError)
     _check(robot, source)
     return robot
 
 
 def robot_digest(robot: Robot) -> str:
-    """SHA-256, hexadecimal, over the description and the MuJoCo model with all files that it includes, wherever they lie.
+    """Return the SHA-256, hexadecimal, over the description, the MuJoCo model and all files that the model includes.
 
     Raises:
         RobotError: a file cannot be read.
@@ -101,7 +95,7 @@ def robot_digest(robot: Robot) -> str:
 
 
 def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
-    """A MuJoCo model's file and those that it names: included models, meshes, textures, height fields, skins.
+    """Return a MuJoCo model's file and the files that it names: included models, meshes, textures, height fields, skins.
 
     A name that leads nowhere is left out; MuJoCo refuses such a model.
 
@@ -109,8 +103,8 @@ def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
         within: folder in which all must lie, links followed; None for anywhere.
 
     Raises:
-        RobotError: a file cannot be read, is a pipe or a device, lies elsewhere, is not XML or defines entities, all of them
-            are too many or too large, or what they stand for is.
+        RobotError: a file cannot be read, is a pipe or a device, lies elsewhere, is not XML or defines entities; or the files,
+            or the parts that they stand for, are too many or too large.
     """
     try:
         return _model_files(mjcf, within)
@@ -119,7 +113,7 @@ def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
 
 
 def _model_files(mjcf: Path, within: Path | None) -> list[Path]:
-    described = {mjcf: 1.0}  # the XML files, and how many copies are made of what is in them
+    described = {mjcf: 1.0}  # the XML files, and the number of copies that MuJoCo makes of their elements
     found, size = {mjcf: None}, 0
     parts: dict[str, float] = {}
     pending = [mjcf]
@@ -127,14 +121,12 @@ def _model_files(mjcf: Path, within: Path | None) -> list[Path]:
         file = pending.pop(0)
         if within is not None and not file.resolve().is_relative_to(within):
             raise RobotError(f"the model names the file '{one_line(file)}', which is none of its own")
-        if not os.path.isfile(file) and os.path.exists(file):  # MuJoCo would wait for it, or read it without end
+        if not os.path.isfile(file) and os.path.exists(file):  # MuJoCo would wait for a pipe, or read it without end
             raise RobotError(f"'{one_line(file)}' is not a regular file")
         size += file.stat().st_size
         if size > LARGEST_MODEL or len(found) > MOST_FILES:
-            raise RobotError(
-                f"'{one_line(mjcf)}' and the files that it names are over {LARGEST_MODEL // 2**20} MiB or {MOST_FILES:,} files, "
-                "the most that is read of a robot"
-            )
+            most = f"{LARGEST_MODEL // 2**20} MiB or {MOST_FILES:,} files, the most that is read of a robot"
+            raise RobotError(f"'{one_line(mjcf)}' and the files that it names are over {most}")
         if file not in described and file.suffix.lower() not in (".xml", ".mjcf", ".urdf"):
             continue
         elements = _elements(file, described.get(file, 1.0))
@@ -159,31 +151,25 @@ def _model_files(mjcf: Path, within: Path | None) -> list[Path]:
 
 
 _Element = tuple[str, dict[str, str], float]
-"""Tag, attributes, and how many of it MuJoCo makes."""
+"""Tag, attributes, and number of copies that MuJoCo makes."""
 
 
 def _count(elements: list[_Element], parts: dict[str, float], file: Path) -> None:
-    """Add what elements stand for to ``parts``. Before MuJoCo makes them: a line of XML can be a million.
-
-    Raises:
-        RobotError: too many.
-    """
+    """Add the elements' copies to ``parts``; raise ``RobotError`` for too many, since a line of XML can stand for a million."""
     for tag, attributes, copies in elements:
         if tag == "size":
             copies = _product(attributes.get("nkey", ""))
         cells = _product(" ".join(attributes.get(key, "") for key in _CELLS.get(tag, ())))
         if not cells <= _MOST_CELLS:
-            raise RobotError(
-                f"a <{tag}> of '{one_line(file)}' has {_told(cells)} points; at most {_MOST_CELLS:,} are made"
-            )
+            points = f"{_told(cells)} points; at most {_MOST_CELLS:,} are made"
+            raise RobotError(f"a <{tag}> of '{one_line(file)}' has {points}")
         for kind, most in ((_PARTS.get(tag), MOST_PARTS), ("elements", _MOST_ELEMENTS)):
             if kind is None:
                 continue
             parts[kind] = parts.get(kind, 0.0) + copies
             if not parts[kind] <= most:
-                raise RobotError(
-                    f"'{one_line(file)}' has {_told(parts[kind])} {kind} or more; at most {most:,} are simulated of a robot"
-                )
+                made = f"{_told(parts[kind])} {kind} or more"
+                raise RobotError(f"'{one_line(file)}' has {made}; at most {most:,} are simulated of a robot")
 
 
 def _told(count: float) -> str:
@@ -191,7 +177,7 @@ def _told(count: float) -> str:
 
 
 def _product(text: str) -> float:
-    """What several numbers make together, each at least 1; other words are left to MuJoCo."""
+    """Return the product of the numbers in a text, each at least 1; other words are left to MuJoCo."""
     found = 1.0
     for word in text.split():
         with suppress(ValueError):
@@ -200,13 +186,11 @@ def _product(text: str) -> float:
 
 
 def _elements(file: Path, copies: float) -> list[_Element]:
-    """The elements of an XML file of which so many copies are made, in their order."""
+    """Return the elements of an XML file in order, the file itself counting ``copies`` times."""
     with file.open("rb") as opened:
         data = opened.read(LARGEST_XML + 1)
     if len(data) > LARGEST_XML:
-        raise RobotError(
-            f"'{one_line(file)}' is larger than {LARGEST_XML // 10**6} MB, the most that is read of a model"
-        )
+        raise RobotError(f"'{one_line(file)}' is larger than {LARGEST_XML // 10**6} MB, the most read of a model")
     found: list[_Element] = []
     around = [copies]
 
@@ -219,7 +203,7 @@ def _elements(file: Path, copies: float) -> list[_Element]:
     def end(tag: str) -> None:
         around.pop()
 
-    def entity(*_: object) -> None:  # a few lines of them can stand for gigabytes
+    def entity(*_: object) -> None:  # a few lines of entities can stand for gigabytes
         raise RobotError(f"'{one_line(file)}' defines XML entities, which no robot needs; take them out")
 
     parser = expat.ParserCreate()
@@ -235,7 +219,7 @@ def _elements(file: Path, copies: float) -> list[_Element]:
 
 
 def _spread(table: dict[str, Any], keys: Any, joints: list[str], where: str) -> None:
-    """Turn values for all joints, and tables by the ending of joint names, into one value per joint."""
+    """Expand single values, and tables by the ending of joint names, to one value per joint."""
     for key in keys:
         value = table.get(key)
         if isinstance(value, dict):
@@ -249,7 +233,7 @@ def _by_ending(table: Mapping[str, Any], joints: list[str], where: str) -> list[
         if not any(_fits(ending, joint) for joint in joints):
             hint = did_you_mean(ending, [j.removesuffix(_JOINT_ENDING) for j in joints])
             raise RobotError(
-                f"{where} has the key {shown(ending)}, which is neither a joint nor the ending of one{hint}"
+                f"{where} has the key {shown(ending)}, which is neither a joint nor a joint's ending{hint}"
             )
     values = []
     for joint in joints:
@@ -261,26 +245,23 @@ def _by_ending(table: Mapping[str, Any], joints: list[str], where: str) -> list[
 
 
 def _fits(ending: str, joint: str) -> bool:
-    """Whether a table key stands for the joint: its name or whole words at its end, with or without ``_joint``."""
+    """Return whether a key stands for the joint: the name or whole words at its end, with or without ``_joint``."""
     return any(name == ending or name.endswith("_" + ending) for name in (joint, joint.removesuffix(_JOINT_ENDING)))
 
 
 def _check(robot: Robot, source: str) -> None:
-    """Refuse what each field alone allows and all of them together do not."""
-    if not os.path.isfile(robot.mjcf):  # false where the name itself is impossible, too
-        raise RobotError(
-            f"{source}: mjcf names '{one_line(robot.mjcf)}', which does not exist; the path is relative to the robot file"
-        )
+    """Refuse fields that contradict each other."""
+    if not os.path.isfile(robot.mjcf):  # False for an impossible name, too
+        lost = f"mjcf names '{one_line(robot.mjcf)}', which does not exist"
+        raise RobotError(f"{source}: {lost}; the path is relative to the robot file")
     for key in ("joint_names", "foot_names", "collision_bodies", "trunk_shapes", "foot_shapes"):
         names = getattr(robot, key) or ()
         twice = [n for n in names if names.count(n) > 1]
         if twice:
             raise RobotError(f"{source}: {key} names {shown(twice[0])} twice")
     if robot.foot_shapes and len(robot.foot_shapes) != len(robot.foot_names):
-        raise RobotError(
-            f"{source}: foot_shapes has {len(robot.foot_shapes)} names but foot_names has {len(robot.foot_names)}; give one "
-            "for each foot"
-        )
+        counts = f"foot_shapes has {len(robot.foot_shapes)} names but foot_names has {len(robot.foot_names)}"
+        raise RobotError(f"{source}: {counts}; give one for each foot")
     per_joint: dict[str, tuple[float, ...]] = {"default_joint_position": robot.default_joint_position}
     if robot.action_scale is not None:
         per_joint["action_scale"] = robot.action_scale
@@ -294,18 +275,14 @@ def _check(robot: Robot, source: str) -> None:
     if robot.sdk_joint_names and sorted(robot.sdk_joint_names) != sorted(robot.joint_names):
         odd = next((n for n in robot.sdk_joint_names if n not in robot.joint_names), None)
         problem = f"names {shown(odd)}, which is none of joint_names" if odd else "does not name each joint once"
-        raise RobotError(
-            f"{source}: sdk_joint_names {problem}; give every joint once, in the order of the SDK's motors"
-        )
+        raise RobotError(f"{source}: sdk_joint_names {problem}; give every joint once, in the SDK's order of motors")
     if robot.default_parameters not in robot.parameters:
         known = ", ".join(robot.parameters)
-        raise RobotError(
-            f"{source}: default_parameters is {shown(robot.default_parameters)}; the parameter sets are: {known}"
-        )
+        raise RobotError(f"{source}: default_parameters is {shown(robot.default_parameters)}; choose from: {known}")
 
 
 def _check_motors(constants: JointParameters, joints: tuple[str, ...], where: str) -> None:
-    """Refuse a curve of torque over speed that is half given or rises."""
+    """Refuse an incomplete or rising curve of torque over speed."""
     full, none, driving = constants.full_torque_speed, constants.no_load_speed, constants.driving_torque_limit
     if (full is None) != (none is None):
         raise RobotError(f"{where}full_torque_speed and no_load_speed belong together; give both or neither")
@@ -314,7 +291,5 @@ def _check_motors(constants: JointParameters, joints: tuple[str, ...], where: st
             problem = f"is {full[i]:g} rad/s for {joint} but must be below no_load_speed, {none[i]:g}"
             raise RobotError(f"{where}full_torque_speed {problem}")
         if driving and driving[i] > constants.torque_limit[i]:
-            problem = (
-                f"is {driving[i]:g} N·m for {joint} but must not be above torque_limit, {constants.torque_limit[i]:g}"
-            )
-            raise RobotError(f"{where}driving_torque_limit {problem}")
+            most = f"must not be above torque_limit, {constants.torque_limit[i]:g}"
+            raise RobotError(f"{where}driving_torque_limit is {driving[i]:g} N·m for {joint} but {most}")

@@ -1,7 +1,6 @@
-"""Finds robots: the project's own, plug-ins of the entry-point group ``gaitgauge.robots``, and any ``robot.toml``.
+"""Find robots: the project's own, plug-ins of the entry-point group ``gaitgauge.robots``, and any ``robot.toml``.
 
-An entry point refers to a callable that returns a ``Robot``, or to a path of a ``robot.toml``; it bears the robot's
-name.
+An entry point bears the robot's name and refers to a callable that returns a ``Robot``, or to a path of a ``robot.toml``.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _OWN_FOLDER = Path(__file__).parent
 
 
 def robot_names() -> list[str]:
-    """Names of all installed robots, the project's own first."""
+    """Return the names of all installed robots, the project's own first."""
     own = _own()
     return [*own, *sorted(set(plugins(GROUP)) - set(own))]
 
@@ -31,7 +30,7 @@ def load_robot(name_or_path: str | Path, *, check: bool = True) -> Robot:
     Args:
         name_or_path: a name out of ``robot_names()``, the path of a ``robot.toml``, or a folder that holds one. A text
             is a path if it contains a path separator or ends in ``.toml``, else a name.
-        check: compare it with its MuJoCo model (``check_robot``), which takes MuJoCo. A robot that is given by its path is
+        check: compare the robot with its MuJoCo model (``check_robot``), which takes MuJoCo. A robot given by a path is
             compiled in a process of its own.
 
     Raises:
@@ -47,12 +46,12 @@ def load_robot(name_or_path: str | Path, *, check: bool = True) -> Robot:
 
 
 def is_path(text: str) -> bool:
-    """Whether a text names a robot by a path: it contains a path separator or ends in ``.toml``."""
+    """Return whether a text is a robot's path: it contains a path separator or ends in ``.toml``."""
     return "/" in text or os.sep in text or text.endswith(".toml")
 
 
 def lasting(text: str) -> str:
-    """A robot's name, or the absolute path of its description, which holds from any folder."""
+    """Return a robot's name, or the absolute path of its description, which holds from any folder."""
     return os.path.abspath(os.path.expanduser(text)) if is_path(text) else text
 
 
@@ -64,9 +63,8 @@ def _named(text: str) -> Robot:
     if plugin is None:
         known = robot_names()
         hint = did_you_mean(text, known)
-        raise RobotError(
-            f"unknown robot '{one_line(text, 80)}'{hint} (installed: {', '.join(known)}; or give the path of a {ROBOT_FILE})"
-        )
+        choice = f"installed: {', '.join(known)}; or give the path of a {ROBOT_FILE}"
+        raise RobotError(f"unknown robot '{one_line(text, 80)}'{hint} ({choice})")
     found = load_plugin(plugin, RobotError)
     if callable(found):
         found = guarded(plugin, RobotError, found)
@@ -76,9 +74,7 @@ def _named(text: str) -> Robot:
     if not isinstance(found, Robot):
         raise RobotError(f"{source} gave {type(found).__name__}; it must be a path or a callable that returns a Robot")
     if found.name != plugin.name:
-        raise RobotError(
-            f"{source} gave a robot named {shown(found.name)}; entry point and robot must bear the same name"
-        )
+        raise RobotError(f"{source} gave a robot named {shown(found.name)}; entry point and robot must share a name")
     return checked_fields(found, source)
 
 

@@ -1,4 +1,4 @@
-"""What a MuJoCo model tells of a legged robot that nobody has described yet: base, legs, feet, a pose to stand in, motors."""
+"""Survey the MuJoCo model of a legged robot without a description: base, legs, feet, a pose to stand in, motors."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ if TYPE_CHECKING:
 _BEND = 0.8
 """Distance from hip to foot of a standing leg over that of a stretched one: 0.73 for the Go2, 0.85 for ANYmal C."""
 _BEHIND = 0.1
-"""How far a standing foot is behind its hip, or before it where the knee is, over leg length: under the robot's weight knees give
-way, and the hips move towards them."""
+"""Offset of a standing foot from its hip, away from the knee, over leg length: under load knees yield and hips follow."""
 _WIDEST = 2.8
-"""Angle beyond which no pose is looked for [rad]."""
+"""Largest joint angle of a pose [rad]."""
 _STIFFNESS, _TORQUE, _DAMPING, _ARMATURE = 0.3, 0.4, 1.0 / 40.0, 1.5e-4
-"""Stiffness [N·m/rad], torque limit [N·m] and armature [kg·m²] over weight times leg length, and damping over stiffness, of robots
-that walk: for the Go2 0.31, 0.37, 1.6e-4 and 0.025, for ANYmal C 0.26, 0.26, and 0.025."""
+"""Stiffness [N·m/rad], torque limit [N·m] and armature [kg·m²] over weight times leg length, and damping over stiffness. The Go2
+has 0.31, 0.37, 1.6e-4 and 0.025, ANYmal C 0.26, 0.26, and 0.025."""
 
 _FULL_SPEED, _NO_LOAD_SPEED = 5.8, 12.8
 """Motor speeds times leg length [m/s]: those of the Go2."""
 GRAVITY = 9.81
 
 Remarked = tuple[Any, str]
-"""A value, and where it comes from."""
+"""A value and its origin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,14 +49,10 @@ class Leg:
 
 
 class Survey:
-    """A model that is looked over. Names and feet that it lacks and a description needs are given to its spec."""
+    """A model under survey. Names and feet that a description needs are added to its spec."""
 
     def __init__(self, path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-        """Find the base and the legs.
-
-        Raises:
-            RobotError: it is no legged robot on a free base, alone in its file.
-        """
+        """Find the base and the legs; raise ``RobotError`` for anything but one legged robot on a free base."""
         import mujoco
 
         self.mujoco, self.path, self.spec, self.model = mujoco, path, spec, model
@@ -67,9 +62,7 @@ class Survey:
         free = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
         if len(free) != 1:
             first = model.body(1).name if model.nbody > 1 else ""
-            raise self._error(
-                f"has {len(free)} free joints; give its base, '{first}', a <freejoint/> and nothing else one"
-            )
+            raise self._error(f"has {len(free)} free joints; give its base, '{first}', and nothing else a <freejoint/>")
         if (model.geom_bodyid == 0).any():
             name = model.geom(int(np.flatnonzero(model.geom_bodyid == 0)[0])).name
             raise self._error(f"has a geom '{name}' in its worldbody, such as a floor; it must hold the robot alone")
@@ -90,7 +83,7 @@ class Survey:
     # ---- legs -------------------------------------------------------------------------------------------------------
 
     def _find_legs(self) -> list[Leg]:
-        """Legs: what ends in a shape that meets the ground, moved by two joints or more; front left first."""
+        """Find the legs: chains of two joints or more that end in a shape that meets the ground; front left first."""
         model, legs = self.model, []
         moving = {int(b) for b in model.jnt_bodyid[self.hinges]}
         for tip in sorted(moving):
@@ -98,7 +91,7 @@ class Survey:
             if moving.intersection(below):
                 continue
             chain = joint_chain(model, tip, self.base)
-            shapes = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in (tip, *below) and self._solid(g)]
+            shapes = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in (tip, *below) and solid(model, g)]
             if len(chain) < 2 or not shapes:
                 continue
             round_ones = [g for g in shapes if model.geom_type[g] == self.mujoco.mjtGeom.mjGEOM_SPHERE] or shapes
@@ -112,10 +105,9 @@ class Survey:
         return sorted(legs, key=lambda leg: (bool(hips[leg.foot][0] < middle - 1e-3), -hips[leg.foot][1]))
 
     def _with_feet(self, legs: list[Leg]) -> list[Leg]:
-        """The legs, with a sphere added for a foot to each that ends in a whole shank."""
-        geoms, bodies = (
-            {e.id: e for e in kind} for kind in (self.spec.geoms, self.spec.bodies)
-        )  # ids go as one is added
+        """Return the legs, with a sphere added for a foot to each leg that ends in a whole shank."""
+        # ids are lost once a geom is added
+        geoms, bodies = ({e.id: e for e in kind} for kind in (self.spec.geoms, self.spec.bodies))
         names: dict[int, str] = {}
         for leg in legs:
             end = shank_end(self.model, self.data, leg.foot, self.data.xanchor[leg.joints[-1]])
@@ -130,17 +122,11 @@ class Survey:
         old, self.model = self.model, self.spec.compile()
         self.data = self.mujoco.MjData(self.model)
         self.place({})
-        # a body's own shapes keep their order, and what is added comes behind them
+        # a body's own shapes keep their order, and added shapes follow them
         moved = self.model.body_geomadr - old.body_geomadr
-        return [
-            replace(
-                leg,
-                foot=self.model.geom(names[leg.foot]).id
-                if leg.foot in names
-                else leg.foot + int(moved[old.geom_bodyid[leg.foot]]),
-            )
-            for leg in legs
-        ]
+        feet = {leg.foot: leg.foot + int(moved[old.geom_bodyid[leg.foot]]) for leg in legs}
+        feet |= {foot: self.model.geom(name).id for foot, name in names.items()}
+        return [replace(leg, foot=feet[leg.foot]) for leg in legs]
 
     def _ancestors(self, body: int) -> list[int]:
         found = []
@@ -149,11 +135,8 @@ class Survey:
             found.append(body)
         return found
 
-    def _solid(self, geom: int) -> bool:
-        return solid(self.model, geom)
-
     def leg_length(self, leg: Leg) -> float:
-        """Length of a leg when it is stretched [m], without what swings it sideways."""
+        """Return the length of a stretched leg [m], without the link that swings it sideways."""
         return stretched_length(self.data, self._swinging(leg), leg.foot)
 
     def _swinging(self, leg: Leg) -> list[int]:
@@ -162,7 +145,7 @@ class Survey:
     # ---- pose -------------------------------------------------------------------------------------------------------
 
     def default_pose(self) -> tuple[dict[int, float], str]:
-        """An angle for each hinge, and where it comes from: a keyframe, or bent knees with the feet below the hips."""
+        """Return an angle for each hinge, and its origin: a keyframe, or bent knees with the feet below the hips."""
         model = self.model
         for key in range(model.nkey):
             name = model.key(key).name
@@ -183,7 +166,7 @@ class Survey:
         return float(max(low, -_WIDEST)), float(min(high, _WIDEST))
 
     def _bent(self, leg: Leg, pose: dict[int, float]) -> dict[int, float]:
-        """Angles of a leg whose foot is below its hip, knee behind rather than in front."""
+        """Return the leg's angles with the foot below the hip, and the knee behind rather than in front."""
         swinging = self._swinging(leg)
         if len(swinging) < 2:
             return {}
@@ -213,13 +196,13 @@ class Survey:
         return min(found, key=lambda each: each[:2])[2]
 
     def _reach(self, leg: Leg, pose: dict[int, float], swing: float) -> NDArray[np.float64]:
-        """From a leg's swinging hip, at an angle, to its foot [m], (3,)."""
+        """Return the vector from a leg's swinging hip, at an angle, to its foot [m], (3,)."""
         hip = self._swinging(leg)[0]
         self.place({**pose, hip: swing})
         return self.data.geom_xpos[leg.foot] - self.data.xanchor[hip]
 
     def _below(self, hip: int, reach: Callable[[float], NDArray[np.float64]], aside: float) -> tuple[float, float]:
-        """The angle of a hip with which the foot is below it and so far before it [m], and how far it is from there [m]."""
+        """Return the hip's angle that puts the foot below it and ``aside`` before it [m], and the distance that remains [m]."""
         low, high = self._bounds(hip)
         found = (0.5 * (low + high), np.inf)
         for _ in range(3):  # finer each time
@@ -239,20 +222,17 @@ class Survey:
         self.mujoco.mj_kinematics(self.model, self.data)
 
     def depth(self) -> float:
-        """How far the placed robot reaches below its base [m]."""
-        return -min(lowest_point(self.model, self.data, g) for g in range(self.model.ngeom) if self._solid(g))
+        """Return the depth of the placed robot's lowest shape below its base [m]."""
+        return -min(lowest_point(self.model, self.data, g) for g in range(self.model.ngeom) if solid(self.model, g))
 
     def feet_depth(self) -> float:
-        """How far the feet of the placed robot reach below its base [m]."""
+        """Return the depth of the placed robot's lowest foot below its base [m]."""
         return -min(lowest_point(self.model, self.data, leg.foot) for leg in self.legs)
 
     # ---- names ------------------------------------------------------------------------------------------------------
 
     def geom_name(self, geom: int, kind: str) -> str:
-        """A geom's name; one without is given one."""
-        name = self.model.geom(geom).name
-        if name:
-            return name
+        """Return a geom's name; a geom without one gets it here."""
         element = next(g for g in self.spec.geoms if g.id == geom)
         if not element.name:
             element.name = self._free_name(self.body_name(int(self.model.geom_bodyid[geom])), kind)
@@ -260,15 +240,12 @@ class Survey:
         return element.name
 
     def _free_name(self, body: str, kind: str) -> str:
-        """A name for a geom of a body that no other has."""
+        """Return an unused name for a geom of a body."""
         taken = {g.name for g in self.spec.geoms}
         return next(n for i in range(1, 10_000) if (n := f"{body}_{kind}" + (f"_{i}" if i > 1 else "")) not in taken)
 
     def body_name(self, body: int) -> str:
-        """A body's name; one without is given one."""
-        name = self.model.body(body).name
-        if name:
-            return name
+        """Return a body's name; a body without one gets it here."""
         element = next(b for b in self.spec.bodies if b.id == body)
         if not element.name:
             element.name = f"body_{body}"
@@ -276,18 +253,15 @@ class Survey:
         return element.name
 
     def colliding_bodies(self) -> list[str]:
-        """Bodies with a shape that meets the ground and is no foot, the base first."""
+        """Return the bodies with a shape, not a foot, that meets the ground, the base first."""
         feet = {leg.foot for leg in self.legs}
-        bodies = {int(self.model.geom_bodyid[g]) for g in range(self.model.ngeom) if self._solid(g) and g not in feet}
+        shapes = [g for g in range(self.model.ngeom) if solid(self.model, g) and g not in feet]
+        bodies = {int(self.model.geom_bodyid[g]) for g in shapes}
         return [self.body_name(b) for b in sorted(bodies | {self.base}, key=lambda b: (b != self.base, b))]
 
     def trunk(self) -> int:
-        """The largest shape of the base that meets the ground.
-
-        Raises:
-            RobotError: there is none.
-        """
-        own = [g for g in range(self.model.ngeom) if self.model.geom_bodyid[g] == self.base and self._solid(g)]
+        """Return the largest shape of the base that meets the ground; raise ``RobotError`` where there is none."""
+        own = [g for g in range(self.model.ngeom) if self.model.geom_bodyid[g] == self.base and solid(self.model, g)]
         if not own:
             base = self.model.body(self.base).name
             raise self._error(f"has no shape on its base '{base}' that meets the ground; give it a geom with contype 1")
@@ -296,12 +270,11 @@ class Survey:
     # ---- motors -----------------------------------------------------------------------------------------------------
 
     def motors(self, joints: list[int], length: float, stiffer: float = 1.0) -> dict[str, Remarked]:
-        """Constants of the joints by the keys of ``JointParameters``.
+        """Return constants of the joints, in the given order, by the keys of ``JointParameters``.
 
         Args:
-            joints: in the robot's order.
             length: of the legs [m].
-            stiffer: factor of a stiffness that is guessed.
+            stiffer: factor of a guessed stiffness.
         """
         model = self.model
         strength = GRAVITY * float(model.body_mass.sum()) * length
@@ -348,7 +321,7 @@ class Survey:
         }
 
     def _gains(self, actuator: int | None) -> tuple[float, float]:
-        """Stiffness and damping that a position servo gives its joint: its gear multiplies the angle that it sees, and its torque."""
+        """Return stiffness and damping that a position servo gives its joint: the gear multiplies the measured angle and the torque."""
         if actuator is None:
             return 0.0, 0.0
         squared = float(self.model.actuator_gear[actuator, 0]) ** 2
@@ -372,5 +345,5 @@ class Survey:
 
 
 def _round(value: float) -> float:
-    """Two digits: more would not be known."""
+    """Round to two digits: a guess has no more."""
     return float(f"{value:.2g}")

@@ -1,4 +1,4 @@
-"""Terrain as data: boxes, an optional height field, the floor plane, and where episodes start and end.
+"""Terrain as data: boxes, an optional height field, the floor plane, and the start and end of episodes.
 
 Frame: x forward, y left, z up, metres. A terrain sits in one world of its own; nothing here knows an engine.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .height import ground_height
-from .shapes import Box, FloatArray, HeightField
+from .shapes import Box, FloatArray, HeightField, TerrainError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +42,17 @@ class Terrain:
     target: tuple[float, float, float] | None = None
     """Goal position of the base [m], where the terrain has one."""
     backward: bool = False
-    """True where the robot is to cross the terrain walking backwards."""
+    """True where the robot crosses the terrain walking backwards."""
+
+    def __post_init__(self) -> None:
+        for number, box in enumerate(self.boxes):
+            for axis, half in zip("xyz", box.half_size, strict=True):
+                if not half > 0.0:
+                    raise TerrainError(
+                        f"terrain '{self.name}' level {self.level}: box {number} (from 0) at {tuple(map(float, box.center))} m has the "
+                        f"half size {half:g} m along {axis}, which must be above 0; make it larger, or leave the box out at this level"
+                    )
 
     def height(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return the height of the ground at (x, y) [m], any shape: the highest of floor, boxes and height field; no walls."""
-        return ground_height(
-            self.boxes, self.height_field, np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        )
+        return ground_height(self.boxes, self.height_field, np.asarray(x), np.asarray(y))

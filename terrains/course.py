@@ -1,4 +1,4 @@
-"""Ground as a course: stretches one after another along x, level or sloping, or stairs up or down. Made of solid boxes."""
+"""Ground as a course of solid boxes: stretches one after another along x, level or sloping, or stairs up or down."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from .base import Box
 from .registry import TerrainError
 
 _THICKNESS = 0.4
-"""Of a sloping plate [m]: no foot passes through it in a substep."""
+"""Thickness of a sloping plate [m]: no foot passes through it in a substep."""
 _FLOOR = 1e-6
-"""Height below which a stretch is the floor itself [m]."""
+"""Largest height of a stretch that is the floor itself [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,37 +23,34 @@ class Stretch:
     """A piece of a course."""
 
     length: Annotated[float, Field(gt=0.0, le=200.0)]
-    """Along x [m]."""
+    """Length along x [m]."""
     rise: Annotated[float, Field(ge=-50.0, le=50.0)] = 0.0
-    """How much higher it ends than it begins [m]; below zero it leads down."""
+    """Height of the end above the beginning [m]; negative for a stretch that leads down."""
     steps: Annotated[int, Field(ge=0, le=200)] = 0
-    """0: one plane. Otherwise so many equal steps, each a riser and then its tread."""
+    """Number of equal steps, each a riser and then its tread; 0 for one plane."""
 
 
 def course_boxes(
     stretches: Sequence[Stretch], *, begin: float, height: float, width: float, source: str
 ) -> tuple[Box, ...]:
-    """Boxes of a course, which stand on the floor; after its last stretch the floor goes on.
+    """Return the boxes of a course, which stand on the floor; after its last stretch the floor goes on.
 
     Args:
-        stretches: from its beginning on.
-        begin: x at which it begins [m].
+        begin: x of the beginning [m].
         height: of the ground there [m].
         width: along y, half of it on either side of y = 0 [m].
         source: the beginning of an error's sentence.
 
     Raises:
-        TerrainError: it leads below the floor.
+        TerrainError: the course leads below the floor.
     """
     boxes: list[Box] = []
     x, z = begin, height
     for number, stretch in enumerate(stretches, 1):
         end = z + stretch.rise
         if min(z, end) < -_FLOOR:
-            raise TerrainError(
-                f"{source}: stretch {number} leads to {min(z, end):.3g} m, below the floor; raise the height at which the "
-                "ground begins"
-            )
+            deep = f"stretch {number} leads to {min(z, end):.3g} m, below the floor"
+            raise TerrainError(f"{source}: {deep}; raise the height at which the ground begins")
         if stretch.steps:
             tread = stretch.length / stretch.steps
             tops = [z + stretch.rise * (i + 1) / stretch.steps for i in range(stretch.steps)]
@@ -71,7 +68,7 @@ def _block(middle: float, length: float, width: float, top: float) -> Box:
 
 
 def _ramp(x: float, z: float, stretch: Stretch, width: float) -> Box:
-    """A plate whose upper face leads from (x, z) to the stretch's end."""
+    """Return a plate with an upper face from (x, z) to the stretch's end."""
     angle = math.atan2(stretch.rise, stretch.length)
     down = 0.5 * _THICKNESS
     return Box(

@@ -1,4 +1,4 @@
-"""The terrains on which policies are judged: seven names, five shapes, levels 1 to 10.
+"""Build the terrains of the gauge: seven names, five shapes, levels 1 to 10.
 
 The geometry is that of the published RoboGauge terrains, measured in their compiled models, not that of the paper's
 formulas, which differ for the slope and the wave: scores are comparable only on the same ground. The levelled terrains
@@ -19,7 +19,7 @@ LEVELS = range(1, 11)
 """Levels of every gauge terrain but ``flat``."""
 
 STAIR_RISERS = (0.08, 0.11, 0.14, 0.17, 0.18, 0.19, 0.20, 0.21, 0.22, 0.23)
-"""Height of a step at levels 1 to 10 [m]."""
+"""Heights of a step at levels 1 to 10 [m]."""
 STAIR_TREAD = 0.31
 """Distance from one riser to the next [m]."""
 STAIR_COUNT = 33
@@ -40,13 +40,13 @@ _WALLS = (
 
 
 def flat() -> Terrain:
-    """The bare floor plane; no walls, no target."""
+    """Build the bare floor plane; no walls, no target."""
     start = Pose(position=(0.0, 0.0, 0.0))
     return Terrain(name="flat", family="flat", spawns={"level_search": start, "level_eval": start})
 
 
 def slope(level: int, *, backward: bool = False) -> Terrain:
-    """A flat strip, then one plane that rises along +x to the far wall.
+    """Build a flat strip, then one plane that rises along +x to the far wall.
 
     Args:
         level: 1..10; the gradient is 0.10 + 0.47 x difficulty.
@@ -72,7 +72,7 @@ def slope(level: int, *, backward: bool = False) -> Terrain:
 
 
 def stairs(level: int, *, backward: bool = False) -> Terrain:
-    """Stairs that rise along +x from wall to wall: steps of one riser's thickness that overlap, hollow underneath.
+    """Build stairs that rise along +x from wall to wall: steps of one riser's thickness that overlap, hollow underneath.
 
     Args:
         level: 1..10; the riser is ``STAIR_RISERS[level - 1]``.
@@ -99,11 +99,7 @@ def stairs(level: int, *, backward: bool = False) -> Terrain:
 
 
 def obstacle(level: int) -> Terrain:
-    """Five bars across the whole width, 1 m long with gaps of 1 m.
-
-    Args:
-        level: 1..10; the bars are 0.05 + 0.23 x difficulty high [m].
-    """
+    """Build five bars across the whole width, 1 m long with gaps of 1 m, 0.05 + 0.23 x difficulty high [m]."""
     height = 0.05 + 0.23 * level / 10
     bars = tuple(Box(center=(x, 0.0, height / 2), half_size=(0.5, 5.0, height / 2)) for x in (1.5, 3.5, 5.5, 7.5, 9.5))
     return _levelled(
@@ -117,11 +113,7 @@ def obstacle(level: int) -> Terrain:
 
 
 def wave(level: int) -> Terrain:
-    """The sum of a sine along x (wavelength 2 m) and a cosine along y (8/3 m).
-
-    Args:
-        level: 1..10; the lowest trough is at 0, the highest crest at 0.08 x level [m].
-    """
+    """Build the sum of a sine along x (wavelength 2 m) and a cosine along y (8/3 m), between 0 and 0.08 x level [m]."""
     field = HeightField(center=(5.0, 0.0), half_size=(5.0, 5.0), heights=wave_heights(level), base=0.1)
     return _levelled(
         "wave",
@@ -134,15 +126,15 @@ def wave(level: int) -> Terrain:
 
 
 def slope_gradient(level: int) -> float:
-    """Rise over run of the slope at a level 1..10."""
+    """Return the rise over run of the slope at a level 1..10."""
     return 0.10 + 0.47 * level / 10
 
 
 def wave_heights(level: int) -> FloatArray:
-    """Node heights of the wave at a level 1..10 [m], shape (128, 128), rows along +y, columns along +x, read-only.
+    """Return node heights of the wave at a level 1..10 [m], shape (128, 128), rows along +y, columns along +x, read-only.
 
-    The published height map is a 16-bit image, which this fit gives to one part in 10^5; MuJoCo's loader keeps the
-    upper 8 bits, so the ground has steps of up to 3 mm. They are kept here: the published scores were earned on them.
+    The fit matches the published 16-bit height map to one part in 10^5. MuJoCo's loader keeps the upper 8 bits, so the
+    published ground has steps of up to 3 mm; they are kept here.
     """
     x = np.linspace(0.0, 10.0, _WAVE_NODES)
     y = np.linspace(-5.0, 5.0, _WAVE_NODES)
@@ -164,7 +156,7 @@ def _levelled(
     height_field: HeightField | None = None,
     backward: bool | None = None,
 ) -> Terrain:
-    """A terrain between the walls; ``backward`` None means that the family is crossed in one direction only."""
+    """Build a terrain between the walls; ``backward`` is None for a family that is crossed in one direction only."""
     suffix = {None: "", False: "_fd", True: "_bd"}[backward]
     yaw = math.pi if backward else 0.0
     return Terrain(

@@ -1,4 +1,4 @@
-"""Height of the ground above a point of the plane: exact for the floor, boxes of any orientation and height fields."""
+"""Compute the height of the ground above a point of the plane, exact for the floor, boxes of any orientation and height fields."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .shapes import Box, FloatArray, HeightField
 
-# A point on the very edge of a solid counts as above it, whichever way the edge's coordinate was rounded [m].
+# A point on the edge of a solid counts as above it, whichever way the edge's coordinate was rounded [m].
 EDGE_TOLERANCE = 1e-9
 
 
@@ -36,14 +36,9 @@ def ground_height(boxes: Sequence[Box], height_field: HeightField | None, x: Flo
 
 
 def box_top(box: Box, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height at which the vertical line through (x, y) leaves a box.
+    """Return the height at which the vertical line through (x, y) leaves a box [m]; -inf where the line misses the box.
 
-    Args:
-        x: world frame [m], any shape.
-        y: world frame [m], same shape as ``x``.
-
-    Returns:
-        Height [m], same shape; -inf where the line misses the box.
+    ``x`` and ``y`` are in the world frame [m], of one shape, which the heights share.
     """
     offset_x, offset_y = x - box.center[0], y - box.center[1]
     if box.quaternion == (1.0, 0.0, 0.0, 0.0):
@@ -63,7 +58,7 @@ def box_top(box: Box, x: FloatArray, y: FloatArray) -> FloatArray:
             inside &= np.abs(start) <= reach
             continue
         middle, span = -start / rise, half / abs(rise)
-        # The tolerance decides only which lines hit, not the height at which they leave.
+        # The tolerance decides only whether a line hits, not the height at which it leaves.
         lowest = np.maximum(lowest, middle - span - EDGE_TOLERANCE)
         highest = np.minimum(highest, middle + span)
     hit = inside & (lowest <= highest)
@@ -71,16 +66,10 @@ def box_top(box: Box, x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def height_field_top(field: HeightField, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height of a height field's surface, split into triangles as MuJoCo's collision and ray functions split it.
+    """Return the height of a height field's surface at (x, y) [m]; -inf outside of the grid.
 
-    Each cell has the diagonal from its node of lowest x and y to that of highest x and y; each triangle is flat.
-
-    Args:
-        x: world frame [m], any shape.
-        y: world frame [m], same shape as ``x``.
-
-    Returns:
-        Height [m], same shape; -inf outside of the grid.
+    MuJoCo's collision and ray functions split the surface into the same flat triangles: each cell has the diagonal from its
+    node of lowest x and y to its node of highest. ``x`` and ``y`` are in the world frame [m], of one shape, which the heights share.
     """
     rows, columns = field.heights.shape
     # Grid coordinates: columns count along +x, rows along +y, from the corner of lowest x and y.
@@ -103,7 +92,7 @@ def height_field_top(field: HeightField, x: FloatArray, y: FloatArray) -> FloatA
 
 
 def rotation_matrix(quaternion: tuple[float, float, float, float]) -> FloatArray:
-    """Rotation matrix (3, 3) of a quaternion wxyz, which need not have unit length; columns are the rotated axes."""
+    """Return the rotation matrix (3, 3) of a quaternion wxyz of any length; columns are the rotated axes."""
     w, x, y, z = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
     return np.array(
         [

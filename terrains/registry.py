@@ -1,7 +1,6 @@
-"""Finds terrains by name: the gauge's own, and any installed under the entry-point group ``gaitgauge.terrains``.
+"""Find terrains by name: the gauge's own, and plug-ins of the entry-point group ``gaitgauge.terrains``.
 
-The value of such an entry point is a callable that takes the level (0 where none was asked for) and returns a
-``Terrain``.
+Such an entry point is a callable that takes the level (0 for none) and returns a ``Terrain``.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from ..files.parsing import did_you_mean, one_line
 from ..files.plugins import guarded, load_plugin, origin, plugins
 from .base import Terrain
 from .gauge_terrains import LEVELS, flat, obstacle, slope, stairs, wave
+from .shapes import TerrainError
 
 GROUP = "gaitgauge.terrains"
 
@@ -28,17 +28,13 @@ _LEVELLED: dict[str, Callable[[int], Terrain]] = {
 }
 
 
-class TerrainError(ValueError):
-    """A terrain or level that does not exist; the message says what is allowed."""
-
-
 def gauge_terrain_names() -> list[str]:
-    """The seven terrains of the published benchmark, in its order; ``flat``, the first, is the one without levels."""
+    """Return the seven terrains of the published benchmark in its order; only ``flat``, the first, has no levels."""
     return ["flat", *_LEVELLED]
 
 
 def terrain_names() -> list[str]:
-    """Names of all terrains that can be asked for: the gauge's own first, then installed plug-ins."""
+    """Return the names of all terrains: the gauge's own first, then installed plug-ins."""
     own = gauge_terrain_names()
     return own + sorted(set(plugins(GROUP)) - set(own))
 
@@ -48,7 +44,7 @@ def make_terrain(name: str, level: int | None = None) -> Terrain:
 
     Args:
         name: one of ``terrain_names()``.
-        level: 1..10; None or 0 for ``flat``. A plug-in is handed the level as it is, 0 for None.
+        level: 1..10; None or 0 for ``flat``. A plug-in gets any level unchanged, 0 for None.
 
     Raises:
         TerrainError: unknown name, a level that the terrain does not have, or a plug-in that cannot be loaded or gives

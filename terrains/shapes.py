@@ -1,4 +1,4 @@
-"""The shapes that ground is made of, in metres; x forward, y left, z up."""
+"""Shapes of the ground, in metres; x forward, y left, z up."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+
+
+class TerrainError(ValueError):
+    """A terrain or level that does not exist or cannot be built; the message says what is allowed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +25,7 @@ class Box:
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation, wxyz."""
     wall: bool = False
-    """True for the boundary walls: they stop the robot but are no ground to walk on (``height`` ignores them)."""
+    """True for boundary walls, which stop the robot but are no ground to walk on (``height`` ignores them)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Solids of which training tiles are made: square frames, square hills and pits of boxes, and rough height fields.
+"""Solids for training tiles: square frames, square hills and pits of boxes, and rough height fields.
 
 Everything is centred at the origin and symmetric under quarter turns, so a shape is a function of max(|x|, |y|), here
 called the radius: half the side of the square through a point.
@@ -14,9 +14,9 @@ import numpy as np
 from .base import Box, FloatArray
 
 NODE_SPACING = 0.1
-"""Distance of a height field's nodes [m]."""
+"""Distance between a height field's nodes [m]."""
 _THICKNESS = 0.4  # of the tilted plates, enough that no foot passes through in a substep [m]
-_BURIED = 0.05  # how far a plate reaches on below the floor, so that no crack opens where it meets it [m]
+_BURIED = 0.05  # length of a plate below the floor, so that no crack opens between the two [m]
 
 Quaternion = tuple[float, float, float, float]
 Span = tuple[float, float]
@@ -24,12 +24,12 @@ Span = tuple[float, float]
 
 
 def square_block(radius: float, height: float) -> Box:
-    """A full box on the floor, ``height`` high."""
+    """Return a solid box on the floor, ``height`` high."""
     return Box(center=(0.0, 0.0, height / 2), half_size=(radius, radius, height / 2))
 
 
 def square_frame(inner: float, outer: float, height: float) -> tuple[Box, ...]:
-    """Four full boxes on the floor that leave the square of radius ``inner`` free and end at radius ``outer``."""
+    """Return four solid boxes on the floor that leave the square of radius ``inner`` free and end at radius ``outer``."""
     middle, half_width = (inner + outer) / 2, (outer - inner) / 2
     return tuple(
         Box(
@@ -42,20 +42,19 @@ def square_frame(inner: float, outer: float, height: float) -> tuple[Box, ...]:
 
 
 def square_pit_walls(inner: float, outer: float, gradient: float) -> tuple[Box, ...]:
-    """Four tilted plates that rise from the floor at radius ``inner`` outwards to radius ``outer``.
+    """Return four tilted plates that rise from the floor at radius ``inner`` outwards to radius ``outer``.
 
     Neighbours cross in the corners; the higher one is the ground there: its height is ``gradient * (radius - inner)``.
     """
     angle = math.atan(gradient)
     length = (outer - inner) / math.cos(angle)
     top = ((inner + outer) / 2, 0.0, gradient * (outer - inner) / 2)
-    return tuple(
-        _plate(top, (length, 2 * outer), _multiply(_about_z(turn), _about_y(-angle)), turn) for turn in _QUARTER_TURNS
-    )
+    turns = {turn: _multiply(_about_z(turn), _about_y(-angle)) for turn in _QUARTER_TURNS}
+    return tuple(_plate(top, (length, 2 * outer), uphill, turn) for turn, uphill in turns.items())
 
 
 def square_hill(inner: float, outer: float, gradient: float) -> tuple[Box, ...]:
-    """A truncated pyramid: level up to radius ``inner``, then down to the floor at radius ``outer``; 13 boxes.
+    """Return a truncated pyramid, level up to radius ``inner``, then down to the floor at radius ``outer``; 13 boxes.
 
     Boxes are rectangles and the sides are trapezoids: each side is covered by one plate below its upper edge and by two
     along its slanting edges. All three lie in the side's plane and inside the hill or under the floor.
@@ -84,10 +83,10 @@ def square_hill(inner: float, outer: float, gradient: float) -> tuple[Box, ...]:
 
 
 def patchwork(inner: float, outer: float, random: np.random.Generator) -> list[tuple[Span, Span]]:
-    """28 rectangles (range of x, range of y) that fill the square of radius ``outer`` but for that of radius ``inner``.
+    """Return 28 rectangles (range of x, range of y) that fill the square of radius ``outer`` except that of radius ``inner``.
 
-    Four equal regions go round the middle like the sails of a windmill. Each is cut lengthwise into two strips, these
-    into three and four pieces, at random places.
+    Four equal regions go round the middle like the sails of a windmill. Each is cut lengthwise into two strips, and these
+    at random places into three and four pieces.
     """
     width, length = outer - inner, outer + inner
     patches: list[tuple[Span, Span]] = []
@@ -105,21 +104,21 @@ def patchwork(inner: float, outer: float, random: np.random.Generator) -> list[t
 
 
 def _cuts(length: float, pieces: int, random: np.random.Generator) -> list[float]:
-    """Ends of ``pieces`` pieces of a line, in order from 0 to ``length``; each is 0.4 to 1.6 times the mean long."""
+    """Return the ends of ``pieces`` pieces of a line from 0 to ``length``, each 0.4 to 1.6 times the mean long."""
     places = np.arange(pieces + 1) + random.uniform(-0.3, 0.3, pieces + 1)
     places[0], places[-1] = 0, pieces
     return (places * (length / pieces)).tolist()
 
 
 def grid_coordinates(radius: float) -> tuple[FloatArray, FloatArray]:
-    """Node positions x and y [m] of a square height field, each of shape (rows, columns)."""
+    """Return node positions x and y [m] of a square height field, each of shape (rows, columns)."""
     line = np.linspace(-radius, radius, 2 * round(radius / NODE_SPACING) + 1)
     x, y = np.meshgrid(line, line)
     return x, y
 
 
 def roughness(nodes: int, amplitude: float, random: np.random.Generator) -> FloatArray:
-    """Heights in [-amplitude, amplitude] [m], random at every second node, linear between; shape (nodes, nodes)."""
+    """Return heights in [-amplitude, amplitude] [m], random at every second node, linear between; shape (nodes, nodes)."""
     coarse = random.uniform(-amplitude, amplitude, ((nodes + 1) // 2, (nodes + 1) // 2))
     tall = np.empty((nodes, coarse.shape[1]))
     tall[::2], tall[1::2] = coarse, (coarse[:-1] + coarse[1:]) / 2
@@ -129,7 +128,7 @@ def roughness(nodes: int, amplitude: float, random: np.random.Generator) -> Floa
 
 
 def edge_taper(x: FloatArray, y: FloatArray, radius: float, width: float) -> FloatArray:
-    """Factor that falls smoothly from 1 to 0 over the last ``width`` metres before ``radius``; same shape as ``x``."""
+    """Return a factor that falls smoothly from 1 to 0 over the last ``width`` metres before ``radius``; same shape as ``x``."""
     inside = np.clip((radius - np.maximum(np.abs(x), np.abs(y))) / width, 0.0, 1.0)
     taper: FloatArray = inside * inside * (3.0 - 2.0 * inside)
     return taper
@@ -139,7 +138,7 @@ _QUARTER_TURNS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 
 
 def _plate(top: tuple[float, ...], size: tuple[float, float], quaternion: Quaternion, turn: float) -> Box:
-    """A box whose upper face has the middle ``top`` (before the turn about the world's z axis) and the given size."""
+    """Return a box by the middle (before the turn about the world's z axis) and the size of its upper face."""
     w, x, y, z = quaternion
     normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     cosine, sine = math.cos(turn), math.sin(turn)
@@ -161,7 +160,7 @@ def _about_z(angle: float) -> Quaternion:
 
 
 def _multiply(first: Quaternion, second: Quaternion) -> Quaternion:
-    """Hamilton product of quaternions wxyz: ``second`` in the frame that ``first`` turned."""
+    """Return the Hamilton product of quaternions wxyz: ``second`` in the frame that ``first`` turned."""
     w, x, y, z = first
     a, b, c, d = second
     return (

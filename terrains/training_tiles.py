@@ -1,19 +1,19 @@
-"""The ground that policies learn on: one small tile per world, centred at the origin, of nine kinds at twelve levels.
+"""Build the ground for training: one small tile per world, centred at the origin, of nine kinds at twelve levels.
 
 A tile is 8 x 8 m. The robot starts near its centre and has crossed it when it is more than half a tile away. Kinds and
-difficulties start from the published training code; decided differently here:
+difficulties start from the published training code, with these differences:
 
-- Every world has its own tile, so beyond it comes no next one but level ground: the floor plane, or around pits and
-  patches a rim of boxes as high as the tile's edge, which ends at ``TileShape.extent``.
+- Every world has its own tile. Level ground surrounds it: the floor plane, or around pits and patches a rim of boxes as high
+  as the tile's edge, which ends at ``TileShape.extent``.
 - Flat, slopes, stairs, obstacles and bars are boxes, which GPU engines collide four times as fast as height fields and
   which keep risers vertical. Only the wave and the rough slope are height fields.
-- What is to be crossed can not be walked around: stairs, slopes and bars are square rings about the start, obstacles a
-  patchwork without gaps. Nothing can be below the floor plane, so patchwork and start stand as high as its pits are deep.
-- Where a robot must not learn one measure by heart, it is drawn by seed: treads and risers, width, gap and height of
-  bars, length, height, direction and place of waves, the size of patches.
-- Levels go on beyond the hardest that the gauge asks for, since who trains at the limit fails there half of the time.
-- Slopes are plain truncated pyramids with the platform of the stairs, 2.7 m of slope on each side. The published ones
-  are products of two ramps that are cut off 2.4 m from the centre and leave 1.6 m of slope.
+- Robots cannot walk around the obstacles: stairs, slopes and bars are square rings about the start, obstacles a patchwork
+  without gaps. Nothing can be below the floor plane, so patchwork and start stand as high as its pits are deep.
+- The seed draws every measure that a robot must not learn by heart: treads and risers, width, gap and height of bars,
+  length, height, direction and place of waves, the size of patches.
+- Levels go beyond the hardest level of the gauge, since a robot at the limit of its training fails half of the time.
+- Slopes are plain truncated pyramids with the platform of the stairs, 2.7 m of slope on each side. The published slopes
+  are products of two ramps, cut off 2.4 m from the centre, with 1.6 m of slope.
 - Heights are not rounded down to 5 mm.
 """
 
@@ -42,14 +42,14 @@ from .tile_geometry import (
 )
 
 NUM_TILE_LEVELS = 12
-"""Levels are 0..11; the difficulty of a level is level / 10. The gauge's hardest ground is that of level 8 to 10."""
+"""Number of levels, 0..11; the difficulty of a level is level / 10. The gauge's hardest ground is that of level 8 to 10."""
 TILE_SIZE = 8.0
-"""Side of a tile [m]; more than half of it from the centre, horizontally, the robot has crossed the tile."""
+"""Side of a tile [m]; a robot more than half of it from the centre, horizontally, has crossed the tile."""
 
 _EDGE = TILE_SIZE / 2
-_FIELD_EDGE = 5.6  # half the side of height fields: waves go on beyond the tile and come down where nobody walks [m]
-_LAST_RISER = 0.2  # distance from the last riser or bar to the tile's edge, at least: it is crossed before the edge [m]
-_OVERLAP = 0.2  # how far a step reaches under the next one, so that no crack opens between them [m]
+_FIELD_EDGE = 5.6  # half the side of height fields: waves go on beyond the tile and come down outside of it [m]
+_LAST_RISER = 0.2  # least distance from the last riser or bar to the tile's edge: robots cross it before the edge [m]
+_OVERLAP = 0.2  # length of a step under the next one, so that no crack opens between them [m]
 
 Range = tuple[float, float]
 _Grown = tuple[Positive, NotNegative]
@@ -58,9 +58,7 @@ _Shares = tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative]
 
 @dataclass(frozen=True, kw_only=True)
 class TileShape:
-    """Dimensions of the tiles. Pairs are the value at difficulty 0 and its growth up to difficulty 1, where a comment
-    does not call them a range to draw from.
-    """
+    """Dimensions of the tiles. Pairs are a value at difficulty 0 and its growth up to difficulty 1, or a range to draw from."""
 
     platform_radius: Positive = 1.3
     """Half the side of the level square in the middle of slopes and stairs [m]."""
@@ -71,12 +69,11 @@ class TileShape:
     stair_tread: Range = (0.28, 0.36)
     """Range of a flight's mean depth of a step [m]."""
     stair_irregularity: Share = 0.15
-    """Treads and risers of one flight differ from their mean by up to a share, drawn from 0 to this."""
+    """Largest share by which treads and risers of one flight differ from their mean; the share is drawn from 0 to this."""
     stair_count: Annotated[int, Field(ge=1, le=1000)] = 9
     """Largest number of risers between the platform and the tile's edge."""
     obstacle_height: _Grown = (0.05, 0.25)
-    """Height of obstacles over the start, and depth of pits, at difficulty 0, and its growth up to 1 [m]; bars have up to this
-    height."""
+    """Height of obstacles and bars over the start, and depth of pits, at difficulty 0, and its growth up to 1 [m]."""
     obstacle_free_radius: float = 1.5
     """Half the side of the level square around the start between obstacles [m]."""
     obstacle_shares: _Shares = (0.15, 0.2, 0.3, 0.2, 0.15)
@@ -100,7 +97,7 @@ class TileShape:
     taper: Positive = 0.8
     """Width of the zone in which a height field comes down to the floor at its edge [m]."""
     extent: Annotated[float, Field(gt=_EDGE, le=1000.0)] = 40.0
-    """Half the side of the rim around pits [m]; beyond it is the floor, as deep below as the pit."""
+    """Half the side of the rim around pits [m]; the floor beyond is as deep as the pit."""
 
     def __post_init__(self) -> None:
         if self.platform_radius + self.stair_tread[0] > _EDGE - _LAST_RISER:
@@ -124,19 +121,19 @@ class TileShape:
 DEFAULT_SHAPE = TileShape()
 
 Ground = tuple[Box, ...] | HeightField
-"""What a tile consists of beside the floor plane."""
+"""Boxes or height field of a tile, beside the floor plane."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TileKind:
-    """How tiles of one kind are made."""
+    """Recipe for tiles of one kind."""
 
     build: Callable[[float, TileShape, np.random.Generator], Ground]
     """Function of the difficulty (level / 10), the dimensions and the seed's random numbers."""
     random: bool = True
-    """Whether tiles differ from seed to seed."""
+    """True where tiles differ from seed to seed."""
     levelled: bool = True
-    """Whether tiles differ from level to level."""
+    """True where tiles differ from level to level."""
 
 
 def make_tile(kind: str, level: int, seed: int = 0, *, shape: TileShape = DEFAULT_SHAPE) -> Terrain:
@@ -189,7 +186,7 @@ def _slope_down(difficulty: float, shape: TileShape, random: np.random.Generator
 
 
 def _flight(difficulty: float, shape: TileShape, random: np.random.Generator) -> tuple[list[float], list[float]]:
-    """Radius and height of each riser, inside out [m]."""
+    """Return radius and height of each riser, inside out [m]."""
     tread, irregularity = random.uniform(*shape.stair_tread), random.uniform(0.0, shape.stair_irregularity)
     treads, risers = 1.0 + irregularity * random.uniform(-1.0, 1.0, (2, shape.stair_count))
     radii = shape.platform_radius + np.concatenate(([0.0], np.cumsum(tread * treads[:-1])))
@@ -210,7 +207,7 @@ def _stairs_down(difficulty: float, shape: TileShape, random: np.random.Generato
 
 
 def _obstacles(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
-    """Patches of five heights around the start, without gaps: edges are up to twice the obstacle height."""
+    """Build patches of five heights around the start, without gaps: edges are up to twice the obstacle height."""
     height, free = _at(difficulty, shape.obstacle_height), shape.obstacle_free_radius
     shares = np.array(shape.obstacle_shares) / sum(shape.obstacle_shares)
     boxes = [square_block(free, height), *square_frame(_EDGE, shape.extent, height)]
@@ -223,7 +220,7 @@ def _obstacles(difficulty: float, shape: TileShape, random: np.random.Generator)
 
 
 def _bars(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
-    """Square rings about the start, each to be climbed and left again."""
+    """Build square rings about the start, each to be climbed and left again."""
     height = _at(difficulty, shape.obstacle_height)
     boxes: list[Box] = []
     inner = random.uniform(*shape.bar_start)
@@ -235,7 +232,7 @@ def _bars(difficulty: float, shape: TileShape, random: np.random.Generator) -> G
 
 
 def _wave(difficulty: float, shape: TileShape, random: np.random.Generator) -> Ground:
-    """Two waves at right angles, each with its own length, height and place, in a random direction."""
+    """Build two waves at right angles, each with its own length, height and place, in a random direction."""
     x, y = grid_coordinates(_FIELD_EDGE)
     steepness = _at(difficulty, shape.wave_steepness)
     direction = random.uniform(0.0, math.pi)
@@ -272,4 +269,4 @@ TILE_KINDS: dict[str, TileKind] = {
     "flat": TileKind(build=_flat, random=False, levelled=False),
     "bars": TileKind(build=_bars),
 }
-"""All kinds of tile by name. A kind of one's own is another entry; its place decides its random numbers."""
+"""All kinds of tile by name. An entry's place decides its random numbers, so new kinds go to the end."""

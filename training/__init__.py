@@ -1,1 +1,1 @@
-"""How is a policy learned? The environment, the algorithms on rsl_rl, and the run directory."""
+"""Train policies: the environment, the algorithms on rsl_rl, and the run directory."""

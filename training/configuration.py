@@ -6,6 +6,7 @@ The numbers are those of concurrent teacher-student learning as published with i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Annotated, Any
@@ -14,9 +15,15 @@ from pydantic import Field
 from pydantic_core import to_jsonable_python
 
 from ..files.parsing import Count, NotNegative, Positive, Seed, Share
-from .environment.configuration import Ramp
 
-METHODS: tuple[str, ...] = ("cts", "ac_moe", "mcp", "him", "dreamwaq")
+METHODS: Mapping[str, str] = {
+    "cts": "cts:CTS",
+    "ac_moe": "ac_moe:AcMoe",
+    "mcp": "mcp:Mcp",
+    "him": "him:Him",
+    "dreamwaq": "dreamwaq:Dreamwaq",
+}
+"""Methods by name: file in ``training/algorithms`` and class, which ``algorithms.methods.find_method`` imports."""
 STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
 SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "alternate")
 PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
@@ -24,12 +31,13 @@ LOGGERS: tuple[str, ...] = ("tensorboard", "wandb", "neptune")
 COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default")
 
 
+Range = tuple[float, float]
 _Rate = Annotated[float, Field(gt=0.0, le=1e3)]
 Width = Annotated[int, Field(ge=1, le=65_536)]
 
 
 class ConfigurationError(ValueError):
-    """A setting has a value that is not allowed; the message names the setting, the value and what is allowed."""
+    """A setting has a value that is not allowed; the message names the setting, the value and the allowed ones."""
 
 
 def _choose(name: str, value: str, allowed: tuple[str, ...]) -> None:
@@ -44,6 +52,32 @@ def _positive(owner: object, *names: str) -> None:
             raise ConfigurationError(f"{name} is {value}; it must be greater than zero.")
 
 
+def check_rising(configuration: object, *names: str) -> None:
+    """Refuse ranges that end below their beginning.
+
+    Raises:
+        ValueError: one sentence.
+    """
+    for name in names:
+        low, high = getattr(configuration, name)
+        if low > high:
+            raise ValueError(f"{name} is {low:g} to {high:g}; it must rise")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ramp:
+    """A number that moves linearly from ``start`` to ``end`` between two fractions of the run and stays there."""
+
+    start: float
+    """Value until ``begin``."""
+    end: float
+    """Value from ``until`` on."""
+    begin: Share = 0.0
+    """Fraction of the run at which the change begins."""
+    until: Share = 1.0
+    """Fraction of the run at which the change is complete."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfiguration:
     """Sizes of the networks. ELU everywhere, PyTorch's own initial weights."""
@@ -53,8 +87,8 @@ class NetworkConfiguration:
     teacher_hidden: tuple[Width, ...] = (512, 256)
     """Hidden layers of the teacher encoder; of the next state's encoder (``him``), of the decoder (``dreamwaq``)."""
     student_encoder: str = "moe"
-    """``mlp`` (CTS), ``moe`` (MoE-CTS, the paper's) or ``moe_ng`` (experts that do not see the command); other methods than
-    ``cts`` take ``mlp``."""
+    """``mlp`` (CTS), ``moe`` (MoE-CTS, the paper's) or ``moe_ng`` (experts that do not see the command); other methods than ``cts`` take
+    ``mlp``."""
     student_hidden: tuple[Width, ...] = (512, 256)
     """Hidden layers of the student encoder, or of its experts' shared trunk."""
     expert_count: Width = 8
@@ -79,14 +113,14 @@ class NetworkConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class HimConfiguration:
-    """The contrast of ``him``: swapped prediction of prototypes. Where the method's paper gives no number, that of SwAV, from which
-    it takes the idea.
+    """The contrast of ``him``: swapped prediction of prototypes. Where the method's paper gives no number, that of SwAV, from which it
+    takes the idea.
     """
 
     prototypes: Annotated[int, Field(ge=2, le=65_536)] = 32
     """Number of prototypes."""
     temperature: Positive = 0.1
-    """Of the predictions."""
+    """Temperature of the predictions."""
     code_sharpness: Positive = 0.05
     """Entropy of the codes in Sinkhorn-Knopp: the smaller, the nearer to one prototype each."""
     sinkhorn_iterations: Count = 3
@@ -103,11 +137,12 @@ class DreamwaqConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmConfiguration:
-    """PPO and what the encoder learns from. Defaults without a remark are the published ones."""
+    """PPO and the encoder's supervision. Defaults without a remark are the published ones."""
 
     method: str = "cts"
     """``cts`` (concurrent teacher and student), ``ac_moe`` (the same with experts in actor and critic), ``mcp`` (with an actor that
-    multiplies primitives), ``him`` (hybrid internal model) or ``dreamwaq`` (variational estimator)."""
+    multiplies primitives), ``him`` (hybrid internal model) or ``dreamwaq`` (variational estimator); or ``module:name`` of a class of your
+    own that is derived from one of theirs."""
     student_period: int = 4
     """Environment i belongs to the student if i is a multiple of this, else to the teacher, where the method has one."""
     epochs: int = 5
@@ -129,8 +164,8 @@ class AlgorithmConfiguration:
     learning_rate_range: tuple[_Rate, _Rate] = (1e-5, 1e-2)
     """Bounds of the adaptive learning rate."""
     desired_kl: Ramp | Positive | None = 0.01
-    """KL divergence that the learning rate is adapted to after every minibatch; a ramp moves with the environment's schedules, None
-    keeps the rate fixed."""
+    """KL divergence that the learning rate is adapted to after every minibatch; a ramp moves with the environment's schedules, None keeps
+    the rate fixed."""
     max_gradient_norm: float = 1.0
     """Gradient norm limit, of each optimizer; actor side and critic share one norm."""
     student_learning_rate: _Rate = 1e-3
@@ -138,12 +173,11 @@ class AlgorithmConfiguration:
     him: HimConfiguration = HimConfiguration()
     dreamwaq: DreamwaqConfiguration = DreamwaqConfiguration()
     load_balance_coefficient: float = 0.01
-    """Weight of the load balancing loss of the Mixture of Experts, a sum over the experts (the paper's equation). The published
-    code takes the mean: a collapse of all samples onto one of 8 experts would then cost 0.0011 beside a latent error of the
-    order of 0.01."""
+    """Weight of the load balancing loss of the Mixture of Experts, a sum over the experts (the paper's equation). The published code
+    takes the mean: a collapse of all samples onto one of 8 experts would then cost 0.0011 beside a latent error of the order of 0.01."""
     symmetry: str = "none"
-    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image) or ``alternate`` (half of a minibatch
-    is replaced by its mirror image, the other half in the next pass: half of the work of ``augment``)."""
+    """Left-right symmetry: ``none``, ``augment`` (every minibatch is joined by its mirror image) or ``alternate`` (half of a minibatch is
+    replaced by its mirror image, the other half in the next pass: half of the work of ``augment``)."""
     precision: str = "tf32"
     """Matrix products on a GPU: ``float32``, ``tf32`` or ``bfloat16`` (autocast; losses stay in float32)."""
     cuda_graphs: bool | None = None
@@ -153,7 +187,8 @@ class AlgorithmConfiguration:
     Compiling takes about half a minute at the start."""
 
     def __post_init__(self) -> None:
-        _choose("method", self.method, METHODS)
+        if ":" not in self.method:
+            _choose("method", self.method, (*METHODS, "module:name of a class of your own"))
         _choose("symmetry", self.symmetry, SYMMETRY_MODES)
         _choose("precision", self.precision, PRECISIONS)
         _choose("compile_mode", self.compile_mode, COMPILE_MODES)
@@ -171,7 +206,7 @@ class AlgorithmConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfiguration:
-    """How long a run lasts and what it leaves behind."""
+    """Length of a run, and the files and figures that it leaves behind."""
 
     experiment: str = "go2_moe_cts"
     """Name of the folder under ``logs/rsl_rl``."""
@@ -198,19 +233,17 @@ class RunConfiguration:
     gauge_wait: NotNegative = 900.0
     """Longest wait for pending scores, and for pending videos, at the end of a run [s]."""
     random_episode_start: bool = True
-    """Whether the first episodes start at random ages, so that resets spread over time."""
+    """Start the first episodes at random ages, so that resets spread over time."""
     keep_episodes: bool = True
-    """Whether checkpoints hold the running episodes, so that resuming equals never having stopped. They are
-    half of a checkpoint with 8,192 environments; without them a resumed run begins new episodes on the levels reached."""
+    """Keep the running episodes in checkpoints, so that resuming equals never having stopped. They are half of a checkpoint with 8,192
+    environments; without them a resumed run begins new episodes on the levels reached."""
     bootstrap_iterations: int = 60
-    """Iterations at the start of a run from a bare policy (``--init-from``) in which only a teacher and a critic for
-    it are learned."""
+    """Iterations at the start of a run from a bare policy (``--init-from``) in which only a teacher and a critic for it are learned."""
     average_age: float = 0.1
-    """How far back the averaged weights, which are played and gauged, lie in the mean: a fraction of the iterations done (see
-    ``averaging``); 0 for the weights of the last iteration alone, at most 0.5."""
+    """Mean age of the averaged weights, which are played and gauged, as a fraction of the iterations done (see ``averaging``); 0 for the
+    weights of the last iteration alone, at most 0.5."""
     nonfinite_limit: Share = 0.01
-    """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run
-    stops."""
+    """Largest share of non-finite environment samples, and of skipped minibatches, in one iteration before the run stops."""
 
     def __post_init__(self) -> None:
         _positive(self, "steps_per_iteration", "iterations", "save_interval", "nonfinite_limit")
@@ -243,8 +276,8 @@ class TrainingConfiguration:
 
 
 def to_plain(value: Any) -> Any:
-    """Configuration as plain data that YAML and JSON can hold and read back safely: dataclasses and mappings become dictionaries,
-    tuples lists, paths texts.
+    """Return a configuration as plain data that YAML and JSON can hold and read back safely: dataclasses and mappings become
+    dictionaries, tuples lists, paths texts.
 
     Raises:
         ValueError: a value has no plain form.

@@ -1,7 +1,7 @@
-"""The networks of a method, and those of concurrent teacher-student learning.
+"""Build the networks of a method, and those of concurrent teacher-student learning.
 
-The student is the very network that is deployed: an architecture of ``policy.networks``, whose actor a teacher
-borrows. Teacher encoder and critic exist in training only.
+The student is the very network that is deployed: an architecture of ``policy.networks``; a teacher borrows its actor. Teacher encoder
+and critic exist in training only.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Widths:
     """Entries of a frame that hold the command."""
 
     def arguments(self, latent_width: int) -> dict[str, Any]:
-        """Arguments, plain data, that all networks of ``policy.networks`` with an encoder have."""
+        """Return the arguments, plain data, that all networks of ``policy.networks`` with an encoder have."""
         return {
             "frame_width": self.frame,
             "num_actions": self.actions,
@@ -49,7 +49,7 @@ class Widths:
 
 
 def command_entries(contract: PolicyContract) -> tuple[int, ...]:
-    """Entries of an observation frame that hold the command."""
+    """Return the entries of an observation frame that hold the command."""
     start = 0
     for term, width in zip(contract.observation, contract.term_widths, strict=True):
         if term.name == "command":
@@ -59,10 +59,10 @@ def command_entries(contract: PolicyContract) -> tuple[int, ...]:
 
 
 def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason: str) -> dict[str, Any]:
-    """Arguments of a network of ``policy.networks`` whose encoder is plain.
+    """Return the arguments of a network of ``policy.networks`` with a plain encoder.
 
     Raises:
-        ConfigurationError: another encoder is asked for; ``reason`` says what of the method does not go with it.
+        ConfigurationError: another encoder is asked for; ``reason`` names the method's part that does not go with it.
     """
     network, method = configuration.network, configuration.algorithm.method
     if network.student_encoder != "mlp":
@@ -73,7 +73,7 @@ def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason
 
 
 def composed_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
-    """Arguments of a network of ``policy.composed``.
+    """Return the arguments of a network of ``policy.composed``.
 
     Raises:
         ConfigurationError: the student's encoder is no plain one.
@@ -116,9 +116,7 @@ def student_architecture(configuration: NetworkConfiguration, widths: Widths) ->
 
 
 class StudentActor(nn.Module):
-    """The deployed network, called student whatever the method, with its exploration noise; methods add what only training
-    needs.
-    """
+    """The deployed network, called student in every method, with its exploration noise; methods add parts for training."""
 
     def __init__(
         self,
@@ -132,8 +130,15 @@ class StudentActor(nn.Module):
 
         Args:
             architecture: name in ``policy.networks.ARCHITECTURES`` of the student network.
+
+        Raises:
+            ConfigurationError: there is no such architecture.
         """
         super().__init__()
+        if architecture not in ARCHITECTURES:
+            raise ConfigurationError(
+                f"the deployed network is a {architecture!r}; allowed are {', '.join(ARCHITECTURES)}, which policies are played with"
+            )
         self.architecture = architecture
         self.arguments = arguments
         self.student: Any = ARCHITECTURES[architecture](**arguments)
@@ -145,33 +150,33 @@ class StudentActor(nn.Module):
         self._frames = (int(arguments["history_length"]), int(arguments["frame_width"]))
 
     def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Latents (N, L) and gate weights of the encoder (N, K), None without experts, from flat histories (N, H·F), oldest
-        frame first.
+        """Return latents (N, L) and gate weights of the encoder (N, K), None without experts, from flat histories (N, H·F), oldest frame
+        first.
         """
         raise NotImplementedError
 
     def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """What the distribution of the actions is updated with, and the weights of the actor's experts (N, K) where it has any,
-        for latents (N, L) and current frames (N, F).
+        """Return the parameters of the action distribution, and the weights of the actor's experts (N, K) where it has any, for latents
+        (N, L) and current frames (N, F).
         """
         return self.action_mean(latent, policy), None
 
     def action_mean(self, latent: torch.Tensor, policy: torch.Tensor) -> torch.Tensor:
-        """Mean actions (N, J) for latents (N, L) and current frames (N, F)."""
+        """Return the mean actions (N, J) for latents (N, L) and current frames (N, F)."""
         return last_in_float32(self.student.actor, torch.cat((latent, policy), dim=-1))
 
     @property
     def output_std(self) -> torch.Tensor:
-        """Present standard deviation of the exploration noise, (J,)."""
+        """Return the present standard deviation of the exploration noise, (J,)."""
         std: torch.Tensor = self.distribution.std_param.detach().clamp(*self.distribution.std_range)
         return std
 
     def policy_parameters(self) -> list[nn.Parameter]:
-        """What reinforcement learning trains."""
+        """Return the parameters that reinforcement learning trains."""
         return [*self.student.actor.parameters(), *self.distribution.parameters()]
 
     def student_parameters(self) -> list[nn.Parameter]:
-        """What supervision trains: the encoder, and what only training needs for it."""
+        """Return the parameters that supervision trains: the encoder, and its helpers in training."""
         return list(self.student.encoder.parameters())
 
 
@@ -183,18 +188,18 @@ class CtsActor(StudentActor):
 
         Args:
             privileged_width: width of the teacher's input.
-            student: what ``StudentActor`` takes.
+            student: arguments of ``StudentActor``.
         """
         teacher = multilayer_perceptron((privileged_width, *configuration.teacher_hidden, configuration.latent_width))
         super().__init__(configuration, **student)
         self.teacher_encoder = teacher
 
     def teacher_latent(self, privileged: torch.Tensor) -> torch.Tensor:
-        """Unit latents (N, L) from privileged observations (N, P)."""
+        """Return unit latents (N, L) from privileged observations (N, P)."""
         return functional.normalize(self.teacher_encoder(privileged), dim=-1)
 
     def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Unit latents (N, L) and gate weights (N, K), None without experts; see ``StudentActor``."""
+        """Return unit latents (N, L) and gate weights (N, K), None without experts; see ``StudentActor``."""
         frames = history.unflatten(-1, self._frames)
         if isinstance(self.student.encoder, ExpertMixture):
             latent, weights = self.student.encoder(frames)
@@ -202,16 +207,16 @@ class CtsActor(StudentActor):
         return functional.normalize(self.student.encoder(frames.flatten(1)), dim=-1), None
 
     def policy_parameters(self) -> list[nn.Parameter]:
-        """What reinforcement learning trains: teacher encoder, actor and exploration noise."""
+        """Return the parameters that reinforcement learning trains: teacher encoder, actor and exploration noise."""
         return [*self.teacher_encoder.parameters(), *super().policy_parameters()]
 
 
 class ComposedActor(CtsActor):
-    """Teacher encoder, and a student whose actor is composed of experts: AC-MoE and MCP."""
+    """Teacher encoder, and a student with an actor composed of experts: AC-MoE and MCP."""
 
     def composed(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[Sequence[torch.Tensor], torch.Tensor]:
-        """What the actor says, and the weights of its experts (N, K), for latents (N, L) and frames (N, F); in float32, since
-        probability ratios live on small differences of actions.
+        """Return the actor's output and the weights of its experts (N, K), for latents (N, L) and frames (N, F), in float32: probability
+        ratios depend on small differences of actions.
         """
         with torch.autocast(latent.device.type, enabled=False):
             values = torch.cat((latent.float(), policy), dim=-1)
@@ -224,14 +229,12 @@ class ComposedActor(CtsActor):
 
 
 class ValueNetwork(nn.Module):
-    """Values for a latent, a privileged observation and the weights of the actor's experts, of which a method takes what it
-    needs.
-    """
+    """Values for a latent, a privileged observation and the weights of the actor's experts; a method uses those that it needs."""
 
     def value(
         self, latent: torch.Tensor, privileged: torch.Tensor, weights: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Values (N, 1) for detached latents (N, L), privileged observations (N, P) and weights (N, K)."""
+        """Return values (N, 1) for detached latents (N, L), privileged observations (N, P) and weights (N, K)."""
         raise NotImplementedError
 
 
@@ -252,8 +255,8 @@ class CtsCritic(ValueNetwork):
 
 
 def last_in_float32(layers: nn.Sequential, values: torch.Tensor) -> torch.Tensor:
-    """A perceptron whose last layer is computed in float32 whatever the precision of the others: an action in bfloat16 is off by
-    hundredths of the exploration noise, and probability ratios live on such differences.
+    """Apply a perceptron, its last layer in float32 in every precision: an action in bfloat16 is off by hundredths of the exploration
+    noise, and probability ratios depend on such differences.
     """
     *hidden, last = layers
     for layer in hidden:

@@ -1,8 +1,8 @@
 """``key=value`` settings on nested frozen dataclasses, converted to the type of the field they change.
 
-A key is a path of field names separated by dots. An element of a tuple is addressed by its number or, if it has a
-``name``, by that: ``terrain.tiles.stairs_up.share=0.3``. Values: numbers, ``true``/``false``, ``none`` where a field
-may be None, text, and tuples as numbers separated by commas.
+A key is a path of field names separated by dots. An element of a tuple is addressed by its number or, if it has a ``name``, by that:
+``terrain.tiles.stairs_up.share=0.3``. Values: numbers, ``true``/``false``, ``none`` where a field may be None, text, and tuples as
+numbers separated by commas.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ Options = TypeVar("Options")
 
 
 class TaskError(ValueError):
-    """An unknown task, key or value; the message names it and what is allowed."""
+    """An unknown task, key or value; the message names it and the allowed ones."""
 
 
 def apply_overrides(configuration: Options, overrides: Iterable[str]) -> Options:
-    """A copy of a configuration with some settings changed.
+    """Return a copy of a configuration with some settings changed.
 
     Args:
         configuration: a frozen dataclass, nested as deep as it likes.
@@ -40,7 +40,7 @@ def apply_overrides(configuration: Options, overrides: Iterable[str]) -> Options
 
 
 def override_keys(configuration: Any, prefix: str = "") -> list[str]:
-    """All keys that a configuration has, depth first."""
+    """Return all keys that a configuration has, depth first."""
     keys: list[str] = []
     for name, value in _children(configuration):
         keys.extend(override_keys(value, f"{prefix}{name}.") if _has_children(value) else [prefix + name])
@@ -95,7 +95,7 @@ def _replaced(node: Any, name: str, value: Any, key: str) -> Any:
 
 
 def _takes_plain(node: Any, name: str) -> bool:
-    """Whether a field that holds a dataclass may hold a number or text as well."""
+    """Return True if a field that holds a dataclass may hold a number or text as well."""
     hint = get_type_hints(type(node))[name]
     return any(option in (int, float, str) for option in get_args(hint))
 

@@ -1,8 +1,7 @@
-"""Does an engine keep the physics contract? Checks that run against any ``PhysicsBackend``, a third party's included.
+"""Check that an engine keeps the physics contract: any ``PhysicsBackend``, a third party's included.
 
-``run_conformance(name)`` runs them all and returns one result for each; nothing here prints, and nothing needs pytest.
-The expected values come from plain MuJoCo (C) loops and closed formulas in ``reference``, never from another engine of
-this package.
+``run_conformance(name)`` runs all checks and returns one result for each; nothing here prints, and nothing needs pytest.
+Expected values come from plain MuJoCo (C) loops and closed formulas in ``reference``, never from another engine.
 """
 
 from .bench import Bench, ConformanceError

@@ -1,4 +1,4 @@
-"""The test bench: builds small scenes that fit an engine's capabilities and talks to the engine in numpy arrays."""
+"""The test bench: small scenes that fit an engine's capabilities, and calls of the engine with numpy arrays."""
 
 from __future__ import annotations
 
@@ -15,26 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from ...robots.base import JointParameters, Robot
 from ...robots.body_plan import body_plan
 from ...terrains.base import Terrain
-from ..base import (
-    Capability,
-    PhysicsBackend,
-    PhysicsOptions,
-    PhysicsState,
-    Randomization,
-    ResetState,
-    Scene,
-    Support,
-)
+from ..base import Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, ResetState, Scene, Support
 
 FLAT = Terrain(name="conformance_flat", family="flat")
 WORLDS = 4
-"""Number of worlds in nearly every scene, so that an engine that compiles for sizes compiles once."""
+"""Number of worlds in nearly every scene, so that an engine with compiled sizes compiles once."""
 STIFF_LOAD = 6.478
 """Mass times leg length for which ``Bench.stiff`` has kp 800, kd 16 and armature 0.1: a Go2's [kg·m]."""
 
 
 class ConformanceError(AssertionError):
-    """An engine does something else than the contract says; the message gives both values."""
+    """A breach of the contract by an engine; the message gives both values."""
 
 
 def expect(condition: ArrayLike, message: str) -> None:
@@ -44,15 +35,12 @@ def expect(condition: ArrayLike, message: str) -> None:
 
 
 def expect_close(what: str, actual: ArrayLike, expected: ArrayLike, tolerance: ArrayLike) -> float:
-    """Compare arrays of one shape, the first axis being worlds.
+    """Compare arrays, the first axis being worlds, and return the largest difference.
 
     Args:
         what: name of the quantity with its unit, for the message.
         expected: the reference's values; broadcast against ``actual``.
         tolerance: largest allowed magnitude of the difference, broadcast too.
-
-    Returns:
-        The largest difference.
 
     Raises:
         ConformanceError: a value is not finite or too far off.
@@ -84,21 +72,19 @@ class Worlds:
         self.default_pose = np.tile(np.asarray(self.robot.default_joint_position), (self.count, 1))
 
     def precision(self, double: float, single: float) -> float:
-        """A tolerance that depends on the engine's floating-point type only."""
+        """Return a tolerance by the engine's floating-point type."""
         return single if self.backend.dtype == torch.float32 else double
 
     def read(self) -> SimpleNamespace:
-        """Copies of all fields of the present state; floating point as float64."""
+        """Return copies of all fields of the present state; floating point as float64."""
         return _snapshot(self.backend.state)
 
     def read_sample(self) -> SimpleNamespace:
-        """Copies of all fields of the sample."""
+        """Return copies of all fields of the sample."""
         return _snapshot(self.backend.sample)
 
     def reset(self, worlds: ArrayLike | None = None, **arguments: Any) -> None:
-        """``PhysicsBackend.reset`` with the fields of ``ResetState``, which may have one row for all worlds; the base is upright at
-        (0, 0, 1) where no pose is given.
-        """
+        """Reset with fields of ``ResetState``, which may have one row for all worlds; by default the base is upright at (0, 0, 1)."""
         terrain_index = arguments.pop("terrain_index", None)
         arguments = {"base_position": (0.0, 0.0, 1.0), "base_quaternion": (1.0, 0.0, 0.0, 0.0), **arguments}
         rows = {k: np.broadcast_to(v, (self.count, np.shape(v)[-1])) for k, v in arguments.items() if v is not None}
@@ -106,15 +92,8 @@ class Worlds:
         start = ResetState(terrain_index=self._whole(terrain_index), **tensors)
         self.backend.reset(start, self._mask(worlds))
 
-    def step(
-        self,
-        targets: ArrayLike | None = None,
-        *,
-        worlds: ArrayLike | None = None,
-        substeps: int | None = None,
-        **when: ArrayLike,
-    ) -> None:
-        """``PhysicsBackend.step``; ``when``: ``delay`` and ``sample_at``."""
+    def step(self, targets: Any = None, *, worlds: Any = None, substeps: int | None = None, **when: ArrayLike) -> None:
+        """Step as ``PhysicsBackend.step`` does; ``when``: ``delay`` and ``sample_at``."""
         asked = None if targets is None else self._tensor(targets)
         numbers = {name: self._whole(value) for name, value in when.items()}
         self.backend.step(asked, worlds=self._mask(worlds), substeps=substeps, **numbers)
@@ -125,16 +104,16 @@ class Worlds:
             self.step()
 
     def randomize(self, worlds: ArrayLike | None = None, **values: ArrayLike) -> None:
-        """``PhysicsBackend.randomize``; every value has a row for each world of the mask."""
+        """Randomize as ``PhysicsBackend.randomize`` does; every value has a row for each world of the mask."""
         randomization = Randomization(**{name: self._tensor(value) for name, value in values.items()})
         self.backend.randomize(randomization, self._mask(worlds))
 
     def push(self, worlds: ArrayLike | None = None, **velocities: ArrayLike) -> None:
-        """``PhysicsBackend.push``."""
+        """Push as ``PhysicsBackend.push`` does."""
         self.backend.push(self._mask(worlds), **{name: self._tensor(value) for name, value in velocities.items()})
 
     def apply_force(self, force_w: ArrayLike) -> None:
-        """``PhysicsBackend.apply_force``."""
+        """Apply a force as ``PhysicsBackend.apply_force`` does."""
         self.backend.apply_force(self._tensor(force_w))
 
     def _tensor(self, value: ArrayLike) -> torch.Tensor:
@@ -157,12 +136,12 @@ def _snapshot(state: PhysicsState) -> SimpleNamespace:
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """What a check needs to know about the engine under test."""
+    """The engine under test, for a check."""
 
     make: Callable[[Scene, str], PhysicsBackend]
-    """Builds the engine's worlds of a scene on a device."""
+    """Function that builds the engine's worlds of a scene on a device."""
     capabilities: Mapping[str, Capability]
-    """What the engine declares."""
+    """The engine's declaration."""
     robot: Robot
     """The robot in every scene; four-legged, its feet spheres."""
     device: str = "cpu"
@@ -170,19 +149,19 @@ class Bench:
 
     @property
     def gpu(self) -> bool:
-        """Whether the device under test is a GPU."""
+        """Return whether the device under test is a GPU."""
         return not self.device.startswith("cpu")
 
     def supports(self, *names: str) -> bool:
-        """Whether the engine supports all of the named capabilities, exactly or approximately."""
+        """Return whether the engine supports all named capabilities, exactly or approximately."""
         return all(self.capabilities[name].support is not Support.NONE for name in names)
 
     def bound(self, capability: str, *, exact: float, approximate: float) -> float:
-        """A tolerance by how well the engine says it does a thing."""
+        """Return a tolerance by the engine's declared support of a capability."""
         return exact if self.capabilities[capability].support is Support.EXACT else approximate
 
     def physics(self, **changes: Any) -> PhysicsOptions:
-        """The default physics options, less what the engine does not support, plus the changes."""
+        """Return the default physics options without unsupported ones, with the changes."""
         options: dict[str, Any] = {
             "cone": "elliptic" if self.supports("elliptic_cone") else "pyramidal",
             "foot_condim": None if self.supports("foot_condim_6") else 3,
@@ -192,7 +171,7 @@ class Bench:
         return PhysicsOptions(**(options | changes))
 
     def soft(self, **changes: float) -> JointParameters:
-        """The robot's default joint parameters without dry friction, one value for all joints where one is given."""
+        """Return the robot's default joint parameters without dry friction; a change is one value for all joints."""
         base = self.robot.parameters[self.robot.default_parameters]
         values = {f.name: getattr(base, f.name) for f in fields(JointParameters)}
         values["friction_loss"] = (0.0,) * self.robot.num_joints
@@ -200,22 +179,15 @@ class Bench:
         return JointParameters(**values)
 
     def stiff(self) -> JointParameters:
-        """Joints that hold the standing pose nearly rigidly: the robot becomes a table with four feet. All constants grow with the
-        weight times leg length that the joints carry.
-        """
+        """Return joints that hold the standing pose nearly rigidly, by constants in proportion to mass times leg length."""
         plan = body_plan(self.robot)
         load = plan.mass * plan.leg_length / STIFF_LOAD
-        return self.soft(
-            stiffness=800.0 * load,
-            damping=16.0 * load,
-            armature=0.1 * load,
-            joint_damping=0.0,
-            torque_limit=1000.0 * load,
-        )
+        gains = {"stiffness": 800.0 * load, "damping": 16.0 * load, "torque_limit": 1000.0 * load}
+        return self.soft(**gains, armature=0.1 * load, joint_damping=0.0)
 
     @contextmanager
     def worlds(self, parameters: JointParameters | None = None, **scene: Any) -> Iterator[Worlds]:
-        """Build a scene, of ``scene``'s arguments, in the engine; closed at the end."""
+        """Build a scene, from ``scene``'s arguments, in the engine; close it at the end."""
         with closing(self.make(self.scene(parameters, **scene), self.device)) as backend:
             yield Worlds(backend)
 
@@ -227,7 +199,7 @@ class Bench:
         terrain_index: Sequence[int] | None = None,
         **physics: Any,
     ) -> Scene:
-        """A scene that fits the engine.
+        """Return a scene that fits the engine.
 
         Args:
             parameters: joint constants, ``soft()`` where None.

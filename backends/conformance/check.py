@@ -10,17 +10,10 @@ import mujoco
 from ..base import CAPABILITY_NAMES
 from .bench import Bench
 
-# Whatever an engine under test may raise is a failed check, not the end of the run.
+# These errors of an engine under test are a failed check, not the end of the run.
 ENGINE_ERRORS = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    mujoco.FatalError,
+    *(ArithmeticError, AssertionError, AttributeError, LookupError, OSError),
+    *(RuntimeError, TypeError, ValueError, mujoco.FatalError),
 )
 
 
@@ -34,10 +27,10 @@ class Check:
     name: str
     """Room and subject, for example ``motors/latency``."""
     needs: tuple[str, ...]
-    """Capabilities without which the check makes no sense."""
+    """Capabilities that the check requires."""
     run: Callable[[Bench], str]
     about: str
-    """One sentence."""
+    """One sentence: the property that is checked."""
 
 
 _CHECKS: dict[str, Check] = {}

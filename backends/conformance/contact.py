@@ -1,4 +1,4 @@
-"""Checks of what is reported about contacts at rest: forces add up to the weight, moments to the centre of mass."""
+"""Checks of reported contacts: at rest, forces add up to the weight and moments to the centre of mass."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def stand_still(
 
 
 def pressure_point(state: SimpleNamespace) -> np.ndarray:
-    """Where the ground force acts at the height of the contact centre, (N, 2) [m], from force and moment."""
+    """Return the point of attack of the ground force at the height of the contact centre, (N, 2) [m], from force and moment."""
     force, moment, center = state.ground_force_w, state.ground_moment_w, state.contact_center_w
     shift = np.stack([-moment[:, 1], moment[:, 0]], axis=1) / force[:, 2:3]
     return center[:, :2] + shift
@@ -63,7 +63,7 @@ def pressure_point(state: SimpleNamespace) -> np.ndarray:
 def centers_of_mass(
     bench: Bench, worlds: Worlds, state: SimpleNamespace, changes: list[dict[str, Any]] | None = None
 ) -> np.ndarray:
-    """The reference's centre of mass in each world's pose, (N, 3) [m]; ``changes`` as in ``Reference.change``."""
+    """Return the reference's centre of mass in each world's pose, (N, 3) [m]; ``changes`` as in ``Reference.change``."""
     found = []
     for row in range(worlds.count):
         reference = Reference(bench.robot, worlds.backend.scene.parameters)
@@ -98,9 +98,7 @@ def feet(bench: Bench) -> str:
         state = stand_still(bench, worlds)
         force, weight = state.foot_contact_force_w, Reference(bench.robot, bench.stiff()).mass * GRAVITY
         bound = 0.01 * weight
-        expect_close(
-            "sum of foot_contact_force_w against ground_force_w [N]", force.sum(1), state.ground_force_w, bound
-        )
+        expect_close("sum of foot_contact_force_w and ground_force_w [N]", force.sum(1), state.ground_force_w, bound)
         expect_close("foot_normal_force against the vertical [N]", state.foot_normal_force, force[..., 2], bound)
         horizontal = np.linalg.norm(force[..., :2], axis=-1)
         expect_close("foot_tangential_force against the horizontal [N]", state.foot_tangential_force, horizontal, bound)
@@ -133,18 +131,14 @@ def moment(bench: Bench) -> str:
 def bodies(bench: Bench) -> str:
     """On its back, a robot's body and foot forces add up to the ground force, its weight; the base carries some."""
     with bench.worlds(bench.stiff()) as worlds:
-        turned = np.array(
-            [composed(axis_angle((0, 0, 1), a), [0.0, 1.0, 0.0, 0.0]) for a in np.linspace(0, 2, worlds.count)]
-        )
+        yaws, back = np.linspace(0, 2, worlds.count), [0.0, 1.0, 0.0, 0.0]
+        turned = np.array([composed(axis_angle((0, 0, 1), yaw), back) for yaw in yaws])
         lay_on_back(bench, worlds, base_quaternion=turned, held_target=worlds.default_pose)
         worlds.run(0.8)
         state = worlds.read()
         weight = Reference(bench.robot, bench.stiff()).mass * GRAVITY
-        total = state.body_contact_force_w.sum(1) + state.foot_contact_force_w.sum(1)
-        expect_close(
-            "sum of body and foot forces against ground_force_w [N]", total, state.ground_force_w, 0.01 * weight
-        )
-        force = state.ground_force_w
+        total, force = state.body_contact_force_w.sum(1) + state.foot_contact_force_w.sum(1), state.ground_force_w
+        expect_close("sum of body and foot forces against ground_force_w [N]", total, force, 0.01 * weight)
         expect_close("ground_force_w of a robot on its back [N]", force, [0, 0, weight], 0.03 * weight)
         expect_close("foot_contact_force_w of feet in the air [N]", state.foot_contact_force_w, 0.0, 1e-3)
         base = bench.robot.collision_bodies.index(bench.robot.base_body)
@@ -156,7 +150,7 @@ def bodies(bench: Bench) -> str:
 
 @check("contact/trunk", "contact_forces", "plane", "boxes", "per_world_terrain")
 def trunk(bench: Bench) -> str:
-    """With its trunk on a pillar, all that the base carries is the trunk's; on its back no more than that, nose down nothing."""
+    """On its trunk on a pillar the base carries by the trunk alone; on its back the trunk carries a part, on its nose nothing."""
     reference = Reference(bench.robot, bench.stiff())
     pillar, height = trunk_pillar(reference)
     base = bench.robot.collision_bodies.index(bench.robot.base_body)
@@ -166,9 +160,8 @@ def trunk(bench: Bench) -> str:
         state = worlds.read()
         weight, force = reference.mass * GRAVITY, state.trunk_contact_force_w
         expect_close("trunk_contact_force_w of a trunk on a pillar [N]", force, [0, 0, weight], 0.03 * weight)
-        expect_close(
-            "body_contact_force_w of a base on its trunk [N]", state.body_contact_force_w[:, base], force, 1e-3
-        )
+        whole = state.body_contact_force_w[:, base]
+        expect_close("body_contact_force_w of a base on its trunk [N]", whole, force, 1e-3)
         carried = force[:, 2].min()
 
         lay_on_back(bench, worlds, held_target=worlds.default_pose, terrain_index=np.zeros(worlds.count))
@@ -203,15 +196,14 @@ def training(bench: Bench) -> str:
     try:
         return hold_to_converged(bench, TRAINING_PHYSICS)
     except BackendError as refusal:
-        return f"refused: {refusal}"  # an engine that cannot train in this physics has nothing to keep
+        return f"refused: {refusal}"  # the check is void for an engine that cannot train in this physics
 
 
 def hold_to_converged(bench: Bench, physics: PhysicsOptions) -> str:
     """Compare foot forces of robots that land and trot with those of MuJoCo's solver after up to 200 iterations.
 
     Raises:
-        ConformanceError: the forces that only one contact in a hundred, or in a thousand, exceeds are off by more than
-            10 %, or 20 %: contacts kick, or give way.
+        ConformanceError: the 99 % quantile of the forces is off by more than 10 %, or the 99.9 % quantile by more than 20 %.
     """
     changes = {f.name: getattr(physics, f.name) for f in fields(PhysicsOptions)}
     changes |= {"torque_limits": False, "torque_speed_limit": False}
@@ -248,7 +240,7 @@ def hold_to_converged(bench: Bench, physics: PhysicsOptions) -> str:
 
 @check("contact/torsion", "foot_condim_6", "plane")
 def torsion(bench: Bench) -> str:
-    """Spinning on one foot below its centre of mass, a robot slows down as the reference does: by torsional friction of dimension 4."""
+    """Spinning on one foot below its centre of mass, a robot slows down as the reference does, by torsional friction (dimension 4)."""
     parameters, seconds = bench.stiff(), 0.1
     rates = 3.0 * (-1.0) ** np.arange(WORLDS)
     starts = [
@@ -279,9 +271,7 @@ def torsion(bench: Bench) -> str:
 
 
 def spun(reference: Reference, *, foot: int, rate: float) -> dict[str, np.ndarray]:
-    """Arguments of a reset: a robot in its default pose, turned until its centre of mass is above a foot, which touches the ground,
-    and spinning about the vertical through both at ``rate`` [rad/s].
-    """
+    """Return a reset of the robot in its default pose, its centre of mass above one foot on the ground, spinning at ``rate`` [rad/s]."""
     reference.place((0.0, 0.0, 0.0))
     to_foot = reference.foot_position[foot]
     upwards = reference.center_of_mass - to_foot
@@ -297,15 +287,13 @@ def spun(reference: Reference, *, foot: int, rate: float) -> dict[str, np.ndarra
 
 
 def yaw_rate(state: SimpleNamespace) -> np.ndarray:
-    """Angular velocity about the vertical [rad/s], (N,)."""
+    """Return the angular velocity about the vertical [rad/s], (N,)."""
     pairs = zip(state.base_quaternion_w, state.base_angular_velocity_b, strict=True)
     return np.array([rotated(turn, rate)[2] for turn, rate in pairs])
 
 
 def trunk_pillar(reference: Reference) -> tuple[Terrain, float]:
-    """A pillar below the trunk, narrower than its lowest shape and so high that nothing else of the robot in its default pose meets
-    anything, and the height of a level base whose trunk just clears it [m].
-    """
+    """Return a pillar for the trunk's lowest shape, so high that nothing else touches, and the base's height just above it [m]."""
     ground = clear_height(reference, (1.0, 0.0, 0.0, 0.0), clearance=0.0)  # places the base at the origin
     model, data = reference.model, reference.data
     lowest, below = np.inf, (np.zeros(3), np.zeros(3))
@@ -324,14 +312,14 @@ def trunk_pillar(reference: Reference) -> tuple[Terrain, float]:
 
 
 def lay_on_back(bench: Bench, worlds: Worlds, *, clearance: float = 0.001, **reset: Any) -> None:
-    """Reset robots in their default pose to where they just clear the ground [m] on their backs; ``reset`` as ``Worlds.reset`` has it."""
+    """Reset robots in their default pose on their backs, ``clearance`` above the ground [m]; ``reset`` as in ``Worlds.reset``."""
     back = (0.0, 1.0, 0.0, 0.0)
     height = clear_height(Reference(bench.robot, worlds.backend.scene.parameters), back, clearance=clearance)
     worlds.reset(**{"base_position": (0.0, 0.0, height), "base_quaternion": back, **reset})
 
 
 def clear_height(reference: Reference, base_quaternion: ArrayLike, *, clearance: float = 0.001) -> float:
-    """Height of the base origin at which a turned robot in its default pose just clears the ground [m]."""
+    """Return the height of the base origin at which a turned robot in its default pose just clears the ground [m]."""
     reference.place((0.0, 0.0, 0.0), base_quaternion)
     model, data = reference.model, reference.data
     depth = 0.0

@@ -61,12 +61,8 @@ def force(bench: Bench) -> str:
             reference.place(state.base_position_w[row], state.base_quaternion_w[row], state.joint_position[row])
             fallen.append(reference.center_of_mass - start - drift * t)
         acceleration = force_w / reference.mass - [0.0, 0.0, GRAVITY]
-        expect_close(
-            "path of the centre of mass by F = m a [m]",
-            fallen,
-            0.5 * acceleration * t * (t + 0.5 * h),
-            np.abs(acceleration) * t * h + 1e-3,
-        )
+        path, slack = 0.5 * acceleration * t * (t + 0.5 * h), np.abs(acceleration) * t * h + 1e-3
+        expect_close("path of the centre of mass by F = m a [m]", fallen, path, slack)
         worlds.apply_force(np.zeros((worlds.count, 3)))
         before = worlds.read()
         worlds.step(substeps=1)
@@ -93,7 +89,7 @@ def force_reset(bench: Bench) -> str:
 
 
 def _momentum(bench: Bench, asked: dict[str, np.ndarray]) -> np.ndarray:
-    """Velocity of the centre of mass [m/s], (3,)."""
+    """Return the velocity of the centre of mass [m/s], (3,)."""
     import mujoco
 
     reference = Reference(bench.robot, bench.soft())

@@ -1,4 +1,4 @@
-"""Checks of friction: the randomized coefficient is the one that acts, in every world for itself."""
+"""Checks of friction: the randomized coefficient acts, in every world its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of the ground: boxes, turned boxes, height fields, walls, and worlds that differ."""
+"""Checks of the ground: boxes, turned boxes, height fields, walls, and differences between worlds."""
 
 from __future__ import annotations
 
@@ -18,8 +18,13 @@ def _box(name: str, *boxes: Box) -> Terrain:
     return Terrain(name=f"conformance_{name}", family="boxes", boxes=boxes)
 
 
+def _field(name: str, heights: np.ndarray, center: tuple[float, float] = (0.0, 0.0)) -> Terrain:
+    field = HeightField(center=center, half_size=(3.0, 2.0), heights=heights)
+    return Terrain(name=f"conformance_{name}", family="field", height_field=field)
+
+
 def incline(angle: float, *, name: str = "incline") -> Terrain:
-    """A box whose top goes through (0, 0, 0.8) and rises towards -x by ``angle`` [rad]: a turn about +y."""
+    """Return a box with a top through (0, 0, 0.8) that rises towards -x by ``angle`` [rad]: a turn about +y."""
     half = (2.0, 1.5, 0.1)
     center = (-half[2] * float(np.sin(angle)), 0.0, 0.8 - half[2] * float(np.cos(angle)))
     w, x, y, z = axis_angle((0.0, 1.0, 0.0), angle)
@@ -28,7 +33,7 @@ def incline(angle: float, *, name: str = "incline") -> Terrain:
 
 FLOOR = _box("floor")
 PLATFORM = _box("platform", Box(center=(0.0, 0.0, 0.25), half_size=(1.0, 1.0, 0.05)))
-# Turned by a right angle it is long in y; taken unturned it would leave nothing to stand on at y = 1.2.
+# Turned by a right angle the plank is long in y; unturned it would leave nothing to stand on at y = 1.2.
 PLANK = _box(
     "plank",
     Box(center=(0.0, 0.0, 0.1), half_size=(2.0, 0.7, 0.1), quaternion=(0.70710678, 0.0, 0.0, 0.70710678)),
@@ -36,7 +41,7 @@ PLANK = _box(
 )
 PALETTE = (FLOOR, PLATFORM, PLANK, incline(PITCH))
 PLACES = np.array([[0.0, 0.0], [0.5, -0.4], [0.0, 1.2], [0.0, 0.0]])
-"""Where the robots stand on the terrains of ``PALETTE``."""
+"""Places of the robots on the terrains of ``PALETTE``."""
 
 
 def _standing_height(bench: Bench) -> float:
@@ -45,11 +50,11 @@ def _standing_height(bench: Bench) -> float:
 
 @check("ground/boxes", "boxes", "per_world_terrain")
 def boxes(bench: Bench) -> str:
-    """Every world has its own boxes where its terrain says, turned ones included, and robots stand on them."""
+    """Every world has the boxes of its own terrain, turned ones included, and robots stand on them."""
     with bench.worlds(bench.stiff(), terrains=PALETTE, terrain_index=(0, 1, 2, 3)) as worlds:
         heights = np.array([float(t.height(x, y)) for t, (x, y) in zip(PALETTE, PLACES, strict=True)])
         turns = np.array([axis_angle((0.0, 1.0, 0.0), PITCH if row == 3 else 0.0) for row in range(worlds.count)])
-        # a robot that leans with the slope starts a little higher, as its feet's plane goes through the slope's surface
+        # a robot that leans with the slope starts a little higher, because its feet's plane goes through the slope's surface
         lift = np.array([0.0, 0.0, 0.0, _standing_height(bench) * (np.cos(PITCH) - 1.0)])
         xy = PLACES + np.array([[0.0, 0.0]] * 3 + [[_standing_height(bench) * np.sin(PITCH), 0.0]])
         if bench.supports("friction"):
@@ -87,20 +92,16 @@ def switch(bench: Bench) -> str:
 
 
 def terraces() -> Terrain:
-    """A height field of four level terraces, one in each quadrant, all of another height, none at 0."""
+    """Return a height field of four level terraces, one in each quadrant, of different heights above 0."""
     x, y = np.meshgrid(np.linspace(-3.0, 3.0, 61), np.linspace(-2.0, 2.0, 41))
-    ahead = np.where(y > 0.0, 0.20, 0.05)
-    behind = np.where(y > 0.0, 0.15, 0.10)
-    field = HeightField(center=(0.5, 0.25), half_size=(3.0, 2.0), heights=np.where(x > 0.0, ahead, behind))
-    return Terrain(name="conformance_terraces", family="field", height_field=field)
+    ahead, behind = np.where(y > 0.0, 0.20, 0.05), np.where(y > 0.0, 0.15, 0.10)
+    return _field("terraces", np.where(x > 0.0, ahead, behind), center=(0.5, 0.25))
 
 
 def ramp_field() -> Terrain:
-    """A height field that rises along +x and, half as much, along +y."""
+    """Return a height field that rises along +x and, half as much, along +y."""
     x, y = np.meshgrid(np.linspace(-3.0, 3.0, 61), np.linspace(-2.0, 2.0, 41))
-    heights = 0.5 + 0.12 * x + 0.06 * y
-    field = HeightField(center=(0.5, 0.25), half_size=(3.0, 2.0), heights=heights)
-    return Terrain(name="conformance_ramp", family="field", height_field=field)
+    return _field("ramp", 0.5 + 0.12 * x + 0.06 * y, center=(0.5, 0.25))
 
 
 @check("ground/height_field", "height_field", "per_world_terrain")
@@ -128,7 +129,7 @@ def height_field(bench: Bench) -> str:
             expect_close(f"foot height in world {row} on a height field [m]", z, ground + rise, 0.005)
         fluctuation = ""
         if bench.supports("contact_forces"):
-            # Single contacts with a triangle mesh may come and go; over many substeps they must carry the weight.
+            # Single contacts with a triangle mesh may come and go; over many substeps the contacts must carry the weight.
             forces = []
             for _ in range(30):
                 worlds.step(substeps=1)
@@ -141,15 +142,14 @@ def height_field(bench: Bench) -> str:
 
 
 def waves() -> Terrain:
-    """A height field of waves 0.12 m high, 1 m long along x and 1.4 m along y, with nodes every 0.08 m."""
+    """Return a height field of waves 0.12 m high, 1 m long along x and 1.4 m along y, with nodes every 0.08 m."""
     x, y = np.meshgrid(np.linspace(-3.0, 3.0, 76), np.linspace(-2.0, 2.0, 51))
     heights = 0.06 + 0.03 * (np.sin(2.0 * np.pi * x) + np.cos(2.0 * np.pi * y / 1.4))
-    field = HeightField(center=(0.0, 0.0), half_size=(3.0, 2.0), heights=heights - heights.min())
-    return Terrain(name="conformance_waves", family="field", height_field=field)
+    return _field("waves", heights - heights.min())
 
 
 def clearance(terrain: Terrain, points: np.ndarray, reach: float) -> np.ndarray:
-    """Distance of points from the ground [m], found on a grid of ``reach`` [m] around each; (M,) for points (M, 3)."""
+    """Return the distance of points from the ground [m], (M,) for (M, 3), found on a grid of ``reach`` [m] around each."""
     span = np.linspace(-reach, reach, 61)
     dx, dy = (grid.ravel() for grid in np.meshgrid(span, span))
     x, y = points[:, 0, None] + dx, points[:, 1, None] + dy

@@ -1,4 +1,4 @@
-"""Checks of what an engine says about worlds in trouble: watches, divergence, overflow."""
+"""Checks of the flags of worlds in trouble: watches, divergence, overflow."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from .kinematics import base_up
 from .reference import Reference, level_stance
 from .stepping import expect_same_motion, stand, wave
 
-BLOCK = Terrain(
-    name="conformance_block", family="block", boxes=(Box(center=(0.0, 0.0, 0.1), half_size=(0.6, 0.6, 0.1)),)
-)
+_BOX = Box(center=(0.0, 0.0, 0.1), half_size=(0.6, 0.6, 0.1))
+BLOCK = Terrain(name="conformance_block", family="block", boxes=(_BOX,))
 
 
 @check("health/tilt_watch")
@@ -62,9 +61,7 @@ def penetration_watch(bench: Bench) -> str:
         worlds.reset(base_position=position, base_quaternion=stance.quaternion, held_target=worlds.default_pose)
         worlds.step()
         found = worlds.read().penetration_substep
-        expect(
-            found[1] in (1, 2), f"penetration_substep of a robot 40 mm deep in a box is {found[1]}, must be 1 (or 2)"
-        )
+        expect(found[1] in (1, 2), f"penetration_substep of a robot 40 mm deep in a box is {found[1]}, must be 1 or 2")
         expect(found[0] == 0, f"penetration_substep of a robot that stands on a box is {found[0]}, must be 0")
         expect(not found[2:].any(), f"penetration_substep trips at the floor, which is no terrain: {found[2:]}")
         worlds.reset()
@@ -75,7 +72,7 @@ def penetration_watch(bench: Bench) -> str:
 
 @check("health/divergence")
 def divergence(bench: Bench) -> str:
-    """An infinite velocity or a NaN target makes its world diverged; the others go on untouched, a reset heals it."""
+    """An infinite velocity or a NaN target makes its world diverged; other worlds go on untouched, a reset heals the world."""
     with bench.worlds() as worlds, bench.worlds() as untouched:
         for each in (worlds, untouched):
             stand(bench, each)
@@ -112,7 +109,7 @@ def divergence(bench: Bench) -> str:
 
 @check("health/no_overflow", "contact_forces")
 def no_overflow(bench: Bench) -> str:
-    """A robot lying on its back has contacts enough for all engines, and none overflows."""
+    """A robot on its back has many contacts, and no engine overflows."""
     with bench.worlds() as worlds:
         lay_on_back(bench, worlds, clearance=0.06)
         worlds.run(0.4)

@@ -1,4 +1,4 @@
-"""Checks of state, frames and free motion: what everything else rests on."""
+"""Checks of state, frames and free motion, the base of all other checks."""
 
 from __future__ import annotations
 
@@ -14,21 +14,13 @@ from .check import check
 from .reference import GRAVITY, Reference, angle_between, axis_angle, composed, rotated
 
 FORCE_FIELDS = (
-    "joint_torque",
-    "foot_contact_force_w",
-    "foot_normal_force",
-    "foot_tangential_force",
-    "body_contact_force_w",
-    "trunk_contact_force_w",
-    "ground_force_w",
-    "ground_moment_w",
-    "contact_center_w",
-    "contact_count",
-)
+    "joint_torque", "foot_contact_force_w", "foot_normal_force", "foot_tangential_force", "body_contact_force_w",
+    "trunk_contact_force_w", "ground_force_w", "ground_moment_w", "contact_center_w", "contact_count",
+)  # fmt: skip
 
 
 def posed(bench: Bench, count: int, *, seed: int = 1) -> dict[str, Any]:
-    """Arguments of a reset: every world somewhere else, turned about all axes, in another pose and in motion."""
+    """Return a reset to a different place, turn about all axes, pose and motion in every world."""
     random = np.random.default_rng(seed)
     reference = Reference(bench.robot, bench.soft())
     low, high = reference.joint_range.T
@@ -73,7 +65,9 @@ def state_fields(bench: Bench) -> str:
             whole = name == "contact_count" and not value.dtype.is_floating_point
             expect(whole or value.dtype == kind, f"state.{name} is {value.dtype}, must be {kind}")
             expect(value.device.type == backend.device.type, f"state.{name} is on {value.device}, not {backend.device}")
-        worlds.reset(base_position=(0.0, 0.0, 0.0))  # feet and trunk in the floor: there are forces to be forgotten
+        worlds.reset(
+            base_position=(0.0, 0.0, 0.0)
+        )  # feet and trunk in the floor, so that the reset has forces to clear
         worlds.step(worlds.default_pose + 0.1, substeps=1)
         worlds.reset()
         state = worlds.read()
@@ -98,30 +92,23 @@ def state_time(bench: Bench) -> str:
         expect_close("time after 5 + 2 steps of 4 ms [s]", worlds.read().time, 0.028, 1e-6)
         worlds.reset([True, False] * (worlds.count // 2))
         worlds.step(substeps=1)
-        expect_close(
-            "time of reset and other worlds [s]", worlds.read().time, [0.004, 0.032] * (worlds.count // 2), 1e-6
-        )
+        times = [0.004, 0.032] * (worlds.count // 2)
+        expect_close("time of reset and other worlds [s]", worlds.read().time, times, 1e-6)
     return ""
 
 
 @check("reset/state")
 def reset_state(bench: Bench) -> str:
-    """A reset puts every field where it was asked for, in the contract's frames and orders."""
+    """A reset gives every field its requested value, in the contract's frames and orders."""
     with bench.worlds() as worlds:
         asked = posed(bench, worlds.count)
         worlds.reset(**asked)
         state, tolerance = worlds.read(), worlds.precision(1e-9, 1e-5)
         turned = angle_between(state.base_quaternion_w, asked["base_quaternion"])
-        worst = expect_close(
-            "base_quaternion_w, angle from what was asked for (order is wxyz) [rad]", turned, 0.0, tolerance
-        )
-        for name, field in (
-            ("base_position", "base_position_w"),
-            ("base_linear_velocity", "base_linear_velocity_w"),
-            ("base_angular_velocity", "base_angular_velocity_b"),
-            ("joint_position", "joint_position"),
-            ("joint_velocity", "joint_velocity"),
-        ):
+        worst = expect_close("angle of base_quaternion_w (wxyz) from the request [rad]", turned, 0.0, tolerance)
+        frames = {"base_position": "_w", "base_linear_velocity": "_w", "base_angular_velocity": "_b"}
+        for name in (*frames, "joint_position", "joint_velocity"):
+            field = name + frames.get(name, "")
             worst = max(worst, expect_close(f"{field} after a reset", getattr(state, field), asked[name], tolerance))
         worlds.reset()
         state = worlds.read()
@@ -166,20 +153,16 @@ def frames(bench: Bench) -> str:
             midway = 0.5 * (before.base_linear_velocity_w + after.base_linear_velocity_w)
             # Explicit, midpoint and semi-implicit integrators all move with a velocity between the old and the new one.
             slack = 0.5 * np.abs(after.base_linear_velocity_w - before.base_linear_velocity_w)
-            expect_close(
-                "change of base_position_w per second against base_linear_velocity_w [m/s]", moved, midway, slack + 5e-3
-            )
+            what = "change of {} per second against {}"
+            linear = what.format("base_position_w", "base_linear_velocity_w [m/s]")
+            expect_close(linear, moved, midway, slack + 5e-3)
             for row in range(worlds.count):
                 spin = 0.5 * (before.base_angular_velocity_b[row] + after.base_angular_velocity_b[row])
                 expected = composed(before.base_quaternion_w[row], axis_angle(spin, h * float(np.linalg.norm(spin))))
                 off = float(angle_between(after.base_quaternion_w[row], expected)) / h
                 change = np.linalg.norm(after.base_angular_velocity_b[row] - before.base_angular_velocity_b[row])
-                expect_close(
-                    "change of base_quaternion_w per second against base_angular_velocity_b [rad/s]",
-                    off,
-                    0.0,
-                    change + 5e-3,
-                )
+                angular = what.format("base_quaternion_w", "base_angular_velocity_b [rad/s]")
+                expect_close(angular, off, 0.0, change + 5e-3)
             before = after
     return ""
 
@@ -199,13 +182,8 @@ def free_fall(bench: Bench) -> str:
         expect_close("velocity after 0.2 s of free fall [m/s]", state.base_linear_velocity_w, velocity, 2e-3)
         continuous = start + thrown * t - [0.0, 0.0, 0.5 * GRAVITY * t * t]
         euler = continuous - [0.0, 0.0, 0.5 * GRAVITY * t * h]
-        slack = 5e-4
-        expect_close(
-            "position after 0.2 s of free fall [m]",
-            state.base_position_w,
-            0.5 * (continuous + euler),
-            np.abs(continuous - euler) / 2 + slack,
-        )
+        middle, slack = 0.5 * (continuous + euler), np.abs(continuous - euler) / 2 + 5e-4
+        expect_close("position after 0.2 s of free fall [m]", state.base_position_w, middle, slack)
         expect_close("turn during free fall [rad]", angle_between(state.base_quaternion_w, yawed), 0.0, 2e-3)
         to_euler = float(np.abs(state.base_position_w - euler).max())
         to_exact = float(np.abs(state.base_position_w - continuous).max())
@@ -215,7 +193,7 @@ def free_fall(bench: Bench) -> str:
 
 @check("kinematics/tumble")
 def tumble(bench: Bench) -> str:
-    """A limp tumbling robot with moving joints follows the reference: masses, inertias and joint axes are right."""
+    """A limp tumbling robot with moving joints follows the reference, by the right masses, inertias and joint axes."""
     with bench.worlds() as worlds:
         asked = posed(bench, worlds.count, seed=4)
         worlds.reset(**asked)
@@ -263,14 +241,13 @@ def follow_reference(
         quaternions.append(reference.base_quaternion)
         positions.append(reference.base_position)
         joints.append(reference.joint_position)
-    turn = expect_close(
-        "base orientation against the reference [rad]", angle_between(state.base_quaternion_w, quaternions), 0.0, angle
-    )
+    turned = angle_between(state.base_quaternion_w, quaternions)
+    turn = expect_close("base orientation against the reference [rad]", turned, 0.0, angle)
     joint = expect_close("joint_position against the reference [rad]", state.joint_position, joints, angle)
     place = expect_close("base_position_w against the reference [m]", state.base_position_w, positions, position)
     return f"joints {joint:.1e} rad, base {turn:.1e} rad and {place:.1e} m from the reference"
 
 
 def base_up(quaternion: np.ndarray) -> np.ndarray:
-    """The base's z axis in the world frame, (N, 3), of quaternions (N, 4)."""
+    """Return the base's z axis in the world frame, (N, 3), of quaternions (N, 4)."""
     return np.array([rotated(q, (0.0, 0.0, 1.0)) for q in quaternion])

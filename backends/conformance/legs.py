@@ -1,4 +1,4 @@
-"""Check of which parts of the robot meet each other."""
+"""Check of collisions between parts of the robot."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def legs(bench: Bench) -> str:
     if np.isnan(goal).any():
         return "the feet of this robot do not reach beyond each other"
     start = np.array([pose, pose, *goal[2:]])
-    # gentle: what joints of much inertia accelerate with is little against a contact's own stiffness, feet stay apart
+    # gentle: weak motors and much inertia against a contact's own stiffness keep the feet apart
     inertia = bench.stiff().armature[0]
     parameters = bench.soft(armature=inertia, stiffness=200.0 * inertia, damping=20.0 * inertia)
     said = []
@@ -52,7 +52,7 @@ def driven(worlds: Worlds, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
 
 
 def nearest(reference: Reference, pair: list[int], positions: np.ndarray) -> float:
-    """Least distance of the centres of two feet over joint positions (K, J), in foot radii."""
+    """Return the least distance of the centres of two feet over joint positions (K, J), in foot radii."""
     distances = []
     for joints in positions:
         reference.place(joint_position=joints)
@@ -61,7 +61,7 @@ def nearest(reference: Reference, pair: list[int], positions: np.ndarray) -> flo
 
 
 def opposite_feet(bench: Bench) -> list[list[int]]:
-    """Each left foot with its right one, by their order from back to front."""
+    """Return pairs of left and right feet, by their order from back to front."""
     place = body_plan(bench.robot).foot_position
     by_x = np.argsort(place[:, 0])
     sides = by_x[place[by_x, 1] > 0.0], by_x[place[by_x, 1] < 0.0]
@@ -69,7 +69,7 @@ def opposite_feet(bench: Bench) -> list[list[int]]:
 
 
 def crossed_legs(reference: Reference, pair: list[int]) -> np.ndarray:
-    """The default pose, but with both feet of a pair one and a half radii beyond the robot's middle; as ``posed_feet`` finds it."""
+    """Return the default pose with both feet of a pair one and a half radii beyond the robot's middle, from ``posed_feet``."""
     reference.place()
     goal = reference.foot_position
     goal[pair, 1] = -1.5 * reference.foot_radius * np.sign(goal[pair, 1])
@@ -77,7 +77,7 @@ def crossed_legs(reference: Reference, pair: list[int]) -> np.ndarray:
 
 
 def foot_in_shank(reference: Reference, pair: list[int], crossed: np.ndarray) -> np.ndarray:
-    """A crossed pose, but with the first foot inside of the second one's leg, a quarter of the way to its last joint."""
+    """Return a crossed pose with the first foot inside the second foot's leg, a quarter of the way to its last joint."""
     reference.place(joint_position=crossed)
     goal, (first, second) = reference.foot_position, pair
     knee = reference.model.joint(reference.robot.joint_names[body_plan(reference.robot).legs[second][-1]]).id
@@ -86,9 +86,7 @@ def foot_in_shank(reference: Reference, pair: list[int], crossed: np.ndarray) ->
 
 
 def posed_feet(reference: Reference, pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Joint positions that put the feet at ``goal`` [m], (F, 3), by damped Gauss-Newton steps from ``pose``; NaN where they do not
-    reach it.
-    """
+    """Return joint positions with the feet at ``goal`` [m], (F, 3), by damped Gauss-Newton steps from ``pose``; NaN out of reach."""
     lower, upper = joint_ranges(reference.robot).T
     for _ in range(30):
         reference.place(joint_position=pose)

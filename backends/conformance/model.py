@@ -29,14 +29,13 @@ def _at_rest(bench: Bench, worlds: Worlds, changes: list[dict[str, Any]], capabi
     bound = bench.bound(capability, exact=0.01, approximate=0.05)
     off = expect_close("weight on the ground [N]", state.ground_force_w[:, 2], weight, bound * weight)
     below = centers_of_mass(bench, worlds, state, changes)[:, :2]
-    error = expect_close(
-        "pressure point against the centre of mass [m]", pressure_point(state), below, 0.3 * bound + 0.002
-    )
+    point = pressure_point(state)
+    error = expect_close("pressure point against the centre of mass [m]", point, below, 0.3 * bound + 0.002)
     return f"weight to {off:.1e} N, centre of mass to {1e3 * error:.2f} mm"
 
 
 def _in_motion(bench: Bench, values: dict[str, np.ndarray], changes: list[dict[str, Any]], capability: str) -> str:
-    """Compare a step response in the air with that of changed references: inertias and derived constants are right."""
+    """Compare a step response in the air with that of changed references, which tests inertias and derived constants."""
     with bench.worlds() as worlds:
         worlds.randomize(**values)
         asked = posed(bench, worlds.count, seed=21)
@@ -44,17 +43,10 @@ def _in_motion(bench: Bench, values: dict[str, np.ndarray], changes: list[dict[s
         worlds.reset(**asked)
         worlds.step(target)
         worlds.run(0.1)
-        return follow_reference(
-            bench,
-            worlds,
-            asked,
-            worlds.read(),
-            seconds=0.12,
-            angle=bench.bound(capability, exact=0.003, approximate=0.02),
-            position=bench.bound(capability, exact=0.001, approximate=0.005),
-            target=target,
-            changes=changes,
-        )
+        angle = bench.bound(capability, exact=0.003, approximate=0.02)
+        position = bench.bound(capability, exact=0.001, approximate=0.005)
+        run: dict[str, Any] = {"seconds": 0.12, "target": target, "changes": changes}
+        return follow_reference(bench, worlds, asked, worlds.read(), angle=angle, position=position, **run)
 
 
 def _links(bench: Bench) -> np.ndarray:
@@ -73,7 +65,7 @@ def base_mass(bench: Bench) -> str:
 
 @check("model/base_mass_motion", "base_mass")
 def base_mass_motion(bench: Bench) -> str:
-    """A base mass offset is a point load at the base's centre of mass: the base's own inertia stays."""
+    """A base mass offset is a point load at the base's centre of mass and leaves the base's own inertia."""
     changes = [{"base_mass": m} for m in (-1.0, 0.0, 2.0, 4.0)]
     return _in_motion(bench, {"base_mass_offset": np.array([c["base_mass"] for c in changes])}, changes, "base_mass")
 
@@ -112,7 +104,7 @@ def link_mass_motion(bench: Bench) -> str:
 
 @check("model/persistence", "base_mass", "contact_forces", "plane", "friction", "boxes", "per_world_terrain")
 def persistence(bench: Bench) -> str:
-    """Randomization outlives resets, changes of terrain and other randomizations; a mask picks the worlds it is for."""
+    """Randomization outlives resets, changes of terrain and other randomizations; a mask selects its worlds."""
     from .ground import FLOOR, PLATFORM
 
     with bench.worlds(bench.stiff(), terrains=(FLOOR, PLATFORM), terrain_index=(0, 0, 1, 1)) as worlds:
@@ -122,10 +114,7 @@ def persistence(bench: Bench) -> str:
         stand_still(bench, worlds, seconds=0.04, ground=0.3 * index, terrain_index=index)
         state = stand_still(bench, worlds, ground=0.3 * index)
         weight = _weights(bench, [{"base_mass": m} for m in (0.0, 2.0, 0.0, 4.0)])
-        error = expect_close(
-            "weight after resets and a change of terrain [N]", state.ground_force_w[:, 2], weight, 0.02 * weight
-        )
-        expect_close(
-            "height of the new ground [m]", state.base_position_w[:, 2] - 0.3 * index, state.base_position_w[2, 2], 0.01
-        )
+        force, height = state.ground_force_w[:, 2], state.base_position_w[:, 2]
+        error = expect_close("weight after resets and a change of terrain [N]", force, weight, 0.02 * weight)
+        expect_close("height of the new ground [m]", height - 0.3 * index, height[2], 0.01)
     return f"weight to {error:.1e} N"

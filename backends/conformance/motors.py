@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from .bench import Bench, Worlds, expect, expect_close
 from .check import check
 from .kinematics import follow_reference, posed
 
+FALLING = {
+    "torque_limit": 20.0,
+    "driving_torque_limit": 16.0,
+    "full_torque_speed": 10.0,
+    "no_load_speed": 20.0,
+    "damping": 0.0,
+}
+"""Undamped motors with a torque that falls with the speed."""
+
 
 def law(bench: Bench, target: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Motor torque of the default parameters before limits [N·m]."""
+    """Return the motor torque of the default parameters before limits [N·m]."""
     parameters = bench.soft()
     return np.asarray(parameters.stiffness) * (target - position) - np.asarray(parameters.damping) * velocity
 
 
 def one_step_torques(worlds: Worlds, bench: Bench, *, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Reported torque and torque by the law after one substep from random states, targets ``reach`` [rad] away."""
+    """Return the reported torque and the law's torque after one substep from random states, targets ``reach`` [rad] away."""
     random = np.random.default_rng(5)
     asked = posed(bench, worlds.count, seed=5)
     target = asked["joint_position"] + random.uniform(-reach, reach, asked["joint_position"].shape)
@@ -63,14 +74,12 @@ def motor_strength(bench: Bench) -> str:
 def motor_speed_limit(bench: Bench) -> str:
     """With limits by speed the driving torque falls linearly to zero at the no-load speed; braking torque stays whole."""
     # 15 rad/s lies half-way between full torque (16 N·m, up to 10 rad/s) and none (20 rad/s)
-    parameters = bench.soft(
-        torque_limit=20.0, driving_torque_limit=16.0, full_torque_speed=10.0, no_load_speed=20.0, damping=0.0
-    )
+    parameters = bench.soft(**FALLING)
     speed = np.array([0.0, 5.0, 10.0, 12.5, 15.0, 17.5, 20.0, 25.0, -5.0, -15.0, -25.0, -2.5])
     forward = np.array([16.0, 16.0, 16.0, 12.0, 8.0, 4.0, 0.0, 0.0, 20.0, 20.0, 20.0, 20.0])
     backward = -np.array([16.0, 20.0, 20.0, 20.0, 20.0, 20.0, 20.0, 20.0, 16.0, 8.0, 0.0, 16.0])
     joints = np.arange(bench.robot.num_joints) % len(speed)
-    # far beyond the limits in both directions, with half the strength, and 3 N·m, which only the fastest are too fast for
+    # far beyond the limits in both directions, with half the strength, and 3 N·m, beyond the fastest joints alone
     reach = np.array([100.0, -100.0, 100.0, 3.0 / parameters.stiffness[0]])[:, None]
     wanted = np.stack([forward, backward, 0.5 * forward, np.minimum(forward, 3.0)])[:, joints]
     strength = np.ones_like(wanted)
@@ -80,7 +89,7 @@ def motor_speed_limit(bench: Bench) -> str:
         worlds.reset(joint_position=worlds.default_pose, joint_velocity=speed[joints])
         worlds.step(worlds.default_pose + reach, substeps=1)
         error = expect_close("joint_torque with limits by speed [N·m]", worlds.read().joint_torque, wanted, 4e-3)
-        # it is the speed of each substep that counts
+        # the speed of each substep counts
         worlds.reset(joint_velocity=np.full_like(wanted, 12.0))
         worlds.step(worlds.default_pose + 100.0, sample_at=[9] * worlds.count)
         before, after = worlds.read_sample(), worlds.read()
@@ -94,19 +103,14 @@ def motor_speed_limit(bench: Bench) -> str:
 @check("motors/speed", "torque_limits", "torque_speed_limit", "motor_speed")
 def motor_speed(bench: Bench) -> str:
     """The motor speed scales the speeds at which the driving torque falls and ends; torque at rest and in braking stays."""
-    parameters = bench.soft(
-        torque_limit=20.0, driving_torque_limit=16.0, full_torque_speed=10.0, no_load_speed=20.0, damping=0.0
-    )
+    parameters = bench.soft(**FALLING)
     factor = np.array([0.5, 1.0, 1.5, 2.0])[:, None].repeat(bench.robot.num_joints, 1)
     # 15 rad/s is beyond 10, half-way from 10 to 20, the end of full torque of 15 to 30, and below it for 20 to 40
     driving, still = (np.array(torques)[:, None] for torques in ([0.0, 8.0, 16.0, 16.0], [16.0] * 4))
     with bench.worlds(parameters, torque_limits=True, torque_speed_limit=True) as worlds:
         worlds.randomize(motor_speed=factor)
-        for speed, reach, wanted in (
-            (15.0, 100.0, driving),
-            (15.0, -100.0, np.full((4, 1), -20.0)),
-            (0.0, 100.0, still),
-        ):
+        braking = np.full((4, 1), -20.0)
+        for speed, reach, wanted in ((15.0, 100.0, driving), (15.0, -100.0, braking), (0.0, 100.0, still)):
             worlds.reset(joint_position=worlds.default_pose, joint_velocity=np.full_like(factor, speed))
             worlds.step(worlds.default_pose + reach, substeps=1)
             torque = worlds.read().joint_torque
@@ -116,7 +120,7 @@ def motor_speed(bench: Bench) -> str:
 
 @check("motors/gains", "gains")
 def motor_gains(bench: Bench) -> str:
-    """Stiffness and damping are scaled for each world and joint on their own."""
+    """Stiffness and damping have a factor for each world and joint."""
     random = np.random.default_rng(7)
     stiffness, damping = random.uniform(0.5, 1.5, (2, 4, bench.robot.num_joints))
     with bench.worlds() as worlds:
@@ -150,7 +154,7 @@ def motor_offset(bench: Bench) -> str:
 
 @check("motors/limp_and_held")
 def limp_and_held(bench: Bench) -> str:
-    """Motors are limp from a reset to the first target, or hold the one that the reset gives; step(None) keeps it."""
+    """Motors are limp from a reset to the first target, or hold the reset's target; step(None) keeps a target."""
     with bench.worlds() as worlds:
         asked = posed(bench, worlds.count, seed=10)
         worlds.reset(**asked)
@@ -189,9 +193,8 @@ def step_response(bench: Bench) -> str:
         worlds.step(target)
         for _ in range(9):
             worlds.step()
-        error = follow_reference(
-            bench, worlds, asked, worlds.read(), seconds=0.2, angle=0.01, position=0.003, target=target
-        )
+        bounds: dict[str, Any] = {"angle": 0.01, "position": 0.003}
+        error = follow_reference(bench, worlds, asked, worlds.read(), seconds=0.2, target=target, **bounds)
     return f"0.2 s after a step of 0.3 rad: {error}"
 
 
@@ -218,7 +221,7 @@ def joint_friction(bench: Bench) -> str:
 
 @check("motors/latency", "latency")
 def latency(bench: Bench) -> str:
-    """A delay of k lets the previous target act for exactly k substeps, for each world on its own."""
+    """A delay of k lets the previous target act for exactly k substeps, with another k in each world."""
     delay = np.array([0, 3, 9, 10])
     with bench.worlds() as worlds, bench.worlds() as single:
         first, second = worlds.default_pose + 0.2, worlds.default_pose - 0.3
@@ -233,21 +236,16 @@ def latency(bench: Bench) -> str:
             previous = target
             tolerance = worlds.precision(1e-9, 2e-4)
             state, expected = worlds.read(), single.read()
-            error = expect_close(
-                "joint_position with latency [rad]", state.joint_position, expected.joint_position, tolerance
-            )
+            position = expected.joint_position
+            error = expect_close("joint_position with latency [rad]", state.joint_position, position, tolerance)
             expect_close("joint_torque with latency [N·m]", state.joint_torque, expected.joint_torque, 200 * tolerance)
         spread = np.abs(state.joint_position[1:] - state.joint_position[:-1]).max(axis=1).min()
         expect(spread > 10 * tolerance, f"delays 0, 3, 9 and 10 make no difference ({spread:.1e} rad)")
         # a target that came too late to act in its own period acts from the next one on
         worlds.step()
         single.step(np.where((delay == 10)[:, None], second, previous))
-        expect_close(
-            "joint_position in the next period [rad]",
-            worlds.read().joint_position,
-            single.read().joint_position,
-            tolerance,
-        )
+        position = single.read().joint_position
+        expect_close("joint_position in the next period [rad]", worlds.read().joint_position, position, tolerance)
         worlds.reset()
         worlds.step(first, delay=[0, 10, 10, 10])
         torque = worlds.read().joint_torque

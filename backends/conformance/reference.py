@@ -1,6 +1,6 @@
-"""What should happen: plain MuJoCo (C) on the robot's own file, one world, one loop, the motor law written out.
+"""The expected motion: plain MuJoCo (C) on the robot's own file, one world, one loop, the motor law written out.
 
-It shares no code with the engines of this package, on purpose.
+The reference shares no code with the engines of this package, on purpose.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 class Reference:
-    """One robot under gravity, in empty space or, with ``ground``, over a plane that it meets with those contact options."""
+    """One robot under gravity, in empty space or, with ``ground``, over a plane with those contact options."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Reference:
 
     @property
     def mass(self) -> float:
-        """Mass of the robot [kg]."""
+        """Return the mass of the robot [kg]."""
         return float(self.model.body_mass.sum())
 
     def change(
@@ -111,37 +111,37 @@ class Reference:
 
     @property
     def base_position(self) -> Array:
-        """[m], (3,)."""
+        """Return the position of the base [m], (3,)."""
         return self.data.qpos[0:3].copy()
 
     @property
     def base_quaternion(self) -> Array:
-        """wxyz, (4,)."""
+        """Return the orientation of the base, wxyz, (4,)."""
         return self.data.qpos[3:7].copy()
 
     @property
     def base_angular_velocity(self) -> Array:
-        """Body frame [rad/s], (3,)."""
+        """Return the angular velocity of the base, body frame [rad/s], (3,)."""
         return self.data.qvel[3:6].copy()
 
     @property
     def joint_position(self) -> Array:
-        """[rad], (J,)."""
+        """Return the joint positions [rad], (J,)."""
         return self.data.qpos[self.at_position]
 
     @property
     def joint_velocity(self) -> Array:
-        """[rad/s], (J,)."""
+        """Return the joint velocities [rad/s], (J,)."""
         return self.data.qvel[self.at_velocity]
 
     @property
     def foot_position(self) -> Array:
-        """Centres of the foot spheres, world frame [m], (F, 3)."""
+        """Return the centres of the foot spheres, world frame [m], (F, 3)."""
         return self.data.geom_xpos[self.feet].copy()
 
     @property
     def foot_jacobian(self) -> Array:
-        """Of the foot centres, world frame, by the model's degrees of freedom, (F, 3, V)."""
+        """Return the Jacobian of the foot centres, world frame, by the model's degrees of freedom, (F, 3, V)."""
         jacobian = np.zeros((len(self.feet), 3, self.model.nv))
         for of_foot, foot in zip(jacobian, self.feet, strict=True):
             point, body = self.data.geom_xpos[foot], int(self.model.geom_bodyid[foot])
@@ -150,12 +150,12 @@ class Reference:
 
     @property
     def foot_velocity(self) -> Array:
-        """Velocities of the foot centres, world frame [m/s], (F, 3)."""
+        """Return the velocities of the foot centres, world frame [m/s], (F, 3)."""
         return self.foot_jacobian @ self.data.qvel
 
     @property
     def foot_force(self) -> Array:
-        """Magnitude of all contact forces on each foot [N], (F,)."""
+        """Return the magnitude of all contact forces on each foot [N], (F,)."""
         force = np.zeros((len(self.feet), 3))
         for i, contact in enumerate(self.data.contact[: self.data.ncon]):
             wrench = np.zeros(6)
@@ -167,7 +167,7 @@ class Reference:
 
     @property
     def center_of_mass(self) -> Array:
-        """Of the whole robot, world frame [m], (3,)."""
+        """Return the centre of mass of the whole robot, world frame [m], (3,)."""
         return self.data.subtree_com[self.base].copy()
 
 
@@ -211,7 +211,7 @@ def level_stance(reference: Reference, *, clearance: float = 0.0005) -> Stance:
 
 
 def axis_angle(axis: ArrayLike, angle: float) -> Array:
-    """Quaternion wxyz of a turn by ``angle`` [rad] about ``axis`` (any length; zero for no turn)."""
+    """Return the quaternion wxyz of a turn by ``angle`` [rad] about ``axis`` (any length; zero for no turn)."""
     direction = np.asarray(axis, dtype=np.float64)
     length = np.linalg.norm(direction)
     quaternion = np.array([1.0, 0.0, 0.0, 0.0])
@@ -221,7 +221,7 @@ def axis_angle(axis: ArrayLike, angle: float) -> Array:
 
 
 def composed(*quaternions: ArrayLike) -> Array:
-    """Product of quaternions wxyz; the leftmost turn is the outermost."""
+    """Return the product of quaternions wxyz; the leftmost turn is the outermost."""
     product = np.array([1.0, 0.0, 0.0, 0.0])
     for quaternion in quaternions:
         factor = product.copy()
@@ -230,14 +230,14 @@ def composed(*quaternions: ArrayLike) -> Array:
 
 
 def rotated(quaternion: ArrayLike, vector: ArrayLike) -> Array:
-    """A vector turned from the body frame into the world frame."""
+    """Turn a vector from the body frame into the world frame."""
     result = np.zeros(3)
     mujoco.mju_rotVecQuat(result, np.asarray(vector, dtype=np.float64), np.asarray(quaternion, dtype=np.float64))
     return result
 
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
-    """Angle of the turn between pairs of quaternions (N, 4) [rad], (N,)."""
+    """Return the angle of the turn between pairs of quaternions (N, 4) [rad], (N,)."""
     a, b = np.asarray(first), np.asarray(second)
     a, b = a / np.linalg.norm(a, axis=-1, keepdims=True), b / np.linalg.norm(b, axis=-1, keepdims=True)
     # 4 atan2(|a-b|, |a+b|) keeps its precision at small angles, where arccos loses it

@@ -1,6 +1,4 @@
-"""Checks that an engine refuses what it says it cannot do, one for each capability, and arguments that are none: nothing is
-silently ignored.
-"""
+"""Checks that an engine refuses undeclared capabilities, one check for each, and wrong arguments: it ignores nothing silently."""
 
 from __future__ import annotations
 
@@ -76,11 +74,11 @@ REQUESTS: dict[str, Callable[[Bench], None]] = {
     "deterministic": lambda bench: _build(bench, deterministic=True),
     "gpu": lambda bench: bench.make(bench.scene(), "cuda").close(),
 }
-"""What to ask an engine for, by the capability that it takes; nobody asks for contact forces, they are just there."""
+"""Request to an engine by the capability that it needs; contact forces need no request."""
 
 
 def accepts_or_refuses(capability: str) -> Callable[[Bench], str]:
-    """The check for one capability: supported things are accepted, others raise ``BackendError``."""
+    """Return the check of one capability: the engine accepts a supported request and raises ``BackendError`` for others."""
 
     def run(bench: Bench) -> str:
         declared = bench.capabilities[capability].support.value
@@ -99,7 +97,7 @@ def accepts_or_refuses(capability: str) -> Callable[[Bench], str]:
 
 
 def _mistakes(worlds: Worlds) -> dict[str, Callable[[], None]]:
-    """Calls with arguments that cannot be, by what is wrong with them."""
+    """Return calls with wrong arguments, by a description of the mistake."""
     backend, n = worlds.backend, worlds.count
     start = backend.standing()
 
@@ -127,7 +125,7 @@ def _mistakes(worlds: Worlds) -> dict[str, Callable[[], None]]:
         "one force for all worlds": lambda: backend.apply_force(zeros(3)),
         "one motor_strength for all joints": lambda: backend.randomize(Randomization(motor_strength=zeros(n, 1))),
     }
-    if not start.base_position.is_cuda:  # to look at them would mean to wait for the device
+    if not start.base_position.is_cuda:  # an engine on a GPU does not check terrains, which would wait for the device
         for value in (-1, len(backend.scene.terrains)):
             beyond = replace(start, terrain_index=numbers(n, value=value))
             mistakes[f"terrain {value}"] = partial(backend.reset, beyond)
@@ -136,7 +134,7 @@ def _mistakes(worlds: Worlds) -> dict[str, Callable[[], None]]:
 
 @check("refusal/arguments")
 def arguments(bench: Bench) -> str:
-    """Arguments that cannot be (shape, mask, terrain, substeps) are refused and change nothing."""
+    """Wrong arguments (shape, mask, terrain, substeps) are refused and change nothing."""
     with bench.worlds() as worlds:
         worlds.reset()
         worlds.step(worlds.default_pose)

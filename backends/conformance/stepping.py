@@ -1,4 +1,4 @@
-"""Checks of what a step and a reset touch: samples, masks, independence, repeatability."""
+"""Checks of the effects of a step and a reset: samples, masks, independence, repeatability."""
 
 from __future__ import annotations
 
@@ -15,15 +15,9 @@ from .check import check
 from .reference import Reference, level_stance
 
 MOTION_FIELDS = (
-    "base_position_w",
-    "base_quaternion_w",
-    "base_linear_velocity_w",
-    "base_angular_velocity_b",
-    "joint_position",
-    "joint_velocity",
-    "foot_position_w",
-    "foot_velocity_w",
-)
+    "base_position_w", "base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity_b",
+    "joint_position", "joint_velocity", "foot_position_w", "foot_velocity_w",
+)  # fmt: skip
 
 
 def stand(bench: Bench, worlds: Worlds, *, clearance: float = 0.02, held: bool = True) -> None:
@@ -40,13 +34,13 @@ def stand(bench: Bench, worlds: Worlds, *, clearance: float = 0.02, held: bool =
 
 
 def wave(worlds: Worlds, period: int) -> np.ndarray:
-    """Joint targets that differ in every world and control period, (N, J) [rad]."""
+    """Return joint targets that differ in every world and control period, (N, J) [rad]."""
     phase = np.arange(worlds.count)[:, None] + np.arange(worlds.robot.num_joints)[None, :]
     return worlds.default_pose + 0.15 * np.sin(0.9 * period + phase)
 
 
 def expect_same(what: str, first: SimpleNamespace, second: SimpleNamespace, rows: Iterable[int]) -> None:
-    """The rows of two states are the same to the last bit."""
+    """Check that rows of two states are equal to the last bit."""
     chosen = list(rows)
     for field in fields(PhysicsState):
         a, b = getattr(first, field.name)[chosen], getattr(second, field.name)[chosen]
@@ -57,9 +51,7 @@ def expect_same(what: str, first: SimpleNamespace, second: SimpleNamespace, rows
 def expect_same_motion(
     what: str, found: SimpleNamespace, wanted: SimpleNamespace, tolerance: float, rows: Any = slice(None)
 ) -> float:
-    """Poses and joints of the rows of two states are equal to a tolerance, velocities to 20 times that; the largest difference of
-    the bases' positions [m].
-    """
+    """Check that poses and joints of two states agree to a tolerance, velocities to 20 times that; return the bases' distance [m]."""
     errors = {}
     for name in MOTION_FIELDS:
         allowed = 20.0 * tolerance if "velocity" in name else tolerance
@@ -133,7 +125,7 @@ def step_mask(bench: Bench) -> str:
         expect_close("time of the masked worlds [s]", after.time, [0.04, 0.02, 0.04, 0.02], 1e-6)
         moved = np.abs(after.joint_position - before.joint_position).max(axis=1)
         expect(moved[stepped] > 1e-4, "worlds inside of the mask did not move")
-        # the worlds left out go on as if nothing had been: the targets of the masked step were not theirs
+        # worlds outside of the mask go on undisturbed: the targets of the masked step were for others
         worlds.step(worlds=~stepped)
         other.step()
         tolerance = worlds.precision(1e-9, 1e-4)
@@ -148,7 +140,7 @@ def step_mask(bench: Bench) -> str:
 
 @check("reset/mask")
 def reset_mask(bench: Bench) -> str:
-    """Worlds outside of a reset's mask do not change at all and go on as if nothing had been."""
+    """Worlds outside of a reset's mask do not change at all and go on undisturbed."""
     chosen = np.array([False, True, False, True])
     with bench.worlds() as worlds, bench.worlds() as other:
         for each in (worlds, other):
@@ -172,7 +164,7 @@ def reset_mask(bench: Bench) -> str:
 
 @check("reset/repeat")
 def reset_repeat(bench: Bench) -> str:
-    """After a reset nothing of the past is left: the same start gives the same motion."""
+    """A reset clears the past: the same start gives the same motion."""
     with bench.worlds() as worlds:
         ends = []
         for _ in range(2):
@@ -186,7 +178,7 @@ def reset_repeat(bench: Bench) -> str:
 
 @check("stepping/determinism")
 def determinism(bench: Bench) -> str:
-    """Two engines built alike do the same to the last bit; on a GPU only where the engine has a deterministic mode."""
+    """Two equal engines agree to the last bit; on a GPU only where the engine has a deterministic mode."""
     declared = bench.capabilities["deterministic"].support
     if bench.gpu and declared is not Support.EXACT:
         return f"not promised on a GPU: deterministic is '{declared.value}'"
@@ -204,7 +196,7 @@ def determinism(bench: Bench) -> str:
 
 @check("stepping/independence")
 def independence(bench: Bench) -> str:
-    """A world among others moves as it does alone."""
+    """A world among others moves as the same world does alone."""
     with bench.worlds() as worlds:
         stand(bench, worlds)
         for period in range(4):

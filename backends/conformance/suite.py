@@ -18,28 +18,28 @@ ROOMS = (kinematics, motors, stepping, health, contact, legs, ground, friction, 
 
 
 class Outcome(Enum):
-    """What came of a check."""
+    """Outcome of a check."""
 
     PASSED = "passed"
     FAILED = "failed"
     NOT_SUPPORTED = "not supported"
-    """The engine declares that it cannot do this; that it refuses to is checked under ``refusal/…``."""
+    """The engine declares no support; ``refusal/…`` checks that it refuses."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckResult:
-    """What came of one check."""
+    """Result of one check."""
 
     name: str
     outcome: Outcome
     detail: str
-    """What was measured, what is wrong, or what the engine says it cannot do."""
+    """The measured values, the fault, or the capabilities that the engine lacks."""
     seconds: float
     """Wall-clock time [s]."""
 
 
 def all_checks() -> tuple[Check, ...]:
-    """Return all checks in the order in which they run: what everything else rests on comes first."""
+    """Return all checks in the order in which they run, the fundamental ones first."""
     return tuple(check for room in ROOMS for check in registered(room.__name__))
 
 
@@ -60,11 +60,11 @@ def run_check(check: Check, bench: Bench) -> CheckResult:
 
 
 def make_bench(backend: str | type[PhysicsBackend], device: str = "cpu", *, robot: Robot | None = None) -> Bench:
-    """The test bench of an engine, for ``run_check``.
+    """Return the test bench of an engine, for ``run_check``.
 
     Args:
         backend: registry name (``mujoco``, ``newton:steel``, a plug-in's name), or a class.
-        device: where its worlds live, ``cpu`` or ``cuda``.
+        device: of the engine's worlds, ``cpu`` or ``cuda``.
         robot: the robot in the scenes, four-legged with spherical feet; None for the Go2.
 
     Raises:
@@ -75,9 +75,8 @@ def make_bench(backend: str | type[PhysicsBackend], device: str = "cpu", *, robo
     capabilities = found.capabilities()
     undeclared = [n for n in CAPABILITY_NAMES if n not in capabilities]
     if undeclared:
-        raise BackendError(
-            f"backend '{name}' does not declare {', '.join(undeclared)}; capabilities() needs one entry for each"
-        )
+        missing = f"does not declare {', '.join(undeclared)}; capabilities() needs one entry for each"
+        raise BackendError(f"backend '{name}' {missing}")
 
     def make(scene: Scene, on: str) -> PhysicsBackend:
         return make_backend(name, scene, device=on) if isinstance(backend, str) else found(scene, device=on)
@@ -93,12 +92,12 @@ def run_conformance(
     only: Sequence[str] = (),
     report: Callable[[CheckResult], None] | None = None,
 ) -> list[CheckResult]:
-    """Run the conformance checks against an engine; one result for each.
+    """Run the conformance checks against an engine and return one result for each.
 
     Args:
         backend, device, robot: as for ``make_bench``.
         only: beginnings of the names of the checks to run (``motors``, ``contact/rest``); empty for all.
-        report: called with each result as soon as it is there.
+        report: called with each result at once.
 
     Raises:
         BackendError: no check has such a name, or as ``make_bench``.

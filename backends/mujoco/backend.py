@@ -1,10 +1,9 @@
 """The reference engine: MuJoCo on the CPU, many worlds on a thread pool (``mujoco.batch.Batch``), float64, bit-reproducible.
 
-Every world runs on a model of its own, a copy of its terrain's, so that friction, masses and gains can differ. The motor
-law is an affine actuator inside the model and is therefore evaluated at every physics step; where its limits follow the
-speed, every physics step gets the target whose torque they allow. After a step, positions and
-velocities are those of the new state, forces those of the step just taken; the penetration watch sees the contacts with
-which each substep started.
+Every world has a model of its own, a copy of its terrain's, so that friction, masses and gains can differ. The motor law is
+an affine actuator inside the model and acts at every physics step; where its limits follow the speed, every physics step gets
+a target with an allowed torque. After a step, positions and velocities are those of the new state, forces those of the last
+substep; the penetration watch sees the contacts at the start of each substep.
 """
 
 from __future__ import annotations
@@ -41,11 +40,9 @@ from .model import CONTACT_SLOTS, FOOT_SLOTS, build_models
 from .state import RECORDED, BatchState, Records, StateLayout
 
 _STAGE = mujoco.mjtStage.mjSTAGE_VEL.value
-_INVALID = [
-    w.value
-    for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-]
-_FULL = [w.value for w in (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+_WARNING = mujoco.mjtWarning
+_INVALID = [w.value for w in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)]
+_FULL = [w.value for w in (_WARNING.mjWARN_CONTACTFULL, _WARNING.mjWARN_CNSTRFULL)]
 
 Array = NDArray[np.float64]
 
@@ -54,24 +51,23 @@ class MujocoBackend(PhysicsBackend):
     """MuJoCo (C engine) on the CPU. Results do not depend on the number of threads nor on the other worlds."""
 
     name: ClassVar[str] = "mujoco"
+    parallel_processes: ClassVar[bool] = True
 
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:
-        """Exact in everything but GPU execution."""
+        """Declare everything but GPU execution as exact."""
         exact = {name: Capability(support=Support.EXACT) for name in CAPABILITY_NAMES}
         exact["gpu"] = Capability(support=Support.NONE, note="runs on CPU threads")
         exact["penetration"] = Capability(support=Support.EXACT, note="seen one substep late")
-        exact["contact_forces"] = Capability(
-            support=Support.EXACT,
-            note=f"single points of the {CONTACT_SLOTS} strongest contacts, {FOOT_SLOTS} for each foot",
-        )
+        slots = f"single points of the {CONTACT_SLOTS} strongest contacts, {FOOT_SLOTS} for each foot"
+        exact["contact_forces"] = Capability(support=Support.EXACT, note=slots)
         return exact
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         self.device = find_device(device, self.name, gpu=False)
         self.scene = scene
         self.dtype = torch.float64
-        n, robot = scene.num_worlds, scene.robot
+        n, joints = scene.num_worlds, scene.robot.num_joints
         self._limits = MotorLimits.of(scene)
         self._palette = build_models(scene)
         self._terrain = np.asarray(scene.terrain_index, dtype=np.int64)
@@ -89,13 +85,9 @@ class MujocoBackend(PhysicsBackend):
         self._applied, self._time = self._batch.bind("xfrc_applied"), self._batch.bind("time")
         self._index_model(nominal)
         self._randomized: dict[int, dict[str, Array]] = {}
-        joints = robot.num_joints
-        self._held = np.zeros((n, joints))
-        self._offset = np.zeros((n, joints))
         self._limp = np.ones(n, dtype=bool)
-        self._gain, self._strength = np.zeros((n, joints)), np.ones((n, joints))
-        self._speed = np.ones((n, joints))
-        self._kd_over_kp = np.zeros((n, joints))
+        self._held, self._offset, self._gain, self._kd_over_kp = (np.zeros((n, joints)) for _ in range(4))
+        self._strength, self._speed = (np.ones((n, joints)) for _ in range(2))
         self._read_gains(range(n))
         self._warned = np.zeros((n, 2), dtype=np.int64)
         self._live = {
@@ -117,14 +109,13 @@ class MujocoBackend(PhysicsBackend):
     # ---- layout -------------------------------------------------------------------------------------------------
 
     def _index_model(self, model: mujoco.MjModel) -> None:
-        """Find where the robot's joints, feet and sensors lie in MuJoCo's arrays."""
+        """Find the robot's base, joints and bodies in MuJoCo's arrays."""
         robot = self.scene.robot
         free = model.joint(model.body(robot.base_body).jntadr[0])
         self._base = model.body(robot.base_body).id
         if free.type[0] != mujoco.mjtJoint.mjJNT_FREE or free.qposadr[0] != 0:
-            raise BackendError(
-                f"body '{robot.base_body}' of robot '{robot.name}' must carry a free joint and come first"
-            )
+            base = f"body '{robot.base_body}' of robot '{robot.name}'"
+            raise BackendError(f"{base} must carry a free joint and come first")
         self._joint_q = np.array([model.joint(j).qposadr[0] for j in robot.joint_names])
         self._joint_v = np.array([model.joint(j).dofadr[0] for j in robot.joint_names])
         self._bodies = np.array([model.body(b).id for b in robot.collision_bodies])
@@ -133,18 +124,18 @@ class MujocoBackend(PhysicsBackend):
 
     @property
     def state(self) -> PhysicsState:
-        """State after the last call, as views of MuJoCo's memory: they change with the next call."""
+        """Return the state after the last call, as views of MuJoCo's memory that change with the next call."""
         return self._state
 
     @property
     def sample(self) -> PhysicsState:
-        """Snapshot taken by the last ``step(sample_at=…)``."""
+        """Return the snapshot of the last ``step(sample_at=…)``."""
         return self._sample
 
     # ---- acting -------------------------------------------------------------------------------------------------
 
     def _rows(self, worlds: torch.Tensor | None) -> NDArray[np.int64]:
-        """Indices of the masked worlds."""
+        """Return the indices of the masked worlds."""
         return self._everyone if worlds is None else np.flatnonzero(worlds.numpy())
 
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
@@ -158,10 +149,8 @@ class MujocoBackend(PhysicsBackend):
         self._batch.reset(rows.astype(np.int32), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self._qpos[rows, 0:3] = start.base_position.numpy()[rows]
         self._qpos[rows, 3:7] = start.base_quaternion.numpy()[rows]
-        pose = np.asarray(self.scene.robot.default_joint_position)
-        self._qpos[np.ix_(rows, self._joint_q)] = (
-            pose if start.joint_position is None else start.joint_position.numpy()[rows]
-        )
+        pose, asked = np.asarray(self.scene.robot.default_joint_position), start.joint_position
+        self._qpos[np.ix_(rows, self._joint_q)] = pose if asked is None else asked.numpy()[rows]
         for columns, value in (
             (np.arange(0, 3), start.base_linear_velocity),
             (np.arange(3, 6), start.base_angular_velocity),
@@ -177,7 +166,7 @@ class MujocoBackend(PhysicsBackend):
         self._state.forget_forces(rows)
 
     def _switch_terrain(self, rows: NDArray[np.int64], index: NDArray[np.int64]) -> None:
-        """Give worlds another model of the palette, with their own randomization on it."""
+        """Give worlds another model of the palette, with their own randomization."""
         changed = [int(r) for r in rows if index[r] != self._terrain[r]]
         for r in changed:
             self._terrain[r] = index[r]
@@ -196,14 +185,12 @@ class MujocoBackend(PhysicsBackend):
         substeps: int | None = None,
     ) -> None:
         """See ``PhysicsBackend.step``."""
-        total = check_step(
-            self.scene, joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=substeps
-        )
+        total = check_step(self.scene, joint_targets, delay, sample_at, worlds, substeps)
         rows = self._rows(worlds)
         n = len(rows)
         if n == 0:
             return
-        those = slice(None) if n == self.num_worlds else rows  # a slice gives views, which saves copies
+        those = slice(None) if n == self.num_worlds else rows  # a slice gives views without copies
         held, offset, some_limp = self._held[those], self._offset[those], bool(self._limp[those].any())
         targets, waits = held, None
         if joint_targets is not None:
@@ -245,13 +232,13 @@ class MujocoBackend(PhysicsBackend):
                 self._sample.take(self._state, rows, records, at)
 
     def _ids(self, rows: NDArray[np.int64]) -> NDArray[np.int32] | None:
-        """World indices as MuJoCo takes them: None for all."""
+        """Return world indices for MuJoCo: None for all."""
         return None if len(rows) == self.num_worlds else rows.astype(np.int32)
 
     def _memory(self, n: int, count: int) -> tuple[Array, Records]:
-        """Room for the controls of ``n`` worlds over ``count`` substeps, (n, count, J), and for what is recorded of them.
+        """Return memory for the controls of ``n`` worlds over ``count`` substeps, (n, count, J), and for their records.
 
-        It is the same memory for every ``n``, which the processor's caches then hold.
+        All ``n`` share one memory, so that it stays in the processor's caches.
         """
         if (n, count) not in self._rooms:
             whole = self.num_worlds
@@ -273,7 +260,7 @@ class MujocoBackend(PhysicsBackend):
     def _play_some_limp(
         self, rows: NDArray[np.int64], control: Array, limp: NDArray[np.bool_], waits: NDArray[np.bool_]
     ) -> Records:
-        """The same where the motors of some worlds hang limp while they wait, (rows,) and (rows, substeps)."""
+        """Step worlds as ``_play`` does, with ``limp`` motors, (rows,), while their target ``waits``, (rows, substeps)."""
         others, some = rows[~limp], control[~limp]
         loose = self._play_singly(rows[limp], control[limp], waits[limp])
         records = self._memory(len(others), control.shape[1])[1]
@@ -282,8 +269,9 @@ class MujocoBackend(PhysicsBackend):
         return _merge(limp, records, loose)
 
     def _play_singly(self, rows: NDArray[np.int64], control: Array, loose: NDArray[np.bool_]) -> Records:
-        """The same, a substep at a time, where a target must follow the state: ``loose`` motors, (rows, substeps), get the one
-        at which the law gives no torque, and those at a limit that depends on the speed the one that gives the limit.
+        """Step worlds as ``_play`` does, substep by substep, with targets that follow the state.
+
+        ``loose`` motors, (rows, substeps), get a target with zero torque; motors beyond a limit by speed get the limit's target.
         """
         parts = []
         for substep in range(control.shape[1]):
@@ -304,16 +292,14 @@ class MujocoBackend(PhysicsBackend):
         return {name: np.concatenate([p[name] for p in parts], axis=1) for name in RECORDED}
 
     def _watch(self, those: slice | NDArray[np.int64], records: Records) -> bool:
-        """Record the first substep at which a watched limit was exceeded; returns whether any was."""
+        """Record the first substep beyond each watched limit, and return whether there was any."""
         physics, seen = self.scene.physics, {}
         if physics.watch_tilt is not None:
             qpos = records["qpos"]
             seen["tilt_substep"] = qpos[:, :, 4] ** 2 + qpos[:, :, 5] ** 2 > self._tilt_bound
         if self._deep is not None:
-            # no contact reads 0
-            seen["penetration_substep"] = records["sensordata"][:, :, self._deep] < -float(
-                physics.watch_penetration or 0.0
-            )
+            limit = -float(physics.watch_penetration or 0.0)  # no contact reads 0
+            seen["penetration_substep"] = records["sensordata"][:, :, self._deep] < limit
         exceeded = False
         for name, over in seen.items():
             some = bool(over.any())
@@ -322,7 +308,7 @@ class MujocoBackend(PhysicsBackend):
         return exceeded
 
     def _warning_counts(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Number of MuJoCo's invalid-state and buffer-full warnings so far, (rows, 2)."""
+        """Return the number of MuJoCo's invalid-state and buffer-full warnings so far, (rows, 2)."""
         numbers = self._batch.warning[rows, :, 1]
         return np.stack([numbers[:, _INVALID].sum(1), numbers[:, _FULL].sum(1)], axis=1)
 
@@ -337,18 +323,17 @@ class MujocoBackend(PhysicsBackend):
     # ---- changing the model ---------------------------------------------------------------------------------------
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
-        """See ``PhysicsBackend.randomize``. Worlds whose values stay as they are cost nothing: constants of a model are slow to make."""
+        """See ``PhysicsBackend.randomize``. Worlds without a change are skipped: a model's constants are slow to compute."""
         check_randomization(self.scene, randomization, worlds)
         rows = self._rows(worlds)
         values = {f.name: value for f in fields(Randomization) if (value := getattr(randomization, f.name)) is not None}
         for name, value in values.items():
             if len(value) != len(rows):
-                raise BackendError(
-                    f"Randomization.{name} has {len(value)} rows for {len(rows)} worlds; give one row for each"
-                )
+                count = f"{len(value)} rows for {len(rows)} worlds"
+                raise BackendError(f"Randomization.{name} has {count}; give one row for each")
         changed: set[int] = set()
         for name, value in values.items():
-            # copied: the caller may go on writing into its tensor
+            # copied, because the caller may write into its tensor later
             for row, entry in zip(map(int, rows), value.to(torch.float64, copy=True).numpy(), strict=True):
                 known = self._randomized.setdefault(row, {})
                 if name not in known or not np.array_equal(known[name], entry):
@@ -394,12 +379,10 @@ class MujocoBackend(PhysicsBackend):
         """Read kp and strength of each motor, and kd/kp, from which the torque-free target follows."""
         for row in rows:
             model = self._models[row]
-            gain = model.actuator_gainprm[:, 0]
+            gain, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
             self._gain[row] = gain
             self._strength[row] = self._randomized.get(int(row), {}).get("motor_strength", 1.0)
-            self._kd_over_kp[row] = np.divide(
-                -model.actuator_biasprm[:, 2], gain, out=np.zeros_like(gain), where=gain > 0
-            )
+            self._kd_over_kp[row] = np.divide(damping, gain, out=np.zeros_like(gain), where=gain > 0)
 
     def push(
         self,
@@ -409,7 +392,7 @@ class MujocoBackend(PhysicsBackend):
         angular_velocity_b: torch.Tensor | None = None,
     ) -> None:
         """See ``PhysicsBackend.push``."""
-        check_push(self.scene, worlds, linear_velocity_w=linear_velocity_w, angular_velocity_b=angular_velocity_b)
+        check_push(self.scene, worlds, linear_velocity_w, angular_velocity_b)
         rows = self._rows(worlds)
         for first, value in ((0, linear_velocity_w), (3, angular_velocity_b)):
             if value is not None:
@@ -434,12 +417,12 @@ class MujocoBackend(PhysicsBackend):
 
 
 def _first(over: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Position (1-based) of the first true entry of each row, 0 where there is none."""
+    """Return the position (1-based) of the first true entry of each row, 0 where there is none."""
     return np.where(over.any(1), over.argmax(1) + 1, 0)
 
 
 def _merge(limp: NDArray[np.bool_], others: Records, records: Records) -> Records:
-    """Records of limp and other worlds, back in their common order."""
+    """Return records of limp and other worlds in their common order."""
     merged = {}
     for name in RECORDED:
         merged[name] = np.empty((len(limp), *records[name].shape[1:]))

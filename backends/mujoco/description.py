@@ -1,4 +1,4 @@
-"""What the MuJoCo engine says of its model."""
+"""Describe the model of the MuJoCo engine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..description import ModelFields
 
 
 def describe_model(model: mujoco.MjModel, robot: Robot) -> dict[str, list[float]]:
-    """A world's model as ``PhysicsBackend.describe`` says."""
+    """Return a world's model in the terms of ``PhysicsBackend.describe``."""
     feet, floor = [model.geom(f).id for f in robot.foot_geoms], model.geom("floor").id
     bodies = [model.body(name).id for name in robot.collision_bodies]
     joints = [model.joint(name).id for name in robot.joint_names]

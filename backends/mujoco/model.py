@@ -1,6 +1,6 @@
-"""Builds MuJoCo models from a scene: the robot's own file, the motors' constants, the ground and the sensors that report contacts.
+"""Build MuJoCo models from a scene: the robot's own file, the motors' constants, the ground and the sensors for contacts.
 
-Bodies added to the robot's model, all static: ``environment`` holds ``ground`` (floor and walls) and ``terrain`` (boxes and height
+Static bodies are added to the robot's model: ``environment`` holds ``ground`` (floor and walls) and ``terrain`` (boxes and height
 field), so that contact sensors can tell the three apart.
 """
 
@@ -16,28 +16,27 @@ from ...terrains.base import Terrain
 from ..base import BackendError, Scene
 
 CONTACT_SLOTS = 12
-"""Ground contacts reported one by one, the strongest first; a robot that lies flat has about this many."""
+"""Ground contacts reported one by one, the strongest first; a robot that lies flat has about as many."""
 FOOT_SLOTS = 3
 """Contacts reported one by one for each foot."""
 FOOT_SITE = "centre of {}"
-"""Name of the site that the engine puts into a foot."""
+"""Name of the site that the engine adds to a foot."""
 NOTHING: dict[str, Any] = {"contype": 2, "conaffinity": 0}
-"""Meets nothing, yet counts as a collision geom, so that all models of a layout have bounding-volume trees of one size."""
+"""Collision geom that meets nothing, so that all models of a layout have bounding-volume trees of one size."""
 PARKED: dict[str, Any] = {"size": [0.01, 0.01, 0.01], "pos": [0.0, 0.0, -1.0], **NOTHING}
 """Unused boxes of a layout."""
 
 
 def robot_spec(scene: Scene) -> mujoco.MjSpec:
-    """The robot's model with the scene's joint constants, motors and solver options; no ground yet."""
+    """Return the robot's model with the scene's joint constants, motors and solver options, without ground."""
     robot, physics, constants = scene.robot, scene.physics, scene.parameters
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     option = spec.option
     option.timestep = physics.timestep
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     if physics.cone not in ("elliptic", "pyramidal"):
-        raise BackendError(
-            f"friction cone '{physics.cone}' does not exist; use 'elliptic' or 'pyramidal' (PhysicsOptions.cone)"
-        )
+        use = "use 'elliptic' or 'pyramidal' (PhysicsOptions.cone)"
+        raise BackendError(f"friction cone '{physics.cone}' does not exist; {use}")
     elliptic = physics.cone == "elliptic"
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
     option.impratio = physics.impratio
@@ -48,9 +47,8 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
     for j, name in enumerate(robot.joint_names):
         joint = spec.joint(name)
         if joint is None:
-            raise BackendError(
-                f"joint '{name}' of robot '{robot.name}' is not in {robot.mjcf.name}; correct joint_names in robot.toml"
-            )
+            missing = f"joint '{name}' of robot '{robot.name}' is not in {robot.mjcf.name}"
+            raise BackendError(f"{missing}; correct joint_names in robot.toml")
         joint.armature = constants.armature[j]
         joint.damping = np.array([constants.joint_damping[j], 0.0, 0.0])
         joint.frictionloss = constants.friction_loss[j]
@@ -58,8 +56,8 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
     weighed = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     for geom in list(spec.geoms):
         if not (geom.contype or geom.conaffinity):
-            if geom.parent.explicitinertial and not weighed:  # otherwise it may be what the body weighs
-                spec.delete(geom)  # visual only: costs time in every step
+            if geom.parent.explicitinertial and not weighed:  # else the body's mass may come from this geom
+                spec.delete(geom)  # a visual geom costs time in every step
             continue
         if geom.name in robot.foot_geoms and physics.foot_condim is not None:
             geom.condim = physics.foot_condim
@@ -69,7 +67,7 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
 
 
 def _mark_feet(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Put a site at the centre of each foot's geom, whose motion sensors can report."""
+    """Put a site for motion sensors at the centre of each foot's geom."""
     compiled = mujoco.MjModel.from_xml_path(str(robot.mjcf))
     for name, shape in zip(robot.foot_names, robot.foot_geoms, strict=True):
         spec.geom(shape).parent.add_site(name=FOOT_SITE.format(name), pos=compiled.geom(shape).pos)
@@ -99,13 +97,12 @@ def _set_motors(spec: mujoco.MjSpec, scene: Scene) -> None:
 def add_terrain(
     spec: mujoco.MjSpec, terrain: Terrain, *, walls: int, blocks: int, field_shape: tuple[int, int] | None
 ) -> None:
-    """Add the ground of one world.
+    """Add the ground of one world; geoms of the layout that the terrain does not need meet nothing.
 
     Args:
-        walls: number of walls in the layout, at least as many as the terrain has; the rest meets nothing.
+        walls: number of walls in the layout, at least as many as the terrain has.
         blocks: the same for the other boxes.
-        field_shape: (rows, columns) of the layout's height field, None for none. A terrain without one gets one that
-            meets nothing.
+        field_shape: (rows, columns) of the layout's height field, None for none.
     """
     environment = spec.worldbody.add_body(name="environment")
     ground = environment.add_body(name="ground")
@@ -131,7 +128,7 @@ def add_terrain(
 
 
 def add_report_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Add the sensors from which the engine reads foot velocities and ground contacts."""
+    """Add the sensors for foot velocities and ground contacts."""
     robot = scene.robot
     _mark_feet(spec, robot)
 
@@ -166,16 +163,15 @@ def add_report_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
 
 
 def build_models(scene: Scene) -> list[mujoco.MjModel]:
-    """One model per terrain of the scene's palette, all of one layout.
+    """Return one model per terrain of the scene's palette, all of one layout.
 
     Raises:
         BackendError: the palette's height fields differ in their number of nodes, or a name of the robot is missing in its file.
     """
     fields = {t.height_field.heights.shape for t in scene.terrains if t.height_field is not None}
     if len(fields) > 1:
-        raise BackendError(
-            f"the height fields of one scene must have the same number of nodes, but have {sorted(fields)}; use one scene for each"
-        )
+        nodes = f"the height fields of one scene must have the same number of nodes, but have {sorted(fields)}"
+        raise BackendError(f"{nodes}; use one scene for each")
     shape = next(iter(fields), None)
     walls = max(sum(b.wall for b in t.boxes) for t in scene.terrains)
     blocks = max(sum(not b.wall for b in t.boxes) for t in scene.terrains)
@@ -187,11 +183,10 @@ def build_models(scene: Scene) -> list[mujoco.MjModel]:
         try:
             model = spec.compile()
         except ValueError as error:
-            raise BackendError(
-                f"MuJoCo cannot build terrain '{terrain.name}' level {terrain.level}: {error}"
-            ) from error
+            ground = f"terrain '{terrain.name}' level {terrain.level}"
+            raise BackendError(f"MuJoCo cannot build {ground}: {error}") from error
         if shape is not None and terrain.height_field is not None:
-            # the compiler stretches heights to [0, 1]; what the height field says is what must stand
+            # undo the compiler, which stretches heights to [0, 1]
             heights = terrain.height_field.heights
             model.hfield_data[:] = (heights / max(float(heights.max()), 1e-6)).ravel()
         models.append(model)

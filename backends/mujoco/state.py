@@ -1,4 +1,4 @@
-"""Reads a ``PhysicsState`` out of MuJoCo's arrays: poses and velocities as views, contact forces computed when first asked for."""
+"""Read a ``PhysicsState`` out of MuJoCo's arrays: poses and velocities as views, contact forces computed at the first access."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from ..base import PhysicsState, Scene
 from .model import CONTACT_SLOTS, FOOT_SITE, FOOT_SLOTS
 
 RECORDED = ("qpos", "qvel", "sensordata", "actuator_force", "site_xpos")
-"""What the engine records after each substep. Positions and velocities are the new ones in qpos and qvel alone; elsewhere they
-are those with which the substep began."""
+"""Arrays recorded after each substep. Only qpos and qvel are new; the others belong to the substep's beginning."""
 
 Records = dict[str, NDArray[np.float64]]
-"""By name of ``RECORDED``: (rows, substeps, …)."""
+"""Arrays (rows, substeps, …) by the names in ``RECORDED``."""
 
 _FLAGS = {"tilt_substep": np.int64, "penetration_substep": np.int64, "diverged": np.bool_, "overflowed": np.bool_}
 
 
 class StateLayout:
-    """Where the robot's joints, feet and sensors lie in MuJoCo's arrays."""
+    """Places of the robot's joints, feet and sensors in MuJoCo's arrays."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene) -> None:
         robot = scene.robot
@@ -46,14 +45,14 @@ class StateLayout:
         self.points = columns("ground_each").reshape(CONTACT_SLOTS, 7)
         watched = scene.physics.watch_penetration is not None
         self.penetration = int(columns("penetration")[1]) if watched else None
-        # the body that a foot geom belongs to reports its force too: it is subtracted there
+        # a foot geom's body reports the foot's force too, which is subtracted there
         bodies = {model.body(b).id: i for i, b in enumerate(robot.collision_bodies)}
         owners = [(foot, bodies.get(model.geom(g).bodyid[0])) for foot, g in enumerate(robot.foot_geoms)]
         self.foot_owner = [(foot, owner) for foot, owner in owners if owner is not None]
 
 
 class BatchState(PhysicsState):
-    """State of all worlds over arrays of MuJoCo's: ``time``, ``qpos``, ``qvel``, ``torque``, ``sites`` and ``sensors``."""
+    """State of all worlds over MuJoCo's arrays ``time``, ``qpos``, ``qvel``, ``torque``, ``sites`` and ``sensors``."""
 
     def __init__(self, layout: StateLayout, arrays: Mapping[str, NDArray[np.float64]]) -> None:
         self._layout, self._arrays = layout, arrays
@@ -75,7 +74,7 @@ class BatchState(PhysicsState):
             setattr(self, name, torch.from_numpy(array))
 
     def __getattr__(self, name: str) -> torch.Tensor:
-        # reached only for what is not stored: the fields computed on demand
+        # reached only for fields computed on demand
         if name.startswith("_") or name not in _FIELDS:
             raise AttributeError(name)
         if name not in self._computed:
@@ -84,48 +83,37 @@ class BatchState(PhysicsState):
         return self._computed[name]
 
     def renew(self, rows: slice | NDArray[np.int64]) -> None:
-        """Worlds have been stepped: what was computed is out of date."""
+        """Discard computed fields after a step of some worlds."""
         self._computed = {}
         if not self._complete:
             self._has_forces[rows] = True
             self._complete = bool(self._has_forces.all())
 
     def forget_forces(self, rows: NDArray[np.int64]) -> None:
-        """Worlds have been reset: they have no forces until their next step."""
+        """Zero the forces of worlds after a reset, until their next step."""
         self._computed = {}
         self._has_forces[rows] = False
         self._complete = False
 
     def take(self, now: BatchState, rows: NDArray[np.int64], records: Records, at: NDArray[np.int64]) -> None:
-        """Become the state after substep ``at`` (1-based, 0 for none) of the step just taken, for some worlds.
-
-        Args:
-            now: the state after the whole step.
-            rows: the worlds that were stepped.
-            at: (rows,).
-        """
+        """Become, for the stepped worlds ``rows``, the state after substep ``at``, (rows,) from 1, 0 for none, of the step to ``now``."""
         self._computed = {}
         wanted = np.flatnonzero(at > 0)
         worlds, step = rows[wanted], at[wanted]
         last = records["qpos"].shape[1]
         mine, live = self._arrays, now._arrays
-        # what a substep records of positions is what the one before has led to
+        # a substep records the positions that the substep before has led to
         following, final = np.minimum(step, last - 1), step == last
         velocity = self._layout.foot_velocity
         mine["qpos"][worlds] = records["qpos"][wanted, step - 1]
         mine["qvel"][worlds] = records["qvel"][wanted, step - 1]
         mine["torque"][worlds] = records["actuator_force"][wanted, step - 1]
         mine["sensors"][worlds] = records["sensordata"][wanted, step - 1]
-        speeds = np.where(
-            final[:, None, None],
-            live["sensors"][worlds][:, velocity],
-            records["sensordata"][wanted, following][:, velocity],
-        )
+        last_one, later = final[:, None, None], records["sensordata"][wanted, following]
+        speeds = np.where(last_one, live["sensors"][worlds][:, velocity], later[:, velocity])
         for foot, columns in enumerate(velocity):
             mine["sensors"][worlds[:, None], columns] = speeds[:, foot]
-        mine["sites"][worlds] = np.where(
-            final[:, None, None], live["sites"][worlds], records["site_xpos"][wanted, following]
-        )
+        mine["sites"][worlds] = np.where(last_one, live["sites"][worlds], records["site_xpos"][wanted, following])
         mine["time"][worlds] = live["time"][worlds] - (last - step) * self._layout.timestep
         for name, flag in self.flags.items():
             flag[worlds] = now.flags[name][worlds]
@@ -137,14 +125,14 @@ class BatchState(PhysicsState):
         return PhysicsState(**{name: getattr(self, name).clone() for name in _FIELDS})
 
     def _compute_torque(self) -> dict[str, NDArray]:
-        """The motor torques."""
+        """Compute the motor torques."""
         torque = self._arrays["torque"].copy()
         if not self._complete:
             torque[~self._has_forces] = 0
         return {"joint_torque": torque}
 
     def _compute(self) -> dict[str, NDArray]:
-        """Contacts and feet, and joints that do not lie side by side."""
+        """Compute contacts, feet, and joints that do not lie side by side."""
         layout, sensors = self._layout, self._arrays["sensors"]
         n = len(sensors)
         # MuJoCo reports the force of the first object on the second: the robot's on the ground
@@ -184,7 +172,7 @@ _FIELDS = tuple(item.name for item in fields(PhysicsState))
 
 
 def _as_slice(index: NDArray[np.int64]) -> slice | NDArray[np.int64]:
-    """Consecutive indices as a slice, which gives views."""
+    """Return consecutive indices as a slice, which gives views; other indices as they are."""
     if (np.diff(index) == 1).all():
         return slice(int(index[0]), int(index[-1]) + 1)
     return index

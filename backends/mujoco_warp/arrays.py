@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, assignment"
-"""Arrays of the mujoco_warp engine as Warp's kernels see them, bundled by purpose, and what fills the bundles.
+"""Arrays of the mujoco_warp engine for Warp's kernels, bundled by purpose, and functions that fill the bundles.
 
 N worlds, J joints, F feet, L links, G geoms, T terrains, S terrain slots. Numbers are float32 and int32 unless said otherwise.
 """
@@ -17,7 +17,7 @@ vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 @wp.struct
 class Motion:
-    """What mujoco_warp integrates, and the forces handed to it."""
+    """State that mujoco_warp integrates, and forces on it."""
 
     positions: int
     """Length of qpos."""
@@ -52,15 +52,15 @@ class Links:
     rotation: wp.array[wp.quat]
     """Fixed rotation from the link before, xyzw, (L,)."""
     hinge: wp.array[int]
-    """Whether the link ends in a hinge, (L,)."""
+    """1 where the link ends in a hinge, (L,)."""
     axis: wp.array[wp.vec3]
     """Hinge axis in the link's frame, (L,)."""
     anchor: wp.array[wp.vec3]
     """Point on the hinge axis [m], (L,)."""
     address_q: wp.array[int]
-    """Of the hinge in qpos, (L,)."""
+    """Address of the hinge in qpos, (L,)."""
     address_v: wp.array[int]
-    """Of the hinge in qvel, (L,)."""
+    """Address of the hinge in qvel, (L,)."""
     zero: wp.array[float]
     """Hinge angle at which the fixed rotation holds [rad], (L,)."""
     foot: wp.array[wp.vec3]
@@ -69,7 +69,7 @@ class Links:
 
 @wp.struct
 class Roles:
-    """What each geom is, (G,)."""
+    """Role of each geom, (G,)."""
 
     foot: wp.array[int]
     """Index of the foot, -1 for other geoms."""
@@ -128,30 +128,17 @@ class ContactArrays:
 
 
 def motion_arrays(model: mujoco_warp.Model, data: mujoco_warp.Data, shared: SharedModel) -> Motion:
-    """mujoco_warp's own state arrays."""
+    """Return mujoco_warp's own state arrays."""
     sizes = {"positions": model.nq, "velocities": model.nv, "bodies": model.nbody}
     forces = {"applied": data.qfrc_applied, "external": data.xfrc_applied}
     return filled(Motion, data, shared, **sizes, **forces, warmstart=data.qacc_warmstart)
 
 
 def contact_arrays(data: mujoco_warp.Data, *, pyramidal: bool) -> ContactArrays:
-    """mujoco_warp's own contact and constraint arrays."""
+    """Return mujoco_warp's own contact and constraint arrays."""
     contact = data.contact
-    return filled(
-        ContactArrays,
-        contact,
-        count=data.nacon,
-        world=contact.worldid,
-        distance=contact.dist,
-        position=contact.pos,
-        dimension=contact.dim,
-        address=contact.efc_address,
-        row_count=data.nefc,
-        equality_rows=data.ne,
-        friction_rows=data.nf,
-        limit_rows=data.nl,
-        row_id=data.efc.id,
-        row_force=data.efc.force,
-        row_capacity=data.njmax,
-        pyramidal=int(pyramidal),
-    )
+    places = {"world": contact.worldid, "distance": contact.dist, "position": contact.pos, "dimension": contact.dim}
+    counts = {"count": data.nacon, "row_count": data.nefc, "row_capacity": data.njmax}
+    counts |= {"equality_rows": data.ne, "friction_rows": data.nf, "limit_rows": data.nl}
+    rows = {"address": contact.efc_address, "row_id": data.efc.id, "row_force": data.efc.force}
+    return filled(ContactArrays, contact, **places, **counts, **rows, pyramidal=int(pyramidal))

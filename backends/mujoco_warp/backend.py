@@ -1,7 +1,7 @@
 """MuJoCo's equations on the GPU: thousands of worlds stepped together by mujoco_warp, in float32.
 
-After a step, positions and velocities are those of the new state; forces are those of the last substep and come from
-the contacts with which it started, as in the ``mujoco`` engine; so does the penetration watch.
+After a step, positions and velocities are those of the new state. Forces are those of the last substep; they and the
+penetration watch come from the contacts at the substep's start, as in the ``mujoco`` engine.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .memory import bytes_per_world
 from .model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model
 
 PARKED_HEIGHT = 100.0
-"""Height at which a robot waits, away from every contact, that has diverged or must not step [m]."""
+"""Height of robots that have diverged or must not step, away from every contact [m]."""
 
 
 class MujocoWarpBackend(WarpBackend):
@@ -42,15 +42,13 @@ class MujocoWarpBackend(WarpBackend):
 
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:
-        """What the engine does, all of it in single precision."""
+        """Declare every capability, in single precision."""
         entries = {name: Capability(support=Support.EXACT) for name in CAPABILITY_NAMES}
         entries["penetration"] = Capability(support=Support.EXACT, note="seen one substep late")
-        entries["height_field"] = Capability(
-            support=Support.EXACT, note="at most 4 contacts for each geom, where MuJoCo keeps up to 50"
-        )
-        entries["deterministic"] = Capability(
-            support=Support.EXACT, note="on a GPU with PhysicsOptions.deterministic, which sorts contacts every substep"
-        )
+        limit = "at most 4 contacts for each geom, where MuJoCo keeps up to 50"
+        entries["height_field"] = Capability(support=Support.EXACT, note=limit)
+        sort = "on a GPU with PhysicsOptions.deterministic, which sorts contacts every substep"
+        entries["deterministic"] = Capability(support=Support.EXACT, note=sort)
         return entries
 
     @classmethod
@@ -70,9 +68,9 @@ class MujocoWarpBackend(WarpBackend):
                 self._build(self._shared, capacity)
             self._reset_to_default(scene.robot.stand_height)
             if self._scope.on_gpu:
-                with self._scope():  # compiles the kernels, so that none has to be while a graph is recorded
+                with self._scope():  # compiles the kernels before a graph is recorded
                     self._control_period(1, masked=True, sampled=True)
-                self.step(None)  # records the graph and finds out whether its scratch memory fits
+                self.step(None)  # records the graph and tests that its scratch memory fits
                 self._reset_to_default(scene.robot.stand_height)
                 torch.cuda.synchronize(self.device)
         except (RuntimeError, torch.cuda.OutOfMemoryError) as error:
@@ -85,7 +83,7 @@ class MujocoWarpBackend(WarpBackend):
     # ---- building -------------------------------------------------------------------------------------------------
 
     def _build(self, shared: SharedModel, capacity: Capacity) -> None:
-        """Model, data and buffers on the device."""
+        """Build model, data and buffers on the device."""
         scene, model = self.scene, shared.model
         n, robot = scene.num_worlds, scene.robot
         self._model = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(BATCHED_FIELDS, n))
@@ -93,9 +91,8 @@ class MujocoWarpBackend(WarpBackend):
         self._model.opt.tolerance.fill_(self.solver_settings(scene.physics)["tolerance"])
         if scene.physics.deterministic:
             self._model.opt.deterministic = int(mujoco_warp.DeterminismType.ATOMICS)
-        self._data = mujoco_warp.make_data(
-            model, nworld=n, naconmax=capacity.contacts, naccdmax=capacity.convex, njmax=capacity.rows
-        )
+        sizes = {"naconmax": capacity.contacts, "naccdmax": capacity.convex, "njmax": capacity.rows}
+        self._data = mujoco_warp.make_data(model, nworld=n, **sizes)
         self._allocate()
         self._masses = WorldMasses(shared, self._model, self.device)
         self._motion = motion_arrays(self._model, self._data, shared)
@@ -119,7 +116,7 @@ class MujocoWarpBackend(WarpBackend):
     # ---- launching ------------------------------------------------------------------------------------------------
 
     def _read(self, select: Any, value: int, out: StateArrays, *, forces: bool) -> None:
-        """Launch the read-out of the worlds whose ``select`` is ``value``."""
+        """Launch the read-out of the worlds with ``select == value``."""
         n, motion, chosen = self.num_worlds, self._motion, [select, value]
         wp.launch(readout.read_joints, dim=(n, self._joints), inputs=[*chosen, DROPPED, motion, self._live, out])
         wp.launch(readout.read_feet, dim=(n, self._feet), inputs=[*chosen, self._links, motion, out])
@@ -131,37 +128,20 @@ class MujocoWarpBackend(WarpBackend):
     def _place_robots(self) -> None:
         """See ``WarpBackend``."""
         active, motors = self._active_array, self._motors.arrays
-        wp.launch(
-            kernels.reset_worlds,
-            dim=(self.num_worlds, self._joints),
-            inputs=[active, self._request_array, *self._reset_arrays, motors, self._motion, self._live],
-        )
+        inputs = [active, self._request_array, *self._reset_arrays, motors, self._motion, self._live]
+        wp.launch(kernels.reset_worlds, dim=(self.num_worlds, self._joints), inputs=inputs)
         self._clear_forces(active, 1, self._live)
         self._read(active, 1, self._live, forces=False)
 
     def _place_terrain(self) -> None:
         """See ``WarpBackend``."""
         model, data, slots = self._model, self._data, len(self._shared.slot_geom)
-        wp.launch(
-            kernels.place_terrain,
-            dim=(self.num_worlds, max(slots, 1)),
-            inputs=[
-                self._active_array,
-                self._new_terrain_array,
-                len(self.scene.terrains),
-                slots,
-                self._slot_geom,
-                self._palette,
-                self._terrain_array,
-                data.geom_xpos,
-                data.geom_xmat,
-                model.geom_size,
-                model.geom_aabb,
-                model.geom_rbound,
-                model.geom_dataid,
-                int(self._shared.has_field),
-            ],
-        )
+        asked = [self._active_array, self._new_terrain_array, len(self.scene.terrains), slots]
+        tables = [self._slot_geom, self._palette, self._terrain_array]
+        poses = [data.geom_xpos, data.geom_xmat]
+        shapes = [model.geom_size, model.geom_aabb, model.geom_rbound, model.geom_dataid]
+        inputs = [*asked, *tables, *poses, *shapes, int(self._shared.has_field)]
+        wp.launch(kernels.place_terrain, dim=(self.num_worlds, max(slots, 1)), inputs=inputs)
 
     def _control_period(self, total: int, *, masked: bool, sampled: bool) -> None:
         """See ``WarpBackend``; inactive worlds are put aside in any case."""
@@ -174,9 +154,8 @@ class MujocoWarpBackend(WarpBackend):
         for substep in range(total):
             wp.launch(kernels.motor_law, dim=each_joint, inputs=[substep, motors, motion])
             mujoco_warp.step(self._model, data)
-            wp.launch(
-                kernels.end_substep, dim=n, inputs=[substep, self._upright_limit, active, self._parked, motion, live]
-            )
+            end = [substep, self._upright_limit, active, self._parked, motion, live]
+            wp.launch(kernels.end_substep, dim=n, inputs=end)
             if depth is not None:
                 tables = [self._contacts, self._roles, self._palette, self._terrain_array]
                 wp.launch(kernels.watch_penetration, dim=data.naconmax, inputs=[substep, depth, active, *tables, live])

@@ -2,8 +2,7 @@
 # ruff: noqa: UP018 - a variable that changes in a kernel's loop must be made by float(), int() or bool()
 """Warp kernels around mujoco_warp's step: motor law, latency, watches, terrain slots, pushes and resets.
 
-One thread per world, or per world and joint or terrain slot. Every kernel takes masks from device memory, so that none
-of them needs the host.
+One thread per world, or per world and joint or terrain slot. Every kernel takes masks from device memory, without the host.
 """
 
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
@@ -36,10 +35,7 @@ def keep_inactive(
     kept: wp.array2d[float],
     kept_overflow: wp.array[int],
 ) -> None:
-    """Save (or restore) what a step changes in the worlds that must not step.
-
-    Meanwhile their robots are out of reach of everything, since collisions and contacts are what a step takes its time for.
-    """
+    """Save (or restore) the state of the worlds that must not step, and park their robots out of reach to save collision time."""
     world, i = wp.tid()
     if active[world] != 0:
         return
@@ -68,7 +64,7 @@ def keep_inactive(
 
 @wp.kernel
 def motor_law(substep: int, motors: Motors, motion: Motion) -> None:
-    """The motor law with the target that acts in this substep (from 0)."""
+    """Apply the motor law with the target of this substep (from 0)."""
     world, joint = wp.tid()
     position = motion.qpos[world, motion.joint_q[joint]]
     velocity = motion.qvel[world, motion.joint_v[joint]]
@@ -86,7 +82,7 @@ def end_substep(
     motion: Motion,
     state: StateArrays,
 ) -> None:
-    """Catch worlds whose state became invalid, park them out of reach, and watch the tilt of the others."""
+    """Mark worlds with an invalid state, park them out of reach, and watch the tilt of the others."""
     world = wp.tid()
     if active[world] == 0:
         return
@@ -123,7 +119,7 @@ def watch_penetration(
     terrain: wp.array[int],
     state: StateArrays,
 ) -> None:
-    """Record the substep in which a part of the robot is deeper than ``depth`` in a terrain box or height field."""
+    """Record the first substep with a part of the robot deeper than ``depth`` in a terrain box or height field."""
     contact = wp.tid()
     if contact >= contacts.count[0]:
         return
@@ -200,8 +196,7 @@ def place_terrain(
 ) -> None:
     """Write the boxes and the height field of the masked worlds' new terrains.
 
-    mujoco_warp computes poses of static geoms once, when its data are made, and never again: writing them here
-    suffices.
+    mujoco_warp computes poses of static geoms only once, when its data are made, so that poses written here last.
     """
     world, slot = wp.tid()
     if active[world] == 0:
@@ -224,7 +219,7 @@ def place_terrain(
 
 @wp.kernel
 def push_base(active: wp.array[int], twist: wp.array2d[float], motion: Motion) -> None:
-    """Set the base's motion.velocities; NaN keeps the present value."""
+    """Set the base's velocities; NaN keeps the present value."""
     world, i = wp.tid()
     if active[world] == 0:
         return

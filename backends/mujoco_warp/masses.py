@@ -1,4 +1,4 @@
-"""What differs between the worlds of the mujoco_warp engine beside the motors: friction and masses."""
+"""Friction and masses of the mujoco_warp engine, which differ between worlds as the motors do."""
 
 from __future__ import annotations
 
@@ -15,19 +15,10 @@ from ..warp.motors import MotorTensors
 from .model import SharedModel
 
 BATCHED_FIELDS = (
-    "geom_friction",
-    "geom_size",
-    "geom_aabb",
-    "geom_rbound",
-    "geom_dataid",
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "body_subtreemass",
-    "body_invweight0",
-    "dof_invweight0",
-)
-"""Model fields of which every world has its own."""
+    "geom_friction", "geom_size", "geom_aabb", "geom_rbound", "geom_dataid",
+    "body_mass", "body_inertia", "body_ipos", "body_subtreemass", "body_invweight0", "dof_invweight0",
+)  # fmt: skip
+"""Model fields with an entry for every world."""
 
 
 class WorldMasses:
@@ -55,10 +46,10 @@ class WorldMasses:
             write: writes the masked rows of its second argument into the first.
 
         Returns:
-            Whether masses changed, so that constants which follow from them must be computed anew.
+            True where masses changed, so that derived constants must be computed anew.
         """
         if "friction" in rows:
-            # in every geom, so that neither the larger coefficient nor the higher priority can win with another one
+            # in every geom, so that no other coefficient acts by its size or priority
             write(self._friction[:, :, 0], rows["friction"][:, None].expand(-1, self._friction.shape[1]))
         base, bodies = self._base, self._other_bodies
         if "link_mass_scale" in rows:
@@ -76,10 +67,10 @@ class WorldMasses:
 
 
 def describe_model(model: mujoco_warp.Model, shared: SharedModel, motors: MotorTensors) -> dict[str, list[float]]:
-    """The first world as ``PhysicsBackend.describe`` says, read from the engine's own arrays."""
+    """Return the first world in the terms of ``PhysicsBackend.describe``, from the engine's own arrays."""
 
     def first(name: str) -> np.ndarray:
-        return getattr(model, name).numpy()[0]  # an array of all worlds, or of one that stands for all
+        return getattr(model, name).numpy()[0]  # an array of all worlds, or of one for all
 
     bodies, dofs = shared.bodies, shared.joint_v
     joints = [int(shared.model.dof_jntid[d]) for d in dofs]

@@ -1,4 +1,4 @@
-"""How much memory a world of the mujoco_warp engine takes."""
+"""Estimate the memory of a world of the mujoco_warp engine."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from .model import Capacity
 _SCRATCH_FACTOR = 1.3
 """Memory with mujoco_warp's scratch arrays, in units of the engine's data, its own solver's included: an upper bound."""
 _CONVEX_BYTES = 6600
-"""Scratch memory of the convex solver for each contact that it has room for, with 35 iterations [bytes]."""
+"""Scratch memory of the convex solver for each contact of its capacity, with 35 iterations [bytes]."""
 _OWN_BYTES = 8000
-"""This engine's own buffers, and the model fields that every world has for itself [bytes]."""
+"""This engine's own buffers and model fields for every world [bytes]."""
 
 
 def bytes_per_world(model: mujoco.MjModel, capacity: Capacity, worlds: int, processors: int = 132) -> float:
-    """Memory that one world needs [bytes], scratch memory included as an estimate; measured on small copies.
+    """Return the memory of one world [bytes], measured on small copies, with an estimate of scratch memory.
 
     Args:
         capacity: buffer sizes for ``worlds`` worlds.
-        processors: multiprocessors of the GPU; an H200's if nothing is said.
+        processors: multiprocessors of the GPU; an H200's by default.
     """
 
     def size(count: int) -> int:
@@ -47,5 +47,5 @@ def bytes_per_world(model: mujoco.MjModel, capacity: Capacity, worlds: int, proc
 
 
 def _array_bytes(part: object) -> int:
-    """Memory of the Warp arrays that an object holds directly [bytes]."""
+    """Return the memory of an object's own Warp arrays [bytes]."""
     return sum(v.capacity for v in vars(part).values() if isinstance(v, wp.array))

@@ -1,8 +1,7 @@
-"""The model that all worlds of the mujoco_warp engine share, and the tables that give each world its own ground.
+"""Build the model that all worlds of the mujoco_warp engine share, and the tables of each world's ground.
 
-The model holds the robot without what is only seen, a floor, as many box geoms as the palette's fullest terrain needs,
-and one height-field geom if any terrain has a field. A world's terrain is a set of poses and sizes of these geoms, the
-slots.
+The model holds the robot without visual geoms, a floor, box geoms for the palette's fullest terrain, and one height-field geom
+if any terrain has a field. A world's terrain is a set of poses and sizes of these geoms, the slots.
 """
 
 from __future__ import annotations
@@ -19,26 +18,26 @@ from ..base import BackendError, PhysicsOptions, Scene
 from ..mujoco.model import robot_spec
 
 PARKED = (0.0, 0.0, -1000.0)
-"""Where unused slots wait, out of reach of any robot."""
+"""Place of unused slots, out of reach of any robot [m]."""
 PARKED_SIZE = 0.01
 """Half size of an unused slot [m]."""
 DEFAULT_CONTACTS = {"plane": 32, "boxes": 40, "height_field": 56}
-"""Contacts per world for which room is made, by the palette's hardest shape; a robot that lies flat needs about 30."""
+"""Contact capacity of a world, by the palette's hardest shape; a robot that lies flat needs about 30."""
 SPARE_CONTACTS = 256
-"""Room for contacts on top, shared by all worlds: a fallen robot has more than an average one."""
+"""Further contact capacity, shared by all worlds, for fallen robots."""
 
 SMALLEST_TOLERANCE = 1e-6
-"""Solver tolerance below which single precision goes on without getting nearer; mujoco_warp raises smaller ones to it."""
+"""Smallest solver tolerance that single precision reaches; mujoco_warp raises smaller ones to it."""
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int32]
 Tables = dict[str, NDArray]
-"""By name of a structure's field."""
+"""Arrays by the name of a structure's field."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SharedModel:
-    """The compiled model and what the kernels need to know about it. G geoms, B collision bodies, J joints."""
+    """The compiled model and its tables for kernels. G geoms, B collision bodies, J joints."""
 
     model: mujoco.MjModel
     palette: Tables
@@ -49,7 +48,7 @@ class SharedModel:
     """Geom of each slot, (S,)."""
     has_field: bool
     roles: Tables
-    """What each geom is: the fields of ``arrays.Roles``."""
+    """Role of each geom: the fields of ``arrays.Roles``."""
     joint_q: Integers
     """Address in qpos, (J,)."""
     joint_v: Integers
@@ -67,7 +66,7 @@ class Capacity:
     contacts: int
     """Contacts (and candidate pairs) of all worlds together."""
     convex: int
-    """Contacts of all worlds together that go through the iterative convex solver, for each pair of shapes."""
+    """Contacts of all worlds together in the iterative convex solver, for each pair of shapes."""
     rows: int
     """Constraint rows of one world."""
 
@@ -123,7 +122,7 @@ def build_shared_model(scene: Scene) -> SharedModel:
 
 
 def contacts_per_world(physics: PhysicsOptions, *, boxes: bool, fields: bool) -> int:
-    """Contact capacity of a world, from the options or, where they leave it open, from the shapes of the palette.
+    """Return the contact capacity of a world, from the options or else from the shapes of the palette.
 
     Raises:
         BackendError: less than one contact is asked for.
@@ -135,16 +134,16 @@ def contacts_per_world(physics: PhysicsOptions, *, boxes: bool, fields: bool) ->
 
 
 def constraint_rows(model: mujoco.MjModel, feet: Sequence[int], physics: PhysicsOptions, contacts: int) -> int:
-    """Constraint rows of one world: joint friction, joint limits and contacts, feet (geoms) with their own dimension."""
+    """Return the constraint rows of one world: joint friction, joint limits, contacts; feet (geoms) have their own dimension."""
     rows_of = (lambda d: d) if physics.cone == "elliptic" else (lambda d: max(1, 2 * (d - 1)))
     rows = int(np.count_nonzero(model.dof_frictionloss > 0)) + int(model.jnt_limited.sum()) + contacts * rows_of(3)
-    # a foot has two contacts at most times: the ground and another box
+    # a foot rarely has more than two contacts: the ground and another box
     rows += 2 * sum(rows_of(max(int(model.geom_condim[g]), 3)) - rows_of(3) for g in feet)
     return 16 * -(-rows // 16)
 
 
 def buffer_capacity(scene: Scene, shared: SharedModel) -> Capacity:
-    """Sizes of the buffers, from ``PhysicsOptions.contacts_per_world`` or the palette's shapes."""
+    """Return the sizes of the buffers, from ``PhysicsOptions.contacts_per_world`` or the palette's shapes."""
     model, physics = shared.model, scene.physics
     contacts = contacts_per_world(physics, boxes=len(shared.slot_geom) > 0, fields=shared.has_field)
     rows = constraint_rows(model, np.flatnonzero(shared.roles["foot"] >= 0).tolist(), physics, contacts)
@@ -156,16 +155,13 @@ def buffer_capacity(scene: Scene, shared: SharedModel) -> Capacity:
 
 
 def strip(spec: mujoco.MjSpec) -> None:
-    """Remove what the engine brings itself or does not need: actuators (the motor law is ours), sensors, lights and cameras.
-
-    What is only seen is gone already, as far as it carries no mass (``robot_spec``).
-    """
+    """Remove actuators (kernels compute the motor law), sensors, lights and cameras; ``robot_spec`` removes visual geoms."""
     for element in [*spec.actuators, *spec.sensors, *spec.lights, *spec.cameras]:
         spec.delete(element)
 
 
 def _add_slots(spec: mujoco.MjSpec, terrains: tuple[Terrain, ...], slots: int) -> list[str]:
-    """Add floor, box slots and height fields; the names of the slots' geoms, in order."""
+    """Add floor, box slots and height fields; return the names of the slots' geoms, in order."""
     world = spec.worldbody
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
     names = [f"box_{i}" for i in range(slots)]
@@ -185,12 +181,12 @@ def _add_slots(spec: mujoco.MjSpec, terrains: tuple[Terrain, ...], slots: int) -
 
 
 def _top(heights: Floats) -> float:
-    """Height that the engine's unit elevation stands for [m]."""
+    """Return the height of the engine's unit elevation [m]."""
     return max(float(heights.max()), 1e-6)
 
 
 def _write_fields(model: mujoco.MjModel, terrains: tuple[Terrain, ...]) -> None:
-    """Write elevations as they are: MuJoCo's compiler would shift every field's lowest node to zero."""
+    """Write elevations unchanged, because MuJoCo's compiler shifts every field's lowest node to zero."""
     fields = [t.height_field for t in terrains if t.height_field is not None]
     for i, field in enumerate(fields):
         address, size = model.hfield_adr[i], field.heights.size
@@ -198,7 +194,7 @@ def _write_fields(model: mujoco.MjModel, terrains: tuple[Terrain, ...]) -> None:
 
 
 def _palette(terrains: tuple[Terrain, ...], slots: int, has_field: bool) -> Tables:
-    """Slot poses, sizes and bounds of every terrain."""
+    """Return slot poses, sizes and bounds of every terrain."""
     t, s = len(terrains), slots + int(has_field)
     position = np.tile(np.array(PARKED), (t, s, 1))
     rotation = np.tile(np.eye(3), (t, s, 1, 1))
@@ -226,16 +222,8 @@ def _palette(terrains: tuple[Terrain, ...], slots: int, has_field: bool) -> Tabl
             center[i, -1] = (0.0, 0.0, 0.5 * (top - base))
             half[i, -1] = (*field.half_size, 0.5 * (top + base))
             radius[i, -1] = np.sqrt(np.sum(np.square(field.half_size)) + max(top, base) ** 2)
-    return {
-        "position": position,
-        "rotation": rotation,
-        "size": size,
-        "bound_center": center,
-        "bound_half": half,
-        "radius": radius,
-        "field": field_index,
-        "wall": wall,
-    }
+    bounds = {"bound_center": center, "bound_half": half, "radius": radius}
+    return {"position": position, "rotation": rotation, "size": size, "field": field_index, "wall": wall} | bounds
 
 
 def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
@@ -251,9 +239,8 @@ def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
         body = int(model.geom_bodyid[geom])
         while body != base:
             if body == 0:
-                raise BackendError(
-                    f"foot '{name}' of robot '{scene.robot.name}' does not hang on its base '{scene.robot.base_body}'"
-                )
+                foot = f"foot '{name}' of robot '{scene.robot.name}'"
+                raise BackendError(f"{foot} does not hang on its base '{scene.robot.base_body}'")
             chain.append(body)
             body = int(model.body_parentid[body])
         for body in reversed(chain):
@@ -261,9 +248,8 @@ def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
             joints = [first + i for i in range(number)] or [-1]
             for i, joint in enumerate(joints):
                 if joint >= 0 and model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
-                    raise BackendError(
-                        f"joint '{model.joint(joint).name}' of robot '{scene.robot.name}' must be a hinge"
-                    )
+                    wrong = f"joint '{model.joint(joint).name}' of robot '{scene.robot.name}'"
+                    raise BackendError(f"{wrong} must be a hinge")
                 offset = (model.body_pos[body], model.body_quat[body]) if i == 0 else (np.zeros(3), unit)
                 rows.append((*offset, joint))
         start.append(len(rows))
@@ -288,12 +274,12 @@ def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
 
 
 def _body(model: mujoco.MjModel, scene: Scene, name: str) -> int:
-    """Id of a body of the robot."""
+    """Return the id of a body of the robot."""
     return _find(model, scene, mujoco.mjtObj.mjOBJ_BODY, name, f"body '{name}' of robot '{scene.robot.name}' is not in")
 
 
 def _geom(model: mujoco.MjModel, scene: Scene, name: str) -> int:
-    """Id of a foot's geom."""
+    """Return the id of a foot's geom."""
     what = f"foot '{name}' of robot '{scene.robot.name}' is no collision geom of"
     return _find(model, scene, mujoco.mjtObj.mjOBJ_GEOM, name, what)
 

@@ -16,14 +16,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def read_joints(
-    select: wp.array[int],
-    value: int,
-    overflow_mask: int,
-    motion: Motion,
-    live: StateArrays,
-    out: StateArrays,
+    select: wp.array[int], value: int, overflow_mask: int, motion: Motion, live: StateArrays, out: StateArrays
 ) -> None:
-    """Base and joints of the worlds whose ``select`` equals ``value``, and the flags of the live state."""
+    """Read base and joints of the worlds with ``select == value``, and the flags of the live state."""
     world, joint = wp.tid()
     if select[world] != value:
         return
@@ -47,7 +42,7 @@ def read_joints(
 
 @wp.kernel
 def read_feet(select: wp.array[int], value: int, links: Links, motion: Motion, out: StateArrays) -> None:
-    """Positions and velocities of the feet: forward kinematics along each foot's own chain of links."""
+    """Read positions and velocities of the feet by forward kinematics along each foot's chain of links."""
     world, foot = wp.tid()
     if select[world] != value:
         return
@@ -77,7 +72,7 @@ def read_feet(select: wp.array[int], value: int, links: Links, motion: Motion, o
 
 @wp.func
 def row_force(contacts: ContactArrays, world: int, contact: int, row: int) -> float:
-    """Force of one constraint row of a contact; zero where the row was dropped."""
+    """Return the force of one constraint row of a contact; zero for a dropped row."""
     address = contacts.address[contact, row]
     if address < 0 or address >= contacts.row_capacity:
         return 0.0
@@ -86,7 +81,7 @@ def row_force(contacts: ContactArrays, world: int, contact: int, row: int) -> fl
 
 @wp.func
 def local_wrench(contacts: ContactArrays, world: int, contact: int) -> wp.spatial_vector:
-    """Force and torque of a contact in its own frame (normal first) on the second geom.
+    """Return force and torque of a contact on the second geom, in the contact's frame (normal first).
 
     An elliptic cone has one row per direction. A pyramidal one has two opposite edges per tangential direction: their
     sum is normal force, their difference times the friction coefficient is the tangential one.
@@ -121,7 +116,7 @@ def read_contacts(
     if select[world] != value:
         return
     clear_parts(world, feet, bodies, out)
-    # moments are summed about the base, which is near the contacts, to keep single precision, and then moved
+    # sum moments about the base, near the contacts, for precision, and move the sum afterwards
     base = wp.vec3(motion.qpos[world, 0], motion.qpos[world, 1], motion.qpos[world, 2])
     force = wp.vec3(0.0)
     moment = wp.vec3(0.0)
@@ -133,7 +128,7 @@ def read_contacts(
         last = 0
     for row in range(first, last):
         contact = contacts.row_id[world, row]
-        if contacts.address[contact, 0] == row:  # the first row of a contact stands for all of it
+        if contacts.address[contact, 0] == row:  # count a contact at its first row
             pair = contacts.geom[contact]
             ground_first = roles.ground[pair[0]]
             if ground_first + roles.ground[pair[1]] == 1:

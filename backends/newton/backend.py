@@ -1,7 +1,7 @@
 """The Newton engine: its MuJoCo solver as ``newton``, its other solvers as ``newton:NAME``.
 
-Poses and twists live in Newton's state; kernels of ours write the motors' torques into ``Control.joint_f`` before every
-physics step and read state and contacts out afterwards.
+Newton's state holds poses and twists; this package's kernels write the motors' torques into ``Control.joint_f`` before every
+physics step and read state and contacts afterwards.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class NewtonBackend(WarpBackend):
 
     name: ClassVar[str] = "newton"
     adapter: ClassVar[type[SolverAdapter]] = SOLVERS["mujoco"]
-    """The solver that does the work."""
+    """Adapter of the solver."""
 
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:
@@ -48,10 +48,10 @@ class NewtonBackend(WarpBackend):
 
     @classmethod
     def with_solver(cls, solver: str) -> type[NewtonBackend]:
-        """The backend that runs a named solver, ``newton:SOLVER``.
+        """Return the backend of a named solver, ``newton:SOLVER``.
 
         Raises:
-            BackendError: there is no such solver, or this project does not run it.
+            BackendError: this project runs no such solver.
         """
         if solver not in SOLVERS:
             raise BackendError(
@@ -60,15 +60,14 @@ class NewtonBackend(WarpBackend):
             )
         if SOLVERS[solver] is cls.adapter:
             return cls
-        return type(
-            f"{solver.capitalize()}NewtonBackend", (cls,), {"name": f"newton:{solver}", "adapter": SOLVERS[solver]}
-        )
+        fields = {"name": f"newton:{solver}", "adapter": SOLVERS[solver]}
+        return type(f"{solver.capitalize()}NewtonBackend", (cls,), fields)
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         """Build the worlds. ``threads`` is ignored: Warp runs on one CPU thread.
 
         Raises:
-            BackendError: no such device, or something that the solver cannot do.
+            BackendError: no such device, or a scene that the solver cannot simulate.
         """
         self._open(scene, device)
         self.adapter.refuse(scene)
@@ -77,13 +76,13 @@ class NewtonBackend(WarpBackend):
             with self._scope():
                 self._build()
                 self._warm_up()
-        except RuntimeError as error:  # torch's and Warp's out-of-memory errors are such
+        except RuntimeError as error:  # the class of torch's and Warp's out-of-memory errors
             if isinstance(error, BackendError) or not is_memory_error(error):
                 raise
             raise BackendError(self._memory_advice()) from error
 
     def _memory_advice(self) -> str:
-        """The sentence for worlds that do not fit: how many would, measured on small copies."""
+        """Return the sentence for worlds that do not fit, with the number that would, measured on small copies."""
         self.__dict__ = {name: self.__dict__[name] for name in ("scene", "device", "dtype", "_scope", "_warp_device")}
         gc.collect()
 
@@ -104,7 +103,7 @@ class NewtonBackend(WarpBackend):
     # ---- building -----------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
-        """Make model, solver, tensors and the structures that the kernels see."""
+        """Make model, solver, tensors and the structures for the kernels."""
         scene, on, n = self.scene, self._warp_device, self.num_worlds
         world = build_world_model(scene, device=str(on), gap=self.adapter.gap, skin=self.adapter.skin)
         self._world, self._model = world, world.model
@@ -127,7 +126,7 @@ class NewtonBackend(WarpBackend):
         self._kept = tuple(wp.zeros_like(array) for array in kept)
 
     def _warm_up(self) -> None:
-        """Compile everything, while a graph cannot be in the way, and put all worlds at the origin."""
+        """Compile all kernels before any graph is recorded, and put all worlds at the origin."""
         self._reset_to_default(BIRTH_HEIGHT)
         self._control_period(1, masked=True, sampled=True)
         self._solver.inertia_changed()
@@ -153,50 +152,20 @@ class NewtonBackend(WarpBackend):
             self._launch(kernels.copy_inactive, (n, width), self._layout, active, *changed, *self._kept)
         moving = self._coordinates(now)
         self._launch(kernels.begin_period, n, self._layout, active, self._request_array, joints, motors, *moving, state)
+        law = (self._layout, motors, self._dry_friction, self._dry_slope, state.diverged)
+        watched, depth = physics.watch_penetration is not None, float(physics.watch_penetration or 0.0)
+        tables = (self._layout, active, self._contacts, self._palette, self._terrain_array)
         for substep in range(total):
-            self._launch(
-                kernels.motor_law,
-                (n, joints),
-                substep,
-                self._layout,
-                motors,
-                self._dry_friction,
-                self._dry_slope,
-                state.diverged,
-                now.joint_q,
-                now.joint_qd,
-                self._control.joint_f,
-            )
-            watched = physics.watch_penetration is not None
+            joint_state = (now.joint_q, now.joint_qd, self._control.joint_f)
+            self._launch(kernels.motor_law, (n, joints), substep, *law, *joint_state)
             last = substep == total - 1
             self._solver.step(now, after, self._control, observe=last or sampled or watched)
             self._solver.collect_overflow(active, state.overflowed)
             if watched:
-                self._launch(
-                    readout.watch_penetration,
-                    self._solver.contacts.rigid_contact_max,
-                    substep,
-                    float(physics.watch_penetration or 0.0),
-                    self._layout,
-                    active,
-                    self._contacts,
-                    self._palette,
-                    self._terrain_array,
-                    now.body_q,
-                    state,
-                )
-            self._launch(
-                kernels.end_substep,
-                n,
-                substep,
-                self._upright_limit,
-                self._layout,
-                active,
-                *self._coordinates(after),
-                self._solver.warm_start,
-                self._ticks,
-                state,
-            )
+                count = self._solver.contacts.rigid_contact_max
+                self._launch(readout.watch_penetration, count, substep, depth, *tables, now.body_q, state)
+            ended = (*self._coordinates(after), self._solver.warm_start, self._ticks, state)
+            self._launch(kernels.end_substep, n, substep, self._upright_limit, self._layout, active, *ended)
             if sampled:
                 self._read(self._sample_array, substep + 1, after, self._sampled, contacts_of=now)
             now, after = after, now
@@ -209,84 +178,55 @@ class NewtonBackend(WarpBackend):
             self._launch(kernels.copy_inactive, (n, width), self._layout, active, *self._kept, *changed)
 
     def _read(self, select: Any, value: int, state: Any, out: Any, *, contacts_of: Any) -> None:
-        """Write the state of the worlds whose ``select`` equals ``value``; without ``contacts_of`` forces are zero."""
+        """Write the state of the worlds with ``select == value``; forces are zero without ``contacts_of``."""
         n, live = self.num_worlds, self._live
         self._read_motion(select, value, state, out)
         self._clear_forces(select, value, out)
         if contacts_of is None:
             return
         self._read_torques(select, value, out)
-        count = self._solver.contacts.rigid_contact_max
-        poses = contacts_of.body_q
-        self._launch(
-            readout.add_contacts, count, select, value, self._layout, self._contacts, poses, live.diverged, out
+        count, poses, chosen = (
+            self._solver.contacts.rigid_contact_max,
+            contacts_of.body_q,
+            (select, value, self._layout),
         )
-        self._launch(readout.finish_contacts, n, select, value, self._layout, poses, out)
+        self._launch(readout.add_contacts, count, *chosen, self._contacts, poses, live.diverged, out)
+        self._launch(readout.finish_contacts, n, *chosen, poses, out)
 
     def _read_motion(self, select: Any, value: int, state: Any, out: Any) -> None:
         """Write poses, velocities and flags."""
-        n, joints, feet = self.num_worlds, self._joints, self._feet
-        live, com = self._live, self._model.body_com
-        timestep = self.scene.physics.timestep
-        ticks = self._ticks
-        moving = (state.joint_q, state.joint_qd, com)
-        self._launch(
-            readout.read_base_and_joints, (n, joints), select, value, timestep, self._layout, ticks, *moving, live, out
-        )
-        self._launch(readout.read_feet, (n, feet), select, value, self._layout, state.body_q, state.body_qd, com, out)
+        n, com, timestep = self.num_worlds, self._model.body_com, self.scene.physics.timestep
+        moving = (self._layout, self._ticks, state.joint_q, state.joint_qd, com, self._live, out)
+        self._launch(readout.read_base_and_joints, (n, self._joints), select, value, timestep, *moving)
+        bodies = (self._layout, state.body_q, state.body_qd, com, out)
+        self._launch(readout.read_feet, (n, self._feet), select, value, *bodies)
 
     def _place_robots(self) -> None:
         """See ``WarpBackend``."""
         self._mask[:-1].copy_(self._active)
-        self._launch(
-            kernels.reset_worlds,
-            (self.num_worlds, self._joints),
-            self._layout,
-            self._active_array,
-            self._request_array,
-            *self._reset_arrays,
-            self._model.body_com,
-            self._motors.arrays,
-            self._now.joint_q,
-            self._now.joint_qd,
-            self._now.body_f,
-            self._next.body_f,
-            self._ticks,
-            self._live,
-        )
+        asked = (self._layout, self._active_array, self._request_array, *self._reset_arrays)
+        forces = (self._now.body_f, self._next.body_f)
+        written = (self._motors.arrays, self._now.joint_q, self._now.joint_qd, *forces, self._ticks, self._live)
+        dim = (self.num_worlds, self._joints)
+        self._launch(kernels.reset_worlds, dim, *asked, self._model.body_com, *written)
         self._solver.reset(self._now, wp.from_torch(self._mask))
         newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
         self._read(self._active_array, 1, self._now, self._live, contacts_of=None)
 
     def _place_terrain(self) -> None:
         """See ``WarpBackend``."""
-        self._launch(
-            kernels.place_terrain,
-            (self.num_worlds, max(1, len(self._world.layout.slot_shape))),
-            self._layout,
-            self._active_array,
-            self._new_terrain_array,
-            len(self.scene.terrains),
-            self._slot_shape,
-            self._palette,
-            self._terrain_array,
-            self._model.shape_transform,
-            self._model.shape_scale,
-        )
+        asked = (self._layout, self._active_array, self._new_terrain_array, len(self.scene.terrains))
+        tables = (self._slot_shape, self._palette, self._terrain_array)
+        shapes = (self._model.shape_transform, self._model.shape_scale)
+        dim = (self.num_worlds, max(1, len(self._world.layout.slot_shape)))
+        self._launch(kernels.place_terrain, dim, *asked, *tables, *shapes)
         self._solver.shapes_changed(self._terrain_array)
 
     def _push_base(self) -> None:
         """See ``WarpBackend``."""
-        self._launch(
-            kernels.push_base,
-            self.num_worlds,
-            self._layout,
-            self._active_array,
-            self._twist_array,
-            self._model.body_com,
-            self._now.joint_q,
-            self._now.joint_qd,
-        )
+        push = (self._layout, self._active_array, self._twist_array)
+        moved = (self._model.body_com, self._now.joint_q, self._now.joint_qd)
+        self._launch(kernels.push_base, self.num_worlds, *push, *moved)
         newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
         self._read_motion(self._active_array, 1, self._now, self._live)
 
@@ -309,16 +249,9 @@ class NewtonBackend(WarpBackend):
             if "friction" in rows:
                 self._solver.shapes_changed(self._terrain_array)
             if "base_com_offset" in rows:
-                self._launch(
-                    kernels.move_center_of_mass,
-                    self.num_worlds,
-                    self._layout,
-                    masses.nominal_com,
-                    wp.from_torch(masses.com_offset),
-                    self._model.body_com,
-                    self._now.joint_q,
-                    self._now.joint_qd,
-                )
+                shift = (self._layout, masses.nominal_com, wp.from_torch(masses.com_offset))
+                moved = (self._model.body_com, self._now.joint_q, self._now.joint_qd)
+                self._launch(kernels.move_center_of_mass, self.num_worlds, *shift, *moved)
                 newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
             if {"base_mass_offset", "link_mass_scale", "base_com_offset"} & set(rows):
                 masses.write(self._solver)

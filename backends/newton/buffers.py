@@ -1,4 +1,4 @@
-"""The memory that the Newton engine shares between torch and Warp: contacts, masses."""
+"""Memory that the Newton engine shares between torch and Warp: contacts, masses."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from .solvers import SolverAdapter
 
 
 def contact_structure(contacts: newton.Contacts, force: Any, shape_body: Any) -> Any:
-    """Newton's contacts, as the kernels see them."""
+    """Return Newton's contacts as a structure for kernels."""
     kind: Any = kernels.ContactArrays
     own = {"force": force, "shape_body": shape_body}
     return filled(kind, **{n: getattr(contacts, f"rigid_contact_{n}") for n in kind.vars if n not in own}, **own)
 
 
 class MassTensors:
-    """Views of a model's masses, inertias and friction, their nominal values and what randomization makes of them."""
+    """Views of a model's masses, inertias and friction, with their nominal and randomized values."""
 
     def __init__(self, world: WorldModel, worlds: int, device: torch.device) -> None:
         model, layout = world.model, world.layout

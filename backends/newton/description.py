@@ -1,4 +1,4 @@
-"""What the Newton engine says of its model."""
+"""Describe the model of the Newton engine."""
 
 from __future__ import annotations
 
@@ -11,10 +11,7 @@ from .model import WorldModel
 
 
 def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors, dry: np.ndarray) -> dict[str, list[float]]:
-    """The first world as ``PhysicsBackend.describe`` says, read from Newton's arrays.
-
-    ``dry`` is the dry friction in the motor kernel [N·m], (J,): that of solvers without one of their own.
-    """
+    """Return the first world in the terms of ``PhysicsBackend.describe``; ``dry`` is the motor kernel's dry friction [N·m], (J,)."""
     model, layout = world.model, world.layout
     dofs, bodies = layout.joint_v, layout.collision_bodies
 

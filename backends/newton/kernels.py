@@ -2,9 +2,8 @@
 # ruff: noqa: ANN201, UP018
 """Warp kernels around a Newton solver: motor law, latency, divergence, resets, terrain slots, pushes.
 
-They see Newton's own arrays only (joint coordinates, body poses and twists, contacts and contact forces), so that they
-serve every solver. Joints, bodies and shapes of all worlds lie one world after the other: entry ``world * per_world +
-local``.
+The kernels use Newton's own arrays only (joint coordinates, body poses and twists, contacts and contact forces) and so serve
+every solver. Joints, bodies and shapes of all worlds lie one world after the other: entry ``world * per_world + local``.
 
 Newton's conventions: quaternions xyzw; a free joint's velocity is that of the body's centre of mass and its angular
 velocity, both in the world frame; ``body_qd`` likewise. The contract's are wxyz, the base's origin and the body frame.
@@ -19,12 +18,12 @@ from ..warp.state import POSITION_LIMIT, VELOCITY_LIMIT, StateArrays
 wp.set_module_options({"enable_backward": False})
 
 PARKED_HEIGHT = wp.constant(100.0)
-"""Where the base of a diverged world waits for its reset [m]."""
+"""Height of the base of a diverged world until its reset [m]."""
 
 
 @wp.struct
 class Layout:
-    """Where things are in a world's share of Newton's arrays."""
+    """Places of the robot's parts in a world's share of Newton's arrays."""
 
     coordinates: int
     dofs: int
@@ -37,9 +36,9 @@ class Layout:
     foot_center: wp.array[wp.vec3]
     """Centre of the foot sphere in the frame of its body [m]."""
     shape_foot: wp.array[int]
-    """Index of the foot that a shape is, -1 for others."""
+    """Index of a shape's foot, -1 for other shapes."""
     shape_body: wp.array[int]
-    """Index of the collision body that a shape belongs to, -1 for the ground and others."""
+    """Index of a shape's collision body, -1 for the ground and others."""
     shape_trunk: wp.array[int]
     """1 for the trunk's shapes."""
     shape_ground: wp.array[int]
@@ -59,7 +58,7 @@ class Palette:
 
 @wp.struct
 class ContactArrays:
-    """Newton's contacts of all worlds and the forces that the solver found for them."""
+    """Newton's contacts of all worlds with the solver's forces."""
 
     count: wp.array[int]
     shape0: wp.array[int]
@@ -76,7 +75,7 @@ class ContactArrays:
 
 @wp.func
 def root_rotation(joint_q: wp.array[float], start: int) -> wp.quat:
-    """Orientation of the base."""
+    """Return the orientation of the base."""
     q = wp.quat(joint_q[start + 3], joint_q[start + 4], joint_q[start + 5], joint_q[start + 6])
     return wp.normalize(q)
 
@@ -85,7 +84,7 @@ def root_rotation(joint_q: wp.array[float], start: int) -> wp.quat:
 def root_origin_velocity(
     layout: Layout, world: int, joint_q: wp.array[float], joint_qd: wp.array[float], com: wp.array[wp.vec3]
 ) -> wp.vec3:
-    """Velocity of the base's origin, world frame, from that of its centre of mass."""
+    """Return the velocity of the base's origin, world frame, from that of its centre of mass."""
     v = world * layout.dofs
     spin = wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
     arm = wp.quat_rotate(root_rotation(joint_q, world * layout.coordinates), com[world * layout.bodies + layout.base])
@@ -101,7 +100,7 @@ def park(
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
 ):
-    """Put a world that diverged into a state that harms nobody: at rest, high above the ground."""
+    """Put a diverged world at rest, high above the ground."""
     for i in range(layout.coordinates):
         joint_q[world * layout.coordinates + i] = 0.0
     joint_q[world * layout.coordinates + 2] = PARKED_HEIGHT
@@ -115,7 +114,7 @@ def park(
 
 @wp.func
 def state_is_valid(layout: Layout, world: int, joint_q: wp.array[float], joint_qd: wp.array[float]) -> bool:
-    """Whether all coordinates and velocities of a world are finite and of this world."""
+    """Return whether all coordinates and velocities of a world are finite and within the limits."""
     valid = bool(True)
     for i in range(layout.coordinates):
         if not (wp.abs(joint_q[world * layout.coordinates + i]) < POSITION_LIMIT):  # false for NaN, too
@@ -170,7 +169,7 @@ def copy_inactive(
     to_body_qd: wp.array[wp.spatial_vector],
     to_warm_start: wp.array2d[float],
 ):
-    """Copy what a step changes in the worlds that must not step: out of the way before it, and back after it."""
+    """Copy the state of the worlds that must not step, away before a step and back after it."""
     world, i = wp.tid()
     if active[world] != 0:
         return
@@ -200,9 +199,7 @@ def motor_law(
     joint_qd: wp.array[float],
     joint_f: wp.array[float],
 ):
-    """The motor law and, for solvers without it, the joints' dry friction [N·m] with its slope around zero speed
-    [N·m·s/rad].
-    """
+    """Apply the motor law and, for solvers without it, dry friction [N·m] with its slope around zero speed [N·m·s/rad]."""
     world, joint = wp.tid()
     dof = world * layout.dofs + layout.joint_v[joint]
     position = joint_q[world * layout.coordinates + layout.joint_q[joint]]
@@ -229,7 +226,7 @@ def end_substep(
     ticks: wp.array[int],
     state: StateArrays,
 ):
-    """Count the time, catch worlds whose state became invalid and park them, and watch the tilt of the others."""
+    """Count the time, park worlds with an invalid state, and watch the tilt of the others."""
     world = wp.tid()
     if active[world] == 0:
         return
@@ -372,7 +369,7 @@ def move_center_of_mass(
     joint_q: wp.array[float],
     joint_qd: wp.array[float],
 ):
-    """Shift the base's centre of mass; its velocity follows, so that the base itself goes on as it did."""
+    """Shift the base's centre of mass, and adapt its velocity so that the base's motion stays."""
     world = wp.tid()
     velocity = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
     center = nominal + wp.vec3(offset[world, 0], offset[world, 1], offset[world, 2])

@@ -1,7 +1,7 @@
-"""Builds Newton models from a scene, and checks what Newton's importer made of the robot's file.
+"""Build Newton models from a scene, and check Newton's import of the robot's file.
 
 Every world holds the robot, a floor, as many boxes as the palette's fullest terrain needs and one height field if any
-terrain has one. Which boxes lie where is a matter of poses and sizes, called slots, that a reset may change.
+terrain has one. Poses and sizes of boxes and field, called slots, make a terrain, and a reset may change them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..mujoco.model import robot_spec
 from ..mujoco_warp.model import PARKED, PARKED_SIZE, strip
 
 BIRTH_HEIGHT = 50.0
-"""Height of the base in a fresh model [m]: buffers are sized there, and no contact must be in the way."""
+"""Height of the base in a fresh model [m], without contacts while buffers are sized."""
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int32]
@@ -30,7 +30,7 @@ Integers = NDArray[np.int32]
 
 @dataclass(frozen=True, kw_only=True)
 class WorldLayout:
-    """Where things are in one world's share of Newton's arrays. J joints, F feet, S shapes, B bodies, K slots."""
+    """Places in one world's share of Newton's arrays. J joints, F feet, S shapes, B bodies, K slots."""
 
     coordinates: int
     dofs: int
@@ -48,19 +48,15 @@ class WorldLayout:
     foot_center: Floats
     """Foot centres in their bodies' frames [m], (F, 3)."""
     shape_foot: Integers
-    """(S,)."""
     shape_body: Integers
-    """(S,)."""
     shape_trunk: Integers
-    """(S,)."""
     shape_ground: Integers
-    """(S,)."""
     shape_slot: Integers
-    """(S,)."""
+    """Roles of the shapes as in ``kernels.Layout``, (S,) each."""
     slot_shape: Integers
     """Shape of each slot: boxes, then the height field if there is one, (K,)."""
     spare_fields: Integers
-    """Shapes that only carry height fields of the palette into the model, where there are fewer worlds than fields."""
+    """Shapes that only carry further height fields into the model, where the palette has more fields than worlds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,22 +77,22 @@ class SlotTables:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModel:
-    """The Newton model of all worlds and what is known about it."""
+    """The Newton model of all worlds with its layout."""
 
     model: Any
     """A ``newton.Model``; Newton declares every one of its arrays as optional."""
     layout: WorldLayout
     slots: SlotTables
     reference: mujoco.MjModel
-    """The robot as MuJoCo's compiler understands it."""
+    """The robot as compiled by MuJoCo."""
 
 
 def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> WorldModel:
     """Build the model of all worlds.
 
     Args:
-        gap: distance at which contacts are looked for [m], for each shape.
-        skin: whether the robot file's contact margins are kept; they thicken the shapes of solvers with hard contacts.
+        gap: distance of each shape within which Newton looks for contacts [m].
+        skin: keep the robot file's contact margins, which thicken the shapes of solvers with hard contacts.
 
     Raises:
         BackendError: the robot is no tree of hinges on a free base, or Newton cannot import it.
@@ -105,13 +101,12 @@ def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> W
     world = newton.ModelBuilder()
     world.rigid_gap = gap
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what the importer leaves out is checked below, field by field
+        warnings.simplefilter("ignore")  # the import is checked below, field by field
         try:
             world.add_mjcf(source, parse_visuals=False, parse_sites=False, parse_mujoco_options=False)
         except (ValueError, RuntimeError, NotImplementedError) as error:
-            raise BackendError(
-                f"Newton cannot import robot '{scene.robot.name}' ({scene.robot.mjcf.name}): {error}"
-            ) from error
+            robot = f"robot '{scene.robot.name}' ({scene.robot.mjcf.name})"
+            raise BackendError(f"Newton cannot import {robot}: {error}") from error
     _repair_import(world, reference, scene, gap=gap, skin=skin)
     robot_shapes = len(world.shape_type)
     slots = _slot_tables(scene.terrains)
@@ -128,7 +123,7 @@ def build_world_model(scene: Scene, *, device: str, gap: float, skin: bool) -> W
 
 
 def _compiled_robot(scene: Scene) -> tuple[mujoco.MjModel, str]:
-    """The robot with the scene's constants, less motors, sensors and what is only seen: compiled, and as MJCF text."""
+    """Return the robot with the scene's constants, without motors, sensors and visual geoms, compiled and as MJCF text."""
     spec = robot_spec(scene)
     strip(spec)
     for key in list(spec.keys):
@@ -141,7 +136,7 @@ def _compiled_robot(scene: Scene) -> tuple[mujoco.MjModel, str]:
 
 
 def _weigh_what_is_seen(spec: mujoco.MjSpec) -> None:
-    """Write down what the bodies weigh where geoms that are only seen are part of it, and delete these, which Newton does not import."""
+    """Make inertias explicit where visual geoms contribute, and delete those geoms, which Newton does not import."""
     seen = [geom for geom in spec.geoms if not (geom.contype or geom.conaffinity)]
     if not seen:
         return
@@ -158,16 +153,16 @@ def _weigh_what_is_seen(spec: mujoco.MjSpec) -> None:
 
 
 def _leaf(label: str) -> str:
-    """Name of a body, joint or shape: Newton's labels are paths."""
+    """Return the name of a body, joint or shape: Newton's labels are paths."""
     return label.rpartition("/")[2]
 
 
 def _repair_import(
     world: newton.ModelBuilder, reference: mujoco.MjModel, scene: Scene, *, gap: float, skin: bool
 ) -> None:
-    """Give the imported robot MuJoCo's values wherever Newton has a place for them, in full precision.
+    """Give the imported robot MuJoCo's values in full precision, wherever Newton has a field for them.
 
-    Newton reads the file itself: six digits of it, its own defaults for what is not written, its own margins and gaps.
+    Newton's importer reads six digits and has its own defaults, margins and gaps.
     """
     robot = scene.robot
     bodies = [_leaf(label) for label in world.body_label]
@@ -195,12 +190,11 @@ def _repair_import(
         dof, start = int(joint.dofadr[0]), world.joint_qd_start[i]
         world.joint_armature[start] = float(reference.dof_armature[dof])
         world.joint_friction[start] = float(reference.dof_frictionloss[dof])
-        world.joint_damping[start] = float(
-            reference.dof_damping[dof, 0] if reference.dof_damping.ndim > 1 else reference.dof_damping[dof]
-        )
+        damping = reference.dof_damping[dof]
+        world.joint_damping[start] = float(damping[0] if damping.ndim else damping)
         if joint.limited[0]:
             world.joint_limit_lower[start], world.joint_limit_upper[start] = map(float, joint.range)
-        # the motors are ours: no drive of Newton's, no effort limit
+        # kernels compute the motors' torques: no drive of Newton's, no effort limit
         world.joint_target_ke[start] = world.joint_target_kd[start] = 0.0
         world.joint_target_mode[start] = int(newton.JointTargetMode.EFFORT)
         world.joint_effort_limit[start] = 1e6
@@ -215,23 +209,22 @@ def _repair_import(
 
 
 def _xyzw(quaternion: NDArray) -> wp.quat:
-    """Warp's quaternion of a MuJoCo one."""
+    """Return Warp's quaternion of a MuJoCo one."""
     w, x, y, z = (float(v) for v in quaternion)
     return wp.quat(x, y, z, w)
 
 
 def _joint(world: newton.ModelBuilder, name: str, robot: str) -> int:
-    """Index of a joint."""
+    """Return the index of a joint."""
     found = [i for i, label in enumerate(world.joint_label) if _leaf(label) == name]
     if not found:
-        raise BackendError(
-            f"joint '{name}' of robot '{robot}' is not in its model file; correct joint_names in robot.toml"
-        )
+        missing = f"joint '{name}' of robot '{robot}' is not in its model file"
+        raise BackendError(f"{missing}; correct joint_names in robot.toml")
     return found[0]
 
 
 def _slot_tables(terrains: tuple[Terrain, ...]) -> SlotTables:
-    """Slot poses and sizes of every terrain."""
+    """Return slot poses and sizes of every terrain."""
     boxes = max((len(t.boxes) for t in terrains), default=0)
     fields = tuple(t.height_field for t in terrains if t.height_field is not None)
     count, slots = len(terrains), boxes + bool(fields)
@@ -256,14 +249,14 @@ def _slot_tables(terrains: tuple[Terrain, ...]) -> SlotTables:
 def _add_ground(
     world: newton.ModelBuilder, slots: SlotTables, scene: Scene, *, gap: float
 ) -> tuple[list[int], list[int]]:
-    """Add floor, box slots and height field; returns the shapes of the slots and the spare fields."""
+    """Add floor, box slots and height field; return the shapes of the slots and the spare fields."""
     material = newton.ModelBuilder.ShapeConfig(
         mu=1.0,
         mu_torsional=0.005,
         mu_rolling=0.0001,
         gap=gap,
         margin=0.0,
-        # of its own and negative: meets all but itself, which leaves the solver's 32 masks to pairs of the robot's shapes
+        # a negative group meets all but itself, which leaves the solver's 32 masks to pairs of the robot's shapes
         collision_group=min(0, *world.shape_collision_group) - 1,
     )
     world.add_ground_plane(cfg=material)
@@ -283,10 +276,10 @@ def _add_ground(
 
 
 def _newton_field(field: HeightField) -> newton.Heightfield:
-    """A height field in Newton's terms: rows run along +y and columns along +x in both."""
+    """Return a height field in Newton's terms; rows run along +y and columns along +x in both."""
     heights = np.asarray(field.heights, dtype=np.float64)
     low, high = float(heights.min()), float(heights.max())
-    # a level field has no extent that its heights could be a share of
+    # a level field needs an extent, because heights are shares of it
     return newton.Heightfield(
         data=heights,
         nrow=heights.shape[0],
@@ -299,9 +292,9 @@ def _newton_field(field: HeightField) -> newton.Heightfield:
 
 
 def _distribute_fields(everything: newton.ModelBuilder, layout: WorldLayout, slots: SlotTables, scene: Scene) -> None:
-    """Let the worlds' field shapes carry all fields of the palette into the model; which acts where is written later.
+    """Let the worlds' field shapes carry all fields of the palette into the model; resets assign them to worlds.
 
-    Newton copies a shape's field for every shape that bears it, so all but the carriers get a tiny one.
+    Newton copies the field of every shape, so all shapes but the carriers get a tiny field.
     """
     if not slots.fields:
         return
@@ -313,12 +306,12 @@ def _distribute_fields(everything: newton.ModelBuilder, layout: WorldLayout, slo
     for i, shape in enumerate(carriers(layout, slots, scene.num_worlds)):
         field = slots.fields[i]
         everything.shape_source[shape] = _newton_field(field)
-        # the solid below reaches down from the lowest node there, from height 0 here
+        # Newton measures the solid's depth from the lowest node, ``HeightField`` from height 0
         base[shape] = field.base + float(np.min(field.heights))
 
 
 def carriers(layout: WorldLayout, slots: SlotTables, worlds: int) -> list[int]:
-    """The shape of the model that carries each height field of the palette."""
+    """Return the model's shape that carries each height field of the palette."""
     shapes = (int(layout.slot_shape[-1]), *map(int, layout.spare_fields))
     return [(i % worlds) * layout.shapes + shapes[i // worlds] for i in range(len(slots.fields))]
 
@@ -342,9 +335,8 @@ def _layout(
     ):
         missing = [name for name in names if name not in known]
         if missing:
-            raise BackendError(
-                f"{what} '{missing[0]}' of robot '{robot.name}' is not in {robot.mjcf.name}; correct robot.toml"
-            )
+            lost = f"{what} '{missing[0]}' of robot '{robot.name}' is not in {robot.mjcf.name}"
+            raise BackendError(f"{lost}; correct robot.toml")
     if bodies[robot.base_body] != 0:
         raise BackendError(f"body '{robot.base_body}' of robot '{robot.name}' must carry the free joint and come first")
     joints = [_joint(world, name, robot.name) for name in robot.joint_names]

@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def world_point(contacts: ContactArrays, shape: int, point: wp.vec3, body_q: wp.array[wp.transform]) -> wp.vec3:
-    """A contact point in the world frame."""
+    """Return a contact point in the world frame."""
     body = contacts.shape_body[shape]
     if body < 0:
         return point
@@ -32,7 +32,7 @@ def watch_penetration(
     body_q: wp.array[wp.transform],
     state: StateArrays,
 ):
-    """Record the substep in which a part of the robot is deeper than ``depth`` in a terrain box or height field."""
+    """Record the first substep with a part of the robot deeper than ``depth`` in a terrain box or height field."""
     c = wp.tid()
     if c >= contacts.count[0]:
         return
@@ -67,7 +67,7 @@ def read_base_and_joints(
     live: StateArrays,
     out: StateArrays,
 ):
-    """Base and joints of the worlds whose ``select`` equals ``value``, and the flags of the live state."""
+    """Read base and joints of the worlds with ``select == value``, and the flags of the live state."""
     world, joint = wp.tid()
     if select[world] != value:
         return
@@ -100,7 +100,7 @@ def read_feet(
     body_com: wp.array[wp.vec3],
     out: StateArrays,
 ):
-    """Positions and velocities of the feet."""
+    """Read positions and velocities of the feet."""
     world, foot = wp.tid()
     if select[world] != value:
         return
@@ -124,8 +124,8 @@ def add_contacts(
 ):
     """Add each ground contact's force to its foot, body and world.
 
-    ``body_q`` are the poses in which the contacts were found. Moments and the centre are summed about the base in
-    these poses, near the contacts, to keep single precision; ``finish_contacts`` moves them.
+    ``body_q`` are the poses of the collision detection. Moments and the centre are summed about the base in these poses, near
+    the contacts, for precision; ``finish_contacts`` moves the sums.
     """
     c = wp.tid()
     if c >= wp.min(contacts.count[0], contacts.normal.shape[0]):

@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # ruff: noqa: ANN201
-"""Warp kernels that know the inside of one Newton solver."""
+"""Warp kernels for the internals of single Newton solvers."""
 
 # Warp reads the annotations of kernels: no ``from __future__ import annotations`` here.
 import warp as wp
@@ -49,7 +49,7 @@ def place_newton_field(
     upper: wp.array[wp.vec3],
     radius: wp.array[float],
 ):
-    """Let each world's height-field shape bear the field of the world's terrain."""
+    """Give each world's height-field shape the field of the world's terrain."""
     world = wp.tid()
     field = terrain[world]
     at = world * shapes + shape

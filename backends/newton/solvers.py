@@ -1,7 +1,7 @@
-"""The Newton solvers that this project runs, each behind the same few calls.
+"""Adapters of the Newton solvers that this project runs, with one small interface.
 
-A solver is added by measuring that it holds and walks the robot, saying in ``capabilities`` what it cannot do, and
-naming it in ``SOLVERS``. What was measured on those that are not here is told in ``docs/newton.md``.
+To add a solver, measure that the robot stands and walks in it, declare its limits in ``capabilities``, and add it to ``SOLVERS``.
+``docs/newton.md`` holds measurements of other solvers.
 """
 
 from __future__ import annotations
@@ -29,8 +29,12 @@ from .model import WorldModel, carriers
 _EXACT = Capability(support=Support.EXACT)
 
 
+def _roughly(note: str) -> Capability:
+    return Capability(support=Support.APPROXIMATE, note=note)
+
+
 def _declare(**others: Capability) -> dict[str, Capability]:
-    """Everything exact but what is named."""
+    """Return exact capabilities, except the named ones."""
     return {name: others.get(name, _EXACT) for name in CAPABILITY_NAMES}
 
 
@@ -41,17 +45,17 @@ class SolverAdapter(ABC):
     """Name after the colon in ``newton:NAME``."""
     capabilities: ClassVar[Mapping[str, Capability]]
     gap: ClassVar[float]
-    """Distance at which the solver wants to hear of contacts, for each of the two shapes [m]."""
+    """Distance within which the solver needs contacts, for each of the two shapes [m]."""
     skin: ClassVar[bool]
-    """Whether the robot file's contact margins mean to this solver what they mean to MuJoCo."""
+    """True where the robot file's contact margins have MuJoCo's meaning in this solver."""
     own_dry_friction: ClassVar[bool]
-    """Whether the solver knows the joints' dry friction; else the motor kernel adds it."""
+    """True where the solver applies the joints' dry friction; else the motor kernel adds it."""
 
     warm_start: wp.array
-    """What the solver carries from step to step, (N, W); W is 1 and the entry unused where it carries nothing."""
+    """Data that the solver carries from step to step, (N, W); W is 1 and the entry unused for none."""
     solver: Any
     timestep: float
-    """Of a physics step [s]."""
+    """Length of a physics step [s]."""
     fields: _FieldGeom | _FieldShape | None
     """The height field of every world, None where no terrain has one."""
     contacts: newton.Contacts
@@ -59,11 +63,7 @@ class SolverAdapter(ABC):
 
     @classmethod
     def refuse(cls, scene: Scene) -> None:
-        """Raise ``BackendError`` where the scene asks for what the solver cannot do.
-
-        Raises:
-            BackendError: says what was asked for and what to change.
-        """
+        """Raise ``BackendError``, with the option to change, for a scene beyond the solver's capabilities."""
         physics = scene.physics
         for capability, asked, change in (
             ("height_field", any(t.height_field is not None for t in scene.terrains), "use terrains of boxes"),
@@ -86,7 +86,7 @@ class SolverAdapter(ABC):
         """Make the solver and its contact buffers."""
 
     def step(self, before: newton.State, after: newton.State, control: newton.Control, *, observe: bool) -> None:
-        """One physics step. ``observe``: the contact forces are wanted."""
+        """Take one physics step; ``observe``: compute contact forces."""
         wanted = self.observables if observe else None
         self.solver.step(before, after, control, self.contacts, self.timestep, observables=wanted)
 
@@ -99,18 +99,18 @@ class SolverAdapter(ABC):
         self.solver.reset(state, mask, flags=0)
 
     def shapes_changed(self, terrain: Any) -> None:
-        """Take over poses, sizes and friction of the model's shapes; ``terrain`` is each world's, (N,)."""
+        """Pass poses, sizes and friction of the model's shapes to the solver; ``terrain`` is each world's, (N,)."""
         self.solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
         if self.fields is not None:
             self.fields.place(terrain)
 
     def inertia_changed(self) -> None:
-        """Take over masses, inertias and centres of mass of the model's bodies."""
+        """Pass masses, inertias and centres of mass of the model's bodies to the solver."""
         self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
 
 def _contacts_per_world(scene: Scene, world: WorldModel) -> int:
-    """Contact capacity of a world."""
+    """Return the contact capacity of a world."""
     return contacts_per_world(scene.physics, boxes=len(world.layout.slot_shape) > 0, fields=bool(world.slots.fields))
 
 
@@ -119,10 +119,9 @@ class MujocoAdapter(SolverAdapter):
 
     name = "mujoco"
     capabilities = _declare(
-        deterministic=Capability(
-            support=Support.APPROXIMATE,
-            note="to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces",
-        ),
+        deterministic=_roughly(
+            "to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces"
+        )
     )
     gap = 0.0
     skin = True
@@ -142,7 +141,7 @@ class MujocoAdapter(SolverAdapter):
         contacts, reference = _contacts_per_world(scene, world), world.reference
         feet = [reference.geom(name).id for name in scene.robot.foot_geoms]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the margins that it complains about are repaired below
+            warnings.simplefilter("ignore")  # the margins of the warning are repaired below
             try:
                 self.solver = newton.solvers.SolverMuJoCo(
                     model,
@@ -166,7 +165,7 @@ class MujocoAdapter(SolverAdapter):
         self.timestep = physics.timestep
         self._data, self._model = self.solver.mjw_data, self.solver.mjw_model
         if physics.deterministic:
-            # mujoco_warp's own mode; Newton's switch for it asks Warp for one in which Newton's kernels do not compile
+            # mujoco_warp's own mode; Newton's switch asks Warp for a mode in which Newton's kernels do not compile
             self._model.opt.deterministic = int(mujoco_warp.DeterminismType.ATOMICS)
         self._model.opt.warn_overflow = 0  # alarms are reported per world, not printed by the device
         self._check_import(world, scene)
@@ -183,7 +182,7 @@ class MujocoAdapter(SolverAdapter):
         self.observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
 
     def _check_import(self, world: WorldModel, scene: Scene) -> None:
-        """Refuse a robot of which Newton's importer made something else than MuJoCo's compiler."""
+        """Refuse a robot that Newton imports unlike MuJoCo."""
         shape_geom = {int(s): g for g, s in enumerate(_geom_shapes(self.solver)[0])}
         order = np.array([shape_geom[s] for s in range(world.reference.ngeom)])
         wrong = import_differences(self.solver.mj_model, world.reference, order)
@@ -195,27 +194,23 @@ class MujocoAdapter(SolverAdapter):
 
     def collect_overflow(self, active: Any, overflowed: Any) -> None:
         """See ``SolverAdapter.collect_overflow``."""
-        wp.launch(
-            kernels.collect_overflow_bits,
-            dim=active.shape[0],
-            inputs=[active, self._data.overflow, DROPPED, overflowed],
-            device=active.device,
-        )
+        inputs = [active, self._data.overflow, DROPPED, overflowed]
+        wp.launch(kernels.collect_overflow_bits, dim=active.shape[0], inputs=inputs, device=active.device)
 
     def shapes_changed(self, terrain: Any) -> None:
         """See ``SolverAdapter.shapes_changed``."""
         super().shapes_changed(terrain)
-        # Newton zeroes margins for fear of an old limit of mujoco_warp
+        # Newton zeroes margins because of an old limit of mujoco_warp
         wp.copy(self._model.geom_margin, self._margin)
 
 
 def _geom_shapes(solver: Any) -> np.ndarray:
-    """Newton's shape of each MuJoCo geom in every world, (N, G)."""
+    """Return Newton's shape of each MuJoCo geom in every world, (N, G)."""
     return solver.mjc_geom_to_newton_shape.numpy()
 
 
 class _FieldGeom:
-    """The height-field geom of Newton's MuJoCo solver, whose field differs between worlds."""
+    """The height-field geom of Newton's MuJoCo solver, with a field for each world."""
 
     def __init__(self, solver: Any, world: WorldModel, scene: Scene) -> None:
         self._solver, slots, layout = solver, world.slots, world.layout
@@ -234,9 +229,8 @@ class _FieldGeom:
         half = np.array([f.half_size for f in slots.fields])[slots.field]
         position = slots.pose[:, -1, :3].copy()
         position[:, 2] += np.where(present, low, 0.0)
-        box = np.stack(
-            [np.c_[np.zeros((len(present), 2)), 0.5 * (top - base)], np.c_[half, 0.5 * (top + base)]], axis=1
-        )
+        middle = np.c_[np.zeros((len(present), 2)), 0.5 * (top - base)]
+        box = np.stack([middle, np.c_[half, 0.5 * (top + base)]], axis=1)
         radius = np.sqrt((half**2).sum(1) + np.maximum(top, base) ** 2)
         self._asset: wp.array = wp.array(asset[slots.field], dtype=int, device=device)
         self._position: wp.array = wp.array(position, dtype=wp.vec3, device=device)
@@ -256,17 +250,16 @@ class _FieldGeom:
 
 
 class _FieldShape:
-    """The height-field shape of Newton's own collision pipeline, whose field differs between worlds."""
+    """The height-field shape of Newton's own collision pipeline, with a field for each world."""
 
     def __init__(self, world: WorldModel, scene: Scene) -> None:
         model, layout, slots = world.model, world.layout, world.slots
         self._model, self._shapes, self._shape = model, layout.shapes, int(layout.slot_shape[-1])
         shapes = np.array(carriers(layout, slots, scene.num_worlds))[slots.field]
         half = np.array([f.half_size for f in slots.fields])[slots.field]
-        low, top = (
-            np.array([float(limit(f.heights)) for f in slots.fields])[slots.field] for limit in (np.min, np.max)
-        )
-        # replicated shapes share the bounds of the first, whatever field they bear
+        limits = [[float(limit(f.heights)) for f in slots.fields] for limit in (np.min, np.max)]
+        low, top = (np.array(values)[slots.field] for values in limits)
+        # replicated shapes share the bounds of the first, whatever their field
         lower, upper = np.c_[-half, low], np.c_[half, top]
         radius = np.linalg.norm(np.maximum(np.abs(lower), np.abs(upper)), axis=1)
         device = model.device
@@ -301,24 +294,13 @@ class SteelAdapter(SolverAdapter):
 
     name = "steel"
     capabilities = _declare(
-        joint_friction=Capability(
-            support=Support.APPROXIMATE,
-            note="an explicit torque that changes sign over a small speed: a joint at rest creeps",
-        ),
-        elliptic_cone=Capability(
-            support=Support.APPROXIMATE,
-            note="friction is the exact cone of a hard contact; impratio has no meaning here",
-        ),
+        joint_friction=_roughly("an explicit torque that changes sign over a small speed: a joint at rest creeps"),
+        elliptic_cone=_roughly("friction is the exact cone of a hard contact; impratio has no meaning here"),
         foot_condim_6=Capability(
             support=Support.NONE, note="contacts slide, they have no torsional or rolling friction"
         ),
-        contact_forces=Capability(
-            support=Support.APPROXIMATE, note="impulses of hard contacts divided by the timestep, without moments"
-        ),
-        deterministic=Capability(
-            support=Support.APPROXIMATE,
-            note="to the last bit on a CPU; on a GPU by Newton's mode, but for sums of contact forces",
-        ),
+        contact_forces=_roughly("impulses of hard contacts divided by the timestep, without moments"),
+        deterministic=_roughly("to the last bit on a CPU; on a GPU by Newton's mode, but for sums of contact forces"),
     )
     gap = 0.01
     skin = False
@@ -334,16 +316,14 @@ class SteelAdapter(SolverAdapter):
         """See ``SolverAdapter.refuse``; a pyramidal cone is refused too."""
         super().refuse(scene)
         if scene.physics.cone != "elliptic":
-            raise BackendError(
-                "Newton's steel solver has no pyramidal friction cone, its contacts slide on a true cone; "
-                "use PhysicsOptions(cone='elliptic')"
-            )
+            lacks = "Newton's steel solver has no pyramidal friction cone, its contacts slide on a true cone"
+            raise BackendError(f"{lacks}; use PhysicsOptions(cone='elliptic')")
 
     def __init__(self, world: WorldModel, scene: Scene) -> None:
         physics, model = scene.physics, world.model
         contacts = _contacts_per_world(scene, world)
         self.timestep = physics.timestep
-        # one coefficient acts, and the mean of two equal ones is it: the feet's, until it is randomized
+        # the solver takes the mean of two coefficients; all shapes get the feet's until the first randomization
         feet = float(np.mean([world.reference.geom(name).friction[0] for name in scene.robot.foot_geoms]))
         model.shape_material_mu.fill_(feet)
         with warnings.catch_warnings():
@@ -353,7 +333,7 @@ class SteelAdapter(SolverAdapter):
                 iterations=physics.iterations,
                 enable_joint_limits=True,
                 joint_limit_activation_gap=0.1,
-                # point friction and no warm start: nothing is carried over, so that resets and masks leave no trace
+                # point friction and no warm start carry nothing over, so that resets and masks leave no trace
                 friction_anchor_beta=0.0,
                 contact_warmstart=False,
                 enable_restitution=False,
@@ -377,12 +357,8 @@ class SteelAdapter(SolverAdapter):
 
     def collect_overflow(self, active: Any, overflowed: Any) -> None:
         """See ``SolverAdapter.collect_overflow``."""
-        wp.launch(
-            kernels.collect_overflow_flags,
-            dim=active.shape[0],
-            inputs=[active, self.solver.constraint_overflow, overflowed],
-            device=active.device,
-        )
+        inputs = [active, self.solver.constraint_overflow, overflowed]
+        wp.launch(kernels.collect_overflow_flags, dim=active.shape[0], inputs=inputs, device=active.device)
 
 
 SOLVERS: Mapping[str, type[SolverAdapter]] = {each.name: each for each in (MujocoAdapter, SteelAdapter)}
@@ -390,7 +366,7 @@ SOLVERS: Mapping[str, type[SolverAdapter]] = {each.name: each for each in (Mujoc
 
 
 def dry_friction_slope(reference: mujoco.MjModel, dofs: np.ndarray, timestep: float) -> np.ndarray:
-    """Steepest slope of an explicit dry-friction torque around zero speed that does not overshoot [N·m·s/rad], (J,).
+    """Return the steepest slope of an explicit dry-friction torque around zero speed without overshoot [N·m·s/rad], (J,).
 
     A slope of half the joint's own inertia per step keeps even three coupled joints of a leg stable.
 

@@ -57,7 +57,7 @@ class RowFields:
 
 
 def _with_spare(kind: type, source: object) -> tuple:
-    """A structure over the source's arrays, and one over other memory of that size."""
+    """Return a structure over the source's arrays, and one over other memory of that size."""
     return filled(kind, source), filled(kind, **{name: wp.empty_like(getattr(source, name)) for name in kind.vars})
 
 
@@ -98,7 +98,7 @@ class CanonicalOrder:
 def contact_keys(
     count: wp.array[int], geoms: int, contacts: ContactFields, keys: wp.array[wp.int64], order: wp.array[int]
 ) -> None:
-    """A number for each contact that depends on what touches what, and on nothing else."""
+    """Number each contact by its world and geoms alone."""
     contact = wp.tid()
     order[contact] = contact
     key = _LAST
@@ -139,7 +139,7 @@ def move_contacts(
 
 @wp.func
 def row_key(row: int, equality: int, friction: int, limit: int, id: int) -> wp.int64:
-    """Kind of the row first, then the joint or contact that it belongs to."""
+    """Return a row's key: its kind first, then its joint or contact."""
     kind = wp.int64(3)
     if row < equality:
         kind = wp.int64(0)
@@ -160,7 +160,7 @@ def order_rows(
     id: wp.array2d[int],
     order: wp.array2d[int],
 ) -> None:
-    """Insertion sort of a world's rows: stable, so a contact's rows keep their order; quick where little is amiss."""
+    """Sort a world's rows by insertion: stable, so that a contact's rows keep their order; quick for nearly sorted rows."""
     world = wp.tid()
     e, f, j = equality[world], friction[world], limit[world]
     for row in range(wp.min(count[world], capacity)):

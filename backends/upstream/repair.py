@@ -1,4 +1,4 @@
-"""Say what a repair is for, and install it once."""
+"""Declare a repair, and install it once."""
 
 from __future__ import annotations
 
@@ -20,16 +20,12 @@ class Repair:
     versions: str
     """Versions that the repair was written for."""
     fault: str
-    """What is wrong or slow there, the object of a sentence."""
+    """The fault or slowness there, the object of a sentence."""
     install: Callable[[], None]
-    """Replace the functions; idempotent."""
+    """Function that replaces the functions; idempotent."""
 
     def apply(self) -> None:
-        """Install the repair in this process; before the first kernel of the project is built.
-
-        Raises:
-            BackendError: another version is installed.
-        """
+        """Install the repair before the project's first kernel is built; raise ``BackendError`` for another version."""
         found = version(self.project)
         if found not in SpecifierSet(self.versions, prereleases=True):
             raise BackendError(

@@ -1,1 +1,1 @@
-"""What the engines that run on Warp share."""
+"""The common parts of the engines on Warp."""

@@ -1,8 +1,7 @@
-"""What the engines on Warp do alike: buffers that torch writes and kernels read, masks, targets, graphs.
+"""The common part of the engines on Warp: buffers that torch writes and kernels read, masks, targets, graphs.
 
-On a GPU a control period is one CUDA graph, and no call waits for the device. Inputs are copied into fixed buffers, from
-which kernels read; the tensors of ``state`` and ``sample`` are those kernels' outputs. On the CPU the same kernels run one
-by one: right, but slow.
+On a GPU a control period is one CUDA graph, and no call waits for the device. Inputs are copied into fixed buffers for the
+kernels; the tensors of ``state`` and ``sample`` are the kernels' outputs. On the CPU the same kernels run one by one, slowly.
 """
 
 from __future__ import annotations
@@ -28,25 +27,20 @@ class WarpBackend(PhysicsBackend):
     """N worlds on Warp. An engine adds its model and kernels."""
 
     always_masked: ClassVar[bool] = False
-    """Whether worlds that must not step are put aside in every control period, so that one graph serves all masks."""
+    """True where every control period puts aside worlds that must not step, so that one graph serves all masks."""
 
     def _open(self, scene: Scene, device: str) -> None:
-        """Find the device, or raise ``BackendError``; nothing is built yet."""
+        """Find the device, or raise ``BackendError``, before anything is built."""
         self.scene, self.device, self.dtype = scene, find_device(device, self.name), torch.float32
         self._scope = DeviceScope(self.device)
         self._graphs: dict[tuple[int, bool, bool], wp.Graph] = {}
 
     def _allocate(self) -> None:
-        """Make what torch and kernels share, on the present device."""
+        """Allocate the memory that torch and kernels share, on the present device."""
         scene, robot, n = self.scene, self.scene.robot, self.scene.num_worlds
-        self._joints, self._feet, self._bodies = (
-            robot.num_joints,
-            len(robot.foot_names),
-            len(robot.collision_bodies),
-        )
-        allocate = partial(
-            allocate_state, n, joints=self._joints, feet=self._feet, bodies=self._bodies, device=self.device
-        )
+        self._joints, self._feet, self._bodies = robot.num_joints, len(robot.foot_names), len(robot.collision_bodies)
+        sizes = {"joints": self._joints, "feet": self._feet, "bodies": self._bodies}
+        allocate = partial(allocate_state, n, **sizes, device=self.device)
         self._state, self._live = allocate()
         self._sample, self._sampled = allocate()
         self._motors = MotorTensors(scene, self.device)
@@ -58,13 +52,12 @@ class WarpBackend(PhysicsBackend):
         self._default_joints = torch.tensor(robot.default_joint_position, dtype=torch.float32, device=self.device)
         tilt = scene.physics.watch_tilt
         self._upright_limit = -2.0 if tilt is None else math.cos(min(tilt, math.pi))
-        # the buffers once more, as the kernels see them
+        # the same buffers as Warp arrays for the kernels
         self._active_array, self._sample_array = wp.from_torch(self._active), wp.from_torch(self._sample_at)
         self._request_array, self._terrain_array = wp.from_torch(self._has_request), wp.from_torch(self._terrain)
         self._new_terrain_array, self._twist_array = wp.from_torch(self._new_terrain), wp.from_torch(self._twist)
-        self._reset_arrays = [
-            wp.from_torch(t) for t in (self._pose, self._twist, self._new_position, self._new_velocity)
-        ]
+        start = (self._pose, self._twist, self._new_position, self._new_velocity)
+        self._reset_arrays = [wp.from_torch(tensor) for tensor in start]
 
     def _floats(self, *shape: int) -> torch.Tensor:
         return torch.zeros(shape, dtype=torch.float32, device=self.device)
@@ -73,7 +66,7 @@ class WarpBackend(PhysicsBackend):
         return torch.zeros(shape, dtype=torch.int32, device=self.device)
 
     def _reset_to_default(self, height: float) -> None:
-        """Every world at its first terrain's origin in the default pose."""
+        """Put every world at its first terrain's origin in the default pose."""
         position, quaternion = self._floats(self.num_worlds, 3), self._floats(self.num_worlds, 4)
         position[:, 2], quaternion[:, 0] = height, 1.0
         terrain = torch.tensor(self.scene.terrain_index, device=self.device)
@@ -83,40 +76,34 @@ class WarpBackend(PhysicsBackend):
 
     @abstractmethod
     def _control_period(self, total: int, *, masked: bool, sampled: bool) -> None:
-        """Launch everything that happens between two targets.
-
-        Args:
-            total: number of substeps.
-            masked: whether some worlds may have to stay as they are.
-            sampled: whether ``_sample_at`` asks for samples.
-        """
+        """Launch the ``total`` substeps between two targets; ``masked``: some worlds may stay; ``sampled``: fill the sample."""
 
     @abstractmethod
     def _place_terrain(self) -> None:
-        """Launch what gives the active worlds the terrains in ``_new_terrain``."""
+        """Launch the kernels that give the active worlds the terrains in ``_new_terrain``."""
 
     @abstractmethod
     def _place_robots(self) -> None:
-        """Launch what puts the active worlds into the states in the buffers."""
+        """Launch the kernels that put the active worlds into the states in the buffers."""
 
     @abstractmethod
     def _push_base(self) -> None:
-        """Launch what gives the active worlds' bases the velocities in ``_twist``."""
+        """Launch the kernels that give the active worlds' bases the velocities in ``_twist``."""
 
     # ---- the contract -----------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> PhysicsState:
-        """State after the last call; the tensors change with the next one."""
+        """Return the state after the last call; the tensors change with the next call."""
         return self._state
 
     @property
     def sample(self) -> PhysicsState:
-        """Snapshot taken by the last ``step(sample_at=…)``."""
+        """Return the snapshot of the last ``step(sample_at=…)``."""
         return self._sample
 
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
-        """See ``PhysicsBackend.reset``. On a GPU, where looking at terrains would mean to wait, the kernel clamps them."""
+        """See ``PhysicsBackend.reset``. On a GPU the kernel clamps terrains, because a check would wait for the device."""
         check_start(self.scene, start, worlds)
         self._select(worlds)
         self._fill(self._pose[:, 0:3], start.base_position)
@@ -145,9 +132,7 @@ class WarpBackend(PhysicsBackend):
         substeps: int | None = None,
     ) -> None:
         """See ``PhysicsBackend.step``."""
-        total = check_step(
-            self.scene, joint_targets, delay=delay, sample_at=sample_at, worlds=worlds, substeps=substeps
-        )
+        total = check_step(self.scene, joint_targets, delay, sample_at, worlds, substeps)
         self._select(worlds)
         self._has_request.fill_(int(joint_targets is not None))
         self._fill(self._motors.requested, joint_targets)
@@ -173,7 +158,7 @@ class WarpBackend(PhysicsBackend):
         angular_velocity_b: torch.Tensor | None = None,
     ) -> None:
         """See ``PhysicsBackend.push``."""
-        check_push(self.scene, worlds, linear_velocity_w=linear_velocity_w, angular_velocity_b=angular_velocity_b)
+        check_push(self.scene, worlds, linear_velocity_w, angular_velocity_b)
         self._select(worlds)
         self._fill(self._twist[:, 0:3], linear_velocity_w, math.nan)
         self._fill(self._twist[:, 3:6], angular_velocity_b, math.nan)
@@ -181,7 +166,7 @@ class WarpBackend(PhysicsBackend):
             self._push_base()
 
     def close(self) -> None:
-        """Drop the recorded graphs and the memory that they hold."""
+        """Free the recorded graphs with their memory."""
         self._graphs.clear()
 
     # ---- writing buffers --------------------------------------------------------------------------------------------
@@ -203,7 +188,7 @@ class WarpBackend(PhysicsBackend):
             buffer.fill_(source)
 
     def _changes(self, randomization: Randomization, worlds: torch.Tensor | None) -> dict[str, torch.Tensor]:
-        """The fields that change, each with a row for every world; what stands in rows outside of the mask is void.
+        """Return the fields that change, each with a row for every world; rows outside of the mask are void.
 
         The mask is written into ``_active``. A field may have a row for each masked world, or one for every world.
 
@@ -222,9 +207,8 @@ class WarpBackend(PhysicsBackend):
                 counted = worlds is not None and self.device.type == "cpu"  # counting would wait for a GPU
                 wanted = int(self._active.sum()) if counted else len(value) if worlds is not None else self.num_worlds
                 if len(value) != wanted or len(value) == 0:
-                    raise BackendError(
-                        f"Randomization.{item.name} has {len(value)} rows for {wanted} worlds; give one row for each"
-                    )
+                    count = f"{len(value)} rows for {wanted} worlds"
+                    raise BackendError(f"Randomization.{item.name} has {count}; give one row for each")
                 value = value[(torch.cumsum(self._active, 0) - 1).clamp(0, len(value) - 1)]
             rows[item.name] = value
         return rows
@@ -235,7 +219,7 @@ class WarpBackend(PhysicsBackend):
         target.copy_(torch.where(active, rows, target))
 
     def _write_motors(self, rows: dict[str, torch.Tensor]) -> None:
-        """Take over the changed constants of the motor law."""
+        """Write the changed constants of the motor law."""
         motors = self._motors
         for name, target, unit in (
             ("stiffness_scale", motors.stiffness, motors.nominal_stiffness),
@@ -250,11 +234,11 @@ class WarpBackend(PhysicsBackend):
     # ---- reading ------------------------------------------------------------------------------------------------------
 
     def _clear_forces(self, select: Any, value: int, out: StateArrays) -> None:
-        """Launch what zeroes the forces of the worlds whose ``select`` equals ``value``."""
+        """Launch the kernel that zeroes the forces of the worlds with ``select == value``."""
         sizes = [self._joints, self._feet, self._bodies]
         wp.launch(clear_forces, dim=self.num_worlds, inputs=[select, value, *sizes, out])
 
     def _read_torques(self, select: Any, value: int, out: StateArrays) -> None:
-        """Launch what reads their torques."""
+        """Launch the kernel that reads the torques of the worlds with ``select == value``."""
         dim: Any = (self.num_worlds, self._joints)
         wp.launch(read_torques, dim=dim, inputs=[select, value, self._motors.arrays, out])

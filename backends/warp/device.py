@@ -1,4 +1,4 @@
-"""Where Warp's launches go, and what to say where the device's memory is too small."""
+"""Direct Warp's launches to a device, and explain a lack of memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class DeviceScope:
     """Runs Warp's launches on a torch device, in order with torch's own work there."""
 
     def __init__(self, device: torch.device) -> None:
-        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # one line for each of its kernels otherwise
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # else Warp prints a line for each kernel
         wp.init()
         self.on_gpu = device.type == "cuda"
         self.warp_device = wp.device_from_torch(device)
@@ -22,7 +22,7 @@ class DeviceScope:
 
     @contextmanager
     def __call__(self) -> Iterator[None]:
-        """Inside, arrays and launches go to the device and to torch's current stream."""
+        """Direct arrays and launches inside the context to the device and to torch's current stream."""
         if not self.on_gpu:
             with wp.ScopedDevice(self.warp_device):
                 yield
@@ -31,14 +31,14 @@ class DeviceScope:
             yield
 
     def stream(self) -> wp.Stream:
-        """Torch's current stream as Warp's."""
+        """Return torch's current stream as a Warp stream."""
         stream = torch.cuda.current_stream(self._device)
         if stream.cuda_stream not in self._streams:
             self._streams[stream.cuda_stream] = wp.stream_from_torch(stream)
         return self._streams[stream.cuda_stream]
 
     def record(self, launches: Callable[[], None]) -> wp.Graph:
-        """Record launches, which do not happen meanwhile, as a CUDA graph. Their kernels must have run before."""
+        """Record launches as a CUDA graph without running them. Their kernels must have run before."""
         torch.cuda.synchronize(self._device)
         # torch's default stream cannot be recorded
         with wp.ScopedStream(wp.Stream(self.warp_device)), wp.ScopedCapture(force_module_load=False) as capture:
@@ -50,7 +50,7 @@ class DeviceScope:
         wp.capture_launch(graph, stream=self.stream())
 
     def free_bytes(self) -> int:
-        """Free memory of the device [bytes]; 0 on the CPU, where nobody asks."""
+        """Return the free memory of a GPU [bytes]; 0 on the CPU."""
         if not self.on_gpu:
             return 0
         torch.cuda.empty_cache()
@@ -58,13 +58,13 @@ class DeviceScope:
 
 
 def is_memory_error(error: BaseException) -> bool:
-    """Whether torch or Warp ran out of memory."""
+    """Return whether torch or Warp ran out of memory."""
     text = str(error).lower()
     return isinstance(error, torch.cuda.OutOfMemoryError) or "failed to allocate" in text or "out of memory" in text
 
 
 def memory_advice(worlds: int, device: torch.device, free: int, per_world: float) -> str:
-    """The sentence for a device that is too small, with the largest number of worlds that would fit."""
+    """Return the sentence for a lack of memory, with the largest number of worlds that would fit."""
     return (
         f"{worlds} worlds do not fit into the memory of {device}: about {int(free / per_world)} would "
         f"({per_world / 1e3:.0f} kB each, {free / 1e9:.1f} GB free); use fewer worlds, or fewer contacts "

@@ -28,10 +28,10 @@ class Motors:
     speed: wp.array2d[float]
     offset: wp.array2d[float]
     requested: wp.array2d[float]
-    """Targets handed to the present step or reset."""
+    """Targets of the present step or reset."""
     current: wp.array2d[float]
     previous: wp.array2d[float]
-    """Target that still acts while the delay lasts."""
+    """Target that acts during the delay."""
     limp: wp.array[int]
     limp_before: wp.array[int]
     delay: wp.array[int]
@@ -39,7 +39,7 @@ class Motors:
 
 
 class MotorTensors:
-    """The tensors of the motors; torch writes them, kernels read them in ``arrays``. N worlds, J joints."""
+    """Tensors of the motors for torch, and the same memory as ``arrays`` for kernels. N worlds, J joints."""
 
     def __init__(self, scene: Scene, device: torch.device) -> None:
         shape, limits = (scene.num_worlds, scene.robot.num_joints), MotorLimits.of(scene)
@@ -49,11 +49,10 @@ class MotorTensors:
             return torch.tensor(values, dtype=torch.float32, device=device)
 
         self.nominal_stiffness = tensor(scene.parameters.stiffness)
-        """Of the parameter set, (J,)."""
         self.nominal_damping = tensor(scene.parameters.damping)
-        """Of the parameter set, (J,)."""
+        """Damping and, above, stiffness of the parameter set, (J,)."""
         self.torque_limit = tensor(limits.torque)
-        """At rest, (J,)."""
+        """Torque limit at rest, (J,)."""
         self.stiffness = self.nominal_stiffness.repeat(shape[0], 1)
         self.damping = self.nominal_damping.repeat(shape[0], 1)
         self.strength = torch.ones(shape, dtype=torch.float32, device=device)
@@ -62,7 +61,7 @@ class MotorTensors:
         self.requested = torch.zeros(shape, dtype=torch.float32, device=device)
         """Targets of the present step or reset, (N, J)."""
         self.delay = torch.zeros(shape[0], dtype=torch.int32, device=device)
-        """Substeps for which the previous target still acts, (N,)."""
+        """Number of substeps of the previous target, (N,)."""
         self.arrays = arrays = Motors()
         for name in ("torque_limit", "stiffness", "damping", "strength", "speed", "offset", "requested", "delay"):
             setattr(arrays, name, wp.from_torch(getattr(self, name)))
@@ -83,7 +82,7 @@ def take_target(motors: Motors, world: int, joint: int, has_request: int):
 
 @wp.func
 def begin_world(motors: Motors, world: int, has_request: int, state: StateArrays):
-    """The same for what a world has once, and clear its watches."""
+    """Shift a world's limpness at the start of a control period, and clear its watches."""
     motors.limp_before[world] = motors.limp[world]
     if has_request != 0:
         motors.limp[world] = 0
@@ -104,7 +103,7 @@ def hold_target(motors: Motors, world: int, joint: int, has_held: int):
 
 @wp.func
 def reset_world(motors: Motors, world: int, has_held: int, state: StateArrays):
-    """The same for what a world has once, and clear its flags."""
+    """Reset a world's limpness, and clear its flags."""
     motors.limp[world] = 1 - has_held
     motors.limp_before[world] = 1 - has_held
     state.diverged[world] = False
@@ -115,9 +114,7 @@ def reset_world(motors: Motors, world: int, has_held: int, state: StateArrays):
 
 @wp.func
 def motor_torque(motors: Motors, world: int, joint: int, substep: int, position: float, velocity: float) -> float:
-    """The motor law with the target that acts in this substep (from 0); an invalid target or state gives NaN, which a
-    clamp would hide.
-    """
+    """Return the motor law's torque in a substep (from 0); NaN for an invalid target or state, which a clamp would hide."""
     target = motors.current[world, joint]
     limp = motors.limp[world]
     if substep < motors.delay[world]:
@@ -143,7 +140,7 @@ def motor_torque(motors: Motors, world: int, joint: int, substep: int, position:
 
 @wp.kernel
 def read_torques(select: wp.array[int], value: int, motors: Motors, out: StateArrays) -> None:
-    """Torques of the last substep in the worlds whose ``select`` equals ``value``; zero where the world diverged."""
+    """Read torques of the last substep in the worlds with ``select == value``; zero where the world diverged."""
     world, joint = wp.tid()
     if select[world] != value:
         return

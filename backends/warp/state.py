@@ -12,9 +12,9 @@ from ..base import PhysicsState
 wp.set_module_options({"enable_backward": False})
 
 POSITION_LIMIT = wp.constant(1.0e5)
-"""A position beyond this [m, rad] means that the world has diverged."""
+"""Largest position of a world that has not diverged [m, rad]."""
 VELOCITY_LIMIT = wp.constant(1.0e4)
-"""A velocity beyond this [m/s, rad/s] means that the world has diverged."""
+"""Largest velocity of a world that has not diverged [m/s, rad/s]."""
 
 
 @wp.struct
@@ -49,7 +49,7 @@ class StateArrays:
 def allocate_state(
     worlds: int, *, joints: int, feet: int, bodies: int, device: torch.device
 ) -> tuple[PhysicsState, StateArrays]:
-    """A state of zeros: its tensors, and the same memory for the kernels."""
+    """Return a state of zeros as tensors, and the same memory for the kernels."""
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("joint_position", "joint_velocity", "joint_torque"), (joints,))
     shapes |= dict.fromkeys(("foot_position_w", "foot_velocity_w", "foot_contact_force_w"), (feet, 3))
     shapes |= dict.fromkeys(("foot_normal_force", "foot_tangential_force"), (feet,))
@@ -81,7 +81,7 @@ def clear_parts(world: int, feet: int, bodies: int, out: StateArrays) -> None:
 
 @wp.kernel
 def clear_forces(select: wp.array[int], value: int, joints: int, feet: int, bodies: int, out: StateArrays) -> None:
-    """Zero all forces of the worlds whose ``select`` equals ``value``."""
+    """Zero all forces of the worlds with ``select == value``."""
     world = wp.tid()
     if select[world] != value:
         return

@@ -1,4 +1,4 @@
-"""Structures of arrays that kernels see, filled by the names of their fields."""
+"""Fill structures of arrays for kernels by the names of their fields."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ def to_warp(values: Any, dtype: type) -> Any:
 
 
 def filled(kind: Any, *sources: object, **values: Any) -> Any:
-    """A structure of Warp's with every field from ``values``, or from the first source that has something of that name.
+    """Fill a Warp structure with ``values`` or the first source's attribute of a field's name; raise ``TypeError`` for neither.
 
-    NumPy's arrays are copied to the current Warp device, in the field's type.
-
-    Raises:
-        TypeError: none of them has something for a field.
+    NumPy arrays are copied to the current Warp device, in the field's type.
     """
     made = kind()
     for name, field in kind.vars.items():

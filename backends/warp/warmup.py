@@ -1,12 +1,12 @@
-"""Compiles the kernels of the engines on Warp before they are needed, also for a GPU that is not here.
+"""Compile the kernels of the engines on Warp ahead of time, also for a GPU of another machine.
 
-With the GPU, an engine is played for some steps, which compiles all. Without, it is played on the CPU while every launch is
-written down, and the kernels that were launched are compiled for the other architecture: into the same folder, under the same
-names as they are looked for later. What an engine launches on a GPU alone is not seen that way and is compiled at the first use.
+With the GPU, some steps of an engine compile all kernels. Without it, the engine runs on the CPU while every launch is recorded,
+and the launched kernels are compiled for the other architecture, into the folder and under the names of later look-ups. Kernels
+that an engine launches on a GPU alone are missed and compiled at their first use.
 
-A kernel's name holds a hash, and the hash of one with ``wp.static`` in a loop depends on what the process has built before: the
-expressions that a function's last build has resolved are part of it. A program that finds all else compiled builds nothing. Such
-a program's names are those that count, so engines are played until a process builds nothing, and names are taken before builds.
+A kernel's name holds a hash. With ``wp.static`` in a loop the hash includes expressions resolved by the function's last build, so
+it depends on earlier builds of the process. The names that count are those of a program that finds all kernels compiled and builds
+nothing; therefore engines are played until a process builds nothing, and names are taken before builds.
 """
 
 from __future__ import annotations
@@ -29,28 +29,24 @@ from ..base import BackendError, Randomization, Scene
 from ..registry import make_backend
 
 _DEFAULT_BLOCK = 256
-"""Threads of a block where a launch names none."""
+"""Threads of a block for a launch without a block size."""
 _MOST_PLAYS = 5
-"""A kernel's name can change once for each function with ``wp.static`` that it shares with others; two plays do so far."""
+"""Most plays: a kernel's name can change once for each function with ``wp.static`` that it shares; two suffice so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Compiled:
-    """What was compiled."""
+    """Result of a compilation."""
 
     modules: int
-    """Modules, each once for every block size."""
+    """Number of modules, each counted for every block size."""
     fresh: int
-    """Of them, those that were not there before."""
+    """Number of new modules among them."""
     seconds: float
 
 
 def exercise(backend: str, scenes: Iterable[Scene], device: str) -> None:
-    """Play an engine for some steps, so that every kernel that they need is there.
-
-    Raises:
-        BackendError: there is no such engine or device.
-    """
+    """Play an engine for some steps, which compiles their kernels; raise ``BackendError`` for an unknown engine or device."""
     for scene in scenes:
         with closing(make_backend(backend, scene, device=device)) as physics:
             count = physics.num_worlds
@@ -68,7 +64,7 @@ def exercise(backend: str, scenes: Iterable[Scene], device: str) -> None:
 
 
 def _as_in_training(scene: Scene, count: int, options: dict[str, Any]) -> Randomization:
-    """All that training changes from world to world, at its nominal value: changed masses need kernels of their own."""
+    """Return training's randomization at nominal values, because changed masses need kernels of their own."""
     robot = scene.robot
     joints = torch.ones(count, robot.num_joints, **options)
     return Randomization(
@@ -84,14 +80,14 @@ def _as_in_training(scene: Scene, count: int, options: dict[str, Any]) -> Random
 
 
 def exercise_until_compiled(backend: str, scenes: Sequence[Scene], device: str) -> int:
-    """Play an engine in processes of their own until one finds all its kernels compiled; how many there were.
+    """Play an engine in new processes until one finds all kernels compiled, and return the number of processes.
 
     Raises:
-        BackendError: there is no such engine or device, or its kernels have other names each time.
+        BackendError: unknown engine or device, or the kernels have other names each time.
     """
     for plays in range(1, _MOST_PLAYS + 1):
         before = _compiled_files()
-        # one that has built nothing yet, as the programs are that these kernels are for
+        # a process without earlier builds, like the programs that will use these kernels
         spawn = multiprocessing.get_context("spawn")
         answer, reply = spawn.Pipe(duplex=False)
         process = spawn.Process(target=_exercise_and_reply, args=(reply, backend, scenes, device), daemon=True)
@@ -100,10 +96,8 @@ def exercise_until_compiled(backend: str, scenes: Sequence[Scene], device: str) 
         try:
             refusal = answer.recv()
         except EOFError:
-            raise BackendError(
-                f"the program that compiled kernels of {backend} was killed, for want of memory perhaps; what it had "
-                "finished is kept: call again"
-            ) from None
+            killed = f"the program that compiled kernels of {backend} was killed, for want of memory perhaps"
+            raise BackendError(f"{killed}; its finished kernels are kept: call again") from None
         process.join()
         if refusal is not None:
             raise BackendError(refusal)
@@ -116,7 +110,7 @@ def exercise_until_compiled(backend: str, scenes: Sequence[Scene], device: str) 
 
 
 def _exercise_and_reply(reply: Connection, backend: str, scenes: Sequence[Scene], device: str) -> None:
-    """Play, and send why that was refused, or None. It ends by itself where nobody waits for the answer any more."""
+    """Play, and send the refusal or None; end quietly where no process waits for the answer any more."""
     refusal = None
     try:
         exercise(backend, scenes, device)
@@ -131,21 +125,21 @@ def _compiled_files() -> set[Path]:
 
 
 def supported_architectures() -> list[int]:
-    """Architectures that the compiler here knows, such as 90 for ``sm_90``; it needs no GPU."""
+    """Return the architectures that the compiler knows, such as 90 for ``sm_90``; needs no GPU."""
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     wp.init()
     return list(wp.get_cuda_supported_archs())
 
 
 def cache_folder() -> str:
-    """Where compiled kernels are kept."""
+    """Return the folder of compiled kernels."""
     wp.init()
     return str(wp.config.kernel_cache_dir)
 
 
 @contextmanager
 def recorded_launches() -> Iterator[dict[Any, set[int]]]:
-    """Inside, every launch is noted as well as done: block sizes by module."""
+    """Note the block sizes of every launch inside the context, by module."""
     seen: dict[Any, set[int]] = {}
     original = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
 
@@ -167,17 +161,11 @@ def recorded_launches() -> Iterator[dict[Any, set[int]]]:
 
 
 def compile_for(architecture: int, launched: dict[Any, set[int]], *, threads: int = 1) -> Compiled:
-    """Compile modules for an architecture into Warp's cache; what is there already is left alone.
-
-    Args:
-        architecture: such as 90 for ``sm_90``.
-        launched: block sizes by module.
-        threads: compilations at a time.
-    """
+    """Compile modules, given with their block sizes, for an architecture (90 for ``sm_90``) into Warp's cache, where missing."""
     began = time.perf_counter()
     for module, blocks in launched.items():
         for block in blocks:
-            module.get_module_hash(block)  # kept; after the first build below another one would come out
+            module.get_module_hash(block)  # Warp keeps the hash; after the first build below it would differ
     # a module's default block size is part of it, so one module is compiled by one thread
     with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(lambda item: _compile(architecture, *item), launched.items()))
@@ -186,7 +174,7 @@ def compile_for(architecture: int, launched: dict[Any, set[int]], *, threads: in
 
 
 def _compile(architecture: int, module: Any, blocks: Iterable[int]) -> list[bool]:
-    """Compile a module once for each block size; whether each was not there before."""
+    """Compile a module once for each block size, and return whether each is new."""
     usual = module.options["block_dim"]
     before = set(Path(cache_folder()).glob(f"*/*.sm{architecture}*"))
     fresh = []
@@ -201,15 +189,10 @@ def _compile(architecture: int, module: Any, blocks: Iterable[int]) -> list[bool
 
 
 def check_architecture(text: str) -> int:
-    """The number of an architecture such as ``sm_90`` or ``90``.
-
-    Raises:
-        BackendError: the compiler does not know it.
-    """
+    """Return the number of an architecture such as ``sm_90`` or ``90``; raise ``BackendError`` where the compiler lacks it."""
     known = {f"sm_{number}": number for number in supported_architectures()}
     number = known.get(f"sm_{text.removeprefix('sm_')}")
     if number is None:
-        raise BackendError(
-            f"the architecture '{one_line(text, 80)}' is not known to Warp's compiler; choose from: {', '.join(known)} (--arch)"
-        )
+        choice = f"choose from: {', '.join(known)} (--arch)"
+        raise BackendError(f"the architecture '{one_line(text, 80)}' is not known to Warp's compiler; {choice}")
     return number

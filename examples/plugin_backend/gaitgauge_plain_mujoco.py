@@ -40,6 +40,7 @@ class PlainMujocoBackend(PhysicsBackend):
     """See ``PhysicsBackend`` for what each method promises."""
 
     name: ClassVar[str] = "plain-mujoco"
+    parallel_processes: ClassVar[bool] = True
 
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:

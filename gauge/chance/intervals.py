@@ -1,36 +1,32 @@
-"""How sure a score is: what other seeds would have changed, in the levels found and in the quality measured there.
+"""Estimate how sure a score is: how far other seeds would have changed it, in the levels found and in the quality measured there.
 
 Terrains, frictions, payloads, goals and their sub-commands are the benchmark and stay. Seeds are a sample, twice over: the search
-seeds decide about levels (``level_chance``), the quality seeds about everything that is measured at them. Functions take rows of
-``results.json``, so that a result can be judged long after its episodes are gone.
+seeds decide about levels (``level_chance``), the quality seeds about everything that is measured at them. Functions take the rows
+of a ``Result``, so that it can be judged long after its episodes are gone.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import special
 
-from ...files.parsing import NotNegative, Seed, Share
 from ..episodes import QUALITY
+from ..result import CONFIDENCE, ChanceRules, EnvironmentRow
 from .level_chance import bisected_levels, redraw_levels, shared_luck, success_curves
 from .level_curve import expected_levels
 
 Array = NDArray[np.float64]
-Row = Mapping[str, Any]
-_Seeds = Annotated[tuple[Seed, ...], Field(min_length=1, max_length=10_000)]
 
-CONFIDENCE = 0.95
 _QUALITY_STEP = 0.85
-"""What is left of the quality one level higher: 0.84 on waves and 0.79 on obstacles of ``docs/data/repeated_evaluations.json``."""
+"""Share of the quality that is left one level higher: 0.84 on waves and 0.79 on obstacles of ``docs/data/repeated_evaluations.json``."""
 _LEVEL_FREEDOM = 8.0
 """Degrees of freedom of the variance of one environment's level, which rests on a dozen trials: so many keep rare false alarms
 as rare as they should be (``benchmarks/interval_coverage.py --synthetic``)."""
@@ -40,7 +36,7 @@ _UNKNOWN_QUALITY = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Chance:
-    """What chance does to a weighted sum over environments: independent parts whose variances add up."""
+    """The chance in a weighted sum over environments: independent parts with variances that add up."""
 
     levels: Array
     """Deviation in each replicate of the level searches, (B,); zeros where levels were given."""
@@ -51,11 +47,11 @@ class Chance:
 
     @property
     def known(self) -> bool:
-        """Whether it can be estimated: one seed shows no spread."""
+        """True where the spread can be estimated: one seed shows none."""
         return all(table.shape[1] > 1 for table in self.seeds)
 
     def _parts(self) -> tuple[Array, Array]:
-        """Variances that add up, of levels and of every stream of seeds, and their degrees of freedom."""
+        """Return variances that add up, of levels and of every stream of seeds, and their degrees of freedom."""
         tables = [t for t in self.seeds if t.size]
         variances = [(t**2).sum(1) / (t.shape[1] * (t.shape[1] - 1)) for t in tables]
         freedom = [np.full(len(t), t.shape[1] - 1.0) for t in tables]
@@ -73,7 +69,7 @@ class Chance:
         return welch(*self._parts())
 
     def interval(self, value: float, bounds: tuple[float, float] | None = (0.0, 1.0)) -> tuple[float, float] | None:
-        """Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread."""
+        """Return Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread."""
         if not self.known:
             return None
         reach = float(special.stdtrit(self.freedom, 0.5 + 0.5 * CONFIDENCE)) * self.error
@@ -81,7 +77,7 @@ class Chance:
         return max(value - reach, low), min(value + reach, high)
 
     def p_value(self, value: float) -> float | None:
-        """How likely a value at least so far from zero is if it is chance alone, two-sided; None where that is not known."""
+        """Return the chance of a value at least so far from zero if nothing but chance acts, two-sided; None where that is not known."""
         if not self.known:
             return None
         if self.error == 0.0:
@@ -89,7 +85,7 @@ class Chance:
         return 2.0 * float(special.stdtr(self.freedom, -abs(value) / self.error))
 
     def minus(self, other: Chance, *, paired: bool) -> Chance:
-        """Chance in a difference.
+        """Return the chance in a difference.
 
         Args:
             other: of the value that is subtracted; its level searches are independent of these.
@@ -107,49 +103,28 @@ class Chance:
 
 
 def welch(variances: Array, freedoms: Array) -> float:
-    """Degrees of freedom of a sum of estimated variances (Welch and Satterthwaite); infinite for none."""
+    """Return the degrees of freedom of a sum of estimated variances (Welch and Satterthwaite); infinite for none."""
     uncertain = float((variances**2 / freedoms).sum())
     return float(variances.sum()) ** 2 / uncertain if uncertain > 0.0 else math.inf
 
 
 def wilson_interval(share: float, trials: float) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share of successes among so many independent trials (Wilson 1927)."""
+    """Return Wilson's 95 % interval of a share of successes among so many independent trials (Wilson 1927)."""
     z = float(special.ndtri(0.5 + 0.5 * CONFIDENCE))
     centre = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
     reach = z / (1 + z**2 / trials) * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
     return max(centre - reach, 0.0), min(centre + reach, 1.0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChanceRules:
-    """What a suite says that decides about chance."""
-
-    level_weight: NotNegative
-    quality_weight: NotNegative
-    pass_rate: Share
-    levels: Annotated[int, Field(ge=1, le=1000)]
-    seeds: _Seeds
-    """Of the quality episodes."""
-    search_seeds: _Seeds
-    shared_noise: bool
-    """Whether the environments of a seed share its random numbers."""
-    resamples: Annotated[int, Field(ge=1, le=100_000)]
-    """Replicates of the level searches."""
-    level: Literal["bisection", "curve"] = "bisection"
-    """How a level is found, as the suite has it; absent from results that are older than the choice."""
-    bracket_seeds: Annotated[int, Field(ge=1, le=1000)] = 2
-    """Seeds that look for the crossing of a curve."""
-
-
 class Evidence:
     """Trials and runs of the environments of one evaluation, as arrays.
 
     Attributes:
-        rows: the environments of ``results.json``.
+        rows: the environments of the result.
         redrawn: maximum levels of the searches done again, (E, B).
     """
 
-    def __init__(self, rows: Sequence[Row], rules: ChanceRules, *, name: str = "") -> None:
+    def __init__(self, rows: Sequence[EnvironmentRow], rules: ChanceRules, *, name: str = "") -> None:
         """Read the rows and redo the searches.
 
         Args:
@@ -157,10 +132,10 @@ class Evidence:
             name: seeds the generator, so that the same rows have the same intervals; evaluations that are compared have two.
         """
         self.rows, self._rules = list(rows), rules
-        self._flat = np.array([r["terrain"] == "flat" for r in rows], dtype=bool)
-        self._reached = np.array([r["level"] or 0 for r in rows], dtype=np.float64)
-        self._searched = np.array([bool(r.get("trials")) for r in rows], dtype=bool)
-        self._played = np.array([bool(r.get("runs")) for r in rows], dtype=bool)
+        self._flat = np.array([r.flat for r in rows], dtype=bool)
+        self._reached = np.array([r.reached for r in rows], dtype=np.float64)
+        self._searched = np.array([bool(r.trials) for r in rows], dtype=bool)
+        self._played = np.array([bool(r.runs) for r in rows], dtype=bool)
         self.redrawn = np.repeat(self._reached[:, None], rules.resamples, axis=1)
         self._redraw(np.random.default_rng(zlib.crc32(f"levels {name}".encode())))
 
@@ -168,12 +143,8 @@ class Evidence:
         searched = np.flatnonzero(self._searched).tolist()
         if not searched:
             return
-        searches = [
-            {int(level): {int(s): bool(o) for s, o in outcomes.items()} for level, outcomes in row["trials"].items()}
-            for row in (self.rows[at] for at in searched)
-        ]
-        rules = self._rules
-        curves = success_curves(searches, [self.rows[at]["terrain"] for at in searched], rules.levels)
+        searches, rules = [self.rows[at].trials for at in searched], self._rules
+        curves = success_curves(searches, [self.rows[at].terrain for at in searched], rules.levels)
         self.redrawn[searched] = redraw_levels(
             curves,
             seeds=len(rules.search_seeds),
@@ -185,25 +156,25 @@ class Evidence:
             generator=generator,
         )
 
-    def of(self, rows: Sequence[Row]) -> Evidence:
-        """The same rules and other rows."""
+    def of(self, rows: Sequence[EnvironmentRow]) -> Evidence:
+        """Return evidence by the same rules from other rows."""
         return Evidence(rows, self._rules)
 
     def runs(self, columns: Sequence[str]) -> Array:
-        """Mean of some columns in every run, (E, S); zeros where an environment has none.
+        """Return the mean of some columns in every run, (E, S); zeros where an environment has none.
 
         Columns are metrics, ``quality`` or names of sub-commands, whose column is their quality.
         """
         values = np.zeros((len(self.rows), len(self._rules.seeds)))
         for at in np.flatnonzero(self._played).tolist():
             for place, seed in enumerate(self._rules.seeds):
-                run = self.rows[at]["runs"][str(seed)]
-                found = {**run, **run["commands"]}
+                run = self.rows[at].runs[seed]
+                found = {**run.columns, **run.commands}
                 values[at, place] = sum(found[c] for c in columns) / len(columns)
         return values
 
     def chance(self, weights: Array, columns: Sequence[str] = (QUALITY,)) -> Chance:
-        """Chance in a weighted sum over environments of level-weighted values: of the score, with the column ``quality``.
+        """Return the chance in a weighted sum over environments of level-weighted values: of the score, with the column ``quality``.
 
         Args:
             weights: (E,).
@@ -219,17 +190,16 @@ class Evidence:
         return replace(at_reached, **self._of_levels(levels), seeds=(*at_reached.seeds, self._search_seeds(weights)))
 
     def chance_at_levels(self, weights: Array, columns: Sequence[str]) -> Chance:
-        """Chance in a weighted sum over environments of values as measured at the levels reached, see ``chance``."""
+        """Return the chance in a weighted sum over environments of values as measured at the levels reached, see ``chance``."""
         values = self.runs(columns)
         deviations = weights[:, None] * (values - values.mean(1, keepdims=True))
         shared = self._rules.shared_noise
         return Chance(
-            levels=np.zeros(self._rules.resamples),
-            seeds=(deviations.sum(0, keepdims=True) if shared else deviations,),
+            levels=np.zeros(self._rules.resamples), seeds=(deviations.sum(0, keepdims=True) if shared else deviations,)
         )
 
     def value(self, weights: Array, columns: Sequence[str] = (QUALITY,)) -> float:
-        """Weighted sum over environments of level-weighted values, see ``chance``."""
+        """Return the weighted sum over environments of level-weighted values, see ``chance``."""
         means = self.runs(columns).mean(1)
         return float(weights @ np.where(self._flat, means, self._at_levels(self._reached, means)))
 
@@ -240,26 +210,25 @@ class Evidence:
         return rules.level_weight * np.maximum(levels - 1.0, 0.0) + of_quality
 
     def level_chance(self, weights: Array) -> Chance:
-        """Chance in a weighted sum of the environments' levels, ``weights`` (E,). Quality seeds play no part."""
+        """Return the chance in a weighted sum of the environments' levels, ``weights`` (E,). Quality seeds play no part."""
         return Chance(**self._of_levels(weights[:, None] * self.redrawn), seeds=(self._search_seeds(weights),))
 
     def _of_levels(self, levels: Array) -> dict[str, Any]:
-        """Part of the levels in ``Chance``, from what each environment adds in each replicate, (E, B)."""
+        """Return the part of the levels in ``Chance``, from what each environment adds in each replicate, (E, B)."""
         freedom = welch(levels.var(axis=1), np.full(len(levels), _LEVEL_FREEDOM))
         total = levels.sum(0)
         return {"levels": total - total.mean(), "level_freedom": freedom}
 
     def _search_seeds(self, weights: Array) -> Array:
-        """No deviations, of as many seeds as stand behind the levels; two where the levels were given, and are certain."""
+        """Return no deviations, of as many seeds as stand behind the levels; two where the levels were given, and are certain."""
         return np.zeros((0, len(self._rules.search_seeds) if (self._searched & (weights != 0.0)).any() else 2))
 
     def _supposed(self, means: Array) -> Array:
-        """Qualities, (E,), and where none was measured, because no level was passed, the mean of the terrain or of all others."""
+        """Return qualities, (E,), and where none was measured, because no level was passed, the mean of the terrain or of all others."""
         levelled = self._played & ~self._flat
         found = means.copy()
         for at in np.flatnonzero(~self._played & ~self._flat):
-            terrain = self.rows[at]["terrain"]
-            mine = levelled & np.array([r["terrain"] == terrain for r in self.rows])
+            mine = levelled & np.array([r.terrain == self.rows[at].terrain for r in self.rows])
             known = mine if mine.any() else levelled
             found[at] = means[known].mean() if known.any() else _UNKNOWN_QUALITY
         return found

@@ -44,13 +44,13 @@ _LISTENING = 2.0
 _HEADLESS = 30.0
 """Longest time for which the head node may be out of reach [s]; after 60 s Ray ends this process without a word."""
 _MOST_LOSSES = 3
-"""How often in a row a worker is replaced that never finished an episode: then it is not the nodes' fault."""
+"""Replacements in a row of a worker that never finished an episode; after them the fault is not that of the nodes."""
 _MOST_STARTS = 60
-"""How often in a row a worker may die before its first answer: Ray starts some on a dead node until it knows."""
+"""Deaths in a row of a worker before its first answer: Ray starts workers on a dead node until Ray notices."""
 _PAUSE = 2.0
 """Time from such a death to the next start [s]."""
 _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
-"""What a client of gRPC says first: the preface of HTTP/2 and empty settings. A server's first words are its own settings."""
+"""First bytes of a gRPC client: the preface of HTTP/2 and empty settings. A server answers with its own settings."""
 _KEPT = "what had finished is kept: go on with --resume"
 
 
@@ -59,7 +59,7 @@ class ClusterError(RuntimeError):
 
 
 def check_address(address: str) -> None:
-    """Refuse what is no address of a Ray cluster, and a machine without Ray.
+    """Refuse a text that is no address of a Ray cluster, and a machine without Ray.
 
     Raises:
         ClusterError: one sentence.
@@ -104,7 +104,7 @@ class Cluster:
             )
 
     def _free_cpus(self) -> int:
-        """CPUs that are free; those of a run that has just ended may take some seconds to be."""
+        """Return CPUs that are free; those of a run that has just ended may take some seconds to be."""
         until = time.monotonic() + _CONNECTING
         while (free := int(self._ray.available_resources().get("CPU", 0.0))) < 1 and time.monotonic() < until:
             time.sleep(0.5)
@@ -130,9 +130,9 @@ class _Seat:
     call: Any = None
     """The call that it is at; None while it has nothing to do."""
     outbox: list[Play | Drop | Stop] = field(default_factory=list)
-    """What the next call brings it."""
+    """Messages of the next call."""
     there: bool = False
-    """Whether it has answered yet."""
+    """True once the worker has answered."""
     losses: int = 0
     """Workers before it in this seat that were lost since one last finished an episode."""
     failures: int = 0
@@ -262,7 +262,7 @@ class ClusterWorkers:
             )
 
     def _replace(self, number: int, error: Exception) -> None:
-        """A worker is gone."""
+        """Replace a lost worker."""
         seat, reason = self._seats[number], _first_sentence(error)
         self._ray.kill(seat.actor)  # it may only have been out of reach
         if seat.there:
@@ -307,7 +307,7 @@ class ClusterWorkers:
 
 
 def _actor_class() -> type:
-    """The class of the actors. It travels to the nodes as it stands here, and finds out what they have."""
+    """Return the class of the actors. It travels to the nodes as it stands here, and finds out what they have."""
 
     class GaitgaugeWorker:
         def __init__(self, wanted: dict[str, str], shipment: bytes) -> None:
@@ -334,7 +334,7 @@ def _actor_class() -> type:
 
 
 def _ray() -> Any:
-    """Ray's module; ``ClusterError`` where it is not installed."""
+    """Return Ray's module; ``ClusterError`` where it is not installed."""
     try:
         return importlib.import_module("ray")
     except ImportError as error:
@@ -367,6 +367,6 @@ def _knock(address: str, *, greet: bool = False) -> None:
 
 
 def _first_sentence(error: BaseException) -> str:
-    """The beginning of an error's message."""
+    """Return the beginning of an error's message."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return one_line(lines[0].partition(". ")[0].rstrip("."), 160) if lines else type(error).__name__

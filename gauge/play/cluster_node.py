@@ -1,4 +1,4 @@
-"""What a node of a cluster does for ``cluster``: it looks whether it has the same programs, builds the worlds, and plays."""
+"""The part of ``cluster`` that runs on a node: it compares the versions of programs, builds the worlds, and plays."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Arrived:
 
 
 def fingerprint() -> dict[str, str]:
-    """What has to be the same on all nodes."""
+    """Return the versions that must be the same on all nodes."""
     return {**versions(), **plugins(), "source of gaitgauge": source_digest()}
 
 
@@ -58,12 +58,12 @@ class NodeWorker:
                 self._worker = self._begin()
                 told.append(Arrived(processor()))
             told += self._play(self._worker, messages)
-        except Exception as error:  # noqa: BLE001  (whatever it is, who asked has to hear of it)
+        except Exception as error:  # noqa: BLE001  (the caller has to hear of any error)
             told.append(Failed(portable(error)))
         return pickle.dumps(told)
 
     def _difference(self) -> str | None:
-        """What this node has not as it is wanted."""
+        """Return one sentence on a version that differs from the wanted one, None if none does."""
         mine = fingerprint()
         for name in sorted(mine.keys() | self._wanted.keys()):
             here, there = (found.get(name, "not there")[:40] for found in (mine, self._wanted))
@@ -85,7 +85,7 @@ class NodeWorker:
         return worker
 
     def _play(self, worker: Worker, messages: Sequence[Play | Drop | Stop]) -> list[Message]:
-        """Play; told is a record at once, and so is room that was not there before."""
+        """Play until a record is there, or new room, or the time for a report; returns the messages."""
         for message in messages:
             worker.take(message)
         rollout, until = worker.rollout, time.monotonic() + PROGRESS_INTERVAL

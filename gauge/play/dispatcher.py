@@ -25,7 +25,7 @@ _TOGETHER = 8
 
 @dataclass(frozen=True, kw_only=True)
 class Speculation:
-    """Which episodes are played before they are required."""
+    """Chooses episodes that are played before they are required."""
 
     at_work: int = 0
     """Number of episodes at work, required ones included, up to which others are begun speculatively; 0 for none."""
@@ -35,7 +35,7 @@ class Speculation:
     """The same for a quality episode."""
 
     def choose(self, plans: Iterable[Plan], taken: Container[Episode]) -> list[Episode]:
-        """Episodes that are probable enough and not ``taken``, in the order in which they are to start."""
+        """Return episodes that are probable enough and not ``taken``, in the order in which they are to start."""
         least = {"search": self.test_probability, "eval": self.quality_probability}
         found = [
             (episode.stage != "search", -probability, episode)
@@ -61,7 +61,7 @@ def play(
         planners: one for each environment.
         records: episodes that have ended; those that end are added.
         keep: called with each record once, before anything follows from it.
-        workers: who plays. They have stopped on return; the caller closes the transport.
+        workers: the workers that play. They have stopped on return; the caller closes the transport.
         watch: called whenever a worker reports.
 
     Raises:
@@ -90,7 +90,7 @@ def play(
 
 
 class Dispatcher:
-    """Which episodes are at work where, and what the plans are."""
+    """Episodes by the worker that has them, and the plans."""
 
     def __init__(
         self,
@@ -118,36 +118,36 @@ class Dispatcher:
     # ---- what workers tell ----------------------------------------------------------------------------------------
 
     def finish(self, record: Record) -> None:
-        """An episode has ended, one perhaps that was cancelled meanwhile."""
+        """Take the record of an episode, which may have been cancelled meanwhile."""
         self._records[record.episode] = record
         self._worker_of.pop(record.episode, None)
         self._plan(self._plan_of[record.episode])
 
     def hear(self, worker: int, progress: Progress) -> None:
-        """A worker has reported. What it says of its room is old where episodes were sent to it that it has not taken yet."""
+        """Take a worker's report. The reported room is stale while episodes are on their way to the worker."""
         self._progress[worker] = progress
         if progress.played == self._sent[worker]:
             self._room[worker] = progress.room
 
     def lose(self, worker: int) -> None:
-        """A worker is gone: its episodes wait again. It is there again when something is heard of it."""
+        """Let the episodes of a lost worker wait again. The worker is back once it reports."""
         self._lost.append(replace(self._progress[worker], active={}))
         self._progress[worker] = Progress(stopped=True)
         self._room[worker] = self._sent[worker] = 0
         self._worker_of = {episode: other for episode, other in self._worker_of.items() if other != worker}
 
     def active(self) -> dict[Episode, int]:
-        """Episodes at work, and the control steps played of each."""
+        """Return the episodes at work, and the control steps played of each."""
         return {episode: age for progress in self._progress for episode, age in progress.active.items()}
 
     @property
     def physics_steps(self) -> int:
-        """Physics steps so far, added up over worlds."""
+        """Return the physics steps so far, added up over worlds."""
         return sum(progress.physics_steps for progress in (*self._progress, *self._lost))
 
     @property
     def engine_seconds(self) -> float | None:
-        """Time spent inside the engine's stepping, added up over workers [s]; None where the engine does not measure it."""
+        """Return the time spent inside the engine's stepping, added up over workers [s]; None where the engine does not measure it."""
         seconds = [p.engine_seconds for p in (*self._progress, *self._lost) if p.engine_seconds is not None]
         return sum(seconds) if seconds else None
 
@@ -200,7 +200,7 @@ class Dispatcher:
         return sorted(there, key=lambda worker: -self._room[worker])
 
     def _share_tests(self, waiting: Sequence[Episode]) -> None:
-        """Each worker gets its part of all tests at work and waiting, or a few together; they go before all that it has."""
+        """Give each worker its part of all level tests, or a few tests together; they go before all that it has."""
         tests, there = self._tests(), self._by_room()
         part = max(-(-(sum(tests) + len(waiting)) // max(len(there), 1)), _TOGETHER)
         for worker in there:
@@ -209,7 +209,7 @@ class Dispatcher:
             waiting = waiting[most:]
 
     def _share_quality(self, waiting: Sequence[Episode]) -> None:
-        """Workers with room get one after the other; none with tests, on which others wait, while another has no tests."""
+        """Give quality episodes in turn to workers with room, first to those without level tests, on which other episodes wait."""
         tests = self._tests()
         for episode in waiting:
             there = self._by_room()
@@ -220,7 +220,7 @@ class Dispatcher:
             self._push(open_to[0], [episode])
 
     def _tests(self) -> list[int]:
-        """Number of level tests' episodes that each worker has."""
+        """Return the number of level tests' episodes that each worker has."""
         counts = [0] * self._workers.count
         for episode, worker in self._worker_of.items():
             counts[worker] += episode.stage == "search"

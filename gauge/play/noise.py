@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from ...policy.observation_table import OBSERVATIONS
 from ..episodes import Episode
 from ..suite import Noise
 
@@ -32,7 +32,7 @@ class NoiseStream(ABC):
 
     @abstractmethod
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """Noise by observation term and delay [substeps] of every world.
+        """Return noise by observation term and delay [substeps] of every world.
 
         Args:
             step: place in each world's stream, in control steps, (…, K) int64.
@@ -53,7 +53,7 @@ class ReferenceStream(NoiseStream):
     def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
         self._noise, self._joints, self._device = noise, joints, device
         self._seeds: dict[int, int] = {}
-        self._generators: list[_PythonGenerator] = []
+        self._generators: list[random.Random] = []
         self._length = 0
         self._uniform = torch.zeros(0, 0, 2 * joints + 3, device=device)
         self._delays = torch.zeros(0, 0, dtype=torch.int64, device=device)
@@ -72,7 +72,7 @@ class ReferenceStream(NoiseStream):
             self._delays = torch.cat((self._delays, delays), dim=1)
             self._length += more
         if episode.seed not in self._seeds:
-            generator = _PythonGenerator(episode.seed)
+            generator = random.Random(episode.seed)
             uniform, delays = self._tables([generator], self._length)
             self._seeds[episode.seed] = len(self._seeds)
             self._generators.append(generator)
@@ -85,14 +85,19 @@ class ReferenceStream(NoiseStream):
         """See ``NoiseStream.tables``."""
         return self._uniform, self._delays
 
-    def _tables(self, generators: Sequence[_PythonGenerator], count: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """The next ``count`` control steps of some generators: (G, count, W) in physical units, and delays (G, count)."""
+    def _tables(self, generators: Sequence[random.Random], count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the next ``count`` control steps of some generators: (G, count, W) in physical units, and delays (G, count)."""
         uniform = np.zeros((len(generators), count, len(self._observed)), dtype=np.float32)
         delays = np.zeros((len(generators), count), dtype=np.int64)
-        half = [self._half[column] for column in self._observed]
+        low, latency = -np.asarray(self._half)[self._observed], self._noise.latency
         for row, generator in enumerate(generators):
-            unit, delays[row] = generator.draw(count, len(self._half), self._noise.latency, self._observed)
-            uniform[row] = low_to_high(unit, half)
+            draw, delay, steps = generator.random, generator.randint, range(len(self._half))
+            drawn = [([draw() for _ in steps], delay(0, latency)) for _ in range(count)]
+            unit = np.array([numbers for numbers, _ in drawn]).reshape(count, -1)[:, self._observed]
+            uniform[row], delays[row] = (
+                low + (-low - low) * unit,
+                [number for _, number in drawn],
+            )  # as random.uniform does
         return torch.tensor(uniform, device=self._device), torch.tensor(delays, device=self._device)
 
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
@@ -108,68 +113,14 @@ class ReferenceStream(NoiseStream):
         return terms, self._delays.flatten()[at]
 
 
-class _PythonGenerator:
-    """Many draws of ``random.Random(seed)`` at once: the same Mersenne twister, read as whole words through NumPy."""
-
-    def __init__(self, seed: int) -> None:
-        state = random.Random(seed).getstate()[1]
-        self._twister = np.random.MT19937()
-        self._twister.state = {
-            "bit_generator": "MT19937",
-            "state": {"key": np.array(state[:-1], dtype=np.uint32), "pos": state[-1]},
-        }
-        self._words = np.zeros(0, dtype=np.uint64)
-
-    def draw(
-        self, count: int, width: int, most: int, wanted: Sequence[int] | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """``count`` times ``width`` calls of ``random()`` followed by one of ``randint(0, most)``.
-
-        Args:
-            width: calls of ``random()`` in a row.
-            most: largest whole number.
-            wanted: columns of the ``width`` to return, None for all.
-
-        Returns:
-            (count, columns) in [0, 1), and (count,).
-        """
-        bits = (most + 1).bit_length()
-        begins: list[int] = []
-        ends: list[int] = []
-        at = 0
-        # ``randint`` draws again until the number is small enough, so a row's length shows when its last word is read
-        self._need(count * (2 * width + 4))
-        numbers = self._words >> np.uint64(32 - bits)
-        while len(begins) < count:
-            last = at + 2 * width
-            while True:
-                if last >= len(numbers):
-                    self._need(len(self._words) + 1)
-                    numbers = self._words >> np.uint64(32 - bits)
-                if numbers[last] <= most:
-                    break
-                last += 1
-            begins.append(at)
-            ends.append(last)
-            at = last + 1
-        columns = np.arange(width) if wanted is None else np.asarray(wanted)
-        first = np.asarray(begins, dtype=np.int64)[:, None] + 2 * columns
-        high, low = self._words[first] >> np.uint64(5), self._words[first + 1] >> np.uint64(6)
-        whole = numbers[np.asarray(ends, dtype=np.int64)].astype(np.int64)
-        self._words = self._words[at:]
-        return (high * 67108864.0 + low) / 9007199254740992.0, whole
-
-    def _need(self, words: int) -> None:
-        """Have at least so many words at hand."""
-        if len(self._words) < words:
-            more = self._twister.random_raw(max(words - len(self._words), 1 << 12))
-            self._words = np.concatenate((self._words, more))
-
-
-def low_to_high(unit: NDArray[np.float64], half: Sequence[float]) -> NDArray[np.float64]:
-    """Numbers in [0, 1) as ``random.uniform(-half, half)`` maps them; ``unit`` (…, W), ``half`` (W,)."""
-    low = -np.asarray(half)
-    return low + (np.asarray(half) - low) * unit
+_COUNTER_ORDER = (
+    "joint_position",
+    "joint_velocity",
+    "base_angular_velocity_b",
+    "projected_gravity_b",
+    "base_linear_velocity_b",
+)
+"""The project's own observations by their index in a ``CounterStream``; scores depend on it."""
 
 
 class CounterStream(NoiseStream):
@@ -178,17 +129,19 @@ class CounterStream(NoiseStream):
     def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
         self._noise = noise
         self._key = torch.zeros(worlds, dtype=torch.int64, device=device)
-        terms = {
-            "joint_position": (joints, noise.joint_position),
-            "joint_velocity": (joints, noise.joint_velocity),
-            "base_angular_velocity_b": (3, noise.base_angular_velocity),
-            "projected_gravity_b": (3, noise.projected_gravity),
-            "base_linear_velocity_b": (3, noise.base_linear_velocity),
-        }
-        self._widths = {name: width for name, (width, _) in terms.items()}
-        half = [value for width, value in terms.values() for _ in range(width)]
+        noisy = [OBSERVATIONS[name] for name in _COUNTER_ORDER]
+        noisy += [o for o in OBSERVATIONS.values() if o.noise is not None and o.name not in _COUNTER_ORDER]
+        self._widths = {each.name: each.width or joints for each in noisy}
+        half = [each.half_width(noise) for each in noisy for _ in range(self._widths[each.name])]
         self._half = torch.tensor(half, device=device)
-        self._index = torch.arange(len(half) + 1, dtype=torch.int64, device=device)
+        own = sum(self._widths[name] for name in _COUNTER_ORDER)
+        index = [*range(own)]
+        for each in noisy[len(_COUNTER_ORDER) :]:
+            # a plug-in's numbers depend on its name alone, not on what else is installed
+            start = own + 1 + zlib.crc32(each.name.encode())
+            index += range(start, start + self._widths[each.name])
+        # the delay's index comes behind those of the project's own
+        self._index = torch.tensor([*index, own], dtype=torch.int64, device=device)
 
     def assign(self, world: int, episode: Episode, steps: int = TABLE_STEPS) -> None:
         """See ``NoiseStream.assign``."""
@@ -204,7 +157,7 @@ class CounterStream(NoiseStream):
 
 
 def uniform_hash(key: torch.Tensor, step: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    """Uniform numbers in [0, 1) from integers, the same on every device (the SplitMix64 finalizer over a Weyl sequence).
+    """Return uniform numbers in [0, 1) from integers, the same on every device (the SplitMix64 finalizer over a Weyl sequence).
 
     Arguments are int64 and broadcast against each other; returns float32 with 24 random bits.
     """
@@ -216,12 +169,12 @@ def uniform_hash(key: torch.Tensor, step: torch.Tensor, index: torch.Tensor) -> 
 
 
 def _shift(value: torch.Tensor, bits: int) -> torch.Tensor:
-    """Logical right shift of int64."""
+    """Shift int64 to the right, filled up with zeros."""
     return (value >> bits) & ((1 << (64 - bits)) - 1)
 
 
 def make_stream(noise: Noise, joints: int, worlds: int, device: torch.device) -> ReferenceStream | CounterStream:
-    """The stream that a suite asks for."""
+    """Return the stream that a suite asks for."""
     return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, worlds, device)
 
 
@@ -250,7 +203,7 @@ class NoiseReader:
         self._block = []
 
     def next(self) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """Noise by observation term, (K, width), and delays, (K,), of the next control step."""
+        """Return noise by observation term, (K, width), and delays, (K,), of the next control step."""
         if not self._block:
             terms, delays = self._stream.draw(self._now + self._ahead + self._offset)
             columns = [value.unbind(0) for value in terms.values()]

@@ -1,4 +1,4 @@
-"""How far an evaluation is: episodes that have ended, and how long the rest will take, for the progress display.
+"""Progress of an evaluation: episodes that have ended, and how long the rest will take, for the progress display.
 
 Work is counted in control steps that an episode usually takes: a quality episode walks for minutes, a level test for seconds, and
 those of quality come last.
@@ -25,7 +25,7 @@ _ALMOST = 0.95
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """How far an evaluation is, for the progress display."""
+    """Progress of an evaluation, for the display."""
 
     done: int
     """Counted episodes that have ended, those of an earlier run included."""
@@ -65,11 +65,11 @@ class ProgressMeter:
         self._open: set[Episode] = set()  # those that had not ended at some look: of an earlier run they are not
 
     def usual_steps(self, episode: Episode) -> float:
-        """Control steps that an episode usually takes."""
+        """Return the control steps that an episode usually takes."""
         return sum(self._goal_steps[goal] for goal in episode.goals)
 
     def look(self, plans: Sequence[Plan], active: Mapping[Episode, int], now: float | None = None) -> Status:
-        """How far the evaluation is.
+        """Return the progress of the evaluation.
 
         Args:
             plans: of all environments.

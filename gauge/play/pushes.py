@@ -12,14 +12,14 @@ from .segments import Segment
 
 
 def push_force(push: Push, segment: Segment) -> float:
-    """Force of a segment's push, to the left of the heading [N]: a draw that belongs to the segment alone."""
+    """Return the force of a segment's push, to the left of the heading [N]: a draw that belongs to the segment alone."""
     draw = _draw("push", segment)
     side = draw.choice((-1.0, 1.0))
     return side * draw.uniform(*push.force)
 
 
 def push_steps(suite: Suite, segment: Segment) -> tuple[int, int]:
-    """Commanded control steps, counted from 1, from which and before which a segment's push acts: a draw of its own."""
+    """Return the commanded control steps, counted from 1, from which and before which a segment's push acts: a draw of its own."""
     push, period = suite.push, suite.physics.control_period
     assert push is not None
     begin = round(_draw("time of push", segment).uniform(*push.after) / period) + 1
@@ -31,7 +31,7 @@ def _draw(what: str, segment: Segment) -> random.Random:
 
 
 def sideways(quaternion: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-    """A force to the left of the heading in world axes, horizontal [N], (N, 3).
+    """Return a force to the left of the heading in world axes, horizontal [N], (N, 3).
 
     Args:
         quaternion: base orientation wxyz, (N, 4).

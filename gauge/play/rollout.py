@@ -1,12 +1,12 @@
 """Plays episodes on the worlds of one backend: the loop of gauge protocol §3.3 over many worlds, on the CPU and on a GPU.
 
 Episodes fall into segments; a segment takes a world, and when it ends the next one that waits moves in, with its own terrain,
-friction and payload. Every few control steps (``poll_interval``) the rollout looks what has ended. On the CPU that is every
+friction and payload. Every few control steps (``poll_interval``) the rollout looks for ended segments, on the CPU in every
 step. On a GPU a poll waits for the device and resets robots with one more physics step of all worlds, so that polls are
 rarer, and the control steps until the next one are launched before the records of the last one are handed out.
 
 What happens in a segment depends on that segment alone: not on its world, its neighbours, the number of threads or the poll
-interval. ``ControlStep`` has the work of one control step, ``WorldBuffers`` all that is known of the worlds.
+interval. ``CpuStep`` or ``GpuStep`` takes the control steps; ``WorldBuffers`` holds the state of the segments.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ...policy.base import Policy, PolicyError
 from ..episodes import QUALITY, Episode, Record
 from ..goals import TARGET
 from ..suite import Suite
-from .control_step import ControlStep
+from .control_step import ControlStep, CpuStep, GpuStep
 from .sampling import Samples
 from .segments import Segment, SegmentOutcome, SegmentQueue
 from .world_buffers import SegmentCounts
@@ -64,12 +64,16 @@ class Rollout:
             terrain_index: the scene's index of an episode's terrain.
             poll_interval: control steps between two polls; None for 1 on the CPU and ``POLL_INTERVAL`` on a GPU. With 1,
                 values are read during a step too where that saves work. Changes the time alone.
-            capture: whether to capture control steps as CUDA graphs, on a GPU. Changes the time alone.
+            capture: capture control steps as CUDA graphs, on a GPU. Changes the time alone.
         """
         self.suite, self.backend = suite, backend
         self._terrain_index = terrain_index
         self.poll_interval = poll_interval or (1 if backend.device.type == "cpu" else POLL_INTERVAL)
-        self._step = ControlStep(suite, policy, backend, early_outs=self.poll_interval == 1, capture=capture)
+        self._step: ControlStep = (
+            CpuStep(suite, policy, backend)
+            if self.poll_interval == 1
+            else GpuStep(suite, policy, backend, capture=capture)
+        )
         self._queue = SegmentQueue(self._step.rules, (*self._step.samples.names, QUALITY))
         self._columns = len(self._step.samples.names) + 1
         self._segments: dict[int, Segment] = {}  # by the world in which it is at work
@@ -84,8 +88,8 @@ class Rollout:
 
     @property
     def captured(self) -> bool:
-        """Whether control steps are captured as CUDA graphs, or will be."""
-        return self._step.recording.enabled
+        """Return whether control steps are captured as CUDA graphs, or will be."""
+        return self._step.captured
 
     # ---- what there is to play ------------------------------------------------------------------------------------
 
@@ -100,21 +104,21 @@ class Rollout:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to play, and every record has been handed out."""
+        """Return whether there is nothing to play, and every record has been handed out."""
         return not self._segments and not len(self._queue)
 
     @property
     def free_worlds(self) -> int:
-        """Number of worlds without a segment."""
+        """Return the number of worlds without a segment."""
         return self.backend.num_worlds - len(self._segments)
 
     @property
     def room(self) -> int:
-        """Number of segments that could begin at once beside those that wait."""
+        """Return the number of segments that could begin at once beside those that wait."""
         return self.free_worlds - len(self._queue)
 
     def ages(self) -> dict[Episode, int]:
-        """Episodes at work, and the control steps played of each, added up over its segments."""
+        """Return the episodes at work, and the control steps played of each, added up over its segments."""
         ages: dict[Episode, int] = {}
         for world, segment in self._segments.items():
             ages[segment.episode] = ages.get(segment.episode, 0) + self.control_steps - self._began[world]
@@ -152,7 +156,7 @@ class Rollout:
         step, mask = self._step, self._step.buffers.mask(sorted(self._respawn))
         step.buffers.active |= mask
         if self._changed:
-            step.arrange(self._segments, targets=any(s.goal == TARGET for s in self._segments.values()))
+            step.arrange()
         if self._respawn:
             step.reset(mask)
             self.physics_steps += len(self._respawn)
@@ -166,16 +170,16 @@ class Rollout:
         self._launched = True
 
     def poll(self) -> list[Record]:
-        """See what the control steps since the last poll brought."""
+        """Return the records of episodes that have ended since the last poll."""
         if not self._launched:
             return []
         self._launched = False
         step, buffers = self._step, self._step.buffers
-        if step.early_outs and not step.refused and not bool((buffers.ended | buffers.respawn).any()):
+        found = torch.stack((buffers.ended, buffers.respawn, buffers.not_finite))
+        if self.poll_interval == 1 and not bool(found.any()):
             return []
-        flags = torch.stack((buffers.ended, buffers.respawn, buffers.not_finite)).tolist()
         ended, respawn, not_finite = (
-            [world for world, flag in enumerate(row) if flag and world in self._segments] for row in flags
+            [world for world, flag in enumerate(row) if flag and world in self._segments] for row in found.tolist()
         )
         buffers.ended.zero_()
         buffers.respawn.zero_()
@@ -250,7 +254,7 @@ class Rollout:
             self._randomized[world] = pair
 
     def _policy_error(self, world: int) -> PolicyError:
-        """The error of a policy that answered a finite observation with something else."""
+        """Return the error of a policy that answered a finite observation with something else."""
         segment, buffers = self._segments[world], self._step.buffers
         action = buffers.action[world]
         return PolicyError(
@@ -260,7 +264,7 @@ class Rollout:
         )
 
     def _outcomes(self, worlds: Sequence[int]) -> dict[Segment, SegmentOutcome]:
-        """What came of the segments in some worlds, which have ended."""
+        """Return the outcomes of ended segments in some worlds."""
         buffers, table = self._step.buffers, self._step.samples
         counts = dict(zip(worlds, buffers.counts(worlds, table.count), strict=True))
         sampled = {world: c.samples for world, c in counts.items() if c.samples}
@@ -281,7 +285,7 @@ def _outcome(
     keep: NDArray[np.bool_],
     touching: NDArray[np.bool_],
 ) -> SegmentOutcome:
-    """What came of a segment: its counts, and its samples, (T, columns), of which those to keep, (T,), count."""
+    """Return a segment's outcome from its counts and its samples, (T, columns); those to ``keep``, (T,), count."""
     aims = segment.goal == TARGET
     lost = np.zeros((counts.lost_samples, values.shape[1]), dtype=np.float32)
     outcome = SegmentOutcome(

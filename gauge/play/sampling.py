@@ -1,8 +1,10 @@
-"""What the metrics need to know of each sample, kept while a segment runs; the metrics themselves are worked out at its end."""
+"""Keeps the state of each sample while a segment runs; the metrics are computed at the end of the segment."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -10,15 +12,12 @@ from numpy.typing import NDArray
 
 from ...backends.base import PhysicsState
 from ...robots.base import Robot
-from ..metrics import MetricEvaluator, SampledState
+from ..metrics import Instants, MetricEvaluator, SampledState
 from ..suite import Suite
 from .self_contact import SelfContact
 
 GRAVITY = 9.81
 """[m/s²]; turns the robot's mass into its weight."""
-_MOTION = ("base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity_b")
-_JOINTS = ("joint_position", "joint_velocity", "joint_torque")
-_CONTACTS = ("ground_moment_w", "ground_force_w", "foot_normal_force", "foot_tangential_force")
 
 Samples = tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]
 """Metrics and quality of T samples, (T, columns), NaN where a metric is not defined; which of them count, and in which parts of the
@@ -33,9 +32,7 @@ class SampleTable:
         suite: Suite,
         robot: Robot,
         weight: float,
-        worlds: int,
-        device: torch.device,
-        dtype: torch.dtype,
+        like: PhysicsState,
         *,
         one_by_one: bool,
     ) -> None:
@@ -43,21 +40,21 @@ class SampleTable:
 
         Args:
             weight: its weight [N].
-            one_by_one: evaluate metrics segment by segment. In a CPU's vector units the last bit may depend on who else is in a
+            like: any state of the K worlds.
+            one_by_one: evaluate metrics segment by segment. In a CPU's vector units the last bit may depend on the rest of a
                 batch, while a GPU evaluates all segments at once.
         """
+        worlds, device, dtype = len(like.joint_position), like.joint_position.device, like.joint_position.dtype
         self._metrics = MetricEvaluator(suite.metrics, robot, weight, device, dtype)
         self.names = self._metrics.names
         self._self_contact = SelfContact(robot)
         self._between_samples = suite.metrics.smoothness == "samples"
-        joints, feet = robot.num_joints, len(robot.foot_names)
-        self._fields: tuple[str, ...] = _MOTION + _JOINTS
-        self._widths = [4, 3, 3, joints, joints, joints]
-        if self._metrics.needs_contacts:
-            self._fields += _CONTACTS
-            self._widths += [3, 3, feet, feet]
+        joints = robot.num_joints
+        needed = {*self._metrics.columns, "joint_position"}  # joint positions show which parts touch each other
+        self._shapes = {f.name: getattr(like, f.name).shape[1:] for f in fields(PhysicsState) if f.name in needed}
+        widths = [math.prod(shape) for shape in self._shapes.values()]
         # then the command, the torque before, whether that is known, and whether the sample counts
-        self._split = [*self._widths, 3, joints, 1, 1]
+        self._split = [*widths, 3, joints, 1, 1]
         self._worlds, self._device, self._dtype, self._one_by_one = worlds, device, dtype, one_by_one
         self.rows = torch.zeros(0, 0, device=device, dtype=dtype)
         """All rows, one world's after the other's; other memory after ``reserve``."""
@@ -85,21 +82,21 @@ class SampleTable:
         self.count.masked_fill_(mask, 0)
 
     def forget_torque(self, mask: torch.Tensor) -> None:
-        """Some robots, (K,) bool, were reset: there is no torque to compare their next one with."""
+        """Forget the last torque of robots that were reset, (K,) bool."""
         self._torque_known &= ~mask
 
     def write(self, sample: PhysicsState, due: torch.Tensor, keep: torch.Tensor, command: torch.Tensor) -> None:
-        """Write a row for every world whose sample is due.
+        """Write a row for every world that takes a sample.
 
         Args:
             sample: the state at which it is taken; the other worlds' rows do not matter.
             due: (K,) bool; none may be before ``reserve``.
-            keep: whether it counts, (K,) bool.
+            keep: samples that count, (K,) bool.
             command: commanded velocities, (K, 3).
         """
         if not self.capacity:
             return
-        values = [getattr(sample, name) for name in self._fields]
+        values = [getattr(sample, name).reshape(self._worlds, -1) for name in self._shapes]
         flags = torch.stack((self._torque_known, keep), dim=1)
         row = torch.cat((*values, command, self._torque, flags), dim=1)
         at = torch.clamp(self.count, max=self.capacity - 1).masked_fill_(~due, self.capacity)
@@ -110,7 +107,7 @@ class SampleTable:
             self._torque_known |= due
 
     def end_step(self, state: PhysicsState, active: torch.Tensor) -> None:
-        """A control step has ended: its torque is the one to compare with, where the suite says so."""
+        """Keep the torque at the end of a control step for the next comparison, where the suite says so."""
         if not self._between_samples:
             self._torque.copy_(state.joint_torque)
             self._torque_known |= active
@@ -118,7 +115,7 @@ class SampleTable:
     def read(
         self, worlds: Sequence[int], counts: Sequence[int], limits: torch.Tensor, friction: torch.Tensor
     ) -> list[Samples]:
-        """What the metrics say of some worlds' first samples.
+        """Return the metrics of the first samples of some worlds.
 
         Args:
             counts: number of samples T of each, at least 1.
@@ -132,7 +129,7 @@ class SampleTable:
         mine = self.rows[at]
         rows = [x.split([sum(batch) for batch in batches]) for x in (mine, limits[world], friction[world])]
         values = torch.cat([self._evaluate(*batch) for batch in zip(*rows, batches, strict=True)])
-        poses = mine.split(self._split, dim=1)[self._fields.index("joint_position")].cpu().numpy()
+        poses = mine.split(self._split, dim=1)[list(self._shapes).index("joint_position")].cpu().numpy()
         ends = np.cumsum(counts)[:-1]
         pieces = zip(
             np.split(values.cpu().numpy(), ends), np.split(self._self_contact.touching(poses), ends), strict=True
@@ -142,13 +139,20 @@ class SampleTable:
     def _evaluate(
         self, rows: torch.Tensor, limits: torch.Tensor, friction: torch.Tensor, counts: Sequence[int]
     ) -> torch.Tensor:
-        """Metrics and quality of rows of the table, then whether they count, (N, columns + 1) float32.
+        """Return the metrics and quality of rows of the table, and 1 for those that count, (N, columns + 1) float32.
 
         The rows are those of some segments, one after the other, with so many samples each.
         """
         *values, command, before, known, keep = rows.split(self._split, dim=1)
-        if not self._metrics.needs_contacts:
-            values += [values[0][:, :0]] * len(_CONTACTS)
-        state = SampledState(**dict(zip(_MOTION + _JOINTS + _CONTACTS, values, strict=True)))
-        metrics = self._metrics.evaluate(state, command, limits, friction, before, known[:, 0] > 0)
+        columns = zip(self._shapes.items(), values, strict=True)
+        instants = Instants(
+            state=SampledState({name: value.reshape(-1, *shape) for (name, shape), value in columns}),
+            command=command,
+            limits=limits,
+            friction=friction,
+            torque_before=before,
+            torque_known=known[:, 0] > 0,
+            constants=self._metrics.constants,
+        )
+        metrics = self._metrics.evaluate(instants)
         return torch.cat((self._metrics.with_quality(metrics, keep[:, 0] > 0, counts), keep), dim=1).to(torch.float32)

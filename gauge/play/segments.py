@@ -20,7 +20,7 @@ from ..suite import Suite
 
 
 def count_segments(episode: Episode, suite: Suite | None = None) -> int:
-    """Number of segments of an episode that can be played side by side at first; without the suite, goals of its own count as
+    """Return the number of segments of an episode that can be played side by side at first; without the suite, goals of its own count as
     one each.
     """
     if suite is not None:
@@ -38,32 +38,32 @@ class Segment:
     """Place of the goal in the order in which the episode plays them."""
     sub_command: int
     again: bool = False
-    """Whether the episode's one penetration lies behind it: no other one counts."""
+    """True after the episode's one penetration that counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentOutcome:
-    """What came of a segment, or of its beginning."""
+    """The outcome of a segment, or of its beginning."""
 
     samples: NDArray[np.float32]
     """(T, columns)."""
     touching: NDArray[np.bool_]
-    """Whether parts of the robot touch each other, (T,)."""
+    """True for samples in which parts of the robot touch each other, (T,)."""
     control_steps: int
     physics_steps: int
     falls: int = 0
     diverged: bool = False
     overflowed: bool = False
     reached: bool = False
-    """Whether the target was reached."""
+    """True if the target was reached."""
     restarted: bool = False
-    """Whether a penetration made a target goal start again."""
+    """True if a penetration made a target goal start again."""
     until_penetration: SegmentOutcome | None = None
-    """What a velocity segment was when the robot first went too deep, if it did and if that matters; all of it ran on."""
+    """The outcome of a velocity segment up to its first penetration, if one matters; the segment itself ran on."""
 
 
 class SegmentRules:
-    """What a suite says about segments."""
+    """The rules of a suite about segments."""
 
     def __init__(self, suite: Suite, schedule: Schedule) -> None:
         self.sub_commands = {name: len(commands) for name, commands in schedule.sub_commands.items()}
@@ -77,15 +77,15 @@ class SegmentRules:
         self._target_steps = crossing * (2 if self.restarts else 1)
 
     def most_steps(self, segment: Segment) -> int:
-        """Control steps that the segment does not exceed."""
+        """Return the control steps that the segment does not exceed."""
         return self._target_steps if segment.goal == TARGET else self.stretch
 
     def goals(self, episode: Episode) -> list[str]:
-        """The goals of an episode in the order in which it plays them."""
+        """Return the goals of an episode in the order in which it plays them."""
         return [name for name in self.sub_commands if name in episode.goals]
 
     def noise_start(self, segment: Segment) -> int:
-        """Where in its episode's noise a segment begins, in control steps: no two segments share a draw.
+        """Return the beginning of a segment in its episode's noise, in control steps: no two segments share a draw.
 
         First come the velocity goals' sub-commands in order, then their second attempts, then the target goal.
         """
@@ -97,7 +97,7 @@ class SegmentRules:
         return (before + segment.sub_command + (total if segment.again else 0)) * self.stretch
 
     def segments(self, episode: Episode, goal_index: int, *, again: bool) -> list[Segment]:
-        """All segments of one goal of an episode."""
+        """Return all segments of one goal of an episode."""
         name = self.goals(episode)[goal_index]
         return [
             Segment(episode=episode, goal=name, goal_index=goal_index, sub_command=number, again=again)
@@ -107,23 +107,23 @@ class SegmentRules:
 
 @dataclass
 class OpenEpisode:
-    """An episode of which segments are still to be played."""
+    """An episode with segments that are still to be played."""
 
     episode: Episode
     rules: SegmentRules
     number: int = 0
-    """How many episodes began before it."""
+    """Number of episodes that began before it."""
     outcomes: dict[Segment, SegmentOutcome] = field(default_factory=dict)
     started: set[Segment] = field(default_factory=set)
     """Segments that have been handed out."""
     _made: dict[tuple[int, bool], list[Segment]] = field(default_factory=dict)
 
     def missing(self) -> set[Segment]:
-        """Segments that are needed as far as is known, and have not ended."""
+        """Return segments that are needed as far as is known, and have not ended."""
         return set(self._follow()[1])
 
     def start(self) -> list[Segment]:
-        """Needed segments that have not been handed out yet; they are now."""
+        """Hand out the needed segments that have not been handed out yet."""
         found = [s for s in self._follow()[1] if s not in self.started]
         self.started.update(found)
         return found
@@ -154,7 +154,7 @@ class OpenEpisode:
         return counted, missing, restarted
 
     def _segments(self, goal_index: int, *, again: bool) -> list[Segment]:
-        """The segments of one goal, the same ones every time."""
+        """Return the segments of one goal, the same ones every time."""
         if (goal_index, again) not in self._made:
             self._made[goal_index, again] = self.rules.segments(self.episode, goal_index, again=again)
         return self._made[goal_index, again]
@@ -162,7 +162,7 @@ class OpenEpisode:
     def _play(
         self, segments: Sequence[Segment], watched: bool
     ) -> tuple[list[tuple[Segment, SegmentOutcome]], list[Segment]]:
-        """What counts of a goal's segments up to the one that ends the attempt, and which are missing for that.
+        """Return the segments of a goal that count, up to the one that ends the attempt, and those that are missing for that.
 
         ``watched`` says whether it is certain that a penetration interrupts the goal.
         """
@@ -179,7 +179,7 @@ class OpenEpisode:
         return counted, absent
 
     def record(self, columns: tuple[str, ...]) -> Record:
-        """The episode's record; nothing may be missing."""
+        """Return the episode's record; nothing may be missing."""
         counted, missing, restarted = self._follow()
         assert not missing
         outcomes = [outcome for _, outcome in counted]
@@ -212,14 +212,14 @@ class SegmentQueue:
     """Segments that wait for a world, and the episodes that they belong to."""
 
     def __init__(self, rules: SegmentRules, columns: tuple[str, ...]) -> None:
-        """``columns`` are those of the samples."""
+        """Prepare an empty queue; ``columns`` are those of the samples."""
         self._rules, self._columns = rules, columns
         self._open: dict[Episode, OpenEpisode] = {}
         self._begun = 0
         self._waiting: deque[Segment] = deque()
 
     def __len__(self) -> int:
-        """Number of segments that wait."""
+        """Return the number of segments that wait."""
         return len(self._waiting)
 
     def add(self, episodes: Sequence[Episode]) -> None:
@@ -232,7 +232,7 @@ class SegmentQueue:
                 self._waiting.extend(self._begin(episode))
 
     def take(self, most: int) -> list[Segment]:
-        """Up to ``most`` segments to play now."""
+        """Return up to ``most`` segments to play now."""
         return [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
 
     def _begin(self, episode: Episode) -> list[Segment]:
@@ -241,7 +241,7 @@ class SegmentQueue:
         return opened.start()
 
     def finish(self, outcomes: Mapping[Segment, SegmentOutcome]) -> tuple[list[Record], set[Segment]]:
-        """Segments have ended.
+        """Take the outcomes of segments.
 
         Returns:
             Records of the episodes that are complete with them, in the order in which they began, and segments that may still be
@@ -271,5 +271,5 @@ class SegmentQueue:
         self._waiting = deque(s for s in self._waiting if s.episode not in episodes)
 
     def steps_behind(self, episode: Episode) -> int:
-        """Control steps of an open episode's segments that have ended."""
+        """Return the control steps of an open episode's segments that have ended."""
         return sum(outcome.control_steps for outcome in self._open[episode].outcomes.values())

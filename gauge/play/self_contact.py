@@ -1,4 +1,4 @@
-"""Whether parts of a robot strike each other, seen from its joint angles: what an engine's own options say does not matter."""
+"""Finds parts of a robot that strike each other, from its joint angles alone; the options of an engine do not matter."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class SelfContact:
         self._always = frozenset(self._overlapping(np.asarray(robot.default_joint_position)))
 
     def pairs(self, joint_position: NDArray[np.floating]) -> set[str]:
-        """Names of the geoms that overlap in a pose, (J,) [rad], two and two with a dash between them."""
+        """Return the names of the geoms that overlap in a pose, (J,) [rad], two and two with a dash between them."""
         found = self._overlapping(joint_position) - self._always
         return {"–".join(sorted(self._model.geom(geom).name for geom in pair)) for pair in found}
 
     def touching(self, joint_position: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Whether any parts overlap in poses, (T, J) [rad], none in one that is not finite; (T,)."""
+        """Return whether any parts overlap in poses, (T, J) [rad]; False for a pose that is not finite; (T,)."""
         finite = np.isfinite(joint_position).all(axis=1)
         poses = zip(joint_position, finite, strict=True)
         return np.array(
@@ -34,7 +34,7 @@ class SelfContact:
         )
 
     def _overlapping(self, joint_position: NDArray[np.floating]) -> set[tuple[int, int]]:
-        """Pairs of geoms that overlap in a pose."""
+        """Return the pairs of geoms that overlap in a pose."""
         self._data.qpos[self._joints] = joint_position
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)

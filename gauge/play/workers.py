@@ -29,7 +29,7 @@ from typing import Any, Protocol
 import torch
 
 from ...backends.base import PhysicsBackend, Scene
-from ...backends.mujoco import MujocoBackend
+from ...backends.registry import engine_class
 from ...policy.base import Policy
 from ...policy.foreign.fenced_policy import FencedPolicy
 from ...policy.loading import restore_policy
@@ -81,7 +81,7 @@ class Finished:
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a worker is."""
+    """Progress of a worker."""
 
     played: int = 0
     """``Play`` messages that it has taken."""
@@ -94,7 +94,7 @@ class Progress:
     engine_seconds: float | None = None
     """Time spent inside the engine's stepping so far [s]; None where the engine does not measure it."""
     stopped: bool = False
-    """Whether this is its last message."""
+    """True in the worker's last message."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class Transport(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What workers play with. It is prepared once: forked processes have it as it is."""
+    """The suite, policy, robot and engine of workers. It is prepared once: forked processes have it as it is."""
 
     suite: Suite
     policy: Policy
@@ -156,7 +156,7 @@ class Job:
 
     @cached_property
     def scene(self) -> Scene:
-        """The worlds, with all terrains in one layout.
+        """Return the worlds, with all terrains in one layout.
 
         Raises:
             TerrainError: a terrain cannot be made.
@@ -170,7 +170,7 @@ class Job:
         )
 
     def rollout(self) -> Rollout:
-        """Worlds, and the rollout that plays in them.
+        """Build the worlds, and return the rollout that plays in them.
 
         Raises:
             BackendError: the engine cannot do what the scene asks for.
@@ -180,14 +180,14 @@ class Job:
         return Rollout(self.suite, self.policy, backend, lambda e: index[e.terrain, e.level])
 
     def in_another_process(self) -> Job:
-        """The job in a worker's process: a policy that is at work in a process of its own gets another one there."""
+        """Return the job in a worker's process: a policy that is at work in a process of its own gets another one there."""
         policy = self.policy
         if not isinstance(policy, FencedPolicy):
             return self
         return replace(self, policy=restore_policy(policy.stored, policy.contract, policy.path, self.robot))
 
     def __getstate__(self) -> dict[str, Any]:
-        """To a process that was not forked a policy travels as what was in its file."""
+        """Send the policy to a process that was not forked as the content of its file."""
         policy = self.policy
         assert isinstance(policy, FilePolicy)
         return {**vars(self), "policy": (policy.stored, policy.contract, policy.path)}
@@ -217,7 +217,7 @@ class Worker:
             self.stopped = True
 
     def progress(self) -> Progress:
-        """How far the worker is."""
+        """Return the worker's progress."""
         rollout = self.rollout
         return Progress(
             played=self._played,
@@ -235,8 +235,12 @@ def start_workers(job: Job, count: int) -> Transport:
 
 
 def local_workers(backend: str, device: str, *, threads: int, most: int) -> int:
-    """How many workers share the CPU threads of this machine: an engine that has threads of its own, or a GPU, wants one."""
-    several = backend == MujocoBackend.name and torch.device(device).type == "cpu" and os.name == "posix"
+    """Return the number of workers on this machine, ``most`` at most: one on a GPU, or for an engine without ``parallel_processes``.
+
+    Raises:
+        BackendError: no such engine.
+    """
+    several = torch.device(device).type == "cpu" and os.name == "posix" and engine_class(backend).parallel_processes
     return max(min(threads, most), 1) if several else 1
 
 
@@ -288,7 +292,7 @@ class LocalProcesses:
             raise
 
     def send(self, worker: int, message: Play | Drop | Stop) -> None:
-        """See ``Transport.send``. What is sent to a process that has ended is lost; ``receive`` says why it has."""
+        """See ``Transport.send``. A message to a process that has ended is lost; ``receive`` says why the process ended."""
         with suppress(OSError):
             self._pipes[worker].send(message)
 
@@ -327,7 +331,7 @@ class LocalProcesses:
 
 
 def _run_worker(job: Job, pipe: Connection, inherited: Sequence[Connection]) -> None:
-    """A worker process's whole life.
+    """Play in a worker process until the end of the run.
 
     Args:
         pipe: to its parent.
@@ -351,7 +355,7 @@ def _run_worker(job: Job, pipe: Connection, inherited: Sequence[Connection]) -> 
 
 
 def _serve(worker: Worker, pipe: Connection) -> None:
-    """Play until told to stop. Progress is told now and then, and at once when there is more room than was said."""
+    """Play until told to stop. Send progress now and then, and at once when there is more room than was reported."""
     rollout, next_report, told = worker.rollout, 0.0, 0
     while True:
         now = time.monotonic()
@@ -371,7 +375,7 @@ def _serve(worker: Worker, pipe: Connection) -> None:
 
 
 def portable(error: Exception) -> Exception:
-    """The error itself if it survives the way to the parent, else one with the same words."""
+    """Return the error itself if it survives the way to the parent, else one with the same words."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:  # noqa: BLE001  (some errors cannot be taken apart and put together again)

@@ -1,4 +1,4 @@
-"""What is known of the segment in every world of a rollout: what it is, how far it is, and what it has counted so far.
+"""The state of the segment in every world of a rollout: its description, its progress, and its counts.
 
 A control step reads and writes these tensors in place; where it is captured as a CUDA graph they have to stay where they are.
 """
@@ -21,7 +21,7 @@ from .segments import Segment, SegmentRules
 
 
 class SegmentCounts(NamedTuple):
-    """What a world counted during a segment, and up to its first penetration."""
+    """Counts of a world during a segment, and up to its first penetration."""
 
     control_steps: int
     substeps: int
@@ -53,7 +53,7 @@ class WorldBuffers:
     """Tensors over K worlds, the first axis of each: (K,) where nothing else is said; floating point as in the physics."""
 
     active: Flags
-    """Whether the world takes part in control steps."""
+    """True in worlds that take part in control steps."""
 
     # what does not change during a segment
     spawn: Vectors
@@ -65,7 +65,7 @@ class WorldBuffers:
     target: Vectors
     """Position to reach [m], world frame, (K, 3)."""
     backward: Flags
-    """Whether the way to the target is walked backwards."""
+    """True where the robot walks backwards to the target."""
     speed: Numbers
     """Forward speed on the way to the target [m/s]."""
     limits: Vectors
@@ -73,24 +73,24 @@ class WorldBuffers:
     friction: Numbers
     """Sliding friction coefficient."""
     first_row: Counts
-    """Where the sub-command begins in ``Schedule.commands``."""
+    """First row of the sub-command in ``Schedule.commands``."""
     length: Counts
     """Control steps of the sub-command, or those that the target goal may take."""
     noise_start: Counts
-    """Where the segment begins in its episode's noise [control steps]."""
+    """Beginning of the segment in its episode's noise [control steps]."""
     push_force: Numbers
     """Sideways push, to the left of the heading [N]."""
     push_begin: Counts
     push_end: Counts
     """Commanded steps from which and before which it acts; none where both are the same."""
     aims: Flags
-    """Whether the segment aims at a target."""
+    """True for a segment that aims at a target."""
     sampled: Flags
-    """Whether samples are taken."""
+    """True where samples are taken."""
 
     # how far it is
     settling: Flags
-    """Whether the robot is waited for to stand."""
+    """True until the robot stands after a reset."""
     commanded_steps: Counts
     """Control steps since it stood."""
     tick: Counts
@@ -100,9 +100,9 @@ class WorldBuffers:
     control_steps: Counts
     """Control steps so far."""
     done: Flags
-    """Whether the way to the target is over, and the robot settles once more."""
+    """True once the way to the target is over, while the robot settles again."""
     reached: Flags
-    """Whether the target was reached."""
+    """True once the target was reached."""
     falls: Counts
     diverged: Flags
     overflowed: Flags
@@ -115,9 +115,9 @@ class WorldBuffers:
 
     # the first penetration, and how far the segment was then
     watched: Flags
-    """Whether a penetration would matter."""
+    """True while a penetration would matter."""
     penetrated: Flags
-    """Whether there was one."""
+    """True once a penetration mattered."""
     penetration_control_steps: Counts
     penetration_substeps: Counts
     penetration_samples: Counts
@@ -125,15 +125,15 @@ class WorldBuffers:
 
     # since the last poll
     ended: Flags
-    """Whether the segment has ended."""
+    """True once the segment has ended."""
     respawn: Flags
-    """Whether the robot goes back to its spawn."""
+    """True where the robot goes back to its spawn."""
     not_finite: Flags
-    """Whether the policy answered a finite observation with something else."""
+    """True where the policy's action for a finite observation is not finite."""
 
     @classmethod
     def allocate(cls, count: int, joints: int, device: torch.device, dtype: torch.dtype) -> WorldBuffers:
-        """Buffers of ``count`` empty worlds; ``dtype`` is that of the physics."""
+        """Return the buffers of ``count`` empty worlds; ``dtype`` is that of the physics."""
         tensors = {}
         for name, hint in get_type_hints(cls, include_extras=True).items():
             shape, kind = hint.__metadata__
@@ -145,7 +145,7 @@ class WorldBuffers:
         return made
 
     def mask(self, worlds: Sequence[int]) -> torch.Tensor:
-        """(K,) bool, true for some worlds."""
+        """Return a mask, (K,) bool, True for some worlds."""
         mask = torch.zeros_like(self.active)
         if worlds:
             mask[torch.tensor(worlds, device=mask.device)] = True
@@ -219,7 +219,7 @@ class WorldBuffers:
             flag[at] = False
 
     def counts(self, worlds: Sequence[int], samples: torch.Tensor) -> list[SegmentCounts]:
-        """What some worlds counted; ``samples``: rows that each of the K worlds has in the table of samples, (K,)."""
+        """Return the counts of some worlds; ``samples``: rows that each of the K worlds has in the table of samples, (K,)."""
         whole = (self.control_steps, self.substeps, self.falls, self.lost_samples, samples)
         beginning = (self.penetration_control_steps, self.penetration_substeps, self.penetration_samples)
         flags = (self.diverged, self.overflowed, self.reached, self.penetrated, self.penetration_overflowed)

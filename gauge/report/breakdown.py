@@ -1,12 +1,12 @@
-"""Quality by direction and by command: pure functions from rows of ``results.json``, for the report."""
+"""Quality by direction and by command: pure functions from the rows of a result, for the report."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any
 
 from ..goals import SUB_COMMANDS, TARGET, command_name
+from ..result import EnvironmentRow
 
 DIRECTIONS: Mapping[str, tuple[int, int]] = {
     "forward": (0, 1),
@@ -24,7 +24,7 @@ Table = Mapping[str, Mapping[str, float]]
 
 
 def command_label(name: str) -> str:
-    """A sub-command for readers: ``max_velocity +x`` is ``full speed, then stop: forward``; others go by their names."""
+    """Return a sub-command for readers: ``max_velocity +x`` is ``full speed, then stop: forward``; others go by their names."""
     known = {
         command_name(goal, part): (goal, part) for goal, parts in SUB_COMMANDS.items() for part in range(len(parts))
     }
@@ -35,17 +35,17 @@ def command_label(name: str) -> str:
     return f"{_GOALS[goal]}: {' and '.join(towards)}" if towards else _GOALS[goal]
 
 
-def breakdown(rows: Sequence[Mapping[str, Any]]) -> dict[str, Table]:
-    """Quality (mean@50) as measured, at the levels reached: the mean over a terrain's environments and seeds.
+def breakdown(rows: Sequence[EnvironmentRow]) -> dict[str, Table]:
+    """Return quality (mean@50) as measured, at the levels reached: the mean over a terrain's environments and seeds.
 
     Returns:
         ``direction``: of all sub-commands that go there, ``command``: of each sub-command. Empty where none was recorded.
     """
     values: dict[str, dict[str, list[float]]] = {}
     for row in rows:
-        for run in row.get("runs", {}).values():
-            for name, value in run.get("commands", {}).items():
-                values.setdefault(name, {}).setdefault(row["terrain"], []).append(value)
+        for run in row.runs.values():
+            for name, value in run.commands.items():
+                values.setdefault(name, {}).setdefault(row.terrain, []).append(value)
     if not values:
         return {}
     directions: dict[str, dict[str, list[float]]] = {}
@@ -66,7 +66,7 @@ def _points(signs: Sequence[int], place: tuple[int, int]) -> bool:
 
 
 def _means(values: Mapping[str, Mapping[str, Sequence[float]]]) -> Table:
-    """Means by terrain, and over the terrains, which count the same."""
+    """Return means by terrain, and over the terrains, which count the same."""
     found = {}
     for label, by_terrain in values.items():
         terrains = {terrain: fmean(qualities) for terrain, qualities in by_terrain.items()}

@@ -1,4 +1,4 @@
-"""Geometry of the report's charts: pure functions from rows of ``results.json`` to coordinates in an SVG view box.
+"""Geometry of the report's charts: pure functions from the rows of a result to coordinates in an SVG view box.
 
 The templates draw these numbers and compute nothing themselves. Coordinates are SVG user units, x to the
 right, y downwards.
@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
+from operator import attrgetter
 from typing import Any
 
-Row = Mapping[str, Any]
+from ..result import EnvironmentRow, TerrainScore
 
-FLAT = "flat"
 TERRAIN_LABELS = {
     "slope_fd": "slope, forward",
     "slope_bd": "slope, backward",
@@ -38,39 +38,38 @@ _HEAT_LEFT, _HEAT_TOP, _HEAT_BOTTOM = 34.0, 4.0, 34.0
 
 
 def terrain_label(name: str) -> str:
-    """A terrain's name for readers."""
+    """Return a terrain's name for readers."""
     return TERRAIN_LABELS.get(name, name.replace("_", " "))
 
 
 def number(value: float) -> str:
-    """A number as short as it goes, to three decimals, with a true minus sign."""
+    """Return a number as short as it goes, to three decimals, with a true minus sign."""
     return f"{round(value, 3):g}".replace("-", "−")
 
 
-def strip(row: Mapping[str, Any]) -> dict[str, Any]:
-    """One line of a score chart: marks for the statistics and a band for the interval.
+def strip(marks: Mapping[str, float | None], interval: Sequence[float] | None) -> dict[str, Any]:
+    """Return one line of a score chart: marks for the statistics and a band for the interval.
 
     Args:
-        row: ``mean50`` and, where known, ``mean``, ``mean25`` and ``interval``, all in [0, 1].
+        marks: ``mean50`` and, where known, ``mean`` and ``mean25``, all in [0, 1].
 
     Returns:
         ``ticks``: x of 0, 0.25 … 1; ``band``: (x, width) or None; ``marks``: x by statistic.
     """
-    interval = row.get("interval")
     band = None
     if interval is not None:
         low, high = (_strip_x(v) for v in interval)
         band = (low, _round(max(high - low, 1.0)))
-    marks = {s: _strip_x(row[s]) for s in ("mean", "mean25", "mean50") if row.get(s) is not None}
-    return {"ticks": [_strip_x(i / 4) for i in range(5)], "band": band, "marks": marks}
+    places = {statistic: _strip_x(value) for statistic, value in marks.items() if value is not None}
+    return {"ticks": [_strip_x(i / 4) for i in range(5)], "band": band, "marks": places}
 
 
 def _strip_x(value: float) -> float:
     return _linear(value, (0.0, 1.0), (_STRIP_INSET, STRIP_WIDTH - _STRIP_INSET))
 
 
-def radar(terrains: Mapping[str, Row], statistics: Mapping[str, str]) -> dict[str, Any] | None:
-    """Scores of the terrains on spokes, the first upwards and the others clockwise; None for fewer than three terrains.
+def radar(terrains: Mapping[str, TerrainScore], statistics: Mapping[str, str]) -> dict[str, Any] | None:
+    """Place scores of the terrains on spokes, the first upwards and the others clockwise; None for fewer than three terrains.
 
     Args:
         terrains: terrain by name, with one value in [0, 1] for each statistic.
@@ -93,7 +92,7 @@ def radar(terrains: Mapping[str, Row], statistics: Mapping[str, str]) -> dict[st
         anchor = "middle" if abs(side) < 0.2 else "start" if side > 0 else "end"
         lift = -14.0 if math.cos(angle) > 0.9 else 8.0 if math.cos(angle) < -0.9 else 0.0
         label = {"x": label_x, "y": _round(label_y + lift), "anchor": anchor, "text": terrain_label(name)}
-        spokes.append({"x": x, "y": y, "label": label, "value": row["mean50"]})
+        spokes.append({"x": x, "y": y, "label": label, "value": row.mean50})
     rings = [
         {"value": v, "points": [at(a, v) for a in angles], "label": (_round(centre[0] + 4), at(0.0, v)[1])}
         for v in (0.2, 0.4, 0.6, 0.8, 1.0)
@@ -102,7 +101,7 @@ def radar(terrains: Mapping[str, Row], statistics: Mapping[str, str]) -> dict[st
         {
             "statistic": s,
             "label": label,
-            "points": [at(a, t[s]) for a, t in zip(angles, terrains.values(), strict=True)],
+            "points": [at(a, getattr(t, s)) for a, t in zip(angles, terrains.values(), strict=True)],
         }
         for s, label in statistics.items()
     ]
@@ -110,8 +109,8 @@ def radar(terrains: Mapping[str, Row], statistics: Mapping[str, str]) -> dict[st
     return {"size": size, "centre": centre, "spokes": spokes, "rings": rings, "shapes": shapes}
 
 
-def sweep(rows: Sequence[Row], *, axis: str, quantity: str) -> list[dict[str, Any]]:
-    """Small multiples, one for each terrain: a quantity over friction or payload where only that one varies.
+def sweep(rows: Sequence[EnvironmentRow], *, axis: str, quantity: str) -> list[dict[str, Any]]:
+    """Return small multiples, one for each terrain: a quantity over friction or payload where only that one varies.
 
     Args:
         axis: ``friction`` or ``payload``.
@@ -123,16 +122,16 @@ def sweep(rows: Sequence[Row], *, axis: str, quantity: str) -> list[dict[str, An
         none.
     """
     other = "payload" if axis == "friction" else "friction"
-    series: list[tuple[str, float, list[Row]]] = []
+    series: list[tuple[str, float, list[EnvironmentRow]]] = []
     for terrain, group in _by_terrain(rows, quantity).items():
-        lines = [[r for r in group if r[other] == v] for v in sorted({r[other] for r in group})]
-        lines = [sorted(line, key=lambda r: r[axis]) for line in lines if len(line) > 1]
+        lines = [[r for r in group if getattr(r, other) == v] for v in sorted({getattr(r, other) for r in group})]
+        lines = [sorted(line, key=attrgetter(axis)) for line in lines if len(line) > 1]
         if len(lines) == 1:
-            series.append((terrain, lines[0][0][other], lines[0]))
+            series.append((terrain, getattr(lines[0][0], other), lines[0]))
     if not series:
         return []
     everything = [r for _, _, line in series for r in line]
-    values = sorted({r[axis] for r in everything})
+    values = sorted({getattr(r, axis) for r in everything})
     top = _top(everything, quantity)
     left, right = _PANEL_LEFT, _PANEL_WIDTH - _PANEL_RIGHT
     upper, lower = _PANEL_TOP, _PANEL_HEIGHT - _PANEL_BOTTOM
@@ -160,41 +159,41 @@ def sweep(rows: Sequence[Row], *, axis: str, quantity: str) -> list[dict[str, An
     ]
 
 
-def _point(row: Row, axis: str, quantity: str, x_of: Any, y_of: Any) -> dict[str, Any]:
-    interval = row.get("interval") if quantity == "score" else None
-    value = row[quantity]
+def _point(row: EnvironmentRow, axis: str, quantity: str, x_of: Any, y_of: Any) -> dict[str, Any]:
+    interval = row.interval if quantity == "score" else None
+    along, value = getattr(row, axis), getattr(row, quantity)
     unit = " kg" if axis == "payload" else ""
     shown = f"{value:.4f}" if quantity == "score" else number(value)
     return {
-        "x": x_of(row[axis]),
+        "x": x_of(along),
         "y": y_of(value),
         "whisker": None if interval is None else [y_of(v) for v in interval],
-        "failed": row["level"] == 0 if quantity == "level" else bool(row.get("falls") or row.get("diverged")),
-        "title": f"{axis} {number(row[axis])}{unit}: {quantity} {shown}",
+        "failed": row.level == 0 if quantity == "level" else bool(row.falls or row.diverged),
+        "title": f"{axis} {number(along)}{unit}: {quantity} {shown}",
     }
 
 
-def heat(rows: Sequence[Row], *, quantity: str) -> list[dict[str, Any]]:
-    """For terrains whose frictions and payloads are crossed: one map each, friction to the right, payload upwards.
+def heat(rows: Sequence[EnvironmentRow], *, quantity: str) -> list[dict[str, Any]]:
+    """Return a map of each terrain with crossed frictions and payloads, friction to the right, payload upwards.
 
     Environments without ``quantity`` (``level`` or ``score``) are left out.
     """
     maps = []
     for terrain, group in _by_terrain(rows, quantity).items():
-        frictions, payloads = (sorted({r[a] for r in group}) for a in ("friction", "payload"))
+        frictions, payloads = sorted({r.friction for r in group}), sorted({r.payload for r in group})
         if min(len(frictions), len(payloads)) < 2 or len(group) < len(frictions) + len(payloads):
             continue
         top = _top(rows, quantity)
         bottom = _HEAT_TOP + _CELL * len(payloads)
         cells = [
             {
-                "x": _round(_HEAT_LEFT + _WIDE * frictions.index(r["friction"])),
-                "y": _round(bottom - _CELL * (payloads.index(r["payload"]) + 1)),
-                "share": round(r[quantity] / top, 3),
-                "text": f"{r['score']:.2f}".removeprefix("0") if quantity == "score" else number(r["level"]),
-                "title": f"friction {number(r['friction'])}, payload {number(r['payload'])} kg: {number(r[quantity])}",
+                "x": _round(_HEAT_LEFT + _WIDE * frictions.index(r.friction)),
+                "y": _round(bottom - _CELL * (payloads.index(r.payload) + 1)),
+                "share": round(value / top, 3),
+                "text": f"{value:.2f}".removeprefix("0") if quantity == "score" else number(value),
+                "title": f"friction {number(r.friction)}, payload {number(r.payload)} kg: {number(value)}",
             }
-            for r in group
+            for r, value in ((r, getattr(r, quantity)) for r in group)
         ]
         maps.append(
             {
@@ -216,20 +215,20 @@ def heat(rows: Sequence[Row], *, quantity: str) -> list[dict[str, Any]]:
     return maps
 
 
-def searches(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Outcomes of the level searches, one chart for each terrain: an environment to the row, a level to the column."""
+def searches(rows: Sequence[EnvironmentRow]) -> list[dict[str, Any]]:
+    """Return the outcomes of the level searches, one chart for each terrain: an environment to the row, a level to the column."""
     charts = []
-    top = int(_top([r for r in rows if r.get("level") is not None], "level"))
-    several = len({r["payload"] for r in rows}) > 1
+    top = int(_top(rows, "level"))
+    several = len({r.payload for r in rows}) > 1
     left = 72.0 if several else 30.0
-    for terrain in dict.fromkeys(r["terrain"] for r in rows if r.get("search")):
-        group = [r for r in rows if r["terrain"] == terrain and r.get("search")]
-        group.sort(key=lambda r: (r["payload"], r["friction"]))
+    for terrain in dict.fromkeys(r.terrain for r in rows if r.search):
+        group = [r for r in rows if r.terrain == terrain and r.search]
+        group.sort(key=attrgetter("payload", "friction"))
         lines: list[dict[str, Any]] = []
         for i, row in enumerate(group):
             y = _HEAT_TOP + _CELL * i
-            outcomes = {int(k): v for k, v in row["search"].items()}
-            label = number(row["friction"]) + (f", {number(row['payload'])} kg" if several else "")
+            outcomes = row.search or {}
+            label = number(row.friction) + (f", {number(row.payload)} kg" if several else "")
             lines.append(
                 {
                     "label": label,
@@ -237,7 +236,7 @@ def searches(rows: Sequence[Row]) -> list[dict[str, Any]]:
                     "passed": [left + _CELL * (k - 1) for k, v in sorted(outcomes.items()) if v],
                     "failed": [left + _CELL * (k - 1) for k, v in sorted(outcomes.items()) if not v],
                     "open": [left + _CELL * (k - 1) for k in range(1, top + 1) if k not in outcomes],
-                    "reached": left + _CELL * (row["level"] - 1) if row["level"] else None,
+                    "reached": left + _CELL * (row.level - 1) if row.level else None,
                 }
             )
         bottom = _HEAT_TOP + _CELL * len(group)
@@ -257,7 +256,7 @@ def searches(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]]) -> dict[str, Any]:
-    """Quantities over something that grows, several lines for each label, on axes that begin at zero or below.
+    """Draw quantities over something that grows, several lines for each label, on axes that begin at zero or below.
 
     Args:
         series: by label, for each line the x and y of its points; values that are not finite are left out.
@@ -297,34 +296,34 @@ def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]
 
 
 def _round_values(low: float, high: float) -> list[float]:
-    """Four to eleven multiples of 1, 2 or 5 times a power of ten within a range."""
+    """Return four to eleven multiples of 1, 2 or 5 times a power of ten within a range."""
     power = 10.0 ** math.floor(math.log10((high - low) / 4.0))
     step = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= (high - low) / 4.0 * (1.0 + 1e-9))
     return [float(f"{i * step:.6g}") for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
 
 
 def _tick(value: float) -> str:
-    """A round value with all of its decimals and a true minus sign."""
+    """Return a round value with all of its decimals and a true minus sign."""
     return f"{Decimal(f'{value:.6g}'):f}".replace("-", "−")
 
 
-def _by_terrain(rows: Sequence[Row], quantity: str) -> dict[str, list[Row]]:
-    found: dict[str, list[Row]] = {}
+def _by_terrain(rows: Sequence[EnvironmentRow], quantity: str) -> dict[str, list[EnvironmentRow]]:
+    found: dict[str, list[EnvironmentRow]] = {}
     for row in rows:
-        if row.get(quantity) is not None:
-            found.setdefault(row["terrain"], []).append(row)
+        if getattr(row, quantity) is not None:
+            found.setdefault(row.terrain, []).append(row)
     return found
 
 
-def _top(rows: Sequence[Row], quantity: str) -> float:
-    """Upper end of the axis of a quantity."""
+def _top(rows: Sequence[EnvironmentRow], quantity: str) -> float:
+    """Return the upper end of the axis of a quantity."""
     if quantity == "score":
         return 1.0
-    return float(max([LEVELS, *(r["level"] for r in rows if r.get("level") is not None)]))
+    return float(max([LEVELS, *(r.level for r in rows if r.level is not None)]))
 
 
 def _thin(values: Sequence[float]) -> Sequence[float]:
-    """Every n-th value, so that at most six labels stand beside each other; the first always."""
+    """Return every n-th value, so that at most six labels stand beside each other; the first always."""
     return values[:: math.ceil(len(values) / 6)]
 
 

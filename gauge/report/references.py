@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from ...files.parsing import Name, Share, Text, build, parse_toml, read_text
-from ..coverage import COMPLETE, coverage_of
+from ..result import Result
 
 _FILE = Path(__file__).parent / "references.toml"
 
@@ -27,11 +26,11 @@ class ReferenceScore:
     version: Name
     """The suite's version: others do not compare."""
     policy: Text
-    """Which policy, in words."""
+    """The policy, in words."""
     score: Share
     """Of the whole suite."""
     source: Text
-    """Who says so."""
+    """The publication."""
     interval: tuple[Share, Share] | None = None
     """95 % interval of the score, where it is known."""
     file_sha256: Name | None = None
@@ -48,7 +47,7 @@ class ReferenceTable:
 
 @cache
 def reference_table() -> ReferenceTable:
-    """The scores that ship with the project.
+    """Return the scores that ship with the project.
 
     Raises:
         ReferenceScoreError: the file is malformed.
@@ -57,11 +56,10 @@ def reference_table() -> ReferenceTable:
     return build(ReferenceTable, data, _FILE.name, ReferenceScoreError)
 
 
-def references_for(results: Mapping[str, Any]) -> Sequence[ReferenceScore]:
-    """Scores that compare with some results, the best first: of the same suite, where they hold all of it; not of the same file."""
-    if results["score"] is None or coverage_of(results)["kind"] != COMPLETE:
+def references_for(result: Result) -> Sequence[ReferenceScore]:
+    """Return scores that compare with a result, the best first: of the same suite, where it holds all of it; not of the same file."""
+    if result.score is None or not result.complete:
         return ()
-    suite = (results["suite"]["name"], results["suite"]["version"])
-    own = results["policy"]["file_sha256"]
+    suite, own = (result.suite.name, result.suite.version), result.policy.file_sha256
     found = [r for r in reference_table().reference if (r.suite, r.version) == suite and r.file_sha256 != own]
     return sorted(found, key=lambda r: -r.score)

@@ -22,16 +22,17 @@ from ...files.writing import make_folder, replacing, same_file
 from ...robots import Robot
 from ..base import PROBE_EPISODES, Policy, PolicyError
 from ..contract import HistoryOrder, ObservationTerm, PolicyContract, difference
-from ..foreign.adapters import FOREIGN_TERMS, deploy_contract
+from ..foreign.adapters import deploy_contract
 from ..foreign.torchscript_session import CONTRACT_FILE
 from ..loading import load_policy
 from ..native import NativePolicy
 from ..networks.architectures import MlpNetwork
 from ..observation import term_major_order
+from ..observation_table import observation
 from .modules import SCRIPTS, Explained, TermMajor
 
 PARTS = ("torchscript", "onnx", "deploy")
-"""What ``export_policy`` writes."""
+"""Parts that ``export_policy`` writes."""
 TOLERANCE = 1e-5
 """Largest difference of an action between an export and its policy."""
 CHECK_STEPS = 16
@@ -40,10 +41,7 @@ WIDE = 100.0
 measures, is commanded or may be sent.
 """
 ONNX_OPSET, ONNX_IR_VERSION = 17, 8
-"""What onnxruntime 1.16 reads, which the published C++ controller prescribes on the robot."""
-
-DEPLOY_TERMS = {own: name for name, own in reversed([*FOREIGN_TERMS.items()])}
-"""This project's observation terms as Isaac Lab, whose names the C++ runtime knows, calls them: the first name of each."""
+"""Versions that onnxruntime 1.16 reads, which the published C++ controller prescribes on the robot."""
 
 
 class ExportError(PolicyError):
@@ -150,7 +148,7 @@ def export_unitree(policy: Policy, folder: str | Path, robot: Robot) -> dict[Pat
 
 
 def first_steps(policy: Policy) -> str | None:
-    """What the robot's C++ runtime does otherwise at the start, in one sentence; None where it does the same."""
+    """Return one sentence on the C++ runtime's different start; None where it starts as the policy was trained."""
     frames = _network(policy).history_length
     if frames == 1 or policy.contract.history.start == "repeat":
         return None
@@ -180,16 +178,16 @@ def export_policy(
 
 
 def stacked_contract(contract: PolicyContract, frames: int) -> PolicyContract:
-    """The contract of a network that is handed its whole history, term by term."""
+    """Return the contract of a network that is handed its whole history, term by term."""
     order: HistoryOrder = "term-major" if frames > 1 else "frame-major"
     return replace(contract, history=replace(contract.history, length=frames, order=order))
 
 
 def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
-    """Metadata under mjlab's names. Lists are joined by commas; a term with a scale per entry joins them by semicolons.
+    """Return metadata under mjlab's names. Lists are joined by commas; a term with a scale per entry joins them by semicolons.
 
-    mjlab clips a whole term to one magnitude, and does it before scaling; nothing is returned for a contract whose clips
-    need more than that, so that its runtime refuses the file.
+    mjlab clips a whole term to one magnitude, and does it before scaling; nothing is returned for a contract with clips that
+    need more than that, or that has an observation without a name there, so that its runtime refuses the file.
     """
 
     def numbers(values: tuple[float, ...]) -> str:
@@ -197,7 +195,8 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
 
     terms = contract.observation
     limits = [_limit_before_scaling(term) for term in terms]
-    if None in limits:
+    names = [observation(term.name).foreign_names[:1] for term in terms]
+    if None in limits or () in names:
         return {}
     return {
         "run_path": str(contract.provenance.get("run", "")),
@@ -206,7 +205,7 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
         "joint_damping": numbers(contract.damping),
         "default_joint_pos": numbers(contract.default_joint_position),
         "command_names": "twist",
-        "observation_names": ",".join(DEPLOY_TERMS[term.name] for term in terms),
+        "observation_names": ",".join(name for (name,) in names),
         "observation_terms_scale": ",".join(";".join(repr(s) for s in term.scale) for term in terms),
         "observation_terms_clip": ",".join(f"-{limit!r};{limit!r}" for limit in limits),
         "observation_terms_history_length": ",".join([str(contract.history.length)] * len(terms)),
@@ -216,18 +215,18 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
 
 
 def _limit_before_scaling(term: ObservationTerm) -> float | None:
-    """Magnitude to which a term is clipped before it is scaled, infinity for no clip; None if its entries have different ones."""
+    """Return the magnitude of a term's clip before scaling, infinity for no clip; None if its entries have different ones."""
     if term.clip is None:
         return math.inf
     width = max(len(_every(term.clip, 1)), len(term.scale))
     pairs = zip(_every(term.clip, width), _every(term.scale, width), strict=True)
-    limits = [clip / abs(scale) for clip, scale in pairs if scale]  # what is scaled by zero is zero, clipped or not
+    limits = [clip / abs(scale) for clip, scale in pairs if scale]  # a term scaled by zero is zero, clipped or not
     largest = max(limits, default=math.inf)
     return largest if math.isclose(min(limits, default=math.inf), largest) else None
 
 
 def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: bool = False) -> dict[str, Any]:
-    """The table of a ``deploy.yaml``; gains in the order of the robot's SDK, all else in the policy's.
+    """Return the table of a ``deploy.yaml``; gains in the order of the robot's SDK, all else in the policy's.
 
     With ``finite_clips``, what the contract does not clip is clipped to ``WIDE``.
 
@@ -254,7 +253,12 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
             raise ExportError(
                 f"a deploy.yaml has one clip for all entries of an observation; '{term.name}' has {len(term.clip)}"
             )
-        observations[DEPLOY_TERMS[term.name]] = {
+        names = observation(term.name).foreign_names
+        if not names:
+            raise ExportError(
+                f"a deploy.yaml has no name for the observation '{term.name}'; give it foreign_names, or leave deploy.yaml out"
+            )
+        observations[names[0]] = {
             "params": {"command_name": "base_velocity"} if term.name == "command" else {},
             "clip": clips(term.clip or unclipped),
             "scale": list(term.scale) if len(term.scale) == width else list(term.scale) * width,
@@ -286,7 +290,7 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
 
 
 def _spelled_out(contract: PolicyContract) -> PolicyContract:
-    """The same contract with a scale and a clip for every single entry, so that two can be compared."""
+    """Return the same contract with a scale and a clip for every single entry, so that two can be compared."""
     terms = tuple(
         replace(term, scale=_every(term.scale, width), clip=term.clip and _every(term.clip, width))
         for term, width in zip(contract.observation, contract.term_widths, strict=True)
@@ -295,13 +299,13 @@ def _spelled_out(contract: PolicyContract) -> PolicyContract:
 
 
 def _every(values: float | tuple[float, ...], width: int) -> tuple[float, ...]:
-    """A value for every entry of a term."""
+    """Return a value for every entry of a term."""
     listed = values if isinstance(values, tuple) else (values,)
     return listed * width if len(listed) == 1 else listed
 
 
 def _with_wide_clips(contract: PolicyContract) -> PolicyContract:
-    """The contract with the clips that ``deploy_settings`` writes where there are none."""
+    """Return the contract with the clips that ``deploy_settings`` writes where there are none."""
     clipped = any(term.clip is not None for term in contract.observation)
     terms = tuple(
         t if t.clip is not None else replace(t, clip=WIDE if clipped else tuple(WIDE * abs(s) for s in t.scale))

@@ -1,4 +1,4 @@
-"""The modules that exports consist of: networks that keep their history, and networks that take it term by term."""
+"""Modules of exports: networks that keep their history, and networks that take it term by term."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Explained(nn.Module):
         self.network: Any = network
 
     def forward(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Actions (N, J), latent (N, L) and weights (N, K) for frames (N, H, F)."""
+        """Return actions (N, J), latent (N, L) and weights (N, K) for frames (N, H, F)."""
         return self.network.explained(history)
 
 
@@ -93,5 +93,5 @@ class TermMajor(nn.Module):
         self.frames = (int(network.history_length), int(network.frame_width))  # type: ignore[arg-type]
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for term-major histories (N, H * F)."""
+        """Return actions (N, J) for term-major histories (N, H * F)."""
         return self.network(obs[:, self.order].unflatten(1, self.frames))

@@ -1,4 +1,4 @@
-"""Contracts for policies that come without one: what their files, sidecars and widths tell.
+"""Makes contracts for policies that come without one, from their files, sidecars and widths.
 
 Every adapter notes in the contract's provenance where it took the facts from and what it had to assume.
 """
@@ -26,29 +26,15 @@ from ..contract import (
     standard_contract,
 )
 from ..native import StoredNetwork
+from ..observation_table import ObservationError, foreign_observation
 
 AT_ONCE = 1.0
 """Time after standing within which a fall says that the policy is run wrongly [s]."""
-# Observation terms as Isaac Lab and mjlab name them.
-FOREIGN_TERMS: Mapping[str, str] = {
-    "base_lin_vel": "base_linear_velocity_b",
-    "base_ang_vel": "base_angular_velocity_b",
-    "projected_gravity": "projected_gravity_b",
-    "velocity_commands": "command",
-    "command": "command",
-    "joint_pos_rel": "joint_position",
-    "joint_pos": "joint_position",
-    "joint_vel_rel": "joint_velocity",
-    "joint_vel": "joint_velocity",
-    "last_action": "last_action",
-    "actions": "last_action",
-}
-
 LONGEST_HISTORY = 20
 
 
 def sidecar_contract(path: Path) -> PolicyContract | None:
-    """The contract in ``<stem>.contract.json`` or ``contract.json`` beside a policy file, None if there is neither.
+    """Return the contract in ``<stem>.contract.json`` or ``contract.json`` beside a policy file, None if there is neither.
 
     Raises:
         PolicyError: the sidecar is malformed.
@@ -63,7 +49,7 @@ def sidecar_contract(path: Path) -> PolicyContract | None:
 
 
 def described_contract(path: Path, robot: Robot) -> PolicyContract:
-    """Read a ``contract.toml``: fields of ``PolicyContract``, of which those left out are the robot's standard ones. Where
+    """Read a ``contract.toml``: fields of ``PolicyContract``; fields left out are the robot's standard ones. Where
     it lists the joints in an order of its own, standard values per joint go with their joints.
 
     Raises:
@@ -85,7 +71,7 @@ def described_contract(path: Path, robot: Robot) -> PolicyContract:
 def contract_for_width(
     width: int, robot: Robot, *, order: HistoryOrder, provenance: Mapping[str, Any], source: str
 ) -> PolicyContract:
-    """The standard contract with as many frames as an input of this width holds.
+    """Return the standard contract with as many frames as an input of this width holds.
 
     Raises:
         PolicyError: the width is not that of 1 to ``LONGEST_HISTORY`` frames.
@@ -103,7 +89,7 @@ def contract_for_width(
 
 
 def assumptions(contract: PolicyContract) -> str | None:
-    """What had to be taken for granted of a policy that does not say it, as one sentence; None where nothing was."""
+    """Return the assumptions about a policy that lacks a contract, as one sentence; None where there are none."""
     if "assumed" not in contract.provenance:
         return None
     scales = ", ".join(f"{t.name} × {', '.join(f'{s:g}' for s in t.scale)}" for t in contract.observation)
@@ -126,13 +112,13 @@ def assumptions(contract: PolicyContract) -> str | None:
 
 
 def doubt(contract: PolicyContract) -> str:
-    """What to do where the robot falls within ``AT_ONCE`` of standing, and what was taken for granted of its policy."""
+    """Return advice for a robot that falls within ``AT_ONCE`` of standing, with the assumptions about its policy."""
     taken = assumptions(contract)
     return "'gaitgauge doctor POLICY' tries what may be wrong" + (f"; {taken}" if taken else "")
 
 
 def find_deploy_file(path: Path) -> Path | None:
-    """The ``deploy.yaml`` that belongs to an ONNX file: beside it, or in ``params/`` next to the folder of exports."""
+    """Return the ``deploy.yaml`` that belongs to an ONNX file: beside it, or in ``params/`` next to the folder of exports."""
     candidates = (
         path.with_name(f"{path.stem}.deploy.yaml"),
         path.with_name("deploy.yaml"),
@@ -228,7 +214,7 @@ def _deploy_joints(data: Any, path: Path, robot: Robot) -> tuple[str, ...]:
 
 
 def matching_joint(name: str, robot: Robot) -> str:
-    """The robot's joint of this name, with or without the ending ``_joint``; the name itself if the robot has none
+    """Return the robot's joint of this name, with or without the ending ``_joint``; the name itself if the robot has none
     such.
     """
     bare = name.removesuffix("_joint")
@@ -242,14 +228,15 @@ def _listed(value: Any, missing: float, count: int = 1) -> list[float]:
 
 
 def _own_term(name: str, source: object) -> str:
-    """The project's name of an observation."""
-    if name not in FOREIGN_TERMS:
-        raise PolicyError(f"'{source}' asks for the observation '{name}'; supported are: {', '.join(FOREIGN_TERMS)}")
-    return FOREIGN_TERMS[name]
+    """Return the project's name of an observation."""
+    try:
+        return foreign_observation(name).name
+    except ObservationError as error:
+        raise PolicyError(f"'{source}' {error}") from error
 
 
 def _limit(low: float, high: float, name: str, source: object) -> float:
-    """The magnitude that an observation is clipped to."""
+    """Return the magnitude that an observation is clipped to."""
     if low != -high:
         raise PolicyError(
             f"'{source}' clips the observation '{name}' to [{low}, {high}]; only symmetric limits are supported"
@@ -258,7 +245,7 @@ def _limit(low: float, high: float, name: str, source: object) -> float:
 
 
 def _one_length(lengths: set[int], source: object) -> int:
-    """The length that the histories of all observations have."""
+    """Return the length that the histories of all observations have."""
     if len(lengths) > 1:
         raise PolicyError(
             f"'{source}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
@@ -303,7 +290,7 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
         scale = tuple(float(s) for s in listed.split(";"))
         low, high = (float(v) for v in pair.split(";"))
         limit = _limit(low, high, name, source)
-        clip = tuple(limit * (abs(s) or 1.0) for s in scale)  # what is scaled by zero is zero, clipped or not
+        clip = tuple(limit * (abs(s) or 1.0) for s in scale)  # a term scaled by zero is zero, clipped or not
         terms.append(
             ObservationTerm(
                 name=term, scale=scale, clip=None if limit == math.inf else clip if len(clip) > 1 else clip[0]
@@ -328,7 +315,7 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
 def checkpoint_network(
     entries: Mapping[str, Any], robot: Robot, *, path: Path
 ) -> tuple[PolicyContract, StoredNetwork] | None:
-    """Network and contract of a bare rsl_rl checkpoint, None if it is not one.
+    """Return the network and contract of a bare rsl_rl checkpoint, None if it is not one.
 
     Understood are a plain perceptron as the actor, with or without input normalisation, and a student of concurrent
     teacher-student training (``student_encoder``). The activation is the one in ``params/agent.yaml`` beside it, else
@@ -395,13 +382,13 @@ def _checkpoint_network(
 
 
 def _layers(weights: Mapping[str, torch.Tensor], names: str, ours: str) -> dict[str, torch.Tensor]:
-    """The layers of the perceptron that is called one of ``names``, called ``ours``."""
+    """Return the layers of the perceptron that is called one of ``names``, called ``ours``."""
     found = {k: v for k, v in weights.items() if re.match(rf"({names})\.\d+\.(weight|bias)$", k)}
     return {f"{ours}.{k.split('.', 1)[1]}": v for k, v in found.items()}
 
 
 def _widths(layers: Mapping[str, torch.Tensor]) -> list[int]:
-    """Widths of a perceptron from its weights, input first."""
+    """Return the widths of a perceptron from its weights, input first."""
     weights = sorted(
         ((int(k.split(".")[1]), v) for k, v in layers.items() if k.endswith("weight")), key=lambda pair: pair[0]
     )
@@ -409,7 +396,7 @@ def _widths(layers: Mapping[str, torch.Tensor]) -> list[int]:
 
 
 def _activation(path: Path) -> str:
-    """Activation that the training configuration beside a checkpoint names, ELU if there is none."""
+    """Return the activation that the training configuration beside a checkpoint names, ELU if there is none."""
     settings = path.parent / "params" / "agent.yaml"
     if not settings.is_file():
         return "elu"

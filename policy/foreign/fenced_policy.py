@@ -1,7 +1,9 @@
-"""Policies whose network is a program of somebody else's: it runs in a process of its own (``fence``)."""
+"""Policies with a foreign program as their network; the program runs in a process of its own (``fence``)."""
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Collection
 
 import torch
@@ -35,7 +37,10 @@ class FencedPolicy(FilePolicy):
         """
         self.stored, self.contract, self.path = stored, contract, path
         self._child = child
-        child.ask("prepare", contract=contract.to_json(), attributes=sorted(attributes))
+        answer = child.ask("prepare", contract=contract.to_json(), attributes=sorted(attributes))
+        self.row_by_row = answer.get("batched") is not True
+        if self.row_by_row:
+            _warn_of_speed(path)
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes; the program runs on the CPU wherever the tensors are."""
@@ -45,6 +50,15 @@ class FencedPolicy(FilePolicy):
         """Start work on ``num_episodes`` episodes, each of which goes through the program alone."""
         cpu = torch.device("cpu")
         return FencedSession(self._child, num_episodes, self.contract, self.path, device=cpu, rowwise=True)
+
+
+@functools.cache  # once, and not again in each process that is forked from this one
+def _warn_of_speed(path: str) -> None:
+    logging.getLogger(__name__).warning(
+        "'%s' runs its network for one robot at a time, which is slow, since its code fits a batch of one only; "
+        "export it for any batch size, or import the checkpoint it came from (gaitgauge import)",
+        path,
+    )
 
 
 class FencedSession(PolicySession):

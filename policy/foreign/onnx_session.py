@@ -37,50 +37,6 @@ _RUN_ERRORS: tuple[type[Exception], ...] = (
 )
 
 
-class OnnxFile:
-    """A parsed ONNX file with one observation as its input."""
-
-    def __init__(self, data: bytes, *, source: str) -> None:
-        """Prepare a file's content.
-
-        Args:
-            data: the content, after ``fence.graph.check_graph`` and with all its weights.
-
-        Raises:
-            PolicyError: onnxruntime does not take it, or it has not exactly one float input of shape (batch, width).
-        """
-        self.source = source
-        self.data = data
-        try:
-            self.model = onnx.load_model_from_string(data)
-            self.runtime = _runtime(data)
-        except _RUN_ERRORS as error:
-            raise PolicyError(f"'{source}' is not a usable ONNX file: {first_line(error)}") from error
-        inputs = self.runtime.get_inputs()
-        if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 2:
-            found = "; ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
-            raise PolicyError(
-                f"'{source}' must have one float input of shape (batch, width), but has: {found or 'none'}"
-            )
-        outputs = [o.name for o in self.runtime.get_outputs()]
-        if not outputs:
-            raise PolicyError(f"'{source}' has no output")
-        self.input_name: str = inputs[0].name
-        self.output_name: str = action_output(outputs)
-        shape = inputs[0].shape
-        self.width: int | None = shape[1] if isinstance(shape[1], int) else None
-        """Width of the input, None if the file leaves it open."""
-        self.open_batch = not isinstance(shape[0], int)
-        """Whether the file was exported for any batch size."""
-
-    def variants(self) -> Iterator[bytes]:
-        """The file as exported, if for any batch size, and rewritten for one, mildest change first."""
-        if self.open_batch:
-            yield self.data
-        for open_reshapes in (False, True):
-            yield _with_open_batch(self.model, self.input_name, open_reshapes=open_reshapes)
-
-
 def _runtime(data: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
@@ -122,25 +78,42 @@ def _with_open_batch(model: onnx.ModelProto, input_name: str, *, open_reshapes: 
 
 
 class GraphProgram:
-    """An ONNX file at work for a policy."""
+    """Play an ONNX file with one observation as its input."""
 
     def __init__(self, data: bytes, source: str) -> None:
-        """Prepare the file; ``data`` has been looked through (``fence.graph.check_graph``).
+        """Prepare the file's content with all its weights, after ``fence.graph.check_graph``.
 
         Raises:
-            PolicyError: onnxruntime does not take it.
+            PolicyError: onnxruntime does not take it, or it has not exactly one float input of shape (batch, width).
         """
-        self.source = source
-        self.file = OnnxFile(data, source=source)
+        self.source, self._data = source, data
         self.contract: PolicyContract
         self._batch: bytes | None = None
+        try:
+            self._model = onnx.load_model_from_string(data)
+            runtime = _runtime(data)
+        except _RUN_ERRORS as error:
+            raise PolicyError(f"'{source}' is not a usable ONNX file: {first_line(error)}") from error
+        inputs = runtime.get_inputs()
+        if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 2:
+            found = "; ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+            raise PolicyError(
+                f"'{source}' must have one float input of shape (batch, width), but has: {found or 'none'}"
+            )
+        outputs = [o.name for o in runtime.get_outputs()]
+        if not outputs:
+            raise PolicyError(f"'{source}' has no output")
+        self._names: tuple[str, str] = (inputs[0].name, action_output(outputs))
+        rows, width = inputs[0].shape
+        self._width: int | None = width if isinstance(width, int) else None
+        self._open_batch = not isinstance(rows, int)
 
     def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """``width``: of the input, None if the file leaves it open. ``prepare``: try the file, find a batched form of it."""
+        """Answer ``width`` with the input's width, None for any, and ``prepare`` with whether a batched form was found."""
         if request["do"] == "width":
-            return {"width": self.file.width}
+            return {"width": self._width}
         self.prepare(PolicyContract.from_json(request["contract"]))
-        return {}
+        return {"batched": self._batch is not None}
 
     def prepare(self, contract: PolicyContract) -> None:
         """Try the file on zeros and find a batched form of it.
@@ -149,11 +122,9 @@ class GraphProgram:
             PolicyError: the file fails, or its input or output has another width than the contract says.
         """
         self.contract = contract
-        if self.file.width is not None and self.file.width != contract.observation_width:
-            raise PolicyError(
-                f"'{self.source}' takes {self.file.width} values, {other_width(contract, self.file.width)}"
-            )
-        self._rows = _Runner(self.file.data, self.file, contract)
+        if self._width is not None and self._width != contract.observation_width:
+            raise PolicyError(f"'{self.source}' takes {self._width} values, {other_width(contract, self._width)}")
+        self._rows = self._runner(self._data)
         self._rows.run(np.zeros((1, contract.observation_width), np.float32))
         self._batch = self._proved_batch()
 
@@ -161,16 +132,25 @@ class GraphProgram:
         """Start work on so many episodes, all at once or each alone."""
         if rowwise or (self._batch is None and rows > 1):
             return RowwiseSession(self.session, rows)
-        runner = self._rows if self._batch is None else _Runner(self._batch, self.file, self.contract)
-        return OnnxSession(runner, rows, self.contract)
+        return OnnxSession(self._rows if self._batch is None else self._runner(self._batch), rows)
+
+    def _runner(self, data: bytes) -> _Runner:
+        return _Runner(data, self._names, self.contract, self.source)
+
+    def _variants(self) -> Iterator[bytes]:
+        """Yield the file as exported, if for any batch size, and rewritten for one, mildest change first."""
+        if self._open_batch:
+            yield self._data
+        for open_reshapes in (False, True):
+            yield _with_open_batch(self._model, self._names[0], open_reshapes=open_reshapes)
 
     def _proved_batch(self) -> bytes | None:
         generator = np.random.default_rng(0)
         probe = generator.standard_normal((PROBE_EPISODES, self.contract.observation_width)).astype(np.float32)
         expected = np.concatenate([self._rows.run(probe[i : i + 1]) for i in range(PROBE_EPISODES)])
-        for variant in self.file.variants():
+        for variant in self._variants():
             try:
-                actual = _Runner(variant, self.file, self.contract).run(probe)
+                actual = self._runner(variant).run(probe)
             except PolicyError:
                 continue
             if np.allclose(actual, expected, rtol=PROBE_TOLERANCE, atol=PROBE_TOLERANCE, equal_nan=True):
@@ -179,42 +159,39 @@ class GraphProgram:
 
 
 class _Runner:
-    """Runs one form of a file and checks its output."""
+    """Run one form of a file and check its output."""
 
-    def __init__(self, data: bytes, file: OnnxFile, contract: PolicyContract) -> None:
+    def __init__(self, data: bytes, names: tuple[str, str], contract: PolicyContract, source: str) -> None:
+        """Prepare the form; ``names`` are those of input and output."""
         try:
             self._runtime = _runtime(data)
         except _RUN_ERRORS as error:
-            raise PolicyError(f"'{file.source}' cannot be prepared by onnxruntime: {first_line(error)}") from error
-        self._input, self._output = file.input_name, file.output_name
-        self._contract, self._source = contract, file.source
+            raise PolicyError(f"'{source}' cannot be prepared by onnxruntime: {first_line(error)}") from error
+        (self._input, self._output), self.contract, self.source = names, contract, source
 
     def run(self, observation: np.ndarray) -> np.ndarray:
         try:
             (action,) = self._runtime.run([self._output], {self._input: observation})
         except _RUN_ERRORS as error:
             raise PolicyError(
-                f"'{self._source}' fails on observations of shape {observation.shape}: {first_line(error)}"
+                f"'{self.source}' fails on observations of shape {observation.shape}: {first_line(error)}"
             ) from error
         if not isinstance(action, np.ndarray) or action.dtype.kind not in "fiub":
             found = f"tensor of {action.dtype}" if isinstance(action, np.ndarray) else type(action).__name__
-            raise PolicyError(f"'{self._source}' returns a {found}; a tensor of actions is needed")
-        return checked_action(torch.from_numpy(action), observation.shape[0], self._contract, self._source).numpy()
+            raise PolicyError(f"'{self.source}' returns a {found}; a tensor of actions is needed")
+        return checked_action(torch.from_numpy(action), observation.shape[0], self.contract, self.source).numpy()
 
 
 class OnnxSession(PolicySession):
-    """Runs an ONNX file; it has no memory."""
+    """Run an ONNX file, which has no memory, for all episodes at once."""
 
-    def __init__(self, runner: _Runner, num_episodes: int, contract: PolicyContract) -> None:
-        """Keep a runner, which takes all episodes at once."""
-        self._runner = runner
-        self._num_episodes = num_episodes
-        self._contract = contract
+    def __init__(self, runner: _Runner, num_episodes: int) -> None:
+        self._runner, self._num_episodes = runner, num_episodes
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """See ``PolicySession``: there is nothing to forget."""
 
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
-        check_observation(observation, self._num_episodes, self._contract, self._runner._source)
+        check_observation(observation, self._num_episodes, self._runner.contract, self._runner.source)
         return torch.from_numpy(self._runner.run(observation.numpy()))

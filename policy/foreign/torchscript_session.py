@@ -35,7 +35,7 @@ from .fence.script import CONTRACT_FILE, RESET_METHODS
 
 @contextmanager
 def _plain_execution() -> Iterator[None]:
-    """Without gradients, and without the JIT's specialization to the shapes it has seen.
+    """Run without gradients, and without the JIT's specialization to the shapes it has seen.
 
     That would make the first calls slow, and calls before and after it may round differently.
     """
@@ -101,7 +101,7 @@ def _check_operators(module: Any, *, source: str) -> None:
 
 
 def input_width(module: Any, candidates: Sequence[int], *, source: str) -> int:
-    """The first of the candidate widths that the module accepts as (1, width).
+    """Return the first of the candidate widths that the module accepts as (1, width).
 
     Raises:
         PolicyError: none of them.
@@ -125,7 +125,7 @@ def input_width(module: Any, candidates: Sequence[int], *, source: str) -> int:
 
 
 def first_tensor(output: Any) -> torch.Tensor:
-    """The action in a module's output: the output itself, or the first entry of a tuple or list of any depth behind it.
+    """Return the action in a module's output: the output itself, or the first entry of a tuple or list of any depth behind it.
 
     Raises:
         PolicyError: there is no tensor in that place.
@@ -167,11 +167,11 @@ class ScriptProgram:
         self.memories: tuple[Memory, ...] | None = None
 
     def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """``width``: the first of ``candidates`` that the module takes. ``prepare``: find out how to run it in batches."""
+        """Answer ``width`` with the first of ``candidates`` that the module takes, ``prepare`` with whether it runs in batches."""
         if request["do"] == "width":
             return {"width": input_width(self._module, request["candidates"], source=self.source)}
         self.prepare(PolicyContract.from_json(request["contract"]), request["attributes"])
-        return {}
+        return {"batched": self.memories is not None}
 
     def prepare(self, contract: PolicyContract, attributes: Collection[str]) -> None:
         """Find out how to run the module in batches.
@@ -197,7 +197,7 @@ class ScriptProgram:
         return BatchSession(self._module, rows, self.contract, self.source, self.memories)
 
     def _find_memories(self) -> tuple[Memory, ...] | None:
-        """The module's memories, such that a batch proves equal to single runs; None if there is no such way."""
+        """Return the module's memories, such that a batch proves equal to single runs; None if there is no such way."""
         changed = self._changed_tensors()
         if changed is None:
             return None
@@ -212,7 +212,7 @@ class ScriptProgram:
         return None
 
     def _changed_tensors(self) -> list[tuple[str, str, torch.Tensor]] | None:
-        """Tensors that a run changes, with their initial values; None if it changes anything else."""
+        """Return tensors that a run changes, with their initial values; None if it changes anything else."""
         module = copy.deepcopy(self._module)
         before = self._snapshot(module)
         generator = torch.Generator().manual_seed(0)
@@ -230,7 +230,7 @@ class ScriptProgram:
         return changed
 
     def _snapshot(self, module: Any) -> dict[tuple[str, str], Any]:
-        """Copies of all tensors, and the values of all plain attributes, of a module and its submodules."""
+        """Return copies of all tensors, and the values of all plain attributes, of a module and its submodules."""
         found: dict[tuple[str, str], Any] = {}
         for path, part in module.named_modules():
             for name in self._attributes:
@@ -244,7 +244,7 @@ class ScriptProgram:
         return found
 
     def _proved(self, memories: tuple[Memory, ...]) -> bool:
-        """Whether a batch acts as single copies do."""
+        """Return whether a batch acts as single copies do."""
         batch = BatchSession(self._module, PROBE_EPISODES, self.contract, self.source, memories)
         copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, self.source)
         return act_alike(copies, batch, self.contract.observation_width)
@@ -323,7 +323,7 @@ def _run(module: Any, observation: torch.Tensor, rows: int, contract: PolicyCont
 
 
 def last_line(error: BaseException) -> str:
-    """TorchScript puts its message behind the traceback."""
+    """Return the last line of an error: TorchScript puts its message behind the traceback."""
     return said_lines(error)[-1].rstrip(".")[:200]
 
 

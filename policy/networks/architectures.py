@@ -11,7 +11,7 @@ interfaces:
 
 A network with an encoder or with experts also has ``encode(history) -> (latent, weights)``, which ``forward`` goes
 through: what its actor is given of the history (N, L), None for no encoder, and the gate's weights (N, K), None for no
-experts; they add up to one but for MCP, whose primitives are weighed each for itself. ``gaitgauge latent`` looks at both.
+experts; they add up to one but for MCP, which weighs each primitive for itself. ``gaitgauge latent`` looks at both.
 With a latent it also has ``explained(history)``: the actions, the latent, and the weights where it has experts, which is
 what its TorchScript export gives out.
 
@@ -64,7 +64,7 @@ class MlpNetwork(nn.Module):
         self.network = multilayer_perceptron((width, *hidden, num_actions), activation=activation)
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for ``history`` (N, H, F)."""
+        """Return actions (N, J) for ``history`` (N, H, F)."""
         features = history.flatten(1)
         if self.normalize:
             features = (features - self.mean) / self.deviation
@@ -95,7 +95,7 @@ class CtsNetwork(EncoderNetwork):
         super().__init__(encoder, actor, history_length=history_length, frame_width=frame_width)
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Unit latent (N, L) for ``history`` (N, H, F); there are no experts."""
+        """Return the unit latent (N, L) for ``history`` (N, H, F); there are no experts."""
         return unit(self.encoder(history.flatten(1))), None
 
 
@@ -112,7 +112,7 @@ class ExpertMixture(GatedExperts):
     def __init__(
         self, *, frame_width: int, history_length: int, latent_width: int, expert_blind_to: Sequence[int], **shape: Any
     ) -> None:
-        """``shape``: of experts and gate, as ``GatedExperts`` takes it."""
+        """Build the layers; ``shape`` is that of experts and gate, as ``GatedExperts`` takes it."""
         seen = [i for i in range(frame_width) if i not in set(expert_blind_to)]
         super().__init__(
             gate_inputs=frame_width * history_length,
@@ -124,7 +124,7 @@ class ExpertMixture(GatedExperts):
         self.sees_all = len(seen) == frame_width
 
     def forward(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mixture of the experts' latents (N, L), not normalised, and gate weights (N, K) for ``history`` (N, H, F)."""
+        """Return the mixture of the experts' latents (N, L), not normalised, and gate weights (N, K) for ``history`` (N, H, F)."""
         weights = torch.softmax(self.gate(history.flatten(1)), dim=-1)
         seen = history if self.sees_all else history[:, :, self.seen]
         return mixed(weights, self.opinions(seen.flatten(1))), weights
@@ -170,7 +170,7 @@ class MoeCtsNetwork(EncoderNetwork):
         super().__init__(encoder, actor, history_length=history_length, frame_width=frame_width)
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Unit latent (N, L) and weights of the experts (N, K) for ``history`` (N, H, F)."""
+        """Return the unit latent (N, L) and weights of the experts (N, K) for ``history`` (N, H, F)."""
         mixture, weights = self.encoder(history)
         return unit(mixture), weights
 

@@ -1,4 +1,4 @@
-"""Policies whose actor is composed of experts: the paper's ablations AC-MoE and MCP, with a plain encoder of the history."""
+"""Actors composed of experts: the paper's ablations AC-MoE and MCP, with a plain encoder of the history."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class GatedActor(GatedExperts):
         super().__init__(gate_inputs=inputs, inputs=inputs, outputs=num_actions, **shape)
 
     def weigh(self, values: torch.Tensor) -> torch.Tensor:
-        """Weights of the experts (N, K), which add up to one, for inputs (N, D)."""
+        """Return the weights of the experts (N, K), which add up to one, for inputs (N, D)."""
         return torch.softmax(self.gate(values), dim=-1)
 
     def forward(self, values: torch.Tensor, weights: torch.Tensor) -> tuple[torch.Tensor]:
-        """Actions (N, J) for inputs (N, D) and what ``weigh`` gave for them."""
+        """Return actions (N, J) for inputs (N, D) and what ``weigh`` gave for them."""
         return (mixed(weights, self.opinions(values)),)
 
 
@@ -42,11 +42,11 @@ class CompositeActor(GatedExperts):
         self.register_buffer("seen", torch.tensor(seen, dtype=torch.int64), persistent=False)
 
     def weigh(self, values: torch.Tensor) -> torch.Tensor:
-        """Weights of the primitives (N, K), each in (0, 1), for inputs (N, D)."""
+        """Return the weights of the primitives (N, K), each in (0, 1), for inputs (N, D)."""
         return torch.sigmoid(self.gate(values))
 
     def forward(self, values: torch.Tensor, weights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and standard deviation of the actions, (N, J) each, for inputs (N, D) and what ``weigh`` gave for them."""
+        """Return the mean and standard deviation of the actions, (N, J) each, for inputs (N, D) and what ``weigh`` gave for them."""
         mean, log_std = self.opinions(values[:, self.seen]).chunk(2, dim=-1)
         log_std = log_std.clamp(_LEAST_LOG_STD, _LARGEST_LOG_STD)
         precision = weights.t()[..., None] / (torch.exp(2.0 * log_std) + _LEAST_VARIANCE)
@@ -72,7 +72,7 @@ class _ComposedNetwork(EncoderNetwork):
         activation: str = "elu",
         **actor: Any,
     ) -> None:
-        """``actor``: what ``make_actor`` takes beside the common widths."""
+        """Build the layers; ``actor`` holds the arguments of ``make_actor`` beside the common widths."""
         inputs = frame_width * history_length
         encoder = multilayer_perceptron((inputs, *encoder_hidden, latent_width), activation=activation)
         made = make_actor(
@@ -85,18 +85,18 @@ class _ComposedNetwork(EncoderNetwork):
         super().__init__(encoder, made, history_length=history_length, frame_width=frame_width)
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Unit latent (N, L) and weights of the actor's experts (N, K) for ``history`` (N, H, F)."""
+        """Return the unit latent (N, L) and weights of the actor's experts (N, K) for ``history`` (N, H, F)."""
         latent = unit(self.encoder(history.flatten(1)))
         return latent, self.actor.weigh(torch.cat((latent, history[:, -1]), dim=-1))
 
     def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Actions (N, J), latent (N, L) and weights of the actor's experts (N, K)."""
+        """Return actions (N, J), latent (N, L) and weights of the actor's experts (N, K)."""
         latent, weights = self.encode(history)
         return self.actor(torch.cat((latent, history[:, -1]), dim=-1), weights)[0], latent, weights
 
 
 class AcMoeNetwork(_ComposedNetwork):
-    """CTS whose actor is a mixture of experts (paper, ablation AC-MoE).
+    """Run CTS with a mixture of experts as its actor (paper, ablation AC-MoE).
 
     State dict: ``encoder.<layer>.*``, ``actor.*`` as in ``GatedActor``.
     """
@@ -115,7 +115,7 @@ class AcMoeNetwork(_ComposedNetwork):
 
 
 class McpNetwork(_ComposedNetwork):
-    """CTS whose actor multiplies Gaussian primitives (paper, ablation MCP).
+    """Run CTS with an actor that multiplies Gaussian primitives (paper, ablation MCP).
 
     State dict: ``encoder.<layer>.*``, ``actor.*`` as in ``CompositeActor``.
     """
@@ -130,7 +130,7 @@ class McpNetwork(_ComposedNetwork):
         primitives_blind_to: Sequence[int] = (),
         **common: Any,
     ) -> None:
-        """``primitives_blind_to``: entries of the current frame, as a rule the command's."""
+        """Build the layers; ``primitives_blind_to`` are entries of the current frame, as a rule the command's."""
         super().__init__(
             CompositeActor,
             latent_width=latent_width,

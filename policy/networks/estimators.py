@@ -19,7 +19,7 @@ class _EstimatorNetwork(EncoderNetwork):
     """
 
     latents = 1
-    """What the encoder gives out beside the velocity, in widths of the latent."""
+    """Width of the encoder's output beside the velocity, in widths of the latent."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class DreamwaqNetwork(_EstimatorNetwork):
     latents = 2
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Velocity and mean of the latent, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
+        """Return the velocity and mean of the latent, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
         return self.encoder(history.flatten(1))[:, : VELOCITY + self.latent_width], None
 
 
@@ -57,6 +57,6 @@ class HimNetwork(_EstimatorNetwork):
     """A hybrid internal model (Long et al., "Hybrid Internal Model", 2024): velocity and an embedding on the unit sphere."""
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Velocity and embedding, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
+        """Return the velocity and embedding, (N, 3 + L), for ``history`` (N, H, F); there are no experts."""
         encoded = self.encoder(history.flatten(1))
         return torch.cat((encoded[:, :VELOCITY], unit(encoded[:, VELOCITY:])), dim=-1), None

@@ -1,4 +1,4 @@
-"""Layers that the networks of policy files are made of. Their names in a state dict are part of the file format."""
+"""Layers of the networks in policy files. Their names in a state dict are part of the file format."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
 
 
 def aligned(values: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Inputs (N, I) and weights (O, I) of a linear layer with zeros behind them, so that rows fill whole multiples of 16 bytes. A
+    """Return inputs (N, I) and weights (O, I) of a linear layer with zeros behind them, so that rows fill whole multiples of 16 bytes. A
     product of 225 columns takes three times as long as one of 228 on an H200.
     """
     spare = -weight.shape[1] % 8  # as many fill 16 bytes in half precision
@@ -33,7 +33,7 @@ def aligned(values: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, t
 
 
 def linear(values: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
-    """Outputs (N, O) of a linear layer for inputs (N, I), on a GPU with rows that are aligned."""
+    """Return outputs (N, O) of a linear layer for inputs (N, I), on a GPU with rows that are aligned."""
     if values.is_cuda:
         values, weight = aligned(values, weight)
     return functional.linear(values, weight, bias)
@@ -43,7 +43,7 @@ class Perceptron(nn.Sequential):
     """Layers one after another, called without hooks and detours: on the CPU these cost as much as a small layer."""
 
     def forward(self, input: torch.Tensor) -> torch.Tensor:
-        """Outputs (N, last width) for inputs (N, first width)."""
+        """Return outputs (N, last width) for inputs (N, first width)."""
         for layer in self:
             if isinstance(layer, nn.Linear):
                 input = linear(input, layer.weight, layer.bias)
@@ -55,7 +55,7 @@ class Perceptron(nn.Sequential):
 def multilayer_perceptron(
     widths: Sequence[int], *, activation: str = "elu", activate_output: bool = False
 ) -> Perceptron:
-    """Linear layers of the given widths (input first, output last) with an activation between them.
+    """Return linear layers of the given widths (input first, output last) with an activation between them.
 
     The linear layers are numbered 0, 2, 4 … in the state dict, as rsl_rl numbers them.
     """
@@ -68,12 +68,12 @@ def multilayer_perceptron(
 
 
 def unit(latent: torch.Tensor) -> torch.Tensor:
-    """Vectors of unit length, those that are zero left zero, (…, L). To the last bit what ``functional.normalize`` gives."""
+    """Return vectors of unit length, those that are zero left zero, (…, L). To the last bit what ``functional.normalize`` gives."""
     return latent / torch.linalg.vector_norm(latent, dim=-1, keepdim=True).clamp_min(1e-12)
 
 
 class EncoderNetwork(nn.Module):
-    """A network that acts on what an encoder makes of the history, and on the current frame; see ``networks.py``.
+    """Act on an encoder's latent of the history and on the current frame; see ``architectures.py``.
 
     State dict: ``encoder.*`` and ``actor.*``; the actor's input is what the encoder gives, then the current frame.
     """
@@ -86,15 +86,15 @@ class EncoderNetwork(nn.Module):
         self.actor = actor
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
-        """Actions (N, J) for ``history`` (N, H, F)."""
+        """Return actions (N, J) for ``history`` (N, H, F)."""
         return self.explained(history)[0]
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """What the actor is given of ``history`` (N, H, F), (N, L), and weights of the experts (N, K), None without experts."""
+        """Return the actor's input from ``history`` (N, H, F), (N, L), and weights of the experts (N, K), None without experts."""
         raise NotImplementedError
 
     def explained(self, history: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Actions (N, J), what the encoder gives (N, L) and, with experts, their weights (N, K)."""
+        """Return actions (N, J), what the encoder gives (N, L) and, with experts, their weights (N, K)."""
         latent, weights = self.encode(history)
         actions = self.actor(torch.cat((latent, history[:, -1]), dim=-1))
         return (actions, latent) if weights is None else (actions, latent, weights)
@@ -130,7 +130,7 @@ class Experts(nn.Module):
         self.head_bias = nn.Parameter(torch.empty(heads, outputs).uniform_(-bound, bound))
 
     def opinions(self, values: torch.Tensor) -> torch.Tensor:
-        """What each expert makes of inputs (N, D), (K, N, outputs)."""
+        """Return the output of each expert for inputs (N, D), (K, N, outputs)."""
         features = self.trunk(values).unflatten(1, (self.num_experts, self.expert_width))
         head_weight = self.head_weight.expand(self.num_experts, -1, -1)
         head_bias = self.head_bias.expand(self.num_experts, -1)
@@ -138,7 +138,7 @@ class Experts(nn.Module):
 
 
 class GatedExperts(Experts):
-    """Experts with a gate, which may see more than they do.
+    """Mix experts by a gate, which may see more than the experts do.
 
     State dict: that of ``Experts``, and ``gate.<layer>.*``.
     """
@@ -152,11 +152,11 @@ class GatedExperts(Experts):
         activation: str,
         **shape: Any,
     ) -> None:
-        """``shape``: of the experts, as ``Experts`` takes it."""
+        """Build the layers; ``shape`` is that of the experts, as ``Experts`` takes it."""
         super().__init__(num_experts=num_experts, activation=activation, **shape)
         self.gate = multilayer_perceptron((gate_inputs, *gate_hidden, num_experts), activation=activation)
 
 
 def mixed(weights: torch.Tensor, opinions: torch.Tensor) -> torch.Tensor:
-    """Sum of the experts' opinions (K, N, D) with weights (N, K), (N, D)."""
+    """Return the sum of the experts' opinions (K, N, D) with weights (N, K), (N, D)."""
     return (weights.t()[..., None] * opinions).sum(dim=0)

@@ -131,13 +131,13 @@ class TrotController(nn.Module):
             self.register_buffer(name, torch.tensor(values, dtype=torch.float32), persistent=False)
 
     def initial_state(self, n: int) -> torch.Tensor:
-        """State at the start of an episode, (n, S)."""
+        """Return the state at the start of an episode, (n, S)."""
         return torch.zeros(n, _WIDTH, device=self.default.device)
 
     # ---- leg geometry -----------------------------------------------------------------------------------------------
 
     def foot_positions(self, joints: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Feet in the base frame (N, 4, 3) and their Jacobians (N, 4, 3, 3), columns hip, thigh, calf.
+        """Return feet in the base frame (N, 4, 3) and their Jacobians (N, 4, 3, 3), columns hip, thigh, calf.
 
         ``joints`` is (N, 4, 3) [rad], legs by hip, thigh, calf.
         """
@@ -157,7 +157,7 @@ class TrotController(nn.Module):
         return torch.stack((x, y, z), -1) + self.hips, torch.stack(columns, -1)
 
     def joint_positions(self, feet: torch.Tensor) -> torch.Tensor:
-        """Joints (N, 4, 3) that put the feet (N, 4, 3) there; what is out of reach is approached."""
+        """Return joints (N, 4, 3) that put the feet (N, 4, 3) there; what is out of reach is approached."""
         x, y, z = (feet - self.hips).unbind(-1)
         across, length = self.side * self.thigh_offset, self.link_length
         down = torch.sqrt(torch.clamp(y**2 + z**2 - across**2, min=0.01))
@@ -169,7 +169,7 @@ class TrotController(nn.Module):
     # ---- one step ---------------------------------------------------------------------------------------------------
 
     def forward(self, history: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Actions (N, 12) and the next state for ``history`` (N, 1, 45) and ``state`` (N, S)."""
+        """Return actions (N, 12) and the next state for ``history`` (N, 1, 45) and ``state`` (N, S)."""
         frame = history[:, -1]
         dt = self.control_period
         gravity = frame[:, 3:6]
@@ -288,7 +288,7 @@ class TrotController(nn.Module):
 
 
 def _turned(points: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Points (N, 4, 3) of a level frame seen in one that is rolled and pitched by ``angle`` (N, 4, 2)."""
+    """Return points (N, 4, 3) of a level frame seen in one that is rolled and pitched by ``angle`` (N, 4, 2)."""
     roll, pitch = angle.unbind(-1)
     x, y, z = points.unbind(-1)
     sin, cos = torch.sin(pitch), torch.cos(pitch)

@@ -11,9 +11,8 @@ import jinja2
 
 from ...files.parsing import edited, one_line
 from ...files.writing import make_folder, write_atomically
-from ...gauge.coverage import COMPLETE, coverage_of, coverage_words
 from ...gauge.report.pages import page_template
-from ...gauge.result_check import robot_digest_of
+from ...gauge.result import Result
 from ...gauge.suite import load_suite, suite_names
 from ...policy.contract import PRIVILEGED_TERMS
 from ...policy.finding import shipped_policies
@@ -38,13 +37,13 @@ def write_board(folder: Path, page: Path) -> Path:
     shipped = {name: load_suite(name) for name in suite_names()}
     by_digest = {suite.digest: suite for suite in shipped.values()}
     for file, card in cards.items():
-        named, source = card["suite"], f"the card '{one_line(file)}'"
-        if named["digest"] not in by_digest and (suite := shipped.get(named["name"])):
+        named, source = card.suite, f"the card '{one_line(file)}'"
+        if named.digest not in by_digest and (suite := shipped.get(named.name)):
             raise CardError(
-                f"{source} is of {named['name']} {named['version']} with digest {named['digest'][:12]}…, but {suite.name} here is "
+                f"{source} is of {named} with digest {named.digest[:12]}…, but {suite.name} here is "
                 f"{suite.version} with {suite.digest[:12]}…; evaluate its policy again, or take the card away"
             )
-        check_card(card, by_digest.get(named["digest"]), source)
+        check_card(card, by_digest.get(named.digest), source)
     with edited(f"a card in '{one_line(folder)}'", CardError, jinja2.TemplateError):
         text = render_board(board_data(cards, folder))
     make_folder(page.parent, CardError)
@@ -52,26 +51,26 @@ def write_board(folder: Path, page: Path) -> Path:
     return page
 
 
-def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) -> list[dict[str, Any]]:
-    """Tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first.
+def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[str, Any]]:
+    """Return the tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first.
 
     Args:
-        folder: what the command that checks a card finds the files in.
+        folder: the folder in which the command that checks a card finds the files.
 
     Returns:
         For each table ``suite``, ``backend``, ``robot``, ``robot_digest`` (None where cards do not say), ``ranked`` (complete
         cards, best first, with their ``rank``) and ``others`` (parts, custom runs, levels alone and policies with privileged
         observations, which have no rank).
     """
-    tables: dict[tuple[str, str, str, str, str, str | None], dict[str, Mapping[str, Any]]] = {}
+    tables: dict[tuple[str, str, str, str, str, str | None], dict[str, Result]] = {}
     for name, card in cards.items():
-        of = card["suite"]
-        key = (of["digest"], of["name"], of["version"], card["backend"], card["robot"], robot_digest_of(card))
+        of = card.suite
+        key = (of.digest, of.name, of.version, card.backend, card.robot, card.robot_digest)
         tables.setdefault(key, {})[name] = card
     found = []
     for key, rows in sorted(tables.items(), key=lambda item: -len(item[1])):
         # a card's own name and folder are part of the path: they stand for a policy whose file is called as any other
-        names = distinct_names([f"{folder.absolute() / name}/{card['policy']['path']}" for name, card in rows.items()])
+        names = distinct_names([f"{folder.absolute() / name}/{card.policy.path}" for name, card in rows.items()])
         entries = [_entry(name, card, folder, policy) for (name, card), policy in zip(rows.items(), names, strict=True)]
         entries.sort(key=lambda e: -1.0 if e["score"] is None else e["score"], reverse=True)
         ranked = [e for e in entries if e["ranked"]]
@@ -90,29 +89,28 @@ def board_data(cards: Mapping[str, Mapping[str, Any]], folder: Path = Path()) ->
 
 
 def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
-    """The page, as HTML text. Whatever cards contain is shown as text and never becomes markup."""
+    """Return the page, as HTML text. The texts of cards are shown as text and never becomes markup."""
     return page_template(__file__, "board.html.j2").render(tables=tables)
 
 
-def _entry(name: str, card: Mapping[str, Any], folder: Path, policy: str) -> dict[str, Any]:
-    """A line of the board."""
-    terms: Sequence[str] | None = card["policy"].get("observations")
-    path = card["policy"]["path"]
-    ships = path in shipped_policies() and file_digest(path) == card["policy"]["file_sha256"]
+def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]:
+    """Return a line of the board."""
+    terms, path = card.policy.observations, card.policy.path
+    ships = path in shipped_policies() and file_digest(path) == card.policy.file_sha256
     found = ships or ((folder / name).parent / path).is_file()
-    covered, privileged = coverage_of(card), bool(set(terms or ()) & set(PRIVILEGED_TERMS))
+    privileged = bool(set(terms or ()) & set(PRIVILEGED_TERMS))
     return {
         "card": name,
         "policy": policy,
-        "hash": card["policy"]["file_sha256"],
-        "score": card["score"],
-        "interval": card["score_interval"],
-        "note": card["chance"].get("note"),
-        "level": card["level"],
+        "hash": card.policy.file_sha256,
+        "score": card.score,
+        "interval": card.score_interval,
+        "note": card.chance.note,
+        "level": card.level,
         "observations": "not stated" if terms is None else "privileged" if privileged else "measurable",
         "terms": list(terms or ()),
-        "coverage": coverage_words(covered),
-        "ranked": covered["kind"] == COMPLETE and card["score"] is not None and not privileged,
+        "coverage": card.coverage.words,
+        "ranked": card.complete and card.score is not None and not privileged,
         "rank": None,
         "command": f"gaitgauge verify {shlex.quote(str(folder / name))}{'' if found else ' --policy FILE'}",
     }

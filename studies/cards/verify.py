@@ -1,4 +1,4 @@
-"""Does a score card hold here? Its environments are played again, by the same policy under the same rules, and compared."""
+"""Check whether a score card holds here: its environments are played again, by the same policy under the same rules, and compared."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 
 from ...files.parsing import edited, one_line, shown
 from ...gauge.chance.intervals import Evidence
-from ...gauge.coverage import UNKNOWN, coverage, coverage_of
+from ...gauge.coverage import coverage
 from ...gauge.evaluate import Prepared, Request, Status, evaluate, prepare
 from ...gauge.pipelines import Environment
-from ...gauge.result_check import chance_rules_of, robot_digest_of, unlike, versions_of
+from ...gauge.result import UNKNOWN, EnvironmentRow, Result, Table, unlike
 from ...gauge.result_figures import BY_HAND, check_interval
 from ...gauge.results import chance_rules, environment_weights
 from ...gauge.suite import Suite, load_suite
@@ -24,11 +24,10 @@ from ...robots import robot_names
 from ...robots.loading import robot_digest
 from ..policies import file_digest
 
-Row = Mapping[str, Any]
 _APART = 1_000_000
 """Distance of fresh seeds from those of the next number."""
 _OUTCOME = ("level", "score", "quality", "metrics", "trials", "runs", "falls", "diverged", "overflowed", "restarted")
-"""What of an environment's row must be the same to the last digit for a replay to be called equal."""
+"""Entries of an environment's row that must be the same to the last digit for a replay to be called equal."""
 _FIGURES = (
     "score",
     "score_interval",
@@ -40,7 +39,7 @@ _FIGURES = (
     "groups_interval",
     "health",
 )
-"""What else must be, where all environments are replayed."""
+"""Figures that must be the same as well, where all environments are replayed."""
 
 
 class CardError(ValueError):
@@ -48,7 +47,7 @@ class CardError(ValueError):
 
 
 def prepare_replay(
-    card: Mapping[str, Any],
+    card: Result,
     *,
     policy: str | None = None,
     beside: Path | None = None,
@@ -59,7 +58,7 @@ def prepare_replay(
     fresh: int | None = None,
     trust: bool = False,
 ) -> Prepared:
-    """What must be played to check a card.
+    """Return the evaluation that checks a card.
 
     Args:
         policy: the policy's file, where it is not at the card's path and none that ships.
@@ -72,8 +71,8 @@ def prepare_replay(
         CardError: policy, suite or robot is not the card's, or other seeds can say nothing about it.
         SuiteError, PolicyError, …: as ``evaluate.prepare``.
     """
-    path, wanted = policy or card["policy"]["path"], card["suite"]
-    if fresh is not None and card["score_interval"] is None:
+    path, wanted = policy or card.policy.path, card.suite
+    if fresh is not None and card.score_interval is None:
         raise CardError("the card has no interval, so that nothing can be said of other seeds; leave out --fresh")
     if policy is None and path not in shipped_policies() and not Path(path).is_file():
         if beside is not None and (beside / path).is_file():
@@ -83,48 +82,47 @@ def prepare_replay(
                 f"the card's policy is not at '{one_line(path)}' on this machine; say where it is with --policy"
             )
     found = file_digest(path)
-    if found != card["policy"]["file_sha256"]:
+    if found != card.policy.file_sha256:
         raise CardError(
-            f"'{one_line(path)}' is another policy than the card's: SHA-256 {found[:12]}…, not {card['policy']['file_sha256'][:12]}…; "
+            f"'{one_line(path)}' is another policy than the card's: SHA-256 {found[:12]}…, not {card.policy.file_sha256[:12]}…; "
             "give the right file with --policy"
         )
-    rules = load_suite(suite or wanted["name"])
-    if rules.digest != wanted["digest"]:
+    rules = load_suite(suite or wanted.name)
+    if rules.digest != wanted.digest:
         raise CardError(
-            f"the card was made on {wanted['name']} {wanted['version']} with digest {wanted['digest'][:12]}…, here it is "
+            f"the card was made on {wanted} with digest {wanted.digest[:12]}…, here it is "
             f"{rules.name} {rules.version} with {rules.digest[:12]}…; give the card's suite file with --suite"
         )
     check_card(card, rules, "the card")
-    rows = _sample(card["environments"], rules) if quick else card["environments"]
+    rows = _sample(card.environments, rules) if quick else card.environments
     prepared = prepare(
         Request(
             policy=path,
-            suite=suite or wanted["name"],
-            pipeline="level" if card["pipeline"] == "level" else "stress",
-            backend=card["backend"],
-            robot=card["robot"] if card["robot"] in robot_names() else None,  # else the policy carries it
+            suite=suite or wanted.name,
+            pipeline="level" if card.pipeline == "level" else "stress",
+            backend=card.backend,
+            robot=card.robot if card.robot in robot_names() else None,  # else the policy carries it
             device=device,
-            seeds=chance_rules_of(card, "the card", CardError).seeds,
+            seeds=card.chance.seeds,
             threads=threads,
             trust=trust,
         )
     )
-    stated, observed = card["policy"].get("observations"), [t.name for t in prepared.policy.contract.observation]
+    stated, observed = card.policy.observations, [t.name for t in prepared.policy.contract.observation]
     if stated is not None and list(stated) != observed:
         raise CardError(
             f"the card says that the policy observes {shown(list(stated))}, its file says {shown(observed)}; the card was changed "
             "by hand, so ask its maker for the results.json of the run"
         )
-    expected = robot_digest_of(card)
-    if expected is not None and expected != robot_digest(prepared.robot):
+    if card.robot_digest not in (None, robot_digest(prepared.robot)):
         raise CardError(
-            f"the files of robot '{card['robot']}' are not the card's; check out the commit that made the card"
+            f"the files of robot '{card.robot}' are not the card's; check out the commit that made the card"
         )
     prepared = replace(prepared, environments=tuple(_environment(row) for row in rows))
     return prepared if fresh is None else with_fresh_seeds(prepared, fresh)
 
 
-def check_card(card: Mapping[str, Any], suite: Suite | None, source: str) -> None:
+def check_card(card: Result, suite: Suite | None, source: str) -> None:
     """Check that a card is of the suite it names and holds what of it it says: else a replay of what is left would confirm it.
 
     Args:
@@ -134,31 +132,31 @@ def check_card(card: Mapping[str, Any], suite: Suite | None, source: str) -> Non
     Raises:
         CardError: suite, rules, coverage or interval are others.
     """
-    rules, named = chance_rules_of(card, source, CardError), card["suite"]
+    rules, named = card.chance, card.suite
     if suite is not None:
-        if (named["name"], named["version"]) != (suite.name, suite.version):
+        if (named.name, named.version) != (suite.name, suite.version):
             raise CardError(
-                f"{source} names its suite {named['name']} {named['version']}, but its digest {suite.digest[:12]}… is that of "
+                f"{source} names its suite {named}, but its digest {suite.digest[:12]}… is that of "
                 f"{suite.name} {suite.version}; {BY_HAND}"
             )
         expected = chance_rules(suite, rules.seeds)
-        for name, value in vars(expected).items():
-            if getattr(rules, name) != value:
-                raise CardError(
-                    f"{source}: chance.{name} is {shown(getattr(rules, name))}, but that of {suite.name} is {shown(value)}; {BY_HAND}"
-                )
-        stated = coverage_of(card)["kind"]
-        environments = [_environment(row) for row in card["environments"]]
-        held = coverage(suite, environments, rules.seeds, pipeline=card["pipeline"])
-        if stated not in (held["kind"], UNKNOWN):
+        if name := expected.unlike(rules):
             raise CardError(
-                f"{source} calls itself {one_line(stated)}, but holds {one_line(held['text'])} of {suite.name}; {BY_HAND}"
+                f"{source}: chance.{name} is {shown(getattr(rules, name))}, but that of {suite.name} is "
+                f"{shown(getattr(expected, name))}; {BY_HAND}"
             )
-    check_interval(card, rules, source, CardError)
+        stated = card.coverage.kind
+        environments = [_environment(row) for row in card.environments]
+        held = coverage(suite, environments, rules.seeds, pipeline=card.pipeline)
+        if stated not in (held.kind, UNKNOWN):
+            raise CardError(
+                f"{source} calls itself {one_line(stated)}, but holds {one_line(held.text)} of {suite.name}; {BY_HAND}"
+            )
+    check_interval(card, source, CardError)
 
 
 def with_fresh_seeds(prepared: Prepared, number: int) -> Prepared:
-    """The same evaluation with other seeds, which those who made the policy could not know.
+    """Return the same evaluation with other seeds, which the makers of the policy could not know.
 
     Args:
         prepared: an evaluation with the suite's own seeds.
@@ -179,7 +177,7 @@ def with_fresh_seeds(prepared: Prepared, number: int) -> Prepared:
 
 
 def verify(
-    card: Mapping[str, Any],
+    card: Result,
     prepared: Prepared,
     folder: Path,
     *,
@@ -197,8 +195,8 @@ def verify(
 
 
 @edited("the card", CardError)
-def judge(card: Mapping[str, Any], replay: Mapping[str, Any], *, fresh: bool = False) -> dict[str, Any]:
-    """Whether a card holds, given the results of a replay of all or some of its environments.
+def judge(card: Result, replay: Result, *, fresh: bool = False) -> dict[str, Any]:
+    """Judge whether a card holds, given the result of a replay of all or some of its environments.
 
     It holds where the replay's score lies within a band around the card's (``tolerance_band``), whose width is that of the replay's
     interval: what the card says of its own does not count. Where the replay has none (one seed, or levels alone) only the same
@@ -215,20 +213,22 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any], *, fresh: bool = F
         names of those that are off though all outcomes are the same; ``settings``: ``name``, ``card`` and ``here`` of each of the
         solver or the motors that differs; ``unlike``: versions that differ, in words.
     """
-    by_key = {_key(row): row for row in card["environments"]}
-    pairs = [(by_key[_key(row)], row) for row in replay["environments"]]
-    same = all(old.get(key) == new.get(key) for old, new in pairs for key in _OUTCOME)
+    by_key = {row.key: row for row in card.environments}
+    pairs = [(by_key[row.key], row) for row in replay.environments]
+    same = all(getattr(old, name) == getattr(new, name) for old, new in pairs for name in _OUTCOME)
     quick = len(pairs) < len(by_key)
     whole = same and not quick and not fresh
-    figures = [key for key in _FIGURES if whole and _says_other(card.get(key), replay.get(key))]
-    equal = same and not (whole and any(_says_other(card.get(key), replay.get(key), by=0.0) for key in _FIGURES))
-    score, interval, here = card["score"], None, replay["score"]
+    stated = card.entries()
+    figures = [name for name in _FIGURES if whole and _says_other(stated.get(name), getattr(replay, name))]
+    equal = same and not (
+        whole and any(_says_other(stated.get(name), getattr(replay, name), by=0.0) for name in _FIGURES)
+    )
+    score, interval, here = card.score, None, replay.score
     if score is not None:
-        weights = environment_weights([old["terrain"] for old, _ in pairs])
+        weights = environment_weights([old.terrain for old, _ in pairs])
         if quick:
-            score = round(float(weights @ np.array([old["score"] for old, _ in pairs])), 6)
-        rules = chance_rules_of(replay, "the replay", CardError)
-        interval = Evidence([new for _, new in pairs], rules).chance(weights).interval(score)
+            score = round(float(weights @ np.array([old.score for old, _ in pairs])), 6)
+        interval = Evidence([new for _, new in pairs], replay.chance).chance(weights).interval(score)
     band = tolerance_band(score, interval)
     within = band is not None and here is not None and band[0] <= here and (fresh or here <= band[1])
     asked, used = _settings(card), _settings(replay)
@@ -247,36 +247,37 @@ def judge(card: Mapping[str, Any], replay: Mapping[str, Any], *, fresh: bool = F
         "band": band,
         "replayed": here,
         "levels": [
-            {**{k: old[k] for k in ("terrain", "friction", "payload")}, "card": old["level"], "here": new["level"]}
+            dict(zip(("terrain", "friction", "payload"), old.key, strict=True), card=old.level, here=new.level)
             for old, new in pairs
-            if old["level"] != new["level"]
+            if old.level != new.level
         ],
         "figures": figures,
         "settings": settings,
-        "unlike": unlike([versions_of(card), versions_of(replay)]),
+        "unlike": unlike([card.versions, replay.versions]),
     }
 
 
 def _says_other(stated: Any, found: Any, *, by: float = 1e-4) -> bool:
-    """Whether a figure, or one in a table or list of them, is off by more than so much; one that is not stated is not."""
+    """Return whether a figure, or one in a table or pair of them, is off by more than so much; one that is not stated is not."""
+    if isinstance(stated, Table):
+        return any(_says_other(value, getattr(found, name), by=by) for name, value in stated.entries().items())
     if isinstance(stated, Mapping):
         return any(_says_other(value, (found or {}).get(key), by=by) for key, value in stated.items())
-    if isinstance(stated, list):
+    if isinstance(stated, tuple):
         return len(stated) != len(found or ()) or any(
             _says_other(a, b, by=by) for a, b in zip(stated, found, strict=True)
         )
     return stated is not None and (found is None or abs(stated - found) > by)
 
 
-def _settings(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of solver and motors, as far as results state them."""
-    solver, motors = results.get("solver") or {}, results.get("motors") or {}
-    gains = {f"motors.{name}": motors[name] for name in ("stiffness", "damping") if name in motors}
-    return {f"solver.{name}": value for name, value in solver.items()} | gains
+def _settings(result: Result) -> dict[str, Any]:
+    """Return settings of solver and motors, as far as the result states them."""
+    gains = {"motors.stiffness": list(result.motors.stiffness), "motors.damping": list(result.motors.damping)}
+    return {f"solver.{name}": value for name, value in result.solver.items()} | {n: g for n, g in gains.items() if g}
 
 
 def tolerance_band(score: float | None, interval: Sequence[float] | None) -> list[float] | None:
-    """Where the score of a replay must lie; None where there is no interval.
+    """Return the band in which the score of a replay must lie; None where there is no interval.
 
     Another machine's rounding makes other episodes of the same seeds, so card and replay are two draws: what two may differ by is
     √2 times what one may be off.
@@ -287,20 +288,16 @@ def tolerance_band(score: float | None, interval: Sequence[float] | None) -> lis
     return [round(max(float(low), 0.0), 6), round(min(float(high), 1.0), 6)]
 
 
-def _sample(rows: Sequence[Row], suite: Suite) -> list[Row]:
-    """One row of each terrain, at nominal friction and payload where there is one."""
+def _sample(rows: Sequence[EnvironmentRow], suite: Suite) -> list[EnvironmentRow]:
+    """Return one row of each terrain, at nominal friction and payload where there is one."""
     nominal = (suite.matrix.nominal_friction, suite.matrix.nominal_payload)
-    chosen: dict[str, Row] = {}
+    chosen: dict[str, EnvironmentRow] = {}
     for row in rows:
-        if row["terrain"] not in chosen or (row["friction"], row["payload"]) == nominal:
-            chosen[row["terrain"]] = row
+        if row.terrain not in chosen or (row.friction, row.payload) == nominal:
+            chosen[row.terrain] = row
     return list(chosen.values())
 
 
-def _environment(row: Row) -> Environment:
-    given = 0 if row["terrain"] == "flat" else None if "search" in row else row["level"]
-    return Environment(terrain=row["terrain"], friction=row["friction"], payload=row["payload"], level=given)
-
-
-def _key(row: Row) -> tuple[str, float, float]:
-    return row["terrain"], row["friction"], row["payload"]
+def _environment(row: EnvironmentRow) -> Environment:
+    given = 0 if row.flat else None if row.search is not None else row.level
+    return Environment(terrain=row.terrain, friction=row.friction, payload=row.payload, level=given)

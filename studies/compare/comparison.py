@@ -1,14 +1,13 @@
-"""Which differences between policies are real: results of one suite side by side, with chance known and many looks corrected for.
+"""Find the real differences between policies: results of one suite side by side, with chance known and many looks corrected for.
 
-Works on ``results.json`` alone (schema 2, whose rows hold every trial and run). Policies that were given the same seeds are
-compared seed by seed.
+A result is enough: its rows hold every trial and run. Policies that were given the same seeds are compared seed by seed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -16,21 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from ...files.parsing import edited, one_line, read_results, shown
-from ...gauge.chance.intervals import CONFIDENCE, Array, Chance, ChanceRules, Evidence
-from ...gauge.coverage import COMPLETE, coverage_of, coverage_words
+from ...files.parsing import edited, one_line, shown
+from ...gauge.chance.intervals import Array, Chance, Evidence
 from ...gauge.episodes import QUALITY
-from ...gauge.result_check import chance_rules_of, check_result, robot_digest_of, unlike, versions_of
-from ...gauge.result_figures import BY_HAND
-from ...gauge.results import ONE_SEED, SCHEMA, environment_weights
+from ...gauge.result import CONFIDENCE, Coverage, EnvironmentRow, Interval, Result, Runs, SuiteName, read_result, unlike
+from ...gauge.result_figures import BY_HAND, check_figures
+from ...gauge.results import ONE_SEED, environment_weights
 from ..naming import distinct_names
 
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
-"""What is compared, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
+"""Kinds of differences, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
 sub-commands are compared as measured, in the environments where both policies were measured at the same level; all else counts
 levels."""
-_SAME = {"suite": "suite", "backend": "engine", "robot": "robot", "pipeline": "pipeline"}
-"""What must be the same in all results, and its name for readers."""
+_SAME = {"backend": "engine", "robot": "robot", "pipeline": "pipeline"}
+"""Fields that must be the same in all results, and their names for readers."""
 
 
 class ComparisonError(ValueError):
@@ -44,7 +42,7 @@ class Difference:
     kind: str
     """One of ``KINDS``."""
     name: str
-    """Which terrain, metric …"""
+    """Terrain, metric …"""
     first: str
     second: str
     """Labels of the policies."""
@@ -54,25 +52,43 @@ class Difference:
     interval: tuple[float, float] | None
     """95 % interval of the difference by itself; None with one seed."""
     p_value: float | None
-    """How likely so large a difference is if both are the same, looked at alone."""
+    """Chance of so large a difference if both are the same, looked at alone."""
     corrected: float | None
     """The same among all that are looked at (Holm)."""
 
     @property
     def real(self) -> bool:
-        """Whether chance is ruled out, all looks considered."""
+        """True where chance is ruled out, all looks considered."""
         return self.corrected is not None and self.corrected < 1.0 - CONFIDENCE
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """What the comparison of some policies found."""
+class Compared:
+    """One policy of a comparison."""
 
-    suite: Mapping[str, Any]
-    policies: tuple[Mapping[str, Any], ...]
-    """Label, path, file digest, coverage (kind and text), score, interval of its runs and trials, and level of each."""
+    label: str
+    path: str
+    file_sha256: str
+    coverage: Coverage
+    score: float
+    score_interval: Interval | None
+    """Of its runs and trials."""
+    level: float | None
+    seeds: tuple[int, ...]
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return vars(self) | {"coverage": {"kind": self.coverage.kind, "text": self.coverage.text}}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """The outcome of a comparison of some policies."""
+
+    suite: SuiteName
+    policies: tuple[Compared, ...]
     paired: bool
-    """Whether all were given the same seeds."""
+    """True where all were given the same seeds."""
     differences: tuple[Difference, ...]
     """Of all pairs, in the order of ``KINDS``."""
     unlike: Sequence[str] = ()
@@ -80,7 +96,7 @@ class Comparison:
 
     @property
     def sentences(self) -> list[str]:
-        """What the scores say, one for each pair, what the details add, what was not alike, of what suite this is not the score."""
+        """Sentences on the scores, one for each pair, on details, on other versions, and on parts of a suite."""
         scores = [d for d in self.differences if d.kind == "score"]
         found = [_score_sentence(d, len(scores)) for d in scores] + [self._details_sentence()]
         if self.unlike:
@@ -91,16 +107,15 @@ class Comparison:
 
     @property
     def complete(self) -> bool:
-        """Whether all that is compared are scores of the whole suite."""
-        return all(p["coverage"]["kind"] == COMPLETE for p in self.policies)
+        """True where all are scores of the whole suite."""
+        return all(p.coverage.complete for p in self.policies)
 
     def _coverage_sentence(self) -> str:
-        suite = f"{self.suite['name']} {self.suite['version']}"
-        texts = {p["label"]: coverage_words(p["coverage"]) for p in self.policies}
+        texts = {p.label: p.coverage.words for p in self.policies}
         if len(set(texts.values())) == 1:
-            return f"None of these is a score of {suite}; all hold the same, {next(iter(texts.values()))}."
+            return f"None of these is a score of {self.suite}; all hold the same, {next(iter(texts.values()))}."
         each = "; ".join(f"'{label}' {text}" for label, text in texts.items())
-        return f"Not all of these are scores of {suite}: {each}."
+        return f"Not all of these are scores of {self.suite}: {each}."
 
     def _details_sentence(self) -> str:
         details = [d for d in self.differences if d.kind != "score"]
@@ -117,11 +132,11 @@ class Comparison:
         return f"Of {len(details)} differences in detail {len(real)} are real after Holm's correction: {shown}{more}."
 
     def plain(self) -> dict[str, Any]:
-        """As plain data."""
+        """Return it as plain data."""
         return {
             "schema": 1,
-            "suite": dict(self.suite),
-            "policies": [dict(p) for p in self.policies],
+            "suite": self.suite.to_data(),
+            "policies": [p.plain() for p in self.policies],
             "paired": self.paired,
             "sentences": self.sentences,
             "differences": [asdict(d) | {"real": d.real} for d in self.differences],
@@ -129,11 +144,11 @@ class Comparison:
 
 
 @edited("one of the results", ComparisonError)
-def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None = None) -> Comparison:
+def compare(results: Sequence[Result], labels: Sequence[str] | None = None) -> Comparison:
     """Compare all pairs of some results.
 
     Args:
-        results: contents of ``results.json``, two or more.
+        results: two or more.
         labels: names of the policies; None for those of their files, see ``distinct_names``.
 
     Raises:
@@ -141,21 +156,32 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
     """
     if len(results) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results, not {len(results)}")
-    labels = list(labels) if labels else distinct_names([r["policy"]["path"] for r in results])
+    labels = list(labels) if labels else distinct_names([r.policy.path for r in results])
     check_different(results, labels)
     check_alike(results, labels)
-    rows = results[0]["environments"]
-    order = {_key(row): at for at, row in enumerate(rows)}
-    weights = environment_weights([row["terrain"] for row in rows])
+    order = {row.key: at for at, row in enumerate(results[0].environments)}
+    weights = environment_weights([row.terrain for row in results[0].environments])
     evidence: list[Evidence] = []
-    intervals: list[tuple[float, float] | None] = []
+    policies: list[Compared] = []
     for at, (label, found) in enumerate(zip(labels, results, strict=True)):
-        source = f"the results of '{label}'"
-        same_order = sorted(found["environments"], key=lambda row: order[_key(row)])
-        with edited(source, ComparisonError):
-            evidence.append(Evidence(same_order, chance_rules_of(found, source, ComparisonError), name=str(at)))
-            intervals.append(evidence[-1].chance(weights).interval(found["score"]))
-    paired = len({(tuple(r["chance"]["seeds"]), len(r["chance"]["search_seeds"])) for r in results}) == 1
+        same_order = sorted(found.environments, key=lambda row: order[row.key])
+        with edited(f"the results of '{label}'", ComparisonError):
+            evidence.append(Evidence(same_order, found.chance, name=str(at)))
+            score = found.score or 0.0
+            interval = evidence[-1].chance(weights).interval(score)
+        policies.append(
+            Compared(
+                label=label,
+                path=found.policy.path,
+                file_sha256=found.policy.file_sha256,
+                coverage=found.coverage,
+                score=score,
+                score_interval=interval and (round(interval[0], 6), round(interval[1], 6)),
+                level=found.level,
+                seeds=found.chance.seeds,
+            )
+        )
+    paired = len({(r.chance.seeds, len(r.chance.search_seeds)) for r in results}) == 1
     raw: list[tuple[str, str, int, int, tuple[float, float], Chance]] = []
     for first, second in combinations(range(len(results)), 2):
         for kind, name, measure in _quantities(results[0], evidence[first], evidence[second]):
@@ -182,30 +208,16 @@ def compare(results: Sequence[Mapping[str, Any]], labels: Sequence[str] | None =
         for at, (kind, name, first, second, values, chance) in enumerate(raw)
     ]
     return Comparison(
-        suite=results[0]["suite"],
-        policies=tuple(
-            {
-                "label": label,
-                "path": found["policy"]["path"],
-                "file_sha256": found["policy"]["file_sha256"],
-                "coverage": {key: coverage_of(found)[key] for key in ("kind", "text")},
-                "score": found["score"],
-                "score_interval": interval and [round(end, 6) for end in interval],
-                "level": found["level"],
-                "seeds": list(found["chance"]["seeds"]),
-            }
-            for label, found, interval in zip(labels, results, intervals, strict=True)
-        ),
+        suite=results[0].suite,
+        policies=tuple(policies),
         paired=paired,
         differences=tuple(sorted(differences, key=lambda d: KINDS.index(d.kind))),
-        unlike=unlike(
-            [versions_of(r) | {f"solver.{k}": v for k, v in (r.get("solver") or {}).items()} for r in results]
-        ),
+        unlike=unlike([r.versions | {f"solver.{k}": v for k, v in r.solver.items()} for r in results]),
     )
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down correction: chance of one false alarm or more among all, whatever they have in common."""
+    """Apply Holm's step-down correction: the chance of one false alarm or more among all, whatever they have in common."""
     order = np.argsort(p_values, kind="stable")
     found = np.zeros(len(p_values))
     highest = 0.0
@@ -215,26 +227,15 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return found.tolist()
 
 
-def load_result(path: Path) -> dict[str, Any]:
-    """Read a results folder, its ``results.json``, or a copy of that.
+def load_result(path: Path) -> Result:
+    """Read a results folder, its ``results.json``, or a copy of that, and check that its figures follow from its runs.
 
     Raises:
-        ComparisonError: there is none, or it is damaged, or too old to compare.
+        ComparisonError: there is none, or it is damaged, edited, or too old to compare.
     """
-    try:
-        file = path / "results.json" if path.is_dir() else path
-        there = file.exists()
-    except OSError as error:
-        raise ComparisonError(f"'{one_line(path)}' cannot be read: {error.strerror}") from error
-    if not there:
-        raise ComparisonError(f"there are no results at '{one_line(path)}'; give a folder of 'gaitgauge evaluate'")
-    found = read_results(file, "results", ComparisonError)
-    if (schema := found.get("schema")) != SCHEMA or "environments" not in found:
-        raise ComparisonError(
-            f"'{file}' has schema {shown(schema)}, a comparison needs {SCHEMA}, which holds trials and runs; "
-            "run its evaluation again with --resume"
-        )
-    check_result(found, f"results '{one_line(file)}'", ComparisonError)
+    found = read_result(path, ComparisonError)
+    file = path / "results.json" if path.is_dir() else path
+    check_figures(found, f"results '{one_line(file)}'", ComparisonError)
     return found
 
 
@@ -252,97 +253,93 @@ def check_different(contestants: Sequence[object], labels: Sequence[str]) -> Non
 
 
 @edited("one of the results", ComparisonError)
-def check_alike(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> None:
+def check_alike(results: Sequence[Result], labels: Sequence[str]) -> None:
     """Refuse results that were not given the same episodes; of what is yet to be played, what is known of them before.
 
     Raises:
         ComparisonError: one sentence.
     """
     for label, found in zip(labels, results, strict=True):
-        if found["score"] is None:
+        if found.score is None:
             raise ComparisonError(
                 f"the results of '{label}' have levels and no scores; use the pipeline stress or multi"
             )
-    suites = [f"{r['suite']['name']} {r['suite']['version']}" for r in results]
-    rules = [
-        chance_rules_of(r, f"the results of '{label}'", ComparisonError)
-        for label, r in zip(labels, results, strict=True)
-    ]
-    for label, suite, mine, found in zip(labels[1:], suites[1:], rules[1:], results[1:], strict=True):
-        if suite != suites[0]:
+        found.check_replicates(f"the results of '{label}'", ComparisonError)
+    first, name = results[0], labels[0]
+    for label, found in zip(labels[1:], results[1:], strict=True):
+        if str(found.suite) != str(first.suite):
             raise ComparisonError(
-                f"results of different suites do not compare: '{labels[0]}' has {suites[0]}, '{label}' has {suite}; "
+                f"results of different suites do not compare: '{name}' has {first.suite}, '{label}' has {found.suite}; "
                 "evaluate both on one suite (--suite)"
             )
-        if found["suite"]["digest"] != results[0]["suite"]["digest"]:
+        if found.suite.digest != first.suite.digest:
             raise ComparisonError(
-                f"'{labels[0]}' and '{label}' name the suite {suite}, but its rules were changed between them; "
+                f"'{name}' and '{label}' name the suite {first.suite}, but its rules were changed between them; "
                 "evaluate both again"
             )
-        for key, word in list(_SAME.items())[1:]:
-            if found.get(key) != results[0].get(key):
+        for key, word in _SAME.items():
+            if getattr(found, key) != getattr(first, key):
                 raise ComparisonError(
-                    f"results with different {word}s do not compare: '{labels[0]}' has {results[0].get(key)}, "
-                    f"'{label}' has {found.get(key)}; evaluate both alike"
+                    f"results with different {word}s do not compare: '{name}' has {getattr(first, key)}, "
+                    f"'{label}' has {getattr(found, key)}; evaluate both alike"
                 )
-        files = [robot_digest_of(r) for r in (results[0], found)]
+        files = [first.robot_digest, found.robot_digest]
         if None not in files and files[0] != files[1]:
             raise ComparisonError(
-                f"'{labels[0]}' and '{label}' name the robot {found['robot']}, but its files differ "
+                f"'{name}' and '{label}' name the robot {found.robot}, but its files differ "
                 f"({' and '.join(str(f)[:12] for f in files)}); evaluate both on one robot (--robot)"
             )
-        for name in (f.name for f in fields(ChanceRules) if f.name not in ("seeds", "search_seeds")):
-            first, other = getattr(rules[0], name), getattr(mine, name)
-            if first != other:
-                raise ComparisonError(
-                    f"the rules of chance differ, though the suite is one: chance.{name} is {first} in '{labels[0]}' and {other} in "
-                    f"'{label}'; {BY_HAND}"
-                )
-        searched = [any(row.get("trials") for row in r["environments"]) for r in (results[0], found)]
+        if rule := first.chance.unlike(found.chance, "seeds", "search_seeds"):
+            raise ComparisonError(
+                f"the rules of chance differ, though the suite is one: chance.{rule} is {getattr(first.chance, rule)} in '{name}' "
+                f"and {getattr(found.chance, rule)} in '{label}'; {BY_HAND}"
+            )
+        searched = [any(row.trials for row in r.environments) for r in (first, found)]
         if searched[0] != searched[1]:
-            given, other = (label, labels[0]) if searched[0] else (labels[0], label)
+            given, other = (label, name) if searched[0] else (name, label)
             raise ComparisonError(
                 f"'{given}' was given its level and that of '{other}' was searched for; evaluate both with the same --level"
             )
-        levels = [coverage_of(r).get("levels", []) for r in (results[0], found)]
+        levels = [list(r.coverage.levels) for r in (first, found)]
         if levels[0] != levels[1]:
             raise ComparisonError(
-                f"'{labels[0]}' was given level {shown(levels[0])} and '{label}' level {shown(levels[1])}; evaluate both with "
+                f"'{name}' was given level {shown(levels[0])} and '{label}' level {shown(levels[1])}; evaluate both with "
                 "the same --level"
             )
-        both = [{_key(row) for row in r["environments"]} for r in (results[0], found)]
+        both = [{row.key for row in r.environments} for r in (first, found)]
         lone = sorted(both[0] ^ both[1])
         if lone:
             terrain, friction, payload = lone[0]
-            owner = labels[0] if lone[0] in both[0] else label
+            owner = name if lone[0] in both[0] else label
             raise ComparisonError(
-                f"'{labels[0]}' and '{label}' were not given the same environments: only '{owner}' has {terrain} at friction "
+                f"'{name}' and '{label}' were not given the same environments: only '{owner}' has {terrain} at friction "
                 f"{friction:g} and payload {payload:g} kg; give both the same --terrain, --friction and --payload"
             )
 
 
-def _reported(results: Mapping[str, Any], kind: str, name: str, value: float) -> float:
-    """A value as the results have it, which may be rounded by the suite's rules on its way."""
+def _reported(result: Result, kind: str, name: str, value: float) -> float:
+    """Return a value as the result has it, which may be rounded by the suite's rules on its way."""
     if kind == "score":
-        return float(results["score"])
+        return result.score or 0.0
     if kind == "group":
-        return float(results["groups"][name])
-    return float(results["terrains"][name]["score"]) if kind == "terrain" else value
+        return result.groups[name]
+    found = result.terrains[name].score if kind == "terrain" else value
+    return 0.0 if found is None else found
 
 
 Measure = Callable[[Evidence], tuple[float, Chance]]
 
 
-def _quantities(results: Mapping[str, Any], first: Evidence, second: Evidence) -> Iterator[tuple[str, str, Measure]]:
-    """Everything in which two policies are compared: kind, name, and what gives its value and chance."""
+def _quantities(result: Result, first: Evidence, second: Evidence) -> Iterator[tuple[str, str, Measure]]:
+    """Yield everything in which two policies are compared: kind, name, and the function that gives its value and chance."""
     rows = first.rows
-    terrains = [row["terrain"] for row in rows]
+    terrains = [row.terrain for row in rows]
     yield "score", "score", partial(_score, environment_weights(terrains), (QUALITY,))
     levelled = np.array([t != "flat" for t in terrains], dtype=np.float64)
-    if any(row.get("trials") for row in rows):
+    if any(row.trials for row in rows):
         yield "level", "mean level", partial(_level, levelled / levelled.sum())
     even = np.full(len(rows), 1.0 / len(rows))
-    for group, metrics in results["group_metrics"].items():
+    for group, metrics in result.group_metrics.items():
         yield "group", group, partial(_score, even, tuple(metrics))
     names = list(dict.fromkeys(terrains))
     for terrain in names if len(names) > 1 else ():
@@ -352,32 +349,30 @@ def _quantities(results: Mapping[str, Any], first: Evidence, second: Evidence) -
         for value, weights in _sweep(rows, axis, other):
             yield axis, f"{value:g}", partial(_score, weights, (QUALITY,))
     at_same = _at_same_levels(first, second)
-    alike = np.array([bool(row.get("runs")) for row in at_same[first].rows])
+    alike = np.array([bool(row.runs) for row in at_same[first].rows])
     if alike.any():
         same = alike / alike.sum()
-        commands = next(list(next(iter(row["runs"].values()))["commands"]) for row in rows if row.get("runs"))
-        for metric in results["metrics"]:
+        commands = next(list(next(iter(row.runs.values())).commands) for row in rows if row.runs)
+        for metric in result.metrics:
             yield "metric", metric, partial(_as_measured, same, (metric,), at_same)
         for command in commands:
             yield "command", command, partial(_as_measured, same, (command,), at_same)
 
 
 def _at_same_levels(first: Evidence, second: Evidence) -> dict[Evidence, Evidence]:
-    """The runs of two evaluations at levels that both were measured at, the lowest one of each environment; no runs elsewhere."""
-    found: tuple[list[dict[str, Any]], list[dict[str, Any]]] = ([], [])
+    """Return the runs of two evaluations at levels that both were measured at, the lowest one of each environment; no runs elsewhere."""
+    found: tuple[list[EnvironmentRow], list[EnvironmentRow]] = ([], [])
     for one, other in zip(first.rows, second.rows, strict=True):
         tables = (_runs_by_level(one), _runs_by_level(other))
-        common = sorted(tables[0].keys() & tables[1].keys(), key=int)
+        common = sorted(tables[0].keys() & tables[1].keys())
         for rows, row, table in zip(found, (one, other), tables, strict=True):
-            rows.append({**row, "trials": {}, "runs": table[common[0]] if common else {}})
+            rows.append(replace(row, trials={}, runs=table[common[0]] if common else {}))
     return {first: first.of(found[0]), second: second.of(found[1])}
 
 
-def _runs_by_level(row: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
-    """Runs of an environment by the level at which they were played, 0 on flat ground."""
-    if not row.get("runs"):
-        return {}
-    return row.get("runs_by_level") or {str(math.ceil(row["level"] or 0)): row["runs"]}
+def _runs_by_level(row: EnvironmentRow) -> Mapping[int, Runs]:
+    """Return the runs of an environment by the level at which they were played, 0 on flat ground."""
+    return (row.runs_by_level or {math.ceil(row.reached): row.runs}) if row.runs else {}
 
 
 def _score(weights: Array, columns: Sequence[str], evidence: Evidence) -> tuple[float, Chance]:
@@ -385,7 +380,7 @@ def _score(weights: Array, columns: Sequence[str], evidence: Evidence) -> tuple[
 
 
 def _level(weights: Array, evidence: Evidence) -> tuple[float, Chance]:
-    return float(weights @ [row["level"] or 0 for row in evidence.rows]), evidence.level_chance(weights)
+    return float(weights @ [row.reached for row in evidence.rows]), evidence.level_chance(weights)
 
 
 def _as_measured(
@@ -395,19 +390,16 @@ def _as_measured(
     return float(weights @ found.runs(columns).mean(1)), found.chance_at_levels(weights, columns)
 
 
-def _sweep(rows: Sequence[Mapping[str, Any]], axis: str, other: str) -> Iterator[tuple[float, Array]]:
-    """Values of friction, or of payload, and weights of their environments: those where the other was played with several."""
-    along = {o: {r[axis] for r in rows if r[other] == o} for o in {r[other] for r in rows}}
-    for value in sorted({r[axis] for r in rows}):
-        mine = [at for at, r in enumerate(rows) if r[axis] == value and len(along[r[other]]) > 1]
+def _sweep(rows: Sequence[EnvironmentRow], axis: str, other: str) -> Iterator[tuple[float, Array]]:
+    """Yield values of friction, or of payload, and weights of their environments: those where the other was played with several."""
+    places = [(getattr(row, axis), getattr(row, other)) for row in rows]
+    along = {o: {value for value, at in places if at == o} for _, o in places}
+    for value in sorted({value for value, _ in places}):
+        mine = [at for at, (own, o) in enumerate(places) if own == value and len(along[o]) > 1]
         if mine:
             weights = np.zeros(len(rows))
-            weights[mine] = environment_weights([rows[at]["terrain"] for at in mine])
+            weights[mine] = environment_weights([rows[at].terrain for at in mine])
             yield value, weights
-
-
-def _key(row: Mapping[str, Any]) -> tuple[str, float, float]:
-    return row["terrain"], row["friction"], row["payload"]
 
 
 def _named(found: Difference) -> str:
@@ -436,7 +428,7 @@ def _score_sentence(found: Difference, pairs: int) -> str:
 
 
 def format_p(value: float | None) -> str:
-    """A p-value for readers."""
+    """Return a p-value for readers."""
     if value is None:
         return "–"
     return "< 0.001" if value < 0.001 else f"= {value:.3f}"

@@ -1,15 +1,16 @@
-"""A comparison from the command line's arguments: what is a policy is evaluated, what is a result is read."""
+"""Compare what the command line names: evaluate the policies, read the results."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ...gauge.coverage import coverage
 from ...gauge.evaluate import Prepared, Request, Status, evaluate, identity, prepare
 from ...gauge.report.page import write_report
+from ...gauge.result import EnvironmentRow, PolicyName, Provenance, Result, SuiteName
 from ...gauge.results import chance_rules
 from ...gauge.store import check_folder
 from ...policy.finding import find_policy
@@ -20,7 +21,7 @@ from .report import write_comparison
 
 
 def is_result(contestant: str) -> bool:
-    """Whether an argument names results rather than a policy: a folder with ``results.json``, or a file that ends in ``.json``."""
+    """Return whether an argument names results rather than a policy: a folder with ``results.json``, or a file that ends in ``.json``."""
     path = Path(contestant)
     return path.suffix == ".json" or (path / "results.json").is_file()
 
@@ -56,30 +57,33 @@ def compare_all(
     for prepared, target in zip(prepared_requests.values(), folders, strict=True):
         check_folder(target, identity(prepared), resume=True)
     labelled = {
-        c: f"{c}/{result['policy']['path']}" for c, result in found.items()
+        c: f"{c}/{result.policy.path}" for c, result in found.items()
     }  # a card's own name where its policy has none
     for contestant, target in zip(requests, folders, strict=True):
         found[contestant] = evaluate(prepared_requests[contestant], target, resume=True, command=command, watch=watch)
         write_report(target)
-    labels = distinct_names([labelled.get(c, found[c]["policy"]["path"]) for c in contestants])
+    labels = distinct_names([labelled.get(c, found[c].policy.path) for c in contestants])
     comparison = compare([found[c] for c in contestants], labels)
     return comparison.plain(), write_comparison(folder, comparison)
 
 
-def _known_before(prepared: Prepared) -> dict[str, Any]:
-    """What results will say of how they were made, in the keys that ``check_alike`` reads, before anything is played."""
+def _known_before(prepared: Prepared) -> Result:
+    """Return the parts of a result that ``check_alike`` reads, before anything is played."""
     request, suite = prepared.request, prepared.suite
-    return {
-        "suite": {"name": suite.name, "version": suite.version, "digest": suite.digest},
-        "backend": request.backend,
-        "robot": prepared.robot.name,
-        "pipeline": request.pipeline,
-        "score": 0.0 if prepared.rules.quality else None,
-        "chance": asdict(chance_rules(suite, prepared.seeds)),
-        "coverage": coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline),
-        "provenance": {"digests": {"robot": robot_digest(prepared.robot)}},
-        "environments": [
-            {"terrain": e.terrain, "friction": e.friction, "payload": e.payload, "trials": e.searched}
+    return Result(
+        suite=SuiteName(name=suite.name, version=suite.version, digest=suite.digest),
+        policy=PolicyName(path=prepared.policy.path, file_sha256=prepared.policy.file_sha256),
+        backend=request.backend,
+        robot=prepared.robot.name,
+        pipeline=request.pipeline,
+        score=0.0 if prepared.rules.quality else None,
+        chance=chance_rules(suite, prepared.seeds),
+        coverage=coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline),
+        provenance=Provenance(digests={"robot": robot_digest(prepared.robot)}),
+        environments=tuple(
+            EnvironmentRow(
+                terrain=e.terrain, friction=e.friction, payload=e.payload, trials={1: {}} if e.searched else {}
+            )
             for e in prepared.environments
-        ],
-    }
+        ),
+    )

@@ -1,4 +1,4 @@
-"""A comparison as files: ``comparison.json``, ``.csv``, ``.tex`` (a booktabs table) and ``.html`` (one page, loads nothing)."""
+"""Write a comparison as files: ``comparison.json``, ``.csv``, ``.tex`` (a booktabs table) and ``.html`` (one page, loads nothing)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import jinja2
 
 from ...files.parsing import edited, one_line
 from ...files.writing import csv_text, make_folder, write_atomically
+from ...gauge.metrics import metric_label
 from ...gauge.report.charts import terrain_label
-from ...gauge.report.page import metric_label
 from ...gauge.report.pages import page_template
 from .. import interval_charts
 from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p
@@ -43,7 +43,7 @@ def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
 
 
 def as_csv(found: Comparison) -> str:
-    """One row for each difference."""
+    """Return one row for each difference."""
     names = ("kind", "name", "first", "second", "first_value", "second_value", "difference", "low", "high")
     rows: list[Sequence[object]] = [(*names, "p_value", "corrected_p_value", "real")]
     for d in found.differences:
@@ -54,7 +54,7 @@ def as_csv(found: Comparison) -> str:
 
 
 def as_latex(found: Comparison) -> str:
-    """A ``tabular`` for each pair, for the package booktabs; real differences in bold type."""
+    """Return a ``tabular`` for each pair, for the package booktabs; real differences in bold type."""
     tables = []
     for first, second in _pairs(found):
         lines = [
@@ -78,12 +78,12 @@ def as_latex(found: Comparison) -> str:
                 ]
                 lines.append(" & ".join(cells) + r" \\")
         tables.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
-    head = one_line(f"{found.suite['name']} {found.suite['version']}; {' '.join(found.sentences)}", _LONGEST)
+    head = one_line(f"{found.suite}; {' '.join(found.sentences)}", _LONGEST)
     return "\n\n".join([f"% {head}", *tables]) + "\n"
 
 
 def as_page(found: Comparison) -> str:
-    """The page, as HTML text. Whatever names contain is shown as text and never becomes markup."""
+    """Return the page, as HTML text. Names are shown as text and never becomes markup."""
     pairs = []
     for first, second in _pairs(found):
         kinds = []
@@ -114,7 +114,7 @@ def _odds(p: float | None) -> str:
 
 
 def label(found: Difference) -> str:
-    """What a difference is of, for readers."""
+    """Return the subject of a difference, for readers."""
     if found.kind == "terrain":
         return terrain_label(found.name)
     if found.kind == "metric":

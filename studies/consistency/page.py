@@ -7,8 +7,8 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ...files.parsing import shown
+from ...gauge.metrics import metric_label
 from ...gauge.report.charts import number, terrain_label
-from ...gauge.report.page import metric_label
 from ...gauge.report.pages import page_of, page_template
 from ...gauge.store import StoreError
 from .. import interval_charts
@@ -22,11 +22,7 @@ CURVES = {
     "joints": ("joint angles, root mean square", "rad"),
     "energy": ("difference of mechanical energy", "J"),
 }
-TESTS = {
-    "air": "Chirp in free fall",
-    "stand": "Standing pose held",
-    "walk": "The policy’s recorded targets",
-}
+TESTS = {"air": "Chirp in free fall", "stand": "Standing pose held", "walk": "The policy’s recorded targets"}
 FIELD_LABELS = {
     "total_mass": "total mass [kg]",
     "body_mass": "body masses [kg]",

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from ...gauge.chance.intervals import CONFIDENCE, welch, wilson_interval
+from ...gauge.chance.intervals import welch, wilson_interval
+from ...gauge.result import CONFIDENCE
 from ...gauge.results import environment_weights
 
 Array = NDArray[np.float64]

@@ -234,14 +234,7 @@ class _Policy:
     """The study of one policy."""
 
     def __init__(
-        self,
-        prepared: PreparedStudy,
-        name: str,
-        policy: FilePolicy,
-        folder: Path,
-        *,
-        resume: bool,
-        watch: Watch,
+        self, prepared: PreparedStudy, name: str, policy: FilePolicy, folder: Path, *, resume: bool, watch: Watch
     ) -> None:
         self._prepared, self._name, self._policy, self._folder = prepared, name, policy, folder
         self._resume, self._watch = resume, watch
@@ -291,7 +284,7 @@ class _Policy:
             "floor": floor_only(design, self._records[reference], floor, f"{self._name}/floor"),
             "pairs": pairs,
             "attribution": attribution,
-            "health": {label: health(records.values()) for label, records in self._records.items()},
+            "health": {label: health(records.values()).to_data() for label, records in self._records.items()},
         }
 
     # ---- closed loop ----------------------------------------------------------------------------------------------

@@ -15,26 +15,16 @@ from typing import Any, get_args
 
 from ...policy.contract import (
     PER_JOINT,
-    TERM_WIDTH,
     ContractError,
     HistoryOrder,
     ObservationTerm,
     PolicyContract,
     reordered,
 )
+from ...policy.observation_table import observation
 from ...robots import Robot, RobotError
 from ...robots.body_plan import BodyPlan, body_plan
 
-_SCALES: dict[str, tuple[tuple[float, ...], ...]] = {
-    "base_linear_velocity_b": ((1.0,), (2.0,)),
-    "base_angular_velocity_b": ((1.0,), (0.25,), (0.2,)),
-    "projected_gravity_b": ((1.0,),),
-    "command": ((1.0,), (2.0, 2.0, 0.25)),
-    "joint_position": ((1.0,),),
-    "joint_velocity": ((1.0,), (0.1,), (0.05,)),
-    "last_action": ((1.0,),),
-}
-"""Factors that training codes put on observations: none, and those of legged_gym and Isaac Lab."""
 _ACTION_SCALES = (0.1, 0.2, 0.25, 0.3, 0.5, 1.0)
 """Action scales that are in use [rad]."""
 _GAINS = ((0.5, 1.0), (2.0, 1.0), (1.0, 0.5), (1.0, 2.0), (0.5, 0.5), (2.0, 2.0), (4.0, 2.0), (0.25, 0.5))
@@ -220,18 +210,12 @@ def _scales(contract: PolicyContract, robot: Robot) -> Iterator[Alternative]:
     for term in terms:
         if term.name == "projected_gravity_b":
             yield made("sign of gravity", "turned round", {term.name: tuple(-s for s in term.scale)})
-        for scale in _SCALES[term.name]:
+        for scale in observation(term.name).scales_in_use:
             told = ", ".join(f"{s:g}" for s in scale)
             yield made("observation scale", f"{term.name} × {told}", {term.name: scale})
     names = [t.name for t in terms]
     yield made("observation scale", "nothing is scaled", dict.fromkeys(names, (1.0,)))
-    yield made("observation scale", "as in legged_gym", {n: _legged_gym(n) for n in names})
-
-
-def _legged_gym(name: str) -> tuple[float, ...]:
-    """The factor that legged_gym puts on an observation."""
-    factors = {"base_linear_velocity_b": (2.0,), "base_angular_velocity_b": (0.25,), "joint_velocity": (0.05,)}
-    return (2.0, 2.0, 0.25) if name == "command" else factors.get(name, (1.0,))
+    yield made("observation scale", "as in legged_gym", {n: observation(n).scale for n in names})
 
 
 def _term_orders(contract: PolicyContract, robot: Robot) -> Iterator[Alternative]:
@@ -241,7 +225,7 @@ def _term_orders(contract: PolicyContract, robot: Robot) -> Iterator[Alternative
         yield _ordered(contract, f"{b.name} before {a.name}", (*terms[:i], b, a, *terms[i + 2 :]))
     for term in terms:
         rest = [t for t in terms if t is not term]
-        for place in range(len(terms) if TERM_WIDTH[term.name] else 0):
+        for place in range(len(terms) if observation(term.name).width else 0):
             where = f"after {rest[place - 1].name}" if place else "first"
             yield _ordered(contract, f"{term.name} {where}", (*rest[:place], term, *rest[place:]))
 

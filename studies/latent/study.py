@@ -40,11 +40,7 @@ class LatentError(ValueError):
 
 
 def study_latents(
-    request: LatentRequest,
-    folder: Path,
-    *,
-    command: Sequence[str] = (),
-    watch: Watch = lambda *_: None,
+    request: LatentRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
 ) -> dict[str, Any]:
     """Look at the latents of some policies. What cannot be looked at is said under ``refused``; the others are.
 

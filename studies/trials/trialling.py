@@ -31,11 +31,7 @@ MEASURES = ("reached", "progress", "mean_speed", "peak_speed", "speed_time", "tr
 
 
 def run_trials(
-    request: TrialRequest,
-    folder: Path,
-    *,
-    command: Sequence[str] = (),
-    watch: Watch = lambda *_: None,
+    request: TrialRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
 ) -> dict[str, Any]:
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...files.parsing import did_you_mean, one_line, read_text, shown
+from ...gauge.metrics import metric_groups
 
 COMMANDS: Mapping[str, tuple[str, ...]] = {
     "longitudinal": ("linear", "stairs"),
@@ -23,13 +24,6 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
     "angular": ("angular",),
 }
 """The paper's motions behind each command: those of one command are averaged first, so that commands weigh the same."""
-
-GROUPS: Mapping[str, tuple[str, ...]] = {
-    "tracking": ("lin_vel_err", "ang_vel_err"),
-    "safety": ("dof_power", "dof_limits"),
-    "quality": ("orientation_stability", "torque_smoothness", "zmp_margin", "friction_margin"),
-}
-"""The paper's groups. A motion capture of a real robot gives the first six metrics; a group has those that were measured."""
 
 EXAMPLES = Path(__file__).parent / "examples"
 AVERAGE = "average"
@@ -186,12 +180,10 @@ def aggregate_errors(real: Table, predicted: Table, commands: Mapping[str, str] 
         )
         for m in metrics
     }
-    groups = {g: [m for m in names if m in metrics] for g, names in GROUPS.items()}
+    groups = metric_groups(metrics)
     return PredictionErrors(
         metrics=rows,
-        groups={
-            r: {g: _mean([row[m] for m in names]) for g, names in groups.items() if names} for r, row in rows.items()
-        },
+        groups={r: {g: _mean([row[m] for m in names]) for g, names in groups.items()} for r, row in rows.items()},
         bias=bias,
     )
 

@@ -1,4 +1,4 @@
-"""The table of capabilities in ``docs/backends.md``, made from what the engines declare.
+"""The table of capabilities in ``docs/reference/backends.md``, made from what the engines declare.
 
 python tests/backends/capability_table.py
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 from gaitgauge.backends.base import CAPABILITY_NAMES, Support
 from gaitgauge.backends.registry import find_backend
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "backends.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "backends.md"
 
 BEGIN, END = "<!-- capabilities: begin -->", "<!-- capabilities: end -->"
 """The table's place in the document."""

@@ -31,7 +31,9 @@ def test_cells_say_what_is_declared():
 def test_the_document_is_up_to_date(tmp_path):
     copy = tmp_path / "backends.md"
     copy.write_text(DOCUMENT.read_text(encoding="utf-8"), encoding="utf-8")
-    assert not update_document(copy), "docs/backends.md is out of date; it says itself how to write its table anew"
+    assert not update_document(copy), (
+        "docs/reference/backends.md is out of date; it says itself how to write its table anew"
+    )
 
 
 def test_an_outdated_table_is_replaced_and_the_rest_stays(tmp_path):

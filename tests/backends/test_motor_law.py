@@ -83,7 +83,7 @@ def test_a_robot_whose_motors_are_unknown_is_refused_in_a_sentence(engine):
     unknown = replace(GO2.parameters["gauge"], full_torque_speed=None, no_load_speed=None)
     with pytest.raises(BackendError, match=r"'go2' does not say how fast its motors turn; add full_torque_speed"):
         make_backend(engine, scene(parameters=unknown, **BOTH))
-    with pytest.raises(BackendError, match=r"torque_speed_limit is on while torque_limits is off"):
+    with pytest.raises(BackendError, match=r"torque_speed_limit is on without torque_limits"):
         make_backend(engine, scene(torque_limits=False, torque_speed_limit=True))
 
 

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,13 +10,18 @@ from gaitgauge.cli import clip
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.picture import choose_renderer
 from gaitgauge.gauge.report.page import CLIP
+from gaitgauge.gauge.result import EnvironmentRow, read_result
+from gaitgauge.gauge.store import StoreError
 
+CARD = Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json"
+RESULT = read_result(CARD, StoreError)
 make_clip = clip.make_clip  # the suite's fixture puts another in its place
 
 
 def rows(*places):
     names = ("terrain", "level", "friction", "payload")
-    return {"environments": [dict(zip(names, place, strict=True)) for place in places]}
+    found = tuple(EnvironmentRow(**dict(zip(names, place, strict=True))) for place in places)
+    return replace(RESULT, environments=found)
 
 
 def test_robot_is_shown_where_it_was_judged():
@@ -52,8 +58,8 @@ settling = { longest = 0.1 }
     )
     asked = []
 
-    def film(folder: Path, results, options) -> str | None:
-        asked.append((results["suite"]["name"], options))
+    def film(folder: Path, result, options) -> str | None:
+        asked.append((result.suite.name, options))
         (folder / CLIP).write_bytes(b"RIFF")
         return None if len(asked) == 1 else "no clip: nothing draws"
 

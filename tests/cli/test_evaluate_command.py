@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 from gaitgauge.cli.evaluate import doubtful_assumptions, print_results
+from gaitgauge.gauge.result import Health, read_result
+from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
 from tiny_suite import SUITE
 
@@ -28,18 +30,15 @@ def reproducible(folder: Path) -> tuple[dict, bytes]:
 def test_what_went_wrong_is_said_in_words(run, tmp_path, policy, tiny):
     part = ("--terrain", "flat", "--friction", 0.6, "--seed", 0)
     assert run("evaluate", policy, "--suite", tiny, *part, "--out", tmp_path / "run", "--threads", 1).exit_code == 0
-    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    result = read_result(tmp_path / "run", StoreError)
     said = []
     console = SimpleNamespace(print=lambda *_: None, say=lambda text: said.append(str(text)))
-    results["health"] = {"episodes": 3, "falls": 2, "diverged": 0, "overflowed": 0, "self_contact": 0.0429}
-    print_results(console, results)
+    print_results(console, replace(result, health=Health(episodes=3, falls=2, self_contact=0.0429)))
     assert "in 3 quality episodes: 2 falls, parts of the robot touch each other in 4.3 % of the samples" in said
-    results["health"] = {"episodes": 1, "falls": 1, "diverged": 1, "overflowed": 0, "self_contact": None}
-    print_results(console, results)
+    print_results(console, replace(result, health=Health(episodes=1, falls=1, diverged=1)))
     assert "in 1 quality episode: 1 fall, 1 diverged" in said
     said.clear()
-    results["health"] = {"episodes": 3, "falls": 0, "diverged": 0, "overflowed": 0, "self_contact": None}
-    print_results(console, results)
+    print_results(console, replace(result, health=Health(episodes=3)))
     assert not any("quality episodes" in line for line in said)
 
 

@@ -82,7 +82,7 @@ def test_entries_that_cannot_start_for_different_reasons_are_all_named(run, tiny
 
 def test_a_folder_of_other_settings_keeps_its_tables(run, tmp_path):
     """Every entry is refused, each in a sentence of its own."""
-    shutil.copytree(ROOT / "docs/data/sweeps/baselines", tmp_path / "out", ignore=shutil.ignore_patterns("*.pt"))
+    shutil.unpack_archive(ROOT / "docs/data/sweeps/baselines.zip", tmp_path / "out")
     text = (ROOT / "benchmarks/sweeps/baselines.toml").read_text().replace("iterations=1530", "iterations=1531")
     (tmp_path / "sweep.toml").write_text(text)
     (tmp_path / "out/sweep.html").write_text("of an earlier call")
@@ -116,9 +116,8 @@ def test_a_training_that_was_stopped_from_outside_is_no_success(run, tiny, monke
 
 
 def test_a_run_that_is_damaged_leaves_a_table_and_the_others_are_kept(run, tmp_path):
-    shutil.copytree(
-        ROOT / "docs/data/sweeps/baselines", tmp_path / "out", ignore=shutil.ignore_patterns("HIM", "MoE*", "seed-1")
-    )
+    shutil.unpack_archive(ROOT / "docs/data/sweeps/baselines.zip", tmp_path / "all")
+    shutil.copytree(tmp_path / "all", tmp_path / "out", ignore=shutil.ignore_patterns("HIM", "MoE*", "seed-1"))
     (tmp_path / "out/comparison.html").write_text("of an earlier call")
     damaged = tmp_path / "out/runs/CTS/seed-0/kept/results.json"
     damaged.write_text("{")
@@ -153,7 +152,7 @@ def test_the_range_of_the_seeds_is_a_column_of_its_own():
 
 def test_on_a_narrow_screen_every_value_of_the_page_has_its_column_s_name(run, tmp_path):
     """There the rows are cards, and no table hides what it has no room for."""
-    shutil.copytree(ROOT / "docs/data/sweeps/from-nothing", tmp_path / "out")
+    shutil.unpack_archive(ROOT / "docs/data/sweeps/from-nothing.zip", tmp_path / "out")
     assert run("sweep", ROOT / "benchmarks/sweeps/from-nothing.toml", "--out", "out", "--report").exit_code == 0
     tables = re.findall(r"<table.*?</table>", (tmp_path / "out/sweep.html").read_text(), re.DOTALL)
     assert len(tables) == 2

@@ -158,7 +158,7 @@ def test_an_error_that_cannot_be_told_keeps_its_exit_code(monkeypatch):
 
     @report_errors
     def command() -> None:
-        logging.getLogger("gaitgauge.policy.foreign.batched_policy").warning("slow")
+        logging.getLogger("gaitgauge.policy.foreign.fenced_policy").warning("slow")
         Terminal(stderr=True).say("half of it")
         raise UserError("wrong")
 
@@ -213,7 +213,7 @@ def test_notices_come_first_or_not_at_all(capsys, ends):
 
     @report_errors
     def command() -> None:
-        logging.getLogger("gaitgauge.policy.foreign.batched_policy").warning("%s is slow", "it")
+        logging.getLogger("gaitgauge.policy.foreign.fenced_policy").warning("%s is slow", "it")
         if ends == "after a sentence":
             Terminal(stderr=True).say("10 s: half of it")
         if ends != "well":

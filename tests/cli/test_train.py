@@ -11,6 +11,7 @@ import subprocess
 import sys
 import termios
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,11 +19,13 @@ import torch
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.train import parse_duration
 from gaitgauge.files import writing
+from gaitgauge.gauge.result import TerrainScore, read_result
+from gaitgauge.gauge.store import StoreError
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.overrides import override_keys
-from gaitgauge.training.run.launch import prepare
+from gaitgauge.training.processes import idle_gpus
 from gaitgauge.training.run.logger import make_writer
-from gaitgauge.training.run.processes import idle_gpus
+from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.scoring import Scorer, scores_of
 from gaitgauge.training.run.side_process import PROGRAM
@@ -361,9 +364,10 @@ def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):
 
 
 def test_scores_taken_from_results():
-    terrains = {"flat": {"level": None, "mean": 0.5}, "wave": {"level": 3.0, "mean": 0.25}}
-    results = {"score": 0.375, "terrains": terrains, "groups": {"safety": 0.9}}
+    card = read_result(Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json", StoreError)
+    terrains = {"flat": TerrainScore(mean=0.5), "wave": TerrainScore(level=3.0, mean=0.25)}
+    result = replace(card, score=0.375, terrains=terrains, groups={"safety": 0.9})
     expected = {"score": 0.375, "terrain/flat": 0.5, "level/wave": 3.0, "terrain/wave": 0.25, "group/safety": 0.9}
-    assert scores_of(results) == expected
+    assert scores_of(result) == expected
     with pytest.raises(ValueError, match="no score"):
-        scores_of({"score": None})
+        scores_of(replace(result, score=None))

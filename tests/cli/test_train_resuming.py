@@ -7,7 +7,7 @@ import pytest
 import torch
 from gaitgauge.files import writing
 from gaitgauge.files.writing import lock_folder
-from gaitgauge.training.run.launch import prepare
+from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.stopping import TrainingOutcome
 from gaitgauge.training.tasks import TASKS
@@ -239,7 +239,7 @@ def test_a_resume_that_is_refused_changes_nothing(refused, trained, change, name
 @pytest.mark.parametrize("name", TASKS)
 def test_a_resumed_run_has_the_settings_of_its_checkpoint_whatever_the_task_says_today(trained, name, monkeypatch):
     """All of them, also those that nobody had spelled out."""
-    from gaitgauge.training.run import launch
+    from gaitgauge.training.run import plan
 
     entries = torch.load(trained / "model_2.pt", weights_only=True)
     made = prepare(TrainRequest(task=name, backend="fake", device="cpu", num_envs=8, seed=3, iterations=70))
@@ -249,8 +249,8 @@ def test_a_resumed_run_has_the_settings_of_its_checkpoint_whatever_the_task_says
     elsewhere = prepare(
         TrainRequest(task=name, backend="fake", device="cpu", overrides=("training.algorithm.clip=0.9",))
     )
-    monkeypatch.setattr(launch, "find_task", lambda *_, **__: elsewhere.task)
-    monkeypatch.setattr(launch, "check_network", lambda *_: None)  # the file's network is of its own task
+    monkeypatch.setattr(plan, "find_task", lambda *_, **__: elsewhere.task)
+    monkeypatch.setattr(plan, "check_network", lambda *_: None)  # the file's network is of its own task
     resumed = prepare(TrainRequest(task=name, device="cpu", resume=str(path)))
     assert resumed.task.environment == made.task.environment
     assert resumed.task.training == made.task.training

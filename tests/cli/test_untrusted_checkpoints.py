@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.training.environment.own_terms import foreign_functions
-from gaitgauge.training.run import launch, logger
-from gaitgauge.training.run.launch import prepare
+from gaitgauge.training.run import logger
+from gaitgauge.training.run import plan as planning
+from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from small_run import FAKE, SMALL
 
@@ -105,7 +106,7 @@ def test_a_checkpoint_never_chooses_where_data_go(run, trained, tmp_path, monkey
     path = tmp_path / "model_2.pt"
     torch.save(entries, path)
     started, checked = [], []
-    monkeypatch.setattr(launch, "check_logger", checked.append)
+    monkeypatch.setattr(planning, "check_logger", checked.append)
     monkeypatch.setattr(logger.importlib, "import_module", lambda name: started.append(name))
     result = run("train", "go2-flat", "--resume", path, *RESUME)
     assert result.exit_code == 0 and started == []

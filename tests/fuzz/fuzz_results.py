@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from fuzzing import SEEDS, register
 from gaitgauge.api import ResultsError, load_results
 from gaitgauge.files.parsing import edited
 from gaitgauge.gauge.report.page import write_report
+from gaitgauge.gauge.result import Result
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.foreign.adapters import described_contract
 from gaitgauge.policy.foreign.fence.archive import packed, read_archive
@@ -31,8 +33,8 @@ from gaitgauge.training.run.scoring import scores_of
 
 CARD = (SEEDS / "results" / "results.json").read_bytes()
 ROBOT = load_robot("go2")
-TRUE = json.loads(CARD)
-OTHER = TRUE | {"policy": TRUE["policy"] | {"path": "other.pt"}}
+TRUE = Result.from_data(json.loads(CARD), "the seed", ValueError)
+OTHER = replace(TRUE, policy=replace(TRUE.policy, path="other.pt"))
 
 
 def _into(name: str, read: Callable[[Path], Any]) -> Callable[[bytes, Path], None]:
@@ -49,7 +51,7 @@ def _results(folder: Path) -> None:
     found = load_results(folder)
     _ = found.complete, found.terrains, found.metrics
     with edited("it", ResultsError):
-        scores_of(found.data)
+        scores_of(found)
 
 
 def _compared(folder: Path) -> None:

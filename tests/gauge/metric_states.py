@@ -1,7 +1,7 @@
 """Instants of a motion, and what the metrics of a suite make of them."""
 
 import torch
-from gaitgauge.gauge.metrics import MetricEvaluator
+from gaitgauge.gauge.metrics import Instants, MetricEvaluator
 from gaitgauge.gauge.play.sampling import GRAVITY
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.robots.body_plan import total_mass
@@ -34,7 +34,16 @@ def evaluate(suite, state, command=(0.0, 0.0, 0.0), limits=(1.0, 1.0, 1.5), fric
     known = before is not None
     torque = state.joint_torque if before is None else before
     metrics = evaluator(suite)
-    values = metrics.evaluate(state, rows(*command), rows(*limits), scalar(friction), torque, torch.tensor([known]))
+    instants = Instants(
+        state=state,
+        command=rows(*command),
+        limits=rows(*limits),
+        friction=scalar(friction),
+        torque_before=torque,
+        torque_known=torch.tensor([known]),
+        constants=metrics.constants,
+    )
+    values = metrics.evaluate(instants)
     found = metrics.with_quality(values, torch.tensor([True]), [1])
     names = (*suite.metrics.weights, "quality")
     return dict(zip(names, found[0].tolist(), strict=True))

@@ -2,7 +2,6 @@
 
 import math
 import zlib
-from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
@@ -12,7 +11,9 @@ from gaitgauge.gauge.coverage import coverage
 from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.pipelines import make_environments
 from gaitgauge.gauge.plan import PlanRules, environment_result, plan
+from gaitgauge.gauge.result import EnvironmentRow, PolicyName, Provenance, Result
 from gaitgauge.gauge.results import fold, health
+from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
 
 HOSTILE = 'a/<img src="http://evil.example/x.png" onerror=alert(1)></script><script>alert(2)</script>&"\'.pt'
@@ -40,8 +41,18 @@ def ended(suite, episode, generator, reached):
 
 
 def sample(pipeline="stress", suite="robogauge-1.1", resamples=10, **choices):
-    """What ``evaluate`` would write, from synthetic records; a copy for the test to change."""
-    return deepcopy(_sample(pipeline, suite, resamples, **choices))
+    """Return what ``evaluate`` would find, from synthetic records."""
+    return _sample(pipeline, suite, resamples, **choices)
+
+
+def sample_data(*names, **choices):
+    """Return the content of the file of a sample, for the test to edit."""
+    return sample(*names, **choices).to_data()
+
+
+def read(data, error=StoreError):
+    """Return the result that an edited file describes."""
+    return Result.from_data(data, "it", error)
 
 
 @cache
@@ -59,28 +70,32 @@ def _sample(pipeline, suite, resamples, reach=None, **choices):
         while required := plan(environment, records, rules).required:
             records |= {e: ended(suite, e, generator, reached) for e in required}
         environments.append(environment_result(environment, records, rules))
-    results = fold(suite, environments, (*suite.metrics.weights, "quality"))
-    policy = {"path": "policies/go2_cts.pt", "contract_hash": "ab" * 32, "file_sha256": "cd" * 32}
-    covered = coverage(suite, make_environments(suite, **chosen), suite.matrix.seeds, pipeline=pipeline)
-    return results | {
-        "coverage": covered,
-        "policy": policy | {"provenance": {"adapter": "TorchScript", "steps": 5}},
-        "pipeline": pipeline,
-        "backend": "mujoco",
-        "robot": "go2",
-        "health": health([r for e in environments for r in e.records]),
-        "provenance": {
-            "versions": {"python": "3.11.2", "gaitgauge": "0.1.0", "mujoco": "3.17.0", "torch": "2.13.0"},
-            "command": "gaitgauge evaluate policies/go2_cts.pt --suite robogauge-1.1",
-            "date": "2026-01-02T03:04:05+00:00",
-            "host": "lab",
-            "machine": "x86_64, 2 CPUs, Linux 6.1",
-            "device": "cpu",
-            "threads": 2,
-            "seconds": 152.5,
-            "physics_steps": 1_234_567,
-        },
-    }
+    scores = fold(suite, environments, (*suite.metrics.weights, "quality"))
+    return Result(
+        **vars(scores),
+        coverage=coverage(suite, make_environments(suite, **chosen), suite.matrix.seeds, pipeline=pipeline),
+        policy=PolicyName(
+            path="policies/go2_cts.pt",
+            contract_hash="ab" * 32,
+            file_sha256="cd" * 32,
+            provenance={"adapter": "TorchScript", "steps": 5},
+        ),
+        pipeline=pipeline,
+        backend="mujoco",
+        robot="go2",
+        health=health([r for e in environments for r in e.records]),
+        provenance=Provenance(
+            versions={"python": "3.11.2", "gaitgauge": "0.1.0", "mujoco": "3.17.0", "torch": "2.13.0"},
+            command="gaitgauge evaluate policies/go2_cts.pt --suite robogauge-1.1",
+            date="2026-01-02T03:04:05+00:00",
+            host="lab",
+            machine="x86_64, 2 CPUs, Linux 6.1",
+            device="cpu",
+            threads=2,
+            seconds=152.5,
+            physics_steps=1_234_567,
+        ),
+    )
 
 
 PIPELINES = {
@@ -117,4 +132,4 @@ class Page(HTMLParser):
 
 
 def row(terrain="wave", friction=0.6, payload=0.0, level=5, **more):
-    return {"terrain": terrain, "friction": friction, "payload": payload, "level": level, **more}
+    return EnvironmentRow(terrain=terrain, friction=friction, payload=payload, level=level, **more)

@@ -1,16 +1,21 @@
 """Quality by direction and command, and the scores of known policies beside a score."""
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from gaitgauge.gauge.report.breakdown import breakdown, command_label
 from gaitgauge.gauge.report.references import reference_table, references_for
+from gaitgauge.gauge.result import Coverage, Run, read_result
+from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
+from sample_results import PIPELINES, sample
+from sample_results import row as sample_row
 
 
 def row(terrain, *runs):
-    return {"terrain": terrain, "runs": {str(seed): {"quality": 0.5, "commands": run} for seed, run in enumerate(runs)}}
+    found = {seed: Run(columns={"quality": 0.5}, commands=run) for seed, run in enumerate(runs)}
+    return sample_row(terrain, runs=found)
 
 
 def test_means_over_seeds_and_environments_then_over_terrains():
@@ -18,7 +23,7 @@ def test_means_over_seeds_and_environments_then_over_terrains():
         row("flat", {"max_velocity +x": 0.8, "max_velocity -y": 0.6}, {"max_velocity +x": 0.6}),
         row("flat", {"max_velocity +x": 0.4, "diagonal_velocity +x-y": 0.2}),
         row("wave", {"max_velocity +x": 0.1}),
-        {"terrain": "wave"},  # nothing was played
+        row("wave"),  # nothing was played
     ]
     found = breakdown(rows)
     assert found["command"]["full speed, then stop: forward"] == {
@@ -30,7 +35,7 @@ def test_means_over_seeds_and_environments_then_over_terrains():
     assert forward["flat"] == pytest.approx((0.8 + 0.6 + 0.4 + 0.2) / 4)
     assert right == {"mean": pytest.approx(0.4), "flat": pytest.approx(0.4)}
     assert list(found["direction"]) == ["forward", "right"]
-    assert breakdown([{"terrain": "flat", "runs": {"0": {"commands": {}}}}, {"terrain": "wave"}]) == {}
+    assert breakdown([row("flat", {}), row("wave")]) == {}
 
 
 def test_labels_of_commands():
@@ -40,33 +45,35 @@ def test_labels_of_commands():
     assert command_label("own_goal +z") == "own goal +z"
 
 
-def results(suite="robogauge-1.1", version="1.1.0", kind="complete", score=0.6, sha="ab"):
-    return {
-        "suite": {"name": suite, "version": version},
-        "coverage": {"kind": kind, "text": kind},
-        "score": score,
-        "policy": {"file_sha256": sha},
-    }
+def result(suite="robogauge-1.1", version="1.1.0", kind="complete", score=0.6, sha="ab"):
+    found = sample("base", **PIPELINES["base"])
+    return replace(
+        found,
+        suite=replace(found.suite, name=suite, version=version),
+        coverage=Coverage(kind=kind, text=kind),
+        score=score,
+        policy=replace(found.policy, file_sha256=sha),
+    )
 
 
 def test_references_are_of_the_same_suite_and_beside_whole_runs_alone():
-    scores = [r.score for r in references_for(results())]
+    scores = [r.score for r in references_for(result())]
     assert scores == [0.7307, 0.6739, 0.6713, 0.5148]
     ours = next(r for r in reference_table().reference if r.file_sha256)
-    assert [r.score for r in references_for(results(sha=ours.file_sha256))] == [0.6739, 0.6713, 0.5148]
+    assert [r.score for r in references_for(result(sha=ours.file_sha256))] == [0.6739, 0.6713, 0.5148]
     for other in ({"suite": "quick"}, {"version": "2.0.0"}, {"kind": "part"}, {"score": None}):
-        assert not references_for(results(**other))
+        assert not references_for(result(**other))
     for reference in reference_table().reference:
         assert load_suite(reference.suite).version == reference.version, "the suite has moved on"
 
 
 def test_references_that_were_measured_here_are_those_of_the_cards():
     folder = Path(__file__).parents[2] / "docs/data/scorecards"
-    cards = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")]
-    found = {(card["suite"]["name"], card["policy"]["file_sha256"]): card for card in cards}
+    cards = [read_result(path, StoreError) for path in folder.glob("*.json")]
+    found = {(card.suite.name, card.policy.file_sha256): card for card in cards}
     measured = [r for r in reference_table().reference if r.file_sha256]
     assert len(measured) == 2
     for reference in measured:
         card = found[reference.suite, reference.file_sha256]
-        assert reference.score == round(card["score"], 4)
-        assert reference.interval == tuple(round(end, 4) for end in card["score_interval"])
+        assert reference.score == round(card.score, 4)
+        assert reference.interval == tuple(round(end, 4) for end in card.score_interval)

@@ -7,13 +7,14 @@ from typing import Any
 import pytest
 from gaitgauge.gauge.report.page import STATISTIC_LABELS, charts, report_data
 from gaitgauge.gauge.report.pages import page_template
+from gaitgauge.gauge.result import TerrainScore
 from gaitgauge.training.sweep import folding
 from sample_results import PIPELINES, row, sample
 
 
 def test_radar_puts_values_on_their_spokes():
     terrains = {
-        n: {"mean": 1.0, "mean25": 0.0, "mean50": v} for n, v in zip("abcd", (1.0, 0.5, 0.25, 0.0), strict=True)
+        n: TerrainScore(mean=1.0, mean25=0.0, mean50=v) for n, v in zip("abcd", (1.0, 0.5, 0.25, 0.0), strict=True)
     }
     radar = charts.radar(terrains, STATISTIC_LABELS)
     (x, y), radius = radar["centre"], radar["centre"][1] - radar["spokes"][0]["y"]
@@ -25,11 +26,11 @@ def test_radar_puts_values_on_their_spokes():
 
 
 def test_two_terrains_have_bars_in_place_of_a_radar():
-    data = report_data(sample("multi", **PIPELINES["multi"]))
+    result = sample("multi", **PIPELINES["multi"])
+    data = report_data(result)
     assert data["radar"] is None
-    marks = data["terrains"]["wave"]["strip"]["marks"]
-    row = data["terrains"]["wave"]
-    assert marks["mean50"] == pytest.approx(5 + 190 * row["mean50"], abs=0.01)
+    marks = data["terrain_strips"]["wave"]["marks"]
+    assert marks["mean50"] == pytest.approx(5 + 190 * result.terrains["wave"].mean50, abs=0.01)
     assert marks["mean25"] < marks["mean50"] < marks["mean"]
 
 
@@ -50,7 +51,7 @@ def test_sweep_puts_levels_between_nought_and_ten():
 
 
 def test_sweep_draws_whiskers_at_the_interval_and_marks_falls():
-    rows = [row("flat", f, level=None, score=0.5, interval=[0.25, 0.75], falls=f > 0.5) for f in (0.4, 0.8)]
+    rows = [row("flat", f, level=None, score=0.5, interval=(0.25, 0.75), falls=f > 0.5) for f in (0.4, 0.8)]
     (panel,) = charts.sweep(rows, axis="friction", quantity="score")
     _, _, top, bottom = panel["frame"]
     for point in panel["points"]:
@@ -77,7 +78,7 @@ def test_crossed_payloads_become_a_map():
 
 
 def test_search_chart_tells_passed_missed_and_untried_levels():
-    rows = [row(level=6, search={"5": True, "8": False, "7": False, "6": True}), row("flat", level=None)]
+    rows = [row(level=6, search={5: True, 8: False, 7: False, 6: True}), row("flat", level=None)]
     (chart,) = charts.searches(rows)
     (line,) = chart["lines"]
     column = [round((x - chart["left"]) / chart["cell"]) + 1 for x in line["passed"] + line["failed"] + line["open"]]
@@ -86,7 +87,7 @@ def test_search_chart_tells_passed_missed_and_untried_levels():
 
 
 def test_search_that_passes_nothing_marks_no_level():
-    (chart,) = charts.searches([row(level=0, search={"5": False, "2": False, "1": False})])
+    (chart,) = charts.searches([row(level=0, search={5: False, 2: False, 1: False})])
     assert chart["lines"][0]["reached"] is None
 
 

@@ -10,7 +10,7 @@ import torch
 from gaitgauge.gauge.coverage import notes, score_label
 from gaitgauge.gauge.evaluate import Request, prepare
 from gaitgauge.policy.base import PolicySession
-from gaitgauge.policy.contract import TERM_WIDTH, ObservationTerm, standard_contract
+from gaitgauge.policy.contract import ObservationTerm, standard_contract
 from gaitgauge.policy.finding import PRETRAINED
 from gaitgauge.policy.native import FilePolicy, StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import MlpNetwork
@@ -85,7 +85,7 @@ def moment(folder, policy):
 
 @pytest.mark.parametrize("name", CHEATS)
 def test_one_action_for_everything_scores_far_below_walking(moment, name):
-    assert moment(name)["score"] < 0.6 * moment("pretrained")["score"]
+    assert moment(name).score < 0.6 * moment("pretrained").score
 
 
 def test_a_policy_that_knows_what_no_robot_knows_has_no_plain_score(folder):
@@ -124,8 +124,8 @@ def test_a_cheat_has_at_most_a_quarter_on_flat_ground_and_nothing_elsewhere(fold
     suite = folder / "whole.toml"
     suite.write_text(WHOLE)
     found = evaluate(Request(policy=str(policy(name)), suite=str(suite), threads=2), folder / f"whole-{name}")
-    assert found["terrains"].pop("flat")["score"] < 0.25
-    assert {row["score"] for row in found["terrains"].values()} == {0.0}
+    assert found.terrains["flat"].score < 0.25
+    assert {row.score for name, row in found.terrains.items() if name != "flat"} == {0.0}
 
 
 class Altered(FilePolicy):
@@ -142,7 +142,7 @@ class Altered(FilePolicy):
 class AlteredSession(PolicySession):
     def __init__(self, policy, walking, num_episodes):
         self.policy, self.walking, self.step = policy, walking, torch.zeros(num_episodes)
-        widths = [TERM_WIDTH[t.name] or 12 for t in policy.contract.observation]
+        widths = policy.contract.term_widths
         place = [t.name for t in policy.contract.observation].index("command")
         self.scale = torch.tensor(policy.contract.observation[place].scale)
         self.frame, self.place = sum(widths), sum(widths[:place])
@@ -193,7 +193,7 @@ def altered(folder):
 
     def score(name):
         policy = Altered(prepared.policy, **ALTERED.get(name, {}))
-        return evaluate(replace(prepared, policy=policy), folder / f"altered-{name}".replace(" ", "-"))["score"]
+        return evaluate(replace(prepared, policy=policy), folder / f"altered-{name}".replace(" ", "-")).score
 
     return cache(score)
 
@@ -241,7 +241,7 @@ def test_on_obstacles_the_reference_takes_most_of_what_walking_earns_and_little_
             threads=2,
         )
         found = evaluate(request, folder / f"obstacle-{Path(suite).name}-{name}")
-        return found["environments"][0]["quality"]["mean50"]
+        return found.environments[0].quality.mean50
 
     assert quality("pretrained", "robogauge-1.1") < 0.5 * quality("pretrained", commanded)
     assert quality("standing", "robogauge-1.1") > 0.8 * quality("standing", commanded)

@@ -69,7 +69,7 @@ def test_addresses(with_ray, address):
 
 
 def test_another_engine_is_refused(with_ray):
-    with pytest.raises(ClusterError, match="plays with backend 'mujoco' on CPUs, not with 'fake'"):
+    with pytest.raises(ClusterError, match="runs as several processes on CPUs, which backend 'fake' on 'cpu' does not"):
         prepare(Request(policy="pretrained", backend="fake", cluster="auto"))
 
 

@@ -1,9 +1,13 @@
 """What a result may call itself: the whole suite, a part of it, or something of one's own."""
 
+from dataclasses import replace
+
 import pytest
-from gaitgauge.gauge.coverage import coverage, coverage_of, score_label, suite_label
+from gaitgauge.gauge.coverage import coverage, score_label, suite_label
 from gaitgauge.gauge.pipelines import make_environments
+from gaitgauge.gauge.result import AxisCoverage
 from gaitgauge.gauge.suite import load_suite
+from sample_results import PIPELINES, read, sample
 
 REFERENCE, OWN = load_suite("robogauge-1.1"), load_suite("gaitgauge-1")
 
@@ -17,17 +21,17 @@ def covered(suite, *, seeds=None, pipeline="stress", **choices):
 @pytest.mark.parametrize("name", ["robogauge-1.1", "gaitgauge-1", "demo", "mid", "quick"])
 def test_all_of_a_suite_is_complete(name):
     found = covered(load_suite(name))
-    assert (found["kind"], found["text"], found["levels"]) == ("complete", "complete", [])
+    assert (found.kind, found.text, found.levels) == ("complete", "complete", ())
     assert not any(
-        found[axis][key] for axis in ("terrains", "frictions", "payloads", "seeds") for key in ("missing", "foreign")
+        axis.missing or axis.foreign for axis in (found.terrains, found.frictions, found.payloads, found.seeds)
     )
 
 
 def test_all_of_a_suite_named_one_by_one_is_complete():
     matrix = REFERENCE.matrix
     found = covered(REFERENCE, frictions=matrix.frictions[::-1], payloads=(0.0,), seeds=(2, 0, 1))
-    assert found["kind"] == "complete"
-    assert found["environments"] == [63, 63]
+    assert found.kind == "complete"
+    assert found.environments == (63, 63)
 
 
 @pytest.mark.parametrize(
@@ -42,15 +46,15 @@ def test_all_of_a_suite_named_one_by_one_is_complete():
 )
 def test_a_part_says_which(suite, choices, text):
     found = covered(suite, **choices)
-    assert (found["kind"], found["text"]) == ("part", text)
+    assert (found.kind, found.text) == ("part", text)
 
 
 def test_a_part_is_data_too():
     found = covered(REFERENCE, terrains=["wave"], frictions=[0.4, 0.6], seeds=[0, 2])
-    assert found["environments"] == [2, 63]
-    assert found["frictions"] == {"played": [0.4, 0.6], "missing": [0.2, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0], "foreign": []}
-    assert found["seeds"] == {"played": [0, 2], "missing": [1], "foreign": []}
-    assert found["terrains"]["played"] == ["wave"]
+    assert found.environments == (2, 63)
+    assert found.frictions == AxisCoverage(played=(0.4, 0.6), missing=(0.2, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0), foreign=())
+    assert found.seeds == AxisCoverage(played=(0, 2), missing=(1,), foreign=())
+    assert found.terrains.played == ("wave",)
 
 
 @pytest.mark.parametrize(
@@ -72,12 +76,12 @@ def test_a_part_is_data_too():
 )
 def test_values_that_the_suite_does_not_have_make_a_run_custom(suite, choices, text):
     found = covered(suite, **choices)
-    assert (found["kind"], found["text"]) == ("custom", text)
+    assert (found.kind, found.text) == ("custom", text)
 
 
 def test_only_a_complete_run_carries_the_suites_name_and_a_bare_score():
     def named(**choices):
-        found = {"suite": {"name": "robogauge-1.1", "version": "1.1.0"}, "coverage": covered(REFERENCE, **choices)}
+        found = replace(sample("base", **PIPELINES["base"]), coverage=covered(REFERENCE, **choices))
         return suite_label(found), score_label(found)
 
     assert named() == ("robogauge-1.1 1.1.0, complete", "score")
@@ -86,7 +90,9 @@ def test_only_a_complete_run_carries_the_suites_name_and_a_bare_score():
 
 
 def test_results_from_before_are_not_taken_for_complete():
-    old = {"suite": {"name": "robogauge-1.1", "version": "1.1.0"}}
-    assert coverage_of(old)["kind"] == "unknown"
+    data = sample("base", **PIPELINES["base"]).to_data()
+    del data["coverage"]
+    old = read(data)
+    assert old.coverage.kind == "unknown" and not old.complete
     assert "unknown" in suite_label(old)
     assert score_label(old) != "score"

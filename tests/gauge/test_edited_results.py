@@ -4,6 +4,7 @@ import copy
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from gaitgauge.api import ArgumentError, ResultsError, evaluate, load_policy, load_results, train
 from gaitgauge.api import compare as compare_results
 from gaitgauge.backends.base import BackendError
-from gaitgauge.gauge.result_check import MOST_ROWS
+from gaitgauge.gauge.result import MOST_ROWS
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.base import PolicyError
@@ -44,7 +45,7 @@ def edited(tmp_path):
 def test_an_expected_level_is_no_edited_one():
     """A card of gaitgauge-1 was refused for levels that are no whole numbers."""
     card = load_result(Path(__file__).parents[2] / "docs/data/scorecards/pretrained-gaitgauge-1.json")
-    assert any((row["level"] or 0) % 1 for row in card["environments"])
+    assert any(row.reached % 1 for row in card.environments)
 
 
 @pytest.mark.parametrize(
@@ -166,15 +167,15 @@ def test_many_rows_with_many_replicates_are_too_many(edited):
     summary = {"score": rows[0]["score"], "level": None, "terrains": {}, "metrics": {}, "groups": {}, "health": None}
     file.write_text(json.dumps(json.loads(file.read_text()) | summary))
     many = load_result(file)
-    many["chance"]["resamples"] = 100_000
+    many = replace(many, chance=replace(many.chance, resamples=100_000))
     with pytest.raises(ComparisonError, match="1000 environments with 100,000 replicates"):
-        compare([many, many | {"policy": TRUE["policy"] | {"path": "other.pt"}}], ["one", "two"])
+        compare([many, replace(many, policy=replace(many.policy, path="other.pt"))], ["one", "two"])
 
 
 def test_scores_that_no_evaluation_writes_are_not_compared(edited):
     file = edited("environments", 0, "runs", value={"0": {"quality": float("inf")}})
     with pytest.raises(ComparisonError):
-        compare([load_result(file), TRUE], ["one", "two"])
+        compare([load_result(file), load_result(SEED)], ["one", "two"])
 
 
 def test_the_library_reads_coverage_with_care(edited):
@@ -185,7 +186,7 @@ def test_the_library_reads_coverage_with_care(edited):
 @pytest.mark.parametrize("path", ["a\n^^5cinput{b}.pt", "=1+1\r\n^^5cwrite18{c}.pt", "@SUM(1)\u2028\x1b[31m.pt"])
 def test_a_policy_s_name_is_neither_latex_nor_a_formula(edited, tmp_path, path):
     """The name stands in a comment of the table for LaTeX, which a line's end ends; ``^^5c`` is a backslash there."""
-    found = compare([load_result(edited("policy", "path", value=path)), TRUE])
+    found = compare([load_result(edited("policy", "path", value=path)), load_result(SEED)])
     files = write_comparison(tmp_path, found)
     tex = files["tex"].read_text()
     assert tex.isascii() and all(c.isprintable() or c == "\n" for c in tex)

@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.files.provenance import commit
+from gaitgauge.files.writing import json_text
 from gaitgauge.gauge.evaluate import prepare
+from gaitgauge.gauge.result import Health, TerrainScore, read_result
+from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
@@ -20,6 +23,7 @@ from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import RobotError
 from gaitgauge.terrains.registry import TerrainError
+from gaitgauge_fake_engine import FakeBackend
 from scripted_gauge import GO2, Puppet
 from tiny_runs import SMALL, TINY, evaluate, without_provenance
 
@@ -31,32 +35,33 @@ def test_results_name_the_file_that_was_played_whatever_became_of_it(request_for
     expected = hashlib.sha256(path.read_bytes()).hexdigest()
     prepared = prepare(request)
     change(path)
-    results = evaluate(prepared, tmp_path / "run")
-    assert results["policy"]["file_sha256"] == expected
+    assert evaluate(prepared, tmp_path / "run").policy.file_sha256 == expected
 
 
 @pytest.mark.parametrize("base", ["robogauge-1.1", "gaitgauge-1"])
 def test_a_whole_run(request_for, tmp_path, base):
     folder = tmp_path / "run"
     returned = evaluate(request_for(base), folder)
-    results = json.loads((folder / "results.json").read_text())
-    assert results == json.loads(json.dumps(returned))
-    flat, slope = results["environments"]
-    assert (flat["terrain"], flat["level"]) == ("flat", None)
-    assert (slope["terrain"], slope["level"]) == ("slope_fd", 2)
-    assert slope["search"] == {"2": True, "3": False}
-    assert results["level"] == 2.0
-    assert results["score"] == pytest.approx((flat["score"] + slope["score"]) / 2, abs=1e-6)
-    assert results["score_interval"][0] <= results["score"] <= results["score_interval"][1]
-    assert set(results["groups"]) == set(results["groups_interval"]) == {"tracking", "safety", "quality"}
-    assert results["terrains"]["slope_fd"]["score"] == pytest.approx(0.09 + 0.19 * slope["quality"]["mean50"], abs=2e-4)
-    assert results["health"] == {"episodes": 4, "falls": 0, "diverged": 0, "overflowed": 0, "self_contact": 0.0}
-    assert results["suite"]["digest"] == results["provenance"]["digests"]["suite"]
-    assert {len(d) for d in results["provenance"]["digests"].values()} == {64}
-    assert results["provenance"]["digests"].keys() == {"policy", "suite", "robot", "source"}
-    assert results["provenance"]["commit"] == commit()
-    assert results["chance"]["seeds"] == [0, 1] and results["chance"]["search_seeds"] == [100, 101, 102]
-    assert results["provenance"]["processor"]
+    written = (folder / "results.json").read_text()
+    assert written == json_text(returned.to_data())
+    result = read_result(folder, StoreError)
+    assert json_text(result.to_data()) == written
+    flat, slope = result.environments
+    assert (flat.terrain, flat.level) == ("flat", None)
+    assert (slope.terrain, slope.level) == ("slope_fd", 2)
+    assert slope.search == {2: True, 3: False}
+    assert result.level == 2.0
+    assert result.score == pytest.approx((flat.score + slope.score) / 2, abs=1e-6)
+    assert result.score_interval[0] <= result.score <= result.score_interval[1]
+    assert set(result.groups) == set(result.groups_interval) == {"tracking", "safety", "quality"}
+    assert result.terrains["slope_fd"].score == pytest.approx(0.09 + 0.19 * slope.quality.mean50, abs=2e-4)
+    assert result.health == Health(episodes=4, self_contact=0.0)
+    assert result.suite.digest == result.provenance.digests["suite"]
+    assert {len(d) for d in result.provenance.digests.values()} == {64}
+    assert result.provenance.digests.keys() == {"policy", "suite", "robot", "source"}
+    assert result.provenance.commit == commit()
+    assert result.chance.seeds == (0, 1) and result.chance.search_seeds == (100, 101, 102)
+    assert result.provenance.processor
     # every episode that was played is a row, those of the level tests too
     lines = list(csv.DictReader((folder / "episodes.csv").open()))
     rows = [r for r in lines if r["command"] == "all"]
@@ -66,12 +71,12 @@ def test_a_whole_run(request_for, tmp_path, base):
     assert {r["command"] for r in parts} >= {"diagonal_velocity -x-y", "max_velocity +yaw"}
     of_flat = [r for r in rows if r["stage"] == "eval" and r["terrain"] == "flat"]
     quality = np.mean([float(r["quality_mean50"]) for r in of_flat])
-    assert quality == pytest.approx(flat["score"], abs=2e-4)
+    assert quality == pytest.approx(flat.score, abs=2e-4)
     trials = 3 if base == "gaitgauge-1" else 2  # a curve plays all search seeds, a test as many as decide it
     assert len(rows) == len(files) == 4 + 2 * trials
     assert [r["success"] for r in rows if r["stage"] == "search" and r["level"] == "3"] == ["False"] * trials
     if base == "gaitgauge-1":
-        assert slope["curve"] == {"2": 1.0, "3": 0.0}
+        assert slope.curve == {2: 1.0, 3: 0.0}
     assert sum(int(r["physics_steps"]) for r in rows) > 0
 
 
@@ -83,27 +88,39 @@ def test_the_same_request_gives_the_same_results(whole_run, tmp_path):
     assert (again / "episodes.csv").read_bytes() == (once / "episodes.csv").read_bytes()
 
 
+@pytest.mark.parametrize("parallel", [True, False])
+def test_an_engine_from_outside_gets_the_workers_that_it_declares(whole_run, tmp_path, monkeypatch, parallel):
+    request, once = whole_run
+    monkeypatch.setattr(FakeBackend, "parallel_processes", parallel)
+    results = evaluate(replace(request, threads=2), tmp_path / "run")
+    assert results["provenance"]["processes"] == (2 if parallel else 1)
+    assert without_provenance(tmp_path / "run") == without_provenance(once)
+    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (once / "episodes.csv").read_bytes()
+
+
 def test_a_level_run_has_levels_and_no_score(request_for, tmp_path):
-    results = evaluate(request_for(pipeline="level"), tmp_path / "run")
-    assert results["score"] is None
-    low, high = results["terrains"]["slope_fd"].pop("level_interval")
+    result = evaluate(request_for(pipeline="level"), tmp_path / "run")
+    assert result.score is None
+    low, high = result.terrains["slope_fd"].level_interval
     assert 0.0 <= low < 2.0 < high <= 3.0
-    assert results["terrains"] == {"slope_fd": {"level": 2.0}}
+    assert result.terrains == {"slope_fd": TerrainScore(level=2.0, level_interval=(low, high))}
+    written = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert written["terrains"] == {"slope_fd": {"level": 2.0, "level_interval": [low, high]}}
 
 
 def test_a_policy_that_passes_nothing_scores_zero(request_for, tmp_path):
     request = request_for(terrains=("slope_fd",))
-    results = evaluate(request, tmp_path / "run", make=lambda name, scene, **options: Puppet(scene))
-    assert results["score"] == 0.0
-    assert results["level"] == 0.0
-    assert results["metrics"]["dof_power"]["mean50"] == 0.0
+    result = evaluate(request, tmp_path / "run", make=lambda name, scene, **options: Puppet(scene))
+    assert result.score == 0.0
+    assert result.level == 0.0
+    assert result.metrics["dof_power"].mean50 == 0.0
 
 
 def test_seeds_and_frictions_given_twice_count_once(request_for, tmp_path):
     request = request_for(pipeline="multi", frictions=(0.5, 0.5), seeds=(1, 1))
-    results = evaluate(request, tmp_path / "run")
-    assert len(results["environments"]) == 1
-    assert results["health"]["episodes"] == 1
+    result = evaluate(request, tmp_path / "run")
+    assert len(result.environments) == 1
+    assert result.health.episodes == 1
 
 
 def test_the_progress_lists_every_episode_once_and_counts_down(request_for, tmp_path):
@@ -130,9 +147,9 @@ def test_results_are_written_whatever_the_provenance_holds(request_for, tmp_path
     request = request_for()
     prepared = prepare(request)
     prepared.policy.contract = contract
-    results = evaluate(prepared, tmp_path / "run", command=["gaitgauge", "a b", "\udcff"])
+    result = evaluate(prepared, tmp_path / "run", command=["gaitgauge", "a b", "\udcff"])
     written = json.loads((tmp_path / "run" / "results.json").read_text())
-    assert written["score"] == results["score"]
+    assert written["score"] == result.score
     assert written["policy"]["provenance"] == {"note": "nan", "name": "\\ud800", "[/x]": ["inf"]}
     assert written["provenance"]["command"] == "gaitgauge 'a b' '\\udcff'"
 
@@ -204,10 +221,10 @@ def test_terrains_keep_the_suites_order(request_for):
 
 
 def test_a_base_run_is_one_episode(request_for, tmp_path):
-    results = evaluate(request_for(pipeline="base", terrains=("slope_fd",), level=2), tmp_path / "run")
-    assert results["health"]["episodes"] == 1
-    assert results["environments"][0]["level"] == 2
-    assert "search" not in results["environments"][0]
+    result = evaluate(request_for(pipeline="base", terrains=("slope_fd",), level=2), tmp_path / "run")
+    assert result.health.episodes == 1
+    assert result.environments[0].level == 2
+    assert "search" not in result.environments[0].to_data()
 
 
 @pytest.mark.parametrize("pipeline", ["base", "multi"])

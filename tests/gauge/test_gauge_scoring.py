@@ -171,10 +171,10 @@ def test_benchmark_and_level_fold_as_in_the_papers_tables(model):
             level = levels // 9 + (n < levels % 9)
             environments.append(flat_environment([quality], 0.1 * (n + 2), terrain, level, True))
     result = fold(suite, environments, (*METRICS, "quality"))
-    assert [result["terrains"][t]["mean50"] for t in TERRAINS] == pytest.approx(scores, abs=1e-6)
-    assert result["level"] == pytest.approx(level_sum / 54)
-    assert round(result["level"], 2) == level_mean
-    assert result["score"] == pytest.approx(published, abs=3e-4)
+    assert [result.terrains[t].mean50 for t in TERRAINS] == pytest.approx(scores, abs=1e-6)
+    assert result.level == pytest.approx(level_sum / 54)
+    assert round(result.level, 2) == level_mean
+    assert result.score == pytest.approx(published, abs=3e-4)
 
 
 def flat_environment(qualities, friction=0.6, terrain="flat", level=0, searched=False):
@@ -199,13 +199,13 @@ def test_fold_weighs_terrains_the_same_and_counts_unpassed_environments_zero():
     ]
     result = fold(suite, environments, (*METRICS, "quality"))
     wave = (0.09 * 2 + 0.19 * 0.5) / 2
-    assert result["terrains"]["flat"]["score"] == pytest.approx(0.7)
-    assert result["terrains"]["wave"]["score"] == pytest.approx(wave)
-    assert result["score"] == pytest.approx((0.7 + wave) / 2)
-    assert result["level"] == 1.5
+    assert result.terrains["flat"].score == pytest.approx(0.7)
+    assert result.terrains["wave"].score == pytest.approx(wave)
+    assert result.score == pytest.approx((0.7 + wave) / 2)
+    assert result.level == 1.5
     # metrics are weighted by level like quality, over environments and not over terrains
-    assert result["metrics"]["dof_limits"]["mean50"] == pytest.approx((0.7 + 2 * wave) / 3, abs=1e-4)
-    assert [row["score"] for row in result["environments"]] == pytest.approx([0.7, 2 * wave, 0.0])
+    assert result.metrics["dof_limits"].mean50 == pytest.approx((0.7 + 2 * wave) / 3, abs=1e-4)
+    assert [row.score for row in result.environments] == pytest.approx([0.7, 2 * wave, 0.0])
 
 
 def test_the_score_of_an_expected_level_lies_between_those_of_the_levels_beside_it():
@@ -219,35 +219,34 @@ def test_the_score_of_an_expected_level_lies_between_those_of_the_levels_beside_
     )
     environment = replace(flat_environment([], 0.6, "wave", 5.25, True), records=[*low, *high])
     result = fold(suite, [environment], names)
-    (row,) = result["environments"]
-    assert row["score"] == pytest.approx(0.75 * 0.474 + 0.25 * 0.526)
-    assert row["level"] == result["level"] == 5.25
-    assert row["quality"]["mean50"] == pytest.approx(0.55)
-    assert [run["quality"] for run in row["runs"].values()] == pytest.approx([0.53, 0.55, 0.57])
-    assert {at: run["1"]["dof_power"] for at, run in row["runs_by_level"].items()} == pytest.approx(
-        {"5": 0.6, "6": 0.4}
-    )
-    assert row["runs"]["2"]["commands"]["max_velocity +x"] == pytest.approx(0.57)
-    assert result["score"] == pytest.approx(row["score"])
+    (row,) = result.environments
+    assert row.score == pytest.approx(0.75 * 0.474 + 0.25 * 0.526)
+    assert row.level == result.level == 5.25
+    assert row.quality.mean50 == pytest.approx(0.55)
+    assert [run.columns["quality"] for run in row.runs.values()] == pytest.approx([0.53, 0.55, 0.57])
+    powers = {at: runs[1].columns["dof_power"] for at, runs in row.runs_by_level.items()}
+    assert powers == pytest.approx({5: 0.6, 6: 0.4})
+    assert row.runs[2].commands["max_velocity +x"] == pytest.approx(0.57)
+    assert result.score == pytest.approx(row.score)
 
 
 def test_fold_rounds_a_run_before_it_averages_as_the_reference_does():
     suite = replace(REFERENCE, scoring=replace(REFERENCE.scoring, bootstrap=2))
     result = fold(suite, [flat_environment([0.12344, 0.12344, 0.12346])], (*METRICS, "quality"))
-    assert result["score"] == pytest.approx(0.1234)  # (0.1234 + 0.1234 + 0.1235) / 3 = 0.12343
+    assert result.score == pytest.approx(0.1234)  # (0.1234 + 0.1234 + 0.1235) / 3 = 0.12343
     own = replace(OWN, scoring=replace(OWN.scoring, bootstrap=2))
     names = [*own.metrics.weights, "quality"]
     environment = flat_environment([0.12344, 0.12344, 0.12346])
     for item in environment.records:
         item.samples = np.repeat(item.samples[:, :1], len(names), axis=1)
-    assert fold(own, [environment], names)["score"] == pytest.approx(0.123447, abs=1e-6)
+    assert fold(own, [environment], names).score == pytest.approx(0.123447, abs=1e-6)
 
 
 def test_a_policy_that_passes_no_level_anywhere_scores_zero():
     suite = replace(REFERENCE, scoring=replace(REFERENCE.scoring, bootstrap=5))
     environments = [flat_environment([], 0.6, name, 0, True) for name in ("wave", "obstacle")]
     result = fold(suite, environments, (*METRICS, "quality"), evaluated=True)
-    assert result["score"] == 0.0
-    assert result["groups"] == {"tracking": 0.0, "safety": 0.0, "quality": 0.0}
-    assert result["level"] == 0.0
-    assert fold(suite, environments, (*METRICS, "quality"), evaluated=False)["score"] is None
+    assert result.score == 0.0
+    assert result.groups == {"tracking": 0.0, "safety": 0.0, "quality": 0.0}
+    assert result.level == 0.0
+    assert fold(suite, environments, (*METRICS, "quality"), evaluated=False).score is None

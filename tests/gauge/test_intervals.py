@@ -1,10 +1,12 @@
 """Intervals: sub-commands fixed, seeds shared or not, levels redone, and none where one seed shows no spread."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from gaitgauge.gauge.chance.intervals import Chance, ChanceRules, Evidence
+from gaitgauge.gauge.chance.intervals import Chance, Evidence
+from gaitgauge.gauge.result import ChanceRules, EnvironmentRow, Run
 from scipy import stats
 
 
@@ -23,14 +25,13 @@ def rules(**changes):
 
 
 def flat(*qualities, friction=0.6):
-    runs = {str(s): {"quality": q, "lin_vel_err": 1 - q, "commands": {}} for s, q in enumerate(qualities)}
-    return {"terrain": "flat", "friction": friction, "payload": 0.0, "level": None, "runs": runs}
+    runs = {s: Run(columns={"quality": q, "lin_vel_err": 1 - q}) for s, q in enumerate(qualities)}
+    return EnvironmentRow(terrain="flat", friction=friction, payload=0.0, runs=runs)
 
 
 def levelled(level, trials, *qualities, terrain="wave"):
-    row = flat(*qualities) | {"terrain": terrain, "level": level}
-    row["trials"] = {str(k): {str(s): s < reached for s in range(n)} for k, (reached, n) in trials.items()}
-    return row if qualities else {k: v for k, v in row.items() if k != "runs"}
+    outcomes = {k: {s: s < reached for s in range(n)} for k, (reached, n) in trials.items()}
+    return replace(flat(*qualities), terrain=terrain, level=level, trials=outcomes)
 
 
 SEARCH = {5: (4, 4), 8: (4, 5), 9: (1, 3)}
@@ -67,9 +68,7 @@ def test_one_search_seed_has_no_interval():
 
 
 def test_levels_that_were_given_are_certain():
-    row = levelled(6, SEARCH, 0.4, 0.5, 0.6)
-    del row["trials"]
-    evidence = Evidence([row], rules())
+    evidence = Evidence([replace(levelled(6, SEARCH, 0.4, 0.5, 0.6), trials={})], rules())
     assert evidence.redrawn.tolist() == [[6] * 2000]
     assert evidence.chance(np.ones(1)).error == pytest.approx(0.19 * 0.1 / math.sqrt(3))
 

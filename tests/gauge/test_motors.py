@@ -8,6 +8,7 @@ from gaitgauge.gauge.motors import gains_note, joint_parameters
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import ContractError, ObservationTerm, kind_of_observations, standard_contract
 from gaitgauge.robots import RobotError
+from sample_results import sample
 from scripted_gauge import GO2
 
 OWN, REFERENCE = load_suite("gaitgauge-1"), load_suite("robogauge-1.1")
@@ -65,11 +66,12 @@ def test_a_base_linear_velocity_makes_a_score_privileged():
         USUAL, observation=(ObservationTerm(name="base_linear_velocity_b", scale=(2.0,)), *USUAL.observation)
     )
     assert (kind_of_observations(USUAL), kind_of_observations(told)) == ("measurable", "privileged")
-    policy = {"kind_of_observations": "privileged", "observations": [t.name for t in told.observation]}
-    results = {"policy": policy, "coverage": {"kind": "complete", "text": "complete"}, "suite": {}}
-    results["suite"] = {"name": "gaitgauge-1", "version": "1.0.0"}
-    assert score_label(results) == "privileged score"
-    assert notes(results) == ["privileged observations: no sensor of a robot measures base_linear_velocity_b"]
+    whole = sample(suite="gaitgauge-1")
+    observations = tuple(t.name for t in told.observation)
+    policy = replace(whole.policy, kind_of_observations="privileged", observations=observations)
+    result = replace(whole, policy=policy)
+    assert score_label(result) == "privileged score"
+    assert notes(result) == ["privileged observations: no sensor of a robot measures base_linear_velocity_b"]
 
 
 @pytest.mark.parametrize("name", ["base_height", "foot_contact_force", "friction", "height_scan"])

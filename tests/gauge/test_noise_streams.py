@@ -8,7 +8,7 @@ import torch
 from gaitgauge.gauge.play import noise
 from gaitgauge.gauge.play.noise import CounterStream, ReferenceStream, make_stream, uniform_hash
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.policy.observation import NOISE_TERMS
+from gaitgauge.policy.observation_table import OBSERVATIONS
 from scripted_gauge import MAXIMUM, episode
 
 REFERENCE, OWN = load_suite("robogauge-1.1").noise, load_suite("gaitgauge-1").noise
@@ -108,7 +108,7 @@ def test_gravity_and_what_no_robot_measures_are_noisy_too_in_the_own_suite():
         unit = torch.stack([t[name] for t in terms]).double() / half
         assert unit.shape == (2000, 2, 3) and 0.99 < unit.abs().max() <= 1.0
         assert (unit**2).mean().item() == pytest.approx(1 / 3, abs=0.02)
-    assert terms[0].keys() == set(NOISE_TERMS)
+    assert terms[0].keys() == {o.name for o in OBSERVATIONS.values() if o.noise is not None}
     assert "projected_gravity_b" not in stream(REFERENCE).draw(torch.tensor([0]))[0]
 
 

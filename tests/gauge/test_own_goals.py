@@ -58,13 +58,13 @@ def test_phases_follow_each_other_as_multiples_of_the_limits(suite_file):
 @pytest.mark.parametrize("base", ["gaitgauge-1", "robogauge-1.1"])
 def test_a_suite_with_goals_of_its_own_is_played_and_scored(suite_file, tmp_path, base):
     request = Request(policy="pretrained", suite=suite_file(base=base), pipeline="multi")
-    results = evaluate(request, tmp_path / "run")
-    assert 0.0 < results["score"] < 1.0
-    [row] = results["environments"]
-    assert row["runs"]["0"]["commands"].keys() == {"slalom 1", "slalom 2"}
+    result = evaluate(request, tmp_path / "run")
+    assert 0.0 < result.score < 1.0
+    [row] = result.environments
+    assert row.runs[0].commands.keys() == {"slalom 1", "slalom 2"}
     lines = list(csv.DictReader((tmp_path / "run" / "episodes.csv").open()))
     assert [r["command"] for r in lines if r["seed"] == "1"] == ["all", "slalom 1", "slalom 2"]
-    assert json.loads((tmp_path / "run" / "results.json").read_text())["score"] == results["score"]
+    assert json.loads((tmp_path / "run" / "results.json").read_text())["score"] == result.score
 
 
 @pytest.mark.parametrize(

@@ -35,19 +35,19 @@ def request(**choices):
 
 
 def test_flat_ground_agrees_with_the_reference(tmp_path: Path):
-    results = evaluate(request(pipeline="multi", terrains=("flat",), seeds=(0, 1, 2)), tmp_path / "flat")
-    flat = results["environments"][0]
-    assert flat["quality"]["mean50"] == pytest.approx(FLAT_QUALITY[2], abs=0.03)
-    assert flat["quality"]["mean"] == pytest.approx(FLAT_QUALITY[0], abs=0.03)
-    found = {name: values["mean50"] for name, values in flat["metrics"].items()}
+    result = evaluate(request(pipeline="multi", terrains=("flat",), seeds=(0, 1, 2)), tmp_path / "flat")
+    flat = result.environments[0]
+    assert flat.quality.mean50 == pytest.approx(FLAT_QUALITY[2], abs=0.03)
+    assert flat.quality.mean == pytest.approx(FLAT_QUALITY[0], abs=0.03)
+    found = {name: values.mean50 for name, values in flat.metrics.items()}
     assert found == pytest.approx(FLAT_METRICS, abs=0.04)
-    assert flat["diverged"] == 0
-    assert flat["falls"] <= 1  # the reference's own episodes of this policy fell twice in 141: which one does is chance
+    assert flat.diverged == 0
+    assert flat.falls <= 1  # the reference's own episodes of this policy fell twice in 141: which one does is chance
 
 
 def test_the_whole_friction_agrees_with_the_reference(tmp_path: Path):
     """Minutes of simulation: seven terrains, level searches and all."""
-    results = evaluate(request(), tmp_path / "stress")
-    assert results["score"] == pytest.approx(BENCHMARK, abs=0.03)
+    result = evaluate(request(), tmp_path / "stress")
+    assert result.score == pytest.approx(BENCHMARK, abs=0.03)
     for terrain, level in LEVELS.items():
-        assert abs(results["terrains"][terrain]["level"] - level) <= 1, terrain
+        assert abs(result.terrains[terrain].level - level) <= 1, terrain

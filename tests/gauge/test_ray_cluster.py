@@ -98,11 +98,11 @@ def test_three_nodes_equal_one_machine_also_when_one_is_killed(head, nodes, smal
             killed.append(kept(folder))
 
     request = Request(policy=str(PRETRAINED), suite=str(small), threads=3, cluster=head.address)
-    results = evaluate(request, folder, watch=watch)
+    result = evaluate(request, folder, watch=watch)
     assert reproducible(folder) == reproducible(alone)
     assert len(killed) == dying
-    assert results["provenance"]["processes"] == 3
-    assert results["provenance"]["cluster"]["address"] == head.address
+    assert result.provenance.processes == 3
+    assert result.provenance.cluster.address == head.address
 
 
 def test_a_cluster_without_nodes_ends_in_a_sentence_and_the_run_goes_on_elsewhere(head, nodes, small, alone, tmp_path):

@@ -2,15 +2,18 @@
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import repeatability as bench
 import score_cards
+from gaitgauge.gauge.result import TerrainScore
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.studies.compare.comparison import load_result
+from sample_results import PIPELINES, row, sample
 
 SUITE = load_suite("gaitgauge-1")
 
@@ -82,17 +85,14 @@ def played(monkeypatch):
         names.append(folder.name)
         folder.mkdir()
         (folder / "episodes.csv").write_text("command,control_steps\nall,30\nmax_velocity +x,30\nall,12\n")
-        rows = [{"terrain": "flat", "friction": 0.6, "payload": 0.0, "level": None, "score": 0.5}]
-        return {
-            "chance": {"seeds": [1], "search_seeds": [2]},
-            "score": 0.5,
-            "score_interval": [0.4, 0.6],
-            "level": None,
-            "terrains": {"flat": {"score": 0.5, "level": None, "interval": None}},
-            "environments": rows,
-            "coverage": {"text": "complete"},
-            "provenance": {"versions": {}, "processor": "", "date": ""},
-        }
+        return replace(
+            sample("base", **PIPELINES["base"]),
+            score=0.5,
+            score_interval=(0.4, 0.6),
+            level=None,
+            terrains={"flat": TerrainScore(score=0.5)},
+            environments=(row("flat", level=None, score=0.5),),
+        )
 
     monkeypatch.setattr(bench, "evaluate", evaluate)
     return names
@@ -139,8 +139,11 @@ def test_rules_before_are_a_bisection_with_five_seeds_and_no_pushes(tmp_path):
 
 def test_cards_name_the_commit_that_played_where_the_results_do_not_know_it():
     card = sorted(Path(score_cards.__file__).parents[1].glob("docs/data/scorecards/*.json"))[0]
-    results = load_result(card)
-    made = score_cards.card_of({**results, "provenance": {**results["provenance"], "commit": None}}, "cts", None, "abc")
+    result = load_result(card)
+
+    def played(commit):
+        return replace(result, provenance=replace(result.provenance, commit=commit))
+
+    made = score_cards.card_of(played(None), "cts", None, "abc")
     assert made["provenance"]["commit"] == "abc" and made["policy"]["path"] == "cts.gauge.pt"
-    known = {**results, "provenance": {**results["provenance"], "commit": "def"}}
-    assert score_cards.card_of(known, "cts", None, "abc")["provenance"]["commit"] == "def"
+    assert score_cards.card_of(played("def"), "cts", None, "abc")["provenance"]["commit"] == "def"

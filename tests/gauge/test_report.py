@@ -3,13 +3,16 @@
 import json
 import re
 from contextlib import suppress
+from dataclasses import replace
 
 import pytest
 from gaitgauge.api import ResultsError, load_results
+from gaitgauge.gauge.coverage import notes
 from gaitgauge.gauge.report.page import CLIP, metric_matrix, render, sources, warnings, write_report
+from gaitgauge.gauge.result import Health, Statistics
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.studies.compare.comparison import ComparisonError, compare, load_result
-from sample_results import HOSTILE, PIPELINES, Page, row, sample
+from sample_results import HOSTILE, PIPELINES, Page, read, row, sample
 
 
 @pytest.fixture(scope="module")
@@ -19,15 +22,15 @@ def stress():
 
 @pytest.mark.parametrize("pipeline", PIPELINES)
 def test_every_pipeline_renders_well_formed_and_shows_its_environments(pipeline):
-    results = sample(pipeline, **PIPELINES[pipeline])
-    text = render(results)
+    result = sample(pipeline, **PIPELINES[pipeline])
+    text = render(result)
     page = Page(text)
     assert not page.open
     assert "None" not in page.text
     assert "nan" not in page.text.lower().split()
     rows = text.partition('<table class="all')[2].partition("</table>")[0]
-    assert rows.count("<tr>") == len(results["environments"]) + 1
-    shown = f"{results['score']:.4f}" if pipeline != "level" else f"{results['level']:.2f}"
+    assert rows.count("<tr>") == len(result.environments) + 1
+    shown = f"{result.score:.4f}" if pipeline != "level" else f"{result.level:.2f}"
     assert re.search(rf'class="score">{re.escape(shown)}\b', text)
     assert ("no quality episodes" in page.text) == (pipeline == "level")
 
@@ -71,28 +74,28 @@ def test_levels_are_called_what_they_are(suite, label, sentence):
 @pytest.mark.parametrize("suite", ["demo", "mid", "quick"])
 def test_suites_with_one_quality_seed_show_no_interval(suite):
     """One seed shows no spread; the intervals that were printed came from sub-commands, which are no sample."""
-    results = sample(suite=suite)
-    assert (results["score_interval"], results["chance"]["note"]) == (None, "no interval: one seed")
-    assert {row["interval"] for row in results["terrains"].values()} == {None}
-    assert {row["interval"] for row in results["metrics"].values()} == {None}
-    words = Page(render(results)).text
+    result = sample(suite=suite)
+    assert (result.score_interval, result.chance.note) == (None, "no interval: one seed")
+    assert {row.interval for row in result.terrains.values()} == {None}
+    assert {row.interval for row in result.metrics.values()} == {None}
+    words = Page(render(result)).text
     assert "no interval: one seed" in words and "There are no intervals: one seed shows no spread." in words
     assert "Intervals say what" not in words
 
 
 def test_policy_that_passes_nothing_is_a_result():
-    results = sample(terrains=("wave", "obstacle"), frictions=(0.4, 0.6), reach=0)
-    page = Page(render(results))
+    result = sample(terrains=("wave", "obstacle"), frictions=(0.4, 0.6), reach=0)
+    page = Page(render(result))
     assert "Not even level 1 passed in 4 of 4 searched environments" in page.text
-    assert results["level"] == 0
+    assert result.level == 0
     assert "0.00 of 10" in page.text
 
 
 def test_overflow_and_divergence_stand_at_the_top_and_in_the_table():
-    results = sample("base", **PIPELINES["base"])
-    results["health"] |= {"diverged": 1, "overflowed": 2}
-    results["environments"][0] |= {"diverged": 1, "overflowed": 2}
-    text = Page(render(results)).text
+    result = sample("base", **PIPELINES["base"])
+    health, (row,) = replace(result.health, diverged=1, overflowed=2), result.environments
+    row = replace(row, diverged=1, overflowed=2)
+    text = Page(render(replace(result, health=health, environments=(row,)))).text
     assert "events" not in Page(render(sample("base", **PIPELINES["base"]))).text
     assert "No falls" not in text
     assert text.index("Physics diverged in 1 of 3") < text.index("Contacts dropped in 2 of 3") < text.index("Terrains")
@@ -100,7 +103,7 @@ def test_overflow_and_divergence_stand_at_the_top_and_in_the_table():
 
 
 def test_page_asks_for_nothing_from_outside(stress):
-    text = render(stress | {"policy": stress["policy"] | {"path": HOSTILE}})
+    text = render(replace(stress, policy=replace(stress.policy, path=HOSTILE)))
     for _, attributes in Page(text).tags:
         assert not {"src", "href", "srcset", "action", "data", "xlink:href"} & attributes.keys()
     assert not re.search(r"@import|url\(|fetch\(|XMLHttpRequest", text)
@@ -108,7 +111,7 @@ def test_page_asks_for_nothing_from_outside(stress):
 
 
 def test_film_is_part_of_the_page_and_nothing_else_is_loaded(tmp_path, stress):
-    (tmp_path / "results.json").write_text(json.dumps(stress))
+    (tmp_path / "results.json").write_text(json.dumps(stress.to_data()))
     (tmp_path / CLIP).write_bytes(b"RIFFfilm")
     text = write_report(tmp_path).read_text()
     assert [a["src"] for t, a in Page(text).tags if "src" in a] == ["data:image/webp;base64,UklGRmZpbG0="]
@@ -131,7 +134,7 @@ def test_every_number_has_its_name_where_a_phone_hides_the_tables_heads(stress):
 def test_where_a_policy_comes_from_is_told_in_words(stress):
     robot = {"name": "go2", "digest": "5a51"}
     told = {"robot": robot, "task": "go2-flat", "iteration": 1006, "seeds": [1, 2], "note": None}
-    found = sources(stress | {"policy": stress["policy"] | {"provenance": told}})
+    found = sources(replace(stress, policy=replace(stress.policy, provenance=told)))
     shown = [found[f"policy: {key}"] for key in told]
     assert shown == ["name go2, digest 5a51", "go2-flat", "1006", "1, 2", "–"]
 
@@ -145,22 +148,23 @@ def test_directions_commands_and_references_are_shown(stress):
 
 @pytest.mark.parametrize("place", ["path", "command", "terrain", "host", "provenance", "version", "suite"])
 def test_hostile_text_stays_text(place):
-    results = sample("base", **PIPELINES["base"])
+    result = sample("base", **PIPELINES["base"])
     match place:
         case "path":
-            results["policy"]["path"] = HOSTILE
+            result = replace(result, policy=replace(result.policy, path=HOSTILE))
         case "command" | "host":
-            results["provenance"][place] = HOSTILE
+            result = replace(result, provenance=replace(result.provenance, **{place: HOSTILE}))
         case "terrain":
-            results["terrains"] = {HOSTILE: results["terrains"]["flat"]}
-            results["environments"][0] |= {"terrain": HOSTILE, "level": 3, "search": {"5": False, "3": True}}
+            row = replace(result.environments[0], terrain=HOSTILE, level=3, search={5: False, 3: True})
+            terrains = {HOSTILE: result.terrains["flat"]}
+            result = replace(result, terrains=terrains, environments=(row, *result.environments[1:]))
         case "provenance":
-            results["policy"]["provenance"] = {HOSTILE: {"a": HOSTILE}}
+            result = replace(result, policy=replace(result.policy, provenance={HOSTILE: {"a": HOSTILE}}))
         case "version":
-            results["provenance"]["versions"] = {HOSTILE: HOSTILE}
+            result = replace(result, provenance=replace(result.provenance, versions={HOSTILE: HOSTILE}))
         case "suite":
-            results["suite"] = dict.fromkeys(("name", "version", "title"), HOSTILE)
-    page = Page(render(results))
+            result = replace(result, suite=replace(result.suite, name=HOSTILE, version=HOSTILE, title=HOSTILE))
+    page = Page(render(result))
     assert page.count("img") == 0
     assert page.count("script") == 1
     assert "onerror=alert(1)" in page.text
@@ -169,13 +173,13 @@ def test_hostile_text_stays_text(place):
 
 @pytest.mark.parametrize(("suite", "environments"), [("robogauge-1.1", 63), ("gaitgauge-1", 91)])
 def test_full_run_stays_small(suite, environments):
-    results = sample(suite=suite)
-    assert len(results["environments"]) == environments
-    assert len(render(results).encode()) < 300_000
+    result = sample(suite=suite)
+    assert len(result.environments) == environments
+    assert len(render(result).encode()) < 300_000
 
 
 def test_report_is_written_beside_the_results(tmp_path, stress):
-    (tmp_path / "results.json").write_text(json.dumps(stress), encoding="utf-8")
+    (tmp_path / "results.json").write_text(json.dumps(stress.to_data()), encoding="utf-8")
     path = write_report(tmp_path)
     assert path == tmp_path / "report.html"
     assert path.read_text(encoding="utf-8") == render(stress)
@@ -185,7 +189,7 @@ def test_report_is_written_beside_the_results(tmp_path, stress):
 @pytest.mark.parametrize("key", ["environments", "terrains", "provenance", "policy", "health", "score", "metrics"])
 @pytest.mark.parametrize("value", [None, [1], {"a": 1}, "text", -1, "left out"])
 def test_edited_results_are_one_clear_sentence_or_a_page(tmp_path, stress, key, value):
-    changed = {**stress, key: value}
+    changed = {**stress.to_data(), key: value}
     if value == "left out":
         del changed[key]
     (tmp_path / "results.json").write_text(json.dumps(changed))
@@ -193,9 +197,9 @@ def test_edited_results_are_one_clear_sentence_or_a_page(tmp_path, stress, key, 
         write_report(tmp_path)
     except StoreError as error:
         assert "results.json was edited or is damaged" in str(error) and str(error).isprintable()
-    for read in (lambda: compare([load_result(tmp_path), stress], ["a", "b"]), lambda: load_results(tmp_path)):
+    for again in (lambda: compare([load_result(tmp_path), stress], ["a", "b"]), lambda: load_results(tmp_path)):
         with suppress(ComparisonError, ResultsError):
-            read()
+            again()
 
 
 @pytest.mark.parametrize(
@@ -211,16 +215,16 @@ def test_missing_or_damaged_results_are_one_clear_sentence(tmp_path, content, wo
     assert (tmp_path / "report.html").read_text() == "earlier"
 
 
-HEALTHY = {"episodes": 9, "falls": 0, "diverged": 0, "overflowed": 0}
+HEALTHY = Health(episodes=9)
 
 
 def test_warnings_name_what_failed_and_where():
     rows = [
-        row(level=0, search={"1": False}),
+        row(level=0, search={1: False}),
         row("stairs_fd", falls=2, diverged=1, overflowed=0, restarted=0),
         row("slope_fd", falls=5, diverged=0, overflowed=0, restarted=3),
     ]
-    found = warnings({"environments": rows, "health": {"episodes": 6, "falls": 7, "diverged": 1, "overflowed": 0}})
+    found = warnings(rows, Health(episodes=6, falls=7, diverged=1))
     assert [w["severity"] for w in found] == ["grave", "grave", "note", "note"]
     assert found[0]["headline"] == "physics diverged in 1 of 6 quality episodes"
     assert found[1]["places"] == ["slope, forward, μ 0.6 (5)", "stairs, forward, μ 0.6 (2)"]
@@ -230,8 +234,8 @@ def test_warnings_name_what_failed_and_where():
 
 def test_one_episode_is_no_plural():
     rows = [row(falls=1, restarted=1)]
-    health = {"episodes": 1, "falls": 1, "diverged": 1, "overflowed": 1}
-    assert [w["headline"] for w in warnings({"environments": rows, "health": health})] == [
+    health = Health(episodes=1, falls=1, diverged=1, overflowed=1)
+    assert [w["headline"] for w in warnings(rows, health)] == [
         "physics diverged in 1 of 1 quality episode",
         "contacts dropped in 1 of 1 quality episode",
         "1 fall in 1 quality episode",
@@ -241,43 +245,47 @@ def test_one_episode_is_no_plural():
 
 def test_parts_that_touch_are_told_with_the_worst_places_first():
     rows = [row("wave", self_contact=0.004), row("stairs_fd", self_contact=0.0), row("flat", self_contact=0.118)]
-    (warning,) = warnings({"environments": rows, "health": HEALTHY | {"self_contact": 0.041}})
+    (warning,) = warnings(rows, replace(HEALTHY, self_contact=0.041))
     assert warning["severity"] == "note"
     assert warning["headline"] == "parts of the robot touch each other in 4.1 % of the samples"
     assert warning["places"] == ["flat, μ 0.6 (11.8 %)", "wave, μ 0.6 (0.4 %)"]
 
 
 def test_nothing_is_told_of_parts_that_never_touch_or_of_cards_that_do_not_say():
-    for said in ({}, {"self_contact": None}, {"self_contact": 0.0}):
-        assert warnings({"environments": [row("flat")], "health": HEALTHY | said}) == []
+    for said in (HEALTHY, replace(HEALTHY, self_contact=0.0)):
+        assert warnings([row("flat")], said) == []
 
 
 def test_long_lists_of_places_are_cut():
     rows = [row(friction=round(0.1 * i, 1), falls=1) for i in range(1, 10)]
-    (warning,) = warnings({"environments": rows, "health": {"episodes": 9, "falls": 9, "diverged": 0, "overflowed": 0}})
+    (warning,) = warnings(rows, replace(HEALTHY, falls=9))
     assert len(warning["places"]) == 7
     assert warning["places"][-1] == "and 3 more"
 
 
 def test_healthy_run_says_so():
-    results = sample("base", **PIPELINES["base"])
-    results["health"] |= {"falls": 0}
-    results["environments"][0]["falls"] = 0
-    assert warnings(results) == []
-    assert "No falls, no divergence" in render(results)
+    result = sample("base", **PIPELINES["base"])
+    rows = tuple(replace(row, falls=0) for row in result.environments)
+    result = replace(result, environments=rows, health=replace(result.health, falls=0))
+    assert warnings(result.environments, result.health, notes(result)) == []
+    assert "No falls, no divergence" in render(result)
+
+
+def measured(value):
+    return Statistics(mean=value, mean25=value, mean50=value)
 
 
 def test_metric_matrix_is_the_mean_over_played_environments():
     rows = [
-        row(level=2, quality={"mean50": 0.2}, metrics={"m": {"mean50": 0.4}}),
-        row(level=3, quality={"mean50": 0.4}, metrics={"m": {"mean50": 0.8}}),
+        row(level=2, quality=measured(0.2), metrics={"m": measured(0.4)}),
+        row(level=3, quality=measured(0.4), metrics={"m": measured(0.8)}),
         row(level=0, quality=None),
     ]
     assert metric_matrix(rows) == {"wave": {"m": pytest.approx(0.6), "quality": pytest.approx(0.3)}}
 
 
 def test_unknown_metrics_and_terrains_go_by_their_names(stress):
-    results = json.loads(json.dumps(stress).replace("dof_power", "heart_rate").replace("obstacle", "gravel_pit"))
-    page = Page(render(results))
+    text = json.dumps(stress.to_data()).replace("dof_power", "heart_rate").replace("obstacle", "gravel_pit")
+    page = Page(render(read(json.loads(text))))
     assert "heart rate" in page.text
     assert "gravel pit" in page.text

@@ -82,10 +82,10 @@ def test_a_damaged_episode_is_set_aside_and_played_again(finished):
     file = next((run / "episodes").glob("eval-flat*s1*"))
     whole = file.read_bytes()
     file.write_bytes(whole[:100])
-    results = evaluate(request, run, resume=True)
+    result = evaluate(request, run, resume=True)
     assert without_provenance(run) == before
     assert file.read_bytes() == whole
-    assert results["provenance"]["set_aside"] == [file.name + ".damaged"]
+    assert result.provenance.set_aside == (file.name + ".damaged",)
     assert file.with_name(file.name + ".damaged").read_bytes() == whole[:100]
 
 

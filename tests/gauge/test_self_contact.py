@@ -62,7 +62,7 @@ def test_a_pose_that_is_no_number_touches_nothing():
 def test_shares_are_of_all_samples():
     touching = [record(touching=np.array(values)) for values in ([True, False, False], [True, True, False])]
     assert self_contact(touching) == 0.5
-    assert health(touching)["self_contact"] == 0.5
+    assert health(touching).self_contact == 0.5
 
 
 def test_files_that_do_not_say_make_the_share_unknown():

@@ -22,7 +22,7 @@ from gaitgauge.policy.export.files import (
     term_major_order,
 )
 from gaitgauge.policy.foreign.adapters import deploy_contract, mjlab_contract
-from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork
@@ -144,7 +144,7 @@ def test_torchscript_runs_step_by_step_like_the_policy(kind, start, scripted):
             assert torch.allclose(actions, session.act(observation), atol=1e-6), episode
     reloaded = load_policy(path)
     assert reloaded.contract == policy.contract and reloaded.contract.provenance == policy.contract.provenance
-    assert isinstance(reloaded, RebuiltPolicy)
+    assert isinstance(reloaded, FencedPolicy)
 
 
 def test_torchscript_output_is_the_published_one(scripted):

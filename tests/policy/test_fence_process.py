@@ -218,9 +218,7 @@ class Remembering(Plain):
 
 
 @pytest.fixture
-def program(tmp_path, monkeypatch) -> FencedPolicy:
-    """A program that is run although its network could be rebuilt."""
-    monkeypatch.setattr("gaitgauge.policy.loading.rebuilt", lambda policy: policy)
+def program(tmp_path) -> FencedPolicy:
     path = tmp_path / "policy.pt"
     path.write_bytes(script(Remembering()))
     policy = load_policy(path)

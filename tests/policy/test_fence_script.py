@@ -171,3 +171,10 @@ def test_a_method_of_its_own_lets_no_operator_through():
     records[name] += b"  def set_(self: __torch__.Plain, x: Tensor) -> Tensor:\n    return (x).set_(x)\n"
     with pytest.raises(PolicyError, match="set_"):
         check_script(packed(records), source="policy")
+
+
+def test_an_archive_with_a_call_in_its_data_is_refused(tmp_path):
+    records = read_archive(script(Plain()), source="")
+    records["data.pkl"] = b"cos\nsystem\n(X\x04\0\0\0truetR."
+    (tmp_path / "policy.pt").write_bytes(packed(records))
+    refused(tmp_path / "policy.pt", r"os\.system")

@@ -10,7 +10,7 @@ import torch
 import yaml
 from gaitgauge.policy.base import PolicyError, RowwiseSession
 from gaitgauge.policy.contract import History, PolicyContract
-from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.foreign.onnx_session import GraphProgram, OnnxSession
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
@@ -81,8 +81,8 @@ def linear(
     return path
 
 
-def own_code(path: Path, contract: PolicyContract) -> GraphProgram:
-    """The file as it is run where its graph is not understood."""
+def unfenced(path: Path, contract: PolicyContract) -> GraphProgram:
+    """Return the program of a file in this process."""
     program = GraphProgram(path.read_bytes(), "policy.onnx")
     program.prepare(contract)
     return program
@@ -140,7 +140,7 @@ def test_fixed_batch_and_history_are_opened(tmp_path, term_major, cts_network):
     assert policy.contract.history == History(length=5, order="term-major", start="zeros")
     history = torch.randn(EPISODES, 5, 45, generator=torch.Generator().manual_seed(2))
     observation = torch.cat([block.flatten(1) for block in history.split(TERM_WIDTHS, dim=2)], dim=1)
-    opened = own_code(path, policy.contract).session(EPISODES)
+    opened = unfenced(path, policy.contract).session(EPISODES)
     assert isinstance(opened, OnnxSession)
     for session in (policy.session(EPISODES), opened):
         np.testing.assert_allclose(session.act(observation), cts_network(history), atol=1e-5)
@@ -153,8 +153,8 @@ def test_fixed_batch_and_history_are_opened(tmp_path, term_major, cts_network):
 def test_batch_equals_rows(tmp_path, batch, over_batch):
     path = linear(tmp_path / "policy.onnx", batch=batch, over_batch=over_batch)
     policy = load_policy(path)
-    single, own = policy.session(1), own_code(path, policy.contract).session(EPISODES)
-    assert isinstance(policy, RebuiltPolicy)
+    single, own = policy.session(1), unfenced(path, policy.contract).session(EPISODES)
+    assert isinstance(policy, FencedPolicy) and policy.row_by_row == over_batch
     assert isinstance(own, RowwiseSession if over_batch else OnnxSession)
     observation = torch.randn(EPISODES, 45, generator=torch.Generator().manual_seed(2))
     rows = torch.cat([single.act(observation[i : i + 1]) for i in range(EPISODES)])

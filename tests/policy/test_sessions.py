@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.contract import PolicyContract
-from gaitgauge.policy.foreign.batched_policy import RebuiltPolicy
+from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import ARCHITECTURES, unit
@@ -96,7 +96,7 @@ def test_a_session_gives_what_its_network_gives(name, inference, tmp_path, contr
             assert torch.equal(action, expected)
             rows = None if step % 4 == 3 else chosen[: 8 + 8 * (step % 2)]
             picked = slice(None) if rows is None else rows
-            # the last bit may depend on the number of rows, which is why the gauge keeps to one (test_steady.py)
+            # the last bit may depend on the number of rows, which is why the gauge keeps to one (test_batch_invariance.py)
             torch.testing.assert_close(some.act(frame, rows)[picked], expected[picked], rtol=1e-5, atol=1e-5)
     assert torch.equal(given, observations)  # what it was handed is not its memory
     for action, expected in zip(kept, expected_actions(network, observations), strict=True):
@@ -124,7 +124,7 @@ def test_a_torchscript_session_gives_what_its_module_gives(tmp_path: Path, contr
     path = tmp_path / "policy.pt"
     path.write_bytes(archive.getvalue())
     policy, observations = load_policy(path), frames()
-    assert isinstance(policy, RebuiltPolicy)
+    assert isinstance(policy, FencedPolicy)
     session = policy.session(EPISODES)
     with torch.inference_mode():
         module.history = torch.zeros(EPISODES, 3, 45)

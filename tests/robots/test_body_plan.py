@@ -111,7 +111,7 @@ def test_a_suite_watches_the_same_joints_of_any_robot(unseen):
 
     def watched(robot):
         weight = 9.81 * body_plan(robot).mass
-        found = MetricEvaluator(suite.metrics, robot, weight, torch.device("cpu"), torch.float64)._watched
+        found = MetricEvaluator(suite.metrics, robot, weight, torch.device("cpu"), torch.float64).constants.limits[0]
         return [robot.joint_names[i] for i in found]
 
     assert watched(load_robot("go2")) == [n for n in load_robot("go2").joint_names if "calf" not in n]

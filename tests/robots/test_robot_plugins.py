@@ -81,7 +81,7 @@ def test_plugin_does_not_replace_an_own_robot(install_plugin):
         (
             "other",
             "robot_plugin:plugin_robot",
-            "a robot named 'plugged'; entry point and robot must bear the same name",
+            "a robot named 'plugged'; entry point and robot must share a name",
         ),
     ],
 )

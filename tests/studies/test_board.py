@@ -11,10 +11,10 @@ from gaitgauge.studies.cards.board import board_data, render_board, write_board
 from gaitgauge.studies.cards.verify import CardError
 from gaitgauge.studies.compare.comparison import ComparisonError
 from gaitgauge.studies.policies import file_digest
-from sample_results import HOSTILE, Page, sample
+from sample_results import HOSTILE, Page, read, sample
 from typer.testing import CliRunner
 
-CHANCE = sample()["chance"]
+CHANCE = sample().chance.to_data()
 
 
 def card(
@@ -37,9 +37,14 @@ def card(
     } | other
 
 
+def board(cards):
+    """Return the tables of the cards whose content is given."""
+    return board_data({name: read(content) for name, content in cards.items()})
+
+
 def test_complete_cards_are_ranked_by_score_and_others_only_listed():
     part = card(0.9, kind="part", text="1 of 7 terrains")
-    (table,) = board_data({"low.json": card(0.5), "part.json": part, "high.json": card(0.6), "same.json": card(0.5)})
+    (table,) = board({"low.json": card(0.5), "part.json": part, "high.json": card(0.6), "same.json": card(0.5)})
     assert [(e["rank"], e["card"]) for e in table["ranked"]] == [(1, "high.json"), (2, "low.json"), (2, "same.json")]
     assert [(e["rank"], e["coverage"]) for e in table["others"]] == [(None, "part: 1 of 7 terrains")]
     assert table["ranked"][0]["command"] == "gaitgauge verify high.json --policy FILE"
@@ -53,7 +58,7 @@ def test_policies_whose_files_are_called_alike_are_told_apart():
         "c.json": card(0.6, path="c/walk.pt"),
         "d.json": card(0.5, path="d/trot.pt"),
     }
-    (table, other) = board_data(cards | {"e.json": card(0.9, path="b/walk.pt", robot="a1")})
+    (table, other) = board(cards | {"e.json": card(0.9, path="b/walk.pt", robot="a1")})
     assert [e["policy"] for e in table["ranked"]] == ["HIM seed-1", "CTS-seed-1", "b walk", "c walk", "trot"]
     assert [e["policy"] for e in other["ranked"]] == ["walk"]
 
@@ -61,25 +66,25 @@ def test_policies_whose_files_are_called_alike_are_told_apart():
 def test_results_that_do_not_state_their_coverage_or_have_no_score_are_not_ranked():
     old, levels = card(0.7), card(None)
     del old["coverage"]
-    (table,) = board_data({"old.json": old, "levels.json": levels})
+    (table,) = board({"old.json": old, "levels.json": levels})
     assert not table["ranked"]
     assert [e["card"] for e in table["others"]] == ["old.json", "levels.json"]
 
 
 def test_other_rules_engines_and_robots_have_tables_of_their_own():
     cards = {"a": card(0.5), "b": card(0.5, digest="00"), "c": card(0.5, backend="newton"), "d": card(0.5, robot="a1")}
-    assert len(board_data(cards)) == 4
+    assert len(board(cards)) == 4
 
 
 def test_a_robot_of_the_same_name_with_other_files_has_a_table_of_its_own():
     """A policy may carry its robot: a lighter one that is called go2 is none."""
     files = {"a": "ab" * 32, "b": "ab" * 32, "c": "cd" * 32}
     cards = {name: card(0.5, provenance={"digests": {"robot": digest}}) for name, digest in files.items()}
-    tables = board_data(cards)
+    tables = board(cards)
     assert [len(table["ranked"]) for table in tables] == [2, 1]
     assert [table["robot_digest"] for table in tables] == ["ab" * 32, "cd" * 32]
     assert "cdcdcdcdcdcd" in render_board(tables)
-    assert board_data({"old": card(0.5)})[0]["robot_digest"] is None
+    assert board({"old": card(0.5)})[0]["robot_digest"] is None
 
 
 def test_privileged_observations_are_marked_and_have_no_rank():
@@ -89,13 +94,13 @@ def test_privileged_observations_are_marked_and_have_no_rank():
         "3": card(0.7),
     }
     del cards["3"]["policy"]["observations"]
-    (table,) = board_data(cards)
+    (table,) = board(cards)
     assert [(e["rank"], e["observations"]) for e in table["ranked"]] == [(1, "measurable"), (2, "not stated")]
     assert [(e["rank"], e["observations"]) for e in table["others"]] == [(None, "privileged")]
 
 
 def test_the_page_is_well_formed_and_hostile_text_stays_text():
-    page = Page(render_board(board_data({"x.json": card(0.5, path=HOSTILE), "y.json": card(0.4)})))
+    page = Page(render_board(board({"x.json": card(0.5, path=HOSTILE), "y.json": card(0.4)})))
     assert not page.open
     assert page.count("img") == page.count("script") == 0
     assert "0.5000" in page.text and "0.4900 – 0.5100" in page.text
@@ -126,7 +131,7 @@ def test_a_card_is_not_written_over(tmp_path):
 @pytest.fixture
 def whole(tmp_path):
     """A complete card of robogauge-1.1, which a function writes into a folder after changes."""
-    content = sample(resamples=2000)
+    content = sample(resamples=2000).to_data()
     content["suite"]["digest"] = load_suite("robogauge-1.1").digest
 
     def write(**changes):
@@ -171,13 +176,13 @@ def test_a_card_that_names_another_suite_than_its_own_is_not_put_on_the_board(wh
 
 def test_suites_of_the_same_digest_and_other_names_have_tables_of_their_own():
     cards = {name: card(0.5, suite={"name": name, "version": "1", "digest": "ab" * 32}) for name in ("one", "two")}
-    assert [table["suite"]["name"] for table in board_data(cards)] == ["one", "two"]
+    assert [table["suite"]["name"] for table in board(cards)] == ["one", "two"]
 
 
 def test_a_policy_that_ships_is_found_by_name_where_it_is_the_card_s():
     policy = {"path": "pretrained", "file_sha256": file_digest("pretrained")}
     cards = {"a": card(0.5, policy=policy), "b": card(0.4, policy=policy | {"file_sha256": "ab" * 32})}
-    (table,) = board_data(cards)
+    (table,) = board(cards)
     assert [e["command"] for e in table["ranked"]] == [
         "gaitgauge verify a",
         "gaitgauge verify b --policy FILE",  # of another release

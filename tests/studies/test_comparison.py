@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from gaitgauge.gauge.result import Coverage, Provenance, Run, SuiteName
 from gaitgauge.studies.compare.comparison import ComparisonError, compare, holm, load_result
 from gaitgauge.studies.compare.report import as_csv, as_latex, as_page, write_comparison
 from sample_results import sample
@@ -17,14 +18,20 @@ SCORE_CARDS = Path(__file__).parents[2] / "docs" / "data" / "scorecards"
 
 
 def results(*, change=0.0, path="a/first.pt", **choices):
-    """Results of one policy; ``change`` moves the quality of every run."""
+    """Return the result of one policy; ``change`` moves the quality of every run."""
     found = sample(**choices)
-    found["policy"]["path"] = path
-    for row in found["environments"]:
-        for run in row.get("runs", {}).values():
-            run["quality"] += change
-    found["score"] += change * 0.19
-    return found
+
+    def moved(run):
+        return replace(run, columns={**run.columns, "quality": run.columns["quality"] + change})
+
+    rows = tuple(replace(r, runs={s: moved(run) for s, run in r.runs.items()}) for r in found.environments)
+    policy = replace(found.policy, path=path)
+    return replace(found, policy=policy, environments=rows, score=found.score + change * 0.19)
+
+
+def with_rows(result, change):
+    """Return a result with other environments: those that a function gives for each."""
+    return replace(result, environments=tuple(change(row) for row in result.environments))
 
 
 def both(**choices):
@@ -61,7 +68,7 @@ def test_the_same_results_twice_are_refused():
 def test_other_rules_of_chance_are_refused_and_named():
     """They ended in a sentence of NumPy's about shapes."""
     first, second = both()
-    second["chance"]["resamples"] = 20
+    second = replace(second, chance=replace(second.chance, resamples=20))
     with pytest.raises(
         ComparisonError, match=r"chance\.resamples is 10 in 'first' and 20 in 'second'; it was changed by hand"
     ):
@@ -71,13 +78,14 @@ def test_other_rules_of_chance_are_refused_and_named():
 def test_versions_source_and_solver_that_differ_are_said():
     first, second = both(terrains=("flat",))
     assert not any("played alike" in sentence for sentence in compare([first, second]).sentences)
-    for found, version, iterations in ((first, "3.16.0", 100), (second, "3.17.0", 5)):
-        found["provenance"]["versions"]["mujoco"] = version
-        found["solver"] = {"iterations": iterations}
+    made = [
+        replace(found, provenance=Provenance(versions={"mujoco": version}), solver={"iterations": iterations})
+        for found, version, iterations in ((first, "3.16.0", 100), (second, "3.17.0", 5))
+    ]
     assert (
         "They were made with other versions or settings, which may be part of a difference: mujoco 3.16.0 and 3.17.0; "
         "solver.iterations 100 and 5."
-    ) in compare([first, second]).sentences
+    ) in compare(made).sentences
 
 
 def test_everything_that_the_issue_names_is_compared():
@@ -91,17 +99,17 @@ def test_everything_that_the_issue_names_is_compared():
 def test_scores_are_those_of_the_results():
     first, second = both()
     by_name = {(d.kind, d.name): d for d in compare([first, second]).differences}
-    assert by_name["score", "score"].values[0] == pytest.approx(first["score"], abs=1e-6)
-    assert by_name["terrain", "wave"].values[0] == first["terrains"]["wave"]["score"]
-    assert by_name["group", "safety"].values[0] == first["groups"]["safety"]
-    assert by_name["level", "mean level"].values[0] == pytest.approx(first["level"])
+    assert by_name["score", "score"].values[0] == pytest.approx(first.score, abs=1e-6)
+    assert by_name["terrain", "wave"].values[0] == first.terrains["wave"].score
+    assert by_name["group", "safety"].values[0] == first.groups["safety"]
+    assert by_name["level", "mean level"].values[0] == pytest.approx(first.level)
 
 
 def test_a_score_s_interval_is_that_of_its_runs_whatever_the_file_says():
     first, second = both()
     honest = compare([first, second]).policies
-    assert [list(p["score_interval"]) for p in honest] == [first["score_interval"], second["score_interval"]]
-    first["score_interval"] = [first["score"], first["score"]]
+    assert [p.score_interval for p in honest] == [first.score_interval, second.score_interval]
+    first = replace(first, score_interval=(first.score, first.score))
     assert compare([first, second]).policies == honest
     # a band of the file's own says nothing of the difference either
     assert compare([first, second]).differences[0].interval == compare(both()).differences[0].interval
@@ -109,17 +117,18 @@ def test_a_score_s_interval_is_that_of_its_runs_whatever_the_file_says():
 
 def test_the_same_seeds_are_compared_seed_by_seed():
     """Runs that are all better by the same differ for certain, however far the seeds are apart."""
-    first, second = (results(terrains=("flat",), frictions=(0.6,)) for _ in range(2))
-    for row, runs in zip((first, second), ((0.5, 0.6, 0.7), (0.52, 0.62, 0.72)), strict=True):
-        for run, quality in zip(row["environments"][0]["runs"].values(), runs, strict=True):
-            run["quality"] = quality
-        row["score"] = np.mean(runs)
+    pair = [results(terrains=("flat",), frictions=(0.6,)) for _ in range(2)]
+    for at, qualities in enumerate(((0.5, 0.6, 0.7), (0.52, 0.62, 0.72))):
+        (row,) = pair[at].environments
+        runs = {seed: Run(columns={**row.runs[seed].columns, "quality": q}) for seed, q in enumerate(qualities)}
+        runs = {seed: replace(run, commands=row.runs[seed].commands) for seed, run in runs.items()}
+        pair[at] = replace(pair[at], environments=(replace(row, runs=runs),), score=np.mean(qualities))
+    first, second = pair
     score = compare([first, second], ["a", "b"]).differences[0]
     assert score.interval == pytest.approx((0.02, 0.02))
     assert score.real
-    second["chance"]["seeds"] = [5, 6, 7]
-    runs = second["environments"][0]["runs"]
-    second["environments"][0]["runs"] = dict(zip("567", runs.values(), strict=True))
+    second = with_rows(second, lambda row: replace(row, runs=dict(zip((5, 6, 7), row.runs.values(), strict=True))))
+    second = replace(second, chance=replace(second.chance, seeds=(5, 6, 7)))
     found = compare([first, second], ["a", "b"])
     assert not found.paired
     assert not found.differences[0].real
@@ -127,12 +136,10 @@ def test_the_same_seeds_are_compared_seed_by_seed():
 
 def test_metrics_are_compared_where_both_reached_one_level():
     first, second = both(frictions=(0.6,))
-    for row in second["environments"]:
-        if row["terrain"] != "flat":
-            row["level"] = (row["level"] or 1) - 1
-    flat = first["environments"][0]
+    second = with_rows(second, lambda row: row if row.flat else replace(row, level=(row.level or 1) - 1))
+    flat = first.environments[0]
     found = {(d.kind, d.name): d for d in compare([first, second]).differences}
-    runs = [run["dof_power"] for run in flat["runs"].values()]
+    runs = [run.columns["dof_power"] for run in flat.runs.values()]
     assert found["metric", "dof_power"].values[0] == pytest.approx(np.mean(runs), abs=1e-6)
 
 
@@ -142,29 +149,30 @@ def test_metrics_are_compared_at_a_whole_level_that_both_were_measured_at():
     first, second = results(**choices), results(path="b/second.pt", **choices)
 
     def measured(result, level, power):
-        for row in result["environments"]:
-            row["level"] = level + 0.5
-            row["runs_by_level"] = {
-                str(at): {seed: {**run, "dof_power": power + at} for seed, run in row["runs"].items()}
-                for at in (level, level + 1)
-            }
+        def at_level(run, at):
+            return replace(run, columns={**run.columns, "dof_power": power + at})
 
-    measured(first, 5, 0.0)
-    measured(second, 6, 0.1)
-    found = {(d.kind, d.name): d for d in compare([first, second]).differences}
+        def measured_row(row):
+            by_level = {at: {s: at_level(run, at) for s, run in row.runs.items()} for at in (level, level + 1)}
+            return replace(row, level=level + 0.5, runs_by_level=by_level)
+
+        return with_rows(result, measured_row)
+
+    first, other = measured(first, 5, 0.0), measured(second, 6, 0.1)
+    found = {(d.kind, d.name): d for d in compare([first, other]).differences}
     assert found["metric", "dof_power"].values == pytest.approx((6.0, 6.1))
     assert found["level", "mean level"].difference == pytest.approx(1.0)
-    measured(second, 7, 0.1)
-    assert not [d for d in compare([first, second]).differences if d.kind in ("metric", "command")]
+    other = measured(second, 7, 0.1)
+    assert not [d for d in compare([first, other]).differences if d.kind in ("metric", "command")]
 
 
 @pytest.mark.parametrize("suite", ["robogauge-1.1", "gaitgauge-1"])
 def test_one_that_passes_no_level_of_an_environment_compares_with_one_that_does(suite):
     first, second = both(suite=suite, terrains=("flat", "wave"))
-    row = next(r for r in second["environments"] if r["terrain"] == "wave")
-    row["trials"] = {level: dict.fromkeys(outcomes, False) for level, outcomes in row["trials"].items()}
-    row.update(level=0, score=0.0)
-    row.pop("runs")
+    failed = next(r for r in second.environments if r.terrain == "wave")
+    trials = {level: dict.fromkeys(outcomes, False) for level, outcomes in failed.trials.items()}
+    none = replace(failed, trials=trials, level=0, score=0.0, runs={})
+    second = with_rows(second, lambda row: none if row is failed else row)
     found = next(d for d in compare([first, second]).differences if d.kind == "terrain" and d.name == "wave")
     assert found.interval is not None and found.interval[0] < found.difference < found.interval[1]
 
@@ -187,9 +195,9 @@ def test_scores_of_three_are_corrected_for_three_pairs():
 
 def test_files_of_one_name_are_told_apart_by_their_folder():
     pair = [results(path=p) for p in ("runs/a/model_10.pt", "runs\\b\\model_10.pt")]
-    assert [p["label"] for p in compare(pair).policies] == ["a model_10", "b model_10"]
+    assert [p.label for p in compare(pair).policies] == ["a model_10", "b model_10"]
     same = [results(path="x/model.pt", change=change) for change in (0.0, 0.1)]
-    assert [p["label"] for p in compare(same).policies] == ["x (1)", "x (2)"]
+    assert [p.label for p in compare(same).policies] == ["x (1)", "x (2)"]
 
 
 def test_parts_of_one_shape_compare_and_say_that_they_are_no_benchmark():
@@ -203,7 +211,7 @@ def test_parts_of_one_shape_compare_and_say_that_they_are_no_benchmark():
     )
     assert parts.plain()["policies"][0]["coverage"] == {"kind": "part", "text": "2 of 7 terrains, 1 of 9 frictions"}
     first, second = both()
-    second["coverage"] = {"kind": "custom", "text": "seed 9", "levels": []}
+    second = replace(second, coverage=Coverage(kind="custom", text="seed 9"))
     assert compare([first, second]).sentences[-1] == (
         "Not all of these are scores of robogauge-1.1 1.1.0: 'first' complete; 'second' custom: seed 9."
     )
@@ -222,7 +230,7 @@ def test_runs_at_different_given_levels_are_refused():
     ("change", "words"),
     [
         (
-            {"suite": {"name": "mid", "version": "1.0.0", "digest": ""}},
+            {"suite": SuiteName(name="mid", version="1.0.0", digest="")},
             "'second' has mid 1.0.0; evaluate both on one suite",
         ),
         (
@@ -236,26 +244,27 @@ def test_runs_at_different_given_levels_are_refused():
 def test_other_conditions_are_one_sentence(change, words):
     first, second = both()
     with pytest.raises(ComparisonError, match=words):
-        compare([first, second | change])
+        compare([first, replace(second, **change)])
 
 
 def test_a_suite_whose_rules_were_changed_is_another_one():
     first, second = both()
-    second["suite"]["digest"] = "00"
+    second = replace(second, suite=replace(second.suite, digest="00"))
     with pytest.raises(ComparisonError, match=r"name the suite robogauge-1.1 1.1.0, but its rules were changed"):
         compare([first, second])
 
 
 def test_a_robot_whose_files_were_changed_is_another_one():
     first, second = both()
-    for found, digest in ((first, "ab" * 32), (second, "cd" * 32)):
-        found["provenance"] = {"digests": {"robot": digest}}
+    first, second = (
+        replace(found, provenance=Provenance(digests={"robot": digest}))
+        for found, digest in ((first, "ab" * 32), (second, "cd" * 32))
+    )
     with pytest.raises(
         ComparisonError, match=r"name the robot go2, but its files differ \(abababababab and cdcdcdcdcdcd\)"
     ):
         compare([first, second])
-    second["provenance"] = {}  # results of before do not say
-    assert compare([first, second])
+    assert compare([first, replace(second, provenance=Provenance())])  # results of before do not say
 
 
 def test_other_environments_are_refused():
@@ -267,7 +276,7 @@ def test_other_environments_are_refused():
 def test_given_levels_do_not_compare_with_searched_ones():
     first = results(frictions=(0.6,), terrains=("wave",))
     second = results(frictions=(0.6,), terrains=("wave",), path="second.pt")
-    del second["environments"][0]["trials"]
+    second = with_rows(second, lambda row: replace(row, trials={}))
     with pytest.raises(ComparisonError, match="'second' was given its level and that of 'first' was searched for"):
         compare([first, second])
 
@@ -329,9 +338,8 @@ def test_csv_of_one_seed_has_empty_ends():
 @pytest.mark.parametrize("suite", ["robogauge-1.1", "gaitgauge-1"])
 def test_score_cards_that_ship_can_be_compared(suite):
     cards = [load_result(path) for path in sorted(SCORE_CARDS.glob(f"*-{suite}.json"))]
-    for card in cards:
-        card["chance"]["resamples"] = 200  # of 2000, which take seconds
-    found = compare([card for card in cards if card["robot"] == "go2"])
+    cards = [replace(card, chance=replace(card.chance, resamples=200)) for card in cards]  # of 2000, which take seconds
+    found = compare([card for card in cards if card.robot == "go2"])
     assert len(found.policies) >= 2
     assert next(d for d in found.differences if d.kind == "score").real
 

@@ -1,10 +1,11 @@
 """When a score card holds: pure judgements on hand-made replays."""
 
-from copy import deepcopy
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 
 import pytest
 from gaitgauge.gauge.evaluate import Request, identity, prepare
+from gaitgauge.gauge.result import Coverage, Motors
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.studies.cards.verify import CardError, check_card, judge, prepare_replay, with_fresh_seeds
 from gaitgauge.studies.compare.comparison import ComparisonError, load_result
@@ -17,19 +18,25 @@ def card():
     return sample(terrains=("flat", "wave"), frictions=(0.4, 0.6))
 
 
+def with_row(result, at, **changes):
+    """Return a result with other entries in one of its environments."""
+    rows = list(result.environments)
+    rows[at] = replace(rows[at], **changes)
+    return replace(result, environments=tuple(rows))
+
+
 def test_the_same_outcomes_hold_and_are_equal(card):
-    found = judge(card, deepcopy(card))
+    found = judge(card, card)
     assert (found["holds"], found["equal"], found["quick"], found["levels"]) == (True, True, False, [])
-    assert found["interval"] == card["score_interval"]
+    assert found["interval"] == list(card.score_interval)
 
 
 def test_a_score_within_the_band_holds_and_one_outside_does_not(card):
     """Two draws differ by √2 times what one is off: within the interval alone one replay in six of a true card failed."""
-    score = card["score"]
-    low, high = (score + 2**0.5 * (end - score) for end in card["score_interval"])
+    score = card.score
+    low, high = (score + 2**0.5 * (end - score) for end in card.score_interval)
     for value, holds in ((low + 1e-4, True), (high + 1e-4, False), (low - 1e-4, False)):
-        replay = deepcopy(card) | {"score": value}
-        replay["environments"][0]["score"] += 0.001
+        replay = with_row(replace(card, score=value), 0, score=card.environments[0].score + 0.001)
         found = judge(card, replay)
         assert (found["holds"], found["equal"], found["replayed"]) == (holds, False, value)
         # a policy that other seeds judge better was not fitted to those of the card
@@ -37,36 +44,31 @@ def test_a_score_within_the_band_holds_and_one_outside_does_not(card):
 
 
 def test_levels_that_differ_are_listed(card):
-    replay = deepcopy(card)
-    row = replay["environments"][3]
-    row["level"] -= 1
-    (found,) = judge(card, replay)["levels"]
+    level = card.environments[3].level
+    (found,) = judge(card, with_row(card, 3, level=level - 1))["levels"]
     place = {"terrain": "wave", "friction": 0.6, "payload": 0.0}
-    assert found == place | {"card": row["level"] + 1, "here": row["level"]}
+    assert found == place | {"card": level, "here": level - 1}
 
 
 def test_a_sample_is_held_against_the_same_environments(card):
     """Scores of the two sampled rows by hand; the card's own score, over four rows, does not matter."""
-    replay = deepcopy(card)
-    replay["environments"] = [replay["environments"][1], replay["environments"][3]]
-    expected = sum(row["score"] for row in replay["environments"]) / 2
-    replay["score"] = expected
+    rows = (card.environments[1], card.environments[3])
+    expected = sum(row.score for row in rows) / 2
+    replay = replace(card, environments=rows, score=expected)
     found = judge(card, replay)
     assert (found["quick"], found["environments"], found["equal"]) == (True, [2, 4], True)
     assert found["score"] == pytest.approx(expected, abs=1e-6)
     low, high = found["band"]
     assert low < found["interval"][0] < expected < found["interval"][1] < high
-    replay["environments"][0]["score"] += 0.2
-    assert not judge(card, replay | {"score": high + 0.01})["holds"]
+    replay = with_row(replay, 0, score=rows[0].score + 0.2)
+    assert not judge(card, replace(replay, score=high + 0.01))["holds"]
 
 
 def test_without_an_interval_only_the_same_outcome_holds(card):
-    card["score_interval"] = None
-    card["chance"]["seeds"] = [0]  # one seed shows no spread
-    replay = deepcopy(card)
-    assert judge(card, replay)["holds"]
-    replay["environments"][0]["score"] += 1e-6
-    assert not judge(card, replay)["holds"]
+    rules = replace(card.chance, seeds=(0,))  # one seed shows no spread
+    card = replace(card, score_interval=None, chance=rules)
+    assert judge(card, card)["holds"]
+    assert not judge(card, with_row(card, 0, score=card.environments[0].score + 1e-6))["holds"]
 
 
 def test_the_hash_of_a_policys_file_is_what_other_programs_print(tmp_path):
@@ -78,7 +80,7 @@ def test_the_hash_of_a_policys_file_is_what_other_programs_print(tmp_path):
 def test_results_of_something_else_are_no_card(tmp_path):
     path = tmp_path / "half.json"
     path.write_text('{"schema": 2, "environments": [], "suite": {}}')
-    with pytest.raises(ComparisonError, match=r"half\.json': it lacks score, backend, robot, pipeline"):
+    with pytest.raises(ComparisonError, match=r"half\.json': it lacks score, pipeline, backend, robot"):
         load_result(path)
 
 
@@ -101,38 +103,39 @@ def test_fresh_seeds_are_all_others_and_share_what_the_suites_share(suite):
 
 
 def test_a_card_without_an_interval_says_nothing_about_other_seeds(card):
-    card["score_interval"] = None
     with pytest.raises(
         CardError, match="the card has no interval, so that nothing can be said of other seeds; leave out --fresh"
     ):
-        prepare_replay(card, fresh=1)
+        prepare_replay(replace(card, score_interval=None), fresh=1)
 
 
 def test_a_card_of_a_policy_that_ships_names_it():
     """Its path is a name, as the user gave it, and no file's."""
     shipped = load_result(Path(__file__).parents[2] / "docs/data/scorecards/pretrained-gaitgauge-1.json")
-    shipped["policy"]["file_sha256"] = file_digest("pretrained")  # the card may be that of one that shipped before
-    assert len(prepare_replay(shipped, quick=True).environments) == 7
-    shipped["policy"]["file_sha256"] = "ab" * 32
+
+    def named(**changes):
+        return replace(shipped, policy=replace(shipped.policy, **changes))
+
+    mine = named(file_sha256=file_digest("pretrained"))  # the card may be that of one that shipped before
+    assert len(prepare_replay(mine, quick=True).environments) == 7
     with pytest.raises(CardError, match="'pretrained' is another policy than the card's"):
-        prepare_replay(shipped, quick=True)
-    shipped["policy"]["path"] = "latest"  # whatever was trained last is nobody's card
+        prepare_replay(named(file_sha256="ab" * 32), quick=True)
     with pytest.raises(CardError, match="the card's policy is not at 'latest' on this machine"):
-        prepare_replay(shipped, quick=True)
+        prepare_replay(named(path="latest"), quick=True)  # whatever was trained last is nobody's card
 
 
 def test_a_card_that_holds_less_than_it_says_is_refused():
     """Bad environments left out, and the score worked out anew: a replay of what is left would hold."""
     suite, whole = load_suite("robogauge-1.1"), sample(resamples=2000)
     check_card(whole, suite, "it")
-    part = whole | {"environments": [row for row in whole["environments"] if row["terrain"] != "obstacle"]}
+    part = replace(whole, environments=tuple(row for row in whole.environments if row.terrain != "obstacle"))
     with pytest.raises(
         CardError,
         match=r"it calls itself complete, but holds 6 of 7 terrains of robogauge-1\.1; it was changed by hand",
     ):
         check_card(part, suite, "it")
     with pytest.raises(CardError, match=r"it: score_interval is .*, but that of its trials and runs is"):
-        check_card(part | {"coverage": None}, suite, "it")  # results from before say nothing of what they hold
+        check_card(replace(part, coverage=Coverage()), suite, "it")  # results from before say nothing of what they hold
 
 
 def test_a_card_of_a_suite_that_names_another_or_has_other_rules_is_refused():
@@ -141,28 +144,43 @@ def test_a_card_of_a_suite_that_names_another_or_has_other_rules_is_refused():
         with pytest.raises(
             CardError, match=r"it names its suite .*, but its digest a43a.* is that of robogauge-1\.1 1\.1\.0"
         ):
-            check_card(card | {"suite": card["suite"] | {key: value}}, suite, "it")
+            check_card(replace(card, suite=replace(card.suite, **{key: value})), suite, "it")
     with pytest.raises(CardError, match=r"it: chance.resamples is 1000, but that of robogauge-1.1 is 2000"):
-        check_card(card | {"chance": card["chance"] | {"resamples": 1000}}, suite, "it")
+        check_card(replace(card, chance=replace(card.chance, resamples=1000)), suite, "it")
 
 
-@pytest.mark.parametrize("interval", [[0.0, 1.0], [0.9, 0.95], None])
+@pytest.mark.parametrize("interval", [(0.0, 1.0), (0.9, 0.95), None])
 def test_an_interval_that_the_runs_do_not_give_is_refused(card, interval):
     """It was taken as it is printed, and a card with a wide one held whatever its score."""
     check_card(card, None, "it")
     with pytest.raises(CardError, match=r"it: score_interval is .*, but that of its trials and runs is"):
-        check_card(card | {"score_interval": interval}, None, "it")
+        check_card(replace(card, score_interval=interval), None, "it")
 
 
 def test_the_band_is_as_wide_as_the_replay_s_interval(card):
     """Runs that were spread by hand widen the card's interval, and no band."""
-    true = judge(card, deepcopy(card))["band"]
-    forged = deepcopy(card) | {"score_interval": [0.0, 1.0]}
-    for row in forged["environments"]:
-        for at, run in enumerate(row["runs"].values()):
-            run["quality"] += 0.3 * (at - 1)
+    true = judge(card, card)["band"]
+    forged = replace(card, score_interval=(0.0, 1.0))
+    for place, row in enumerate(card.environments):
+        spread = {
+            seed: replace(run, columns={**run.columns, "quality": run.columns["quality"] + 0.3 * (at - 1)})
+            for at, (seed, run) in enumerate(row.runs.items())
+        }
+        forged = with_row(forged, place, runs=spread)
     found = judge(forged, card)
     assert found["band"] == true and not found["equal"]
+
+
+def off(value, steps, by):
+    """Return a result, or a part of it, in which the figure at a path is off."""
+    if not steps:
+        return value + by
+    step, *rest = steps
+    if is_dataclass(value):
+        return replace(value, **{step: off(getattr(value, step), rest, by)})
+    changed = dict(value) if isinstance(value, dict) else list(value)
+    changed[step] = off(value[step], rest, by)
+    return changed if isinstance(value, dict) else tuple(changed)
 
 
 @pytest.mark.parametrize(
@@ -180,29 +198,21 @@ def test_the_band_is_as_wide_as_the_replay_s_interval(card):
 def test_a_figure_that_is_off_where_no_outcome_is_is_named(card, key, inside):
     """The last digits of an interval may be another machine's, and an older card may say less."""
     for by, figures in ((1e-6, []), (0.1, [key])):
-        forged = deepcopy(card)
-        table, last = forged, key
-        for step in inside:
-            table, last = table[last], step
-        table[last] += by
-        found = judge(forged, card)
+        found = judge(off(card, (key, *inside), by), card)
         assert (found["holds"], found["equal"], found["figures"]) == (not figures, False, figures)
-    assert judge(card | {"health": {}, "groups_interval": None}, card)["equal"]
+    older = replace(card, lacking=frozenset({"health", "groups_interval"}))
+    assert judge(older, card)["equal"]
 
 
 def test_another_solver_or_motors_than_the_replay_s_do_not_hold_and_other_versions_are_said(card):
-    card |= {"solver": {"iterations": 100}, "motors": {"stiffness": [20.0], "damping": [0.5], "note": None}}
-    assert judge(card, deepcopy(card))["holds"]
-    for key, value in (
-        ("solver", {"iterations": 5}),
-        ("motors", {"stiffness": [40.0], "damping": [0.5], "note": None}),
-    ):
-        found = judge(card | {key: value}, card)
+    card = replace(card, solver={"iterations": 100}, motors=Motors(stiffness=(20.0,), damping=(0.5,)))
+    assert judge(card, card)["holds"]
+    for key, value in (("solver", {"iterations": 5}), ("motors", Motors(stiffness=(40.0,), damping=(0.5,)))):
+        found = judge(replace(card, **{key: value}), card)
         assert not found["holds"] and [item["name"].partition(".")[0] for item in found["settings"]] == [key]
-    older = deepcopy(card)
-    older["provenance"] |= {"versions": {"mujoco": "3.16.0", "numpy": "1.0"}, "digests": {"source": "ab" * 32}}
-    card["provenance"]["digests"] = {"source": "cd" * 32}
-    found = judge(older, card)
+    versions = {"mujoco": "3.16.0", "numpy": "1.0"}
+    older = replace(card, provenance=replace(card.provenance, versions=versions, digests={"source": "ab" * 32}))
+    found = judge(older, replace(card, provenance=replace(card.provenance, digests={"source": "cd" * 32})))
     assert found["holds"] and found["unlike"] == [
         "mujoco 3.16.0 and 3.17.0",
         "source of gaitgauge abababababab and cdcdcdcdcdcd",

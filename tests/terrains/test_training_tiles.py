@@ -222,6 +222,20 @@ def test_a_kind_of_ones_own(monkeypatch):
     assert make_tile("ditch", 3).spawns["train"].position == (0.0, 0.0, 1.0)
 
 
+def test_a_box_without_a_size_is_refused_by_its_terrain(monkeypatch):
+    def kerb(difficulty, shape, random):
+        step = Box(center=(0.0, 0.0, 0.1), half_size=(1.0, 1.0, 0.1))
+        return step, Box(center=(2.0, 0.0, 0.0), half_size=(0.1, 4.0, 0.1 * difficulty))
+
+    monkeypatch.setitem(TILE_KINDS, "kerb", TileKind(build=kerb, random=False))
+    message = (
+        r"terrain 'tile_kerb' level 0: box 1 \(from 0\) .* half size 0 m along z, which must be above 0; make it larger"
+    )
+    with pytest.raises(TerrainError, match=message):
+        make_tile("kerb", 0)
+    assert len(make_tile("kerb", 1).boxes) == 2
+
+
 def test_bad_requests():
     with pytest.raises(TerrainError, match="unknown kind of training tile 'stairs_upp'; did you mean 'stairs_up'"):
         make_tile("stairs_upp", 0)

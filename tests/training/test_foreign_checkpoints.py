@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 from gaitgauge.policy.native import ForeignFile, save_policy
+from gaitgauge.training.processes import Processes
 from gaitgauge.training.run.checkpoint import CheckpointError, rank_file, read_checkpoint, trim_checkpoint
-from gaitgauge.training.run.processes import Processes
 from gaitgauge.training.run.resuming import begin_with, resume_run
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import random_state, restore_random_state

@@ -4,7 +4,7 @@
 
 import pytest
 import torch
-from gaitgauge.training.algorithms.methods import METHODS
+from gaitgauge.training.configuration import METHODS
 from gaitgauge.training.run.runner import TrainingRunner
 from small_environment import STAIRS, make
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes

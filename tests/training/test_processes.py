@@ -3,9 +3,9 @@
 import pytest
 import torch
 from gaitgauge.training.configuration import ConfigurationError
+from gaitgauge.training.processes import Processes
 from gaitgauge.training.run.keepsake import Keepsake
 from gaitgauge.training.run.logger import RunLogger
-from gaitgauge.training.run.processes import Processes
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything
 from toy_training import ToyEnv, toy_configuration, toy_contract, toy_mirror

@@ -4,8 +4,8 @@ import json
 
 import pytest
 import torch
+from gaitgauge.training.processes import Processes, ProcessLostError
 from gaitgauge.training.run.checkpoint import read_checkpoint
-from gaitgauge.training.run.processes import Processes, ProcessLostError
 from gaitgauge.training.run.resuming import TrainingDivergedError
 from gaitgauge.training.run.run_directory import update_run_json
 from gaitgauge.training.run.runner import TrainingRunner
@@ -50,12 +50,13 @@ def lose(tmp_path, monkeypatch, *, outcome, broken):
     runner = make(tmp_path)
     update_run_json(tmp_path, {"outcome": "running"})
     monkeypatch.setattr(LostProcesses, "lost", False)
-    monkeypatch.setattr("gaitgauge.training.run.runner.time.sleep", lambda _: None)
+    monkeypatch.setattr("gaitgauge.training.run.rescue.time.sleep", lambda _: None)
     runner.learn(1)
     if broken:
         with torch.no_grad():
             runner.alg.actor.student.actor[0].weight[0, 0] = float("nan")
-        monkeypatch.setattr(runner, "_iterate", lambda obs, _: runner._kept.keep(runner.learned(), 2, "cpu") or obs)
+        keep = runner.rescue.keepsake.keep
+        monkeypatch.setattr(runner, "_iterate", lambda obs, _: keep(runner.learned(), 2, "cpu") or obs)
     update_run_json(tmp_path, {"outcome": outcome})
     monkeypatch.setattr(LostProcesses, "lost", True)
     with pytest.raises((ProcessLostError, SystemExit)) as caught:
@@ -106,7 +107,7 @@ def test_a_run_that_loses_a_process_before_its_first_iteration_says_so(tmp_path,
     runner = make(tmp_path)
     runner.iteration = begun_at
     update_run_json(tmp_path, {"outcome": "running"})
-    monkeypatch.setattr("gaitgauge.training.run.runner.time.sleep", lambda _: None)
+    monkeypatch.setattr("gaitgauge.training.run.rescue.time.sleep", lambda _: None)
     monkeypatch.setattr(LostProcesses, "lost", True)
     monkeypatch.setattr(runner, "_iterate", lambda *_: runner.processes.largest(0))
     with pytest.raises(ProcessLostError, match=r"no iteration was complete, so there is no new checkpoint$"):

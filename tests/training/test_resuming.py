@@ -3,8 +3,8 @@
 import pytest
 import torch
 from gaitgauge.training.environment.configuration import ScheduleConfiguration
+from gaitgauge.training.processes import Processes
 from gaitgauge.training.run.checkpoint import copy_checkpoint, rank_file
-from gaitgauge.training.run.processes import Processes
 from gaitgauge.training.run.resuming import resume_run
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything

@@ -28,7 +28,7 @@ TRAIN = (
 )
 SCRIPT = """
 import torch
-from gaitgauge.training.run.processes import Processes
+from gaitgauge.training.processes import Processes
 from gaitgauge.training.run.runner import TrainingRunner
 from toy_training import ToyEnv, toy_configuration, toy_contract
 import os

@@ -11,6 +11,7 @@ from gaitgauge.policy.finding import PRETRAINED, SHIPPED
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 from gaitgauge.studies.policies import file_digest
+from gaitgauge.training.run.checkpoint import read_checkpoint, training_part, write_checkpoint
 from gaitgauge.training.sweep.curves import kept_curves_csv, learning_curves
 from gaitgauge.training.sweep.file import Sweep, SweepEntry, SweepError, load_sweep
 from gaitgauge.training.sweep.folding import fold_sweep
@@ -44,7 +45,8 @@ def finished(tmp_path_factory):
             writer.add_scalar("Perf/total_steps", 1e6 * (step + 1), step)
             writer.add_scalar("Train/mean_reward", 0.5 * step, step)
             writer.add_scalar("Loss/surrogate", -0.25 * step, step)
-    shutil.copy(PRETRAINED, made / "model_3.pt")
+    # with its teacher and critic, as a run's checkpoint
+    write_checkpoint(made / "model_3.pt", read_checkpoint(PRETRAINED, training_state=False, purpose="start from"))
     note = {"task": "go2-moe-cts", "host": "lab-7", "command": "gaitgauge train --log-root /home/me", "seed": 0}
     note |= {"begun_with": "/home/me/first.pt", "resumed": [{"checkpoint": "model_1.pt", "command": "train /home/me"}]}
     note |= {"outcome": "finished", "iteration": 3, "environment_steps": 3_000_000, "training_seconds": 4.5}
@@ -53,6 +55,7 @@ def finished(tmp_path_factory):
     results.mkdir(parents=True)
     card = json.loads(CARD.read_text())
     card["policy"] |= {"path": "/home/me/model_3.pt", "provenance": {"iteration": 3}}
+    card["policy"]["file_sha256"] = file_digest(str(made / "model_3.pt"))
     card["provenance"] |= {"host": "lab-7", "command": "gaitgauge evaluate /home/me/model_3.pt"}
     (results / "results.json").write_text(json.dumps(card))
     return folder
@@ -88,7 +91,8 @@ def test_it_is_small_and_names_no_machine_and_no_folder(kept):
     for name in ("run.json", "results.json"):
         text = (there / "kept" / name).read_text()
         assert "lab-7" not in text and "/home/me" not in text
-    assert (there / "kept" / "policy.gauge.pt").stat().st_size < 0.75 * PRETRAINED.stat().st_size
+    whole = 0.75 * (PRETRAINED.stat().st_size + training_part(PRETRAINED).stat().st_size)
+    assert (there / "kept" / "policy.gauge.pt").stat().st_size < whole
 
 
 def test_the_results_are_a_card_of_the_policy(kept):
@@ -297,7 +301,7 @@ def test_another_checkpoint_that_was_kept_does_not_count(finished, kept, tmp_pat
 def test_the_shipped_folders_are_read(tmp_path):
     """The newest and the oldest."""
     for name in ("baselines", "from-nothing"):
-        shutil.copytree(ROOT / "docs" / "data" / "sweeps" / name, tmp_path / name)
+        shutil.unpack_archive(ROOT / "docs" / "data" / "sweeps" / f"{name}.zip", tmp_path / name)
         sweep = load_sweep(ROOT / "benchmarks" / "sweeps" / f"{name}.toml")
         runs, refused = plan_runs(sweep, tmp_path / name, to_train=False)
         there = [run for run in runs if run.directory]

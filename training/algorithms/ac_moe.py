@@ -1,8 +1,8 @@
 """AC-MoE (paper, ablation, after MoE-Loco): CTS with a plain student encoder, and experts in actor and critic.
 
-The actor mixes the actions of its experts; the critic's value heads, one for each expert, are mixed with the actor's weights, so
-that values train the gate too, and through it the teacher encoder. Both learn from teacher and student samples, and so does the
-balance of the experts, which is part of the policy's loss.
+The actor mixes the actions of its experts; the critic's value heads, one for each expert, are mixed with the actor's weights, so that
+values train the gate too, and through it the teacher encoder. Both learn from teacher and student samples, and so does the balance of the
+experts, which is part of the policy's loss.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class AcMoeActor(ComposedActor):
     """An actor that mixes the actions of its experts."""
 
     def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean actions (N, J) and weights of the experts (N, K); see ``StudentActor``."""
+        """Return the mean actions (N, J) and weights of the experts (N, K); see ``StudentActor``."""
         (mean,), weights = self.composed(latent, policy)
         return mean, weights
 

@@ -1,27 +1,24 @@
-"""Beginning a method's training with a deployed policy alone, which has none of what only training needs: no critic, no teacher,
-no decoder.
+"""Begin a method's training with a deployed policy alone, which has no critic, no teacher and no decoder.
 
-While it lasts, the student acts in all environments; encoder, actor and exploration noise stand still, and what the policy lacks
-is learned for it. Afterwards training goes on as if it had never been cut in two.
+While it lasts, the student acts in all environments; encoder, actor and exploration noise stand still, and the missing networks learn
+from its behaviour. Afterwards training goes on as if it had never been cut in two.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import nn
 
 from ...files.parsing import shown
+from ..configuration import AlgorithmConfiguration
 from .optimization import FlatGradients, load_moments, take_step
-
-if TYPE_CHECKING:
-    from .ppo import PPO
 
 
 def iterations_left(state: Mapping[str, Any]) -> int:
-    """Iterations left of what ``Bootstrap.save`` returned.
+    """Return the iterations left of a state that ``Bootstrap.save`` returned.
 
     Raises:
         ValueError, LookupError, TypeError: it is no such state.
@@ -33,44 +30,46 @@ def iterations_left(state: Mapping[str, Any]) -> int:
 
 
 class Bootstrap:
-    """Learns what a bare policy lacks from the policy's behaviour, for a number of iterations."""
+    """Learns the networks that a bare policy lacks from the policy's behaviour, for a number of iterations."""
 
     def __init__(
         self,
-        algorithm: PPO,
         iterations: int,
+        settings: AlgorithmConfiguration,
         *,
         parameters: Sequence[nn.Parameter],
         losses: Callable[..., torch.Tensor],
         names: Sequence[str],
+        joined: Callable[..., Callable[..., None]],
     ) -> None:
         """Prepare an optimizer of its own: the algorithm's starts fresh once the policy is followed.
 
         Args:
-            algorithm: whose rollout and settings count.
+            parameters: of the missing networks.
             losses: from the rows of a minibatch, one tensor for each group of environments, to one number for each name.
+            joined: makes a step, as ``PPO.joined``.
         """
-        self._algorithm = algorithm
-        self._left = iterations
+        self._left, self._settings = iterations, settings
         self._losses, self._names = losses, names
         parameters = list(parameters)
         self._gradients = FlatGradients(parameters, extra=len(names))
         self._optimizer = torch.optim.Adam(parameters, lr=1e-3)
         self._sums = torch.zeros(len(names) + 2, device=self._gradients.values.device)
         # Not in CUDA graphs: it is over after a few iterations.
-        self._step = algorithm.joined(self._loss, self._optimizer, self._gradients, self._apply, graphs=False)
+        self.step = joined(self._loss, self._optimizer, self._gradients, self._apply, graphs=False)
+        """Step on the rows of a minibatch."""
 
     @property
     def over(self) -> bool:
-        """Whether it has done its iterations."""
+        """True once it has done its iterations."""
         return self._left <= 0
 
     def save(self) -> dict[str, Any]:
-        """Iterations left, and the optimizer's moments."""
+        """Return the iterations left and the optimizer's moments."""
         return {"left": self._left, "optimizer": self._optimizer.state_dict()}
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Take over what ``save`` returned.
+        """Take over a state that ``save`` returned.
 
         Raises:
             ValueError, LookupError, TypeError, AttributeError: it does not fit.
@@ -78,20 +77,17 @@ class Bootstrap:
         self._left = iterations_left(state)
         load_moments(self._optimizer, state["optimizer"])
 
-    def update(self) -> dict[str, float]:
-        """All passes over one rollout.
+    def finish(self) -> dict[str, float]:
+        """End an iteration, after all passes over its rollout.
 
         Returns:
-            Means of the losses over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
-            and were dropped.
+            Means of the losses over the minibatches, by name; ``skipped_minibatches`` counts those with gradients that were not
+            finite and were dropped.
         """
-        algorithm, settings = self._algorithm, self._algorithm.configuration
-        self._sums.zero_()
-        algorithm.losses.prepare_student()
-        algorithm.pass_over(algorithm.storage.minibatch_rows(settings.minibatches), self._step)
         self._left -= 1
         *sums, _, skipped = self._sums.tolist()
-        total = settings.epochs * settings.minibatches
+        self._sums.zero_()
+        total = self._settings.epochs * self._settings.minibatches
         means = {name: value / total for name, value in zip(self._names, sums, strict=True)}
         return means | {"skipped_minibatches": skipped}
 
@@ -100,4 +96,4 @@ class Bootstrap:
         return losses.sum(), losses.detach()
 
     def _apply(self) -> None:
-        take_step(self._optimizer, self._gradients, self._algorithm.configuration.max_gradient_norm, self._sums)
+        take_step(self._optimizer, self._gradients, self._settings.max_gradient_norm, self._sums)

@@ -1,7 +1,7 @@
 """Concurrent teacher-student PPO (paper, method): CTS, MoE-CTS and MoE-NG, which differ by the student's encoder.
 
-Most environments are driven by the teacher, which sees the true state, the others by the student, which sees the last
-few observations. Both share one actor and one critic. Per iteration:
+Most environments are driven by the teacher, which sees the true state, the others by the student, which sees the last few observations.
+Both share one actor and one critic. Per iteration:
 
 1. PPO on both groups. The policy gradient of teacher samples reaches the teacher encoder through the actor; the critic
    gets the latent detached, and so do actor and critic on student samples. Nothing of this trains the student encoder.
@@ -26,8 +26,8 @@ from .symmetry import half_replaced
 
 
 class CtsLosses(Losses):
-    """The teacher's latents are computed where the policy learns, since it learns with it; where the student learns, the teacher
-    stands still and the student's targets are computed once.
+    """Losses of CTS. The teacher's latents are computed anew while the policy learns, since the teacher learns with it; while the student
+    learns, the teacher stands still, and its latents are computed once.
     """
 
     student_names = ("latent", "load_balance", "largest_expert_share")
@@ -41,7 +41,7 @@ class CtsLosses(Losses):
             self.mirrored_targets = torch.zeros_like(latents)
 
     def prepare_student(self) -> None:
-        """The teacher's latents, before the student learns."""
+        """Compute the teacher's latents, before the student learns."""
         storage = self.storage
         privileged = storage.privileged[:, storage.split.num_teacher :].flatten(0, 1)
         self.fill(self.targets, lambda rows: self.actor.teacher_latent(privileged[rows]))
@@ -50,15 +50,19 @@ class CtsLosses(Losses):
             self.fill(self.mirrored_targets, lambda rows: self.actor.teacher_latent(mirrored(privileged[rows])))
 
     def latents(self, privileged: Sequence[torch.Tensor], stored: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """Blocks: the teacher's, the student's, and their mirror images in the same order."""
+        """Return the blocks of latents: the teacher's, the student's, and their mirror images in the same order."""
         return [
             part
             for seen, latent in zip(privileged[::2], stored, strict=True)
             for part in (self.actor.teacher_latent(seen), latent)
         ]
 
+    def latent_error(self, latent: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the mean squared error of the student's latents (B, L), a scalar tensor."""
+        return (latent - target).square().mean()
+
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Latent error of rows of the flattened student-only buffers, plus the experts' load balancing loss; and
+        """Return the latent error of rows of the flattened student-only buffers, plus the experts' load balancing loss; and
         ``student_names``, (3,), detached.
         """
         history = self.storage.student_history.flatten(0, 1)[rows]
@@ -70,7 +74,7 @@ class CtsLosses(Losses):
         history = self.with_images(history, None if self.mirror is None else self.mirror.history)
         with self.autocast():
             latent, weights = self.actor.student_latent(history)
-        error = (latent.float() - target).square().mean()
+        error = self.latent_error(latent.float(), target)
         if weights is None:
             return error, torch.stack((error, torch.zeros_like(error), torch.zeros_like(error))).detach()
         balance, largest = load_balance(weights)
@@ -111,7 +115,7 @@ class CTS(PPO):
         return self.values(torch.cat((teacher, student)), policy, privileged)
 
     def values(self, latent: torch.Tensor, policy: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
-        """Values (N, 1) for latents (N, L), frames (N, F) and states (N, P), without gradients but the critic's own."""
+        """Return values (N, 1) for latents (N, L), frames (N, F) and states (N, P), without gradients but the critic's own."""
         del policy
         return self.critic.value(latent, privileged)
 
@@ -120,19 +124,20 @@ class CTS(PPO):
         return () if self.actor.architecture == "moe_cts" else ("load_balance", "largest_expert_share")
 
     def make_bootstrap(self, iterations: int) -> Bootstrap:
-        """The teacher encoder learns the student's latent from what the teacher sees, the critic the values of the student's
+        """Return a learner of the teacher encoder, from the student's latents, and of the critic, from the values of the student's
         behaviour; afterwards the teacher acts about as the student does.
         """
         return Bootstrap(
-            self,
             iterations,
+            self.configuration,
             parameters=[*self.actor.teacher_encoder.parameters(), *self.critic.parameters()],
             losses=self._teacher_losses,
             names=("teacher_latent", "value"),
+            joined=self.joined,
         )
 
     def _teacher_losses(self, teacher: torch.Tensor, student: torch.Tensor) -> torch.Tensor:
-        """Latent error on the student's samples and value error on all, (2,)."""
+        """Return the latent error on the student's samples and value error on all, (2,)."""
         actor, storage, mirror = self.actor, self.storage, self.losses.mirror
         states = storage.privileged.flatten(0, 1)
         in_history = storage.student_rows(student)

@@ -1,15 +1,13 @@
-"""DreamWaQ (Nahrendra et al., "DreamWaQ: Learning Robust Quadrupedal Locomotion With Implicit Terrain Imagination via Deep
-Reinforcement Learning", 2023).
+"""DreamWaQ (Nahrendra et al., "DreamWaQ: Learning Robust Quadrupedal Locomotion With Implicit Terrain Imagination via Deep Reinforcement
+Learning", 2023).
 
-A context estimator, a beta variational autoencoder: the encoder of the history gives the base's velocity and a Gaussian latent, a
-decoder predicts the next frame from both. Its loss is the error of the velocity, that of the predicted frame, and beta times the
-latent's divergence from the standard normal distribution. The actor sees a sample of the latent where it learns and the mean
-where it is deployed.
+A context estimator, a beta variational autoencoder: the encoder of the history gives the base's velocity and a Gaussian latent, a decoder
+predicts the next frame from both. Its loss is the error of the velocity, that of the predicted frame, and beta times the latent's
+divergence from the standard normal distribution. The actor sees a sample of the latent where it learns and the mean where it is deployed.
 
 Adaptive bootstrapping: whether the actor is given the true or the estimated velocity is drawn for every sample. The estimate's
-probability is 1 - tanh(deviation / mean) of what the policy earns over the randomized worlds: as long as that differs much, the
-policy is not to learn from an estimate that is no better. What it earns is taken from the returns of the last rollout, which
-need no episode to end.
+probability is 1 - tanh(deviation / mean) of the policy's return over the randomized worlds: as long as returns differ much, the policy
+should not learn from an estimate that is no better. The returns are those of the last rollout, which need no episode to end.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from ...policy.networks.architectures import multilayer_perceptron
 from ...policy.networks.estimators import VELOCITY
 from ..configuration import TrainingConfiguration
 from ..networks import Widths
-from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments
+from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO
 
 _LEAST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE = -10.0, 10.0
 
@@ -31,22 +29,18 @@ _LEAST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE = -10.0, 10.0
 class DreamwaqActor(EstimatorActor):
     """The deployed network, the decoder, and how far the estimate of the velocity is trusted."""
 
+    deployed = "dreamwaq"
     trust: torch.Tensor
     """Probability that the actor is given the estimated velocity, ()."""
 
     def __init__(self, configuration: TrainingConfiguration, widths: Widths) -> None:
-        """Build all parts.
-
-        Raises:
-            ConfigurationError: settings that do not fit.
-        """
-        network, arguments = configuration.network, estimator_arguments(configuration, widths)
-        super().__init__(network, architecture="dreamwaq", arguments=arguments)
+        super().__init__(configuration, widths)
+        network = configuration.network
         self.decoder = multilayer_perceptron((VELOCITY + network.latent_width, *network.teacher_hidden, widths.frame))
         self.register_buffer("trust", torch.zeros(()))
 
     def context(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Velocity (N, 3), means and logarithms of the variances of the latent, (N, L) each, from flat histories (N, H·F)."""
+        """Return the velocity (N, 3), means and logarithms of the variances of the latent, (N, L) each, from flat histories (N, H·F)."""
         width = self.student.latent_width
         encoded = self.student.encoder(history).float()
         velocity, mean, log_variance = encoded.split((VELOCITY, width, width), dim=-1)
@@ -73,10 +67,10 @@ class DreamwaqLosses(EstimatorLosses):
         super().__init__(*arguments, **settings)
         samples = self.storage.num_steps * self.storage.num_envs * (2 if self.settings.symmetry == "augment" else 1)
         self.noise = torch.zeros(samples, self.storage.student_latent.shape[-1] - VELOCITY, device=self.device)
-        """Of the latents' samples, new for each update: a recorded step draws no random numbers."""
+        """Noise of the latents' samples, new for each update: a recorded step draws no random numbers."""
 
     def prepare_student(self) -> None:
-        """New noise."""
+        """Draw new noise."""
         self.noise.normal_()
 
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -105,7 +99,7 @@ class Dreamwaq(EstimatorPPO):
 
     @torch.no_grad()
     def compute_returns(self, obs: Any) -> None:
-        """See ``PPO``; what the rollout earned says how far its estimates are trusted in the next."""
+        """See ``PPO``; the rollout's returns decide how far its estimates are trusted in the next."""
         super().compute_returns(obs)
         returns = self.storage.returns
         spread = returns.std() / returns.mean().abs().clamp_min(1e-6)

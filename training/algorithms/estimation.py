@@ -1,9 +1,9 @@
-"""PPO with an estimator: what DreamWaQ and HIM share.
+"""Share the parts of DreamWaQ and HIM: PPO with an estimator.
 
-One network acts everywhere, on the current frame and on what an encoder makes of the history: the base's velocity and a latent.
-The critic sees the true state. PPO trains actor and critic with the estimates that the rollout acted on; nothing of it reaches
-the encoder. Afterwards the encoder learns from the true velocity and from the state one step later, on the same rollout. Samples
-whose episode ended have no next state and count for the velocity alone.
+One network acts everywhere, on the current frame and on an encoder's estimate from the history: the base's velocity and a latent. The
+critic sees the true state. PPO trains actor and critic with the estimates that the rollout acted on; nothing of it reaches the encoder.
+Afterwards the encoder learns from the true velocity and from the state one step later, on the same rollout. Samples at the end of an
+episode have no next state and count for the velocity alone.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .symmetry import VECTOR, MirrorMap
 
 
 def estimator_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
-    """Arguments of a network of ``policy.estimators``.
+    """Return the arguments of a network of ``policy.estimators``.
 
     Raises:
         ConfigurationError: the encoder is no plain one, or the privileged state does not begin with velocity and frame.
@@ -41,24 +41,36 @@ def estimator_arguments(configuration: TrainingConfiguration, widths: Widths) ->
 
 
 class EstimatorActor(StudentActor):
-    """A network that acts on its estimate, with exploration noise; methods add what the encoder learns with."""
+    """A network that acts on its estimate, with exploration noise; methods add helpers of the encoder."""
+
+    deployed: ClassVar[str]
+    """Name of the deployed network in ``policy.networks``."""
+
+    def __init__(self, configuration: TrainingConfiguration, widths: Widths) -> None:
+        """Build the deployed network; methods add the encoder's helpers.
+
+        Raises:
+            ConfigurationError: settings that do not fit.
+        """
+        arguments = estimator_arguments(configuration, widths)
+        super().__init__(configuration.network, architecture=self.deployed, arguments=arguments)
 
     def frames(self, history: torch.Tensor) -> torch.Tensor:
-        """Frames (N, H, F) of flat histories (N, H·F)."""
+        """Return frames (N, H, F) of flat histories (N, H·F)."""
         return history.unflatten(-1, self._frames)
 
     def student_latent(self, history: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Estimates (N, 3 + L), as they are deployed; see ``StudentActor``."""
+        """Return estimates (N, 3 + L), as they are deployed; see ``StudentActor``."""
         estimate: torch.Tensor = self.student.encode(self.frames(history))[0]
         return estimate, None
 
     def acted_on(self, history: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
-        """Estimates (N, 3 + L) as the rollout acts on them, where the true velocity is (N, 3)."""
+        """Return estimates (N, 3 + L) as the rollout acts on them, where the true velocity is (N, 3)."""
         del velocity
         return self.student_latent(history)[0]
 
     def helpers(self) -> list[nn.Parameter]:
-        """What only training needs: the encoder learns with it."""
+        """Return parameters that exist in training only: the encoder learns with them."""
         raise NotImplementedError
 
     def student_parameters(self) -> list[nn.Parameter]:
@@ -82,7 +94,7 @@ class StateCritic(ValueNetwork):
 
 
 class EstimatorLosses(Losses):
-    """What an estimator learns from: histories, true velocities, next states, and which samples have one."""
+    """Histories, true velocities, next states, and a mask of the samples that have one: the data of an estimator."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
@@ -91,7 +103,7 @@ class EstimatorLosses(Losses):
         self.next_state_map = None if self.mirror is None else MirrorMap.joined([self.velocity_map, self.mirror.policy])
 
     def prepare_policy(self) -> None:
-        """What the rollout would have acted on in mirror images."""
+        """Compute the latents on which the rollout would have acted in mirror images."""
         if (mirror := self.mirror) is not None:
             history, velocity = self.storage.student_history.flatten(0, 1), self.velocities()
             self.fill(
@@ -100,15 +112,15 @@ class EstimatorLosses(Losses):
             )
 
     def prepare_student(self) -> None:
-        """Nothing: all is in the rollout."""
+        """Prepare nothing: all is in the rollout."""
 
     def velocities(self) -> torch.Tensor:
         """True velocity of the base of every sample, (T·N, 3)."""
         return self.storage.privileged[..., :VELOCITY].flatten(0, 1)
 
     def samples(self, rows: torch.Tensor) -> Sequence[torch.Tensor]:
-        """Of rows of the rollout, mirrored as the symmetry asks for: histories (B, H·F), states one step later, velocity and
-        frame (B, 3 + F), the present velocity (B, 3), and 1 where the episode went on, (B,).
+        """Return samples of the rollout, mirrored as the symmetry asks for: histories (B, H·F), states one step later, velocity and frame
+        (B, 3 + F), the present velocity (B, 3), and 1 where the episode went on, (B,).
         """
         storage, mirror = self.storage, self.mirror
         history = storage.student_history.flatten(0, 1)[rows]
@@ -160,17 +172,18 @@ class EstimatorPPO(PPO):
         following.copy_(privileged[:, : following.shape[1]])
 
     def make_bootstrap(self, iterations: int) -> Bootstrap:
-        """The critic learns the values of the policy's behaviour, and what only training needs fits itself to the encoder."""
+        """Return a learner of the critic, from the values of the policy's behaviour, and of the encoder's helpers."""
         return Bootstrap(
-            self,
             iterations,
+            self.configuration,
             parameters=[*self.critic.parameters(), *self.actor.helpers()],
             losses=self._bare_losses,
             names=("value", "estimation"),
+            joined=self.joined,
         )
 
     def _bare_losses(self, rows: torch.Tensor) -> torch.Tensor:
-        """Value error and the encoder's loss, (2,)."""
+        """Return the value error and the encoder's loss, (2,)."""
         states = self.storage.privileged.flatten(0, 1)[rows]
         error = self.critic.value(states, states).squeeze(-1) - self.storage.returns.flatten(0, 1)[rows]
         return torch.stack((error.square().mean(), self.losses.student(rows)[0]))

@@ -1,12 +1,11 @@
-"""HIM (Long et al., "Hybrid Internal Model: Learning Agile Legged Locomotion with Simulated Robot Response", 2024), from its
-paper's description.
+"""HIM (Long et al., "Hybrid Internal Model: Learning Agile Legged Locomotion with Simulated Robot Response", 2024), from its paper's
+description.
 
-The encoder of the history gives the base's velocity, by regression, and an embedding on the unit sphere, by contrast: it is to
-fall to the same prototype as the embedding that a second encoder gives to the robot's next state, which is the response that the
-internal model predicts. Both encoders and the prototypes learn by swapped prediction (Caron et al., "Unsupervised Learning of
-Visual Features by Contrasting Cluster Assignments", 2020): each embedding's code, made equal in size over a minibatch by
-Sinkhorn-Knopp, is what the other has to predict. The next state is the velocity and the noise-free frame without the command,
-which is no response of the robot.
+The encoder of the history gives the base's velocity, by regression, and an embedding on the unit sphere, by contrast: it is to fall to
+the same prototype as the embedding that a second encoder gives to the robot's next state, which is the response that the internal model
+predicts. Both encoders and the prototypes learn by swapped prediction (Caron et al., "Unsupervised Learning of Visual Features by
+Contrasting Cluster Assignments", 2020): each embedding's code, made equal in size over a minibatch by Sinkhorn-Knopp, is the other's
+target. The next state is the velocity and the noise-free frame without the command, which is no response of the robot.
 """
 
 from __future__ import annotations
@@ -21,22 +20,18 @@ from ...policy.networks.architectures import multilayer_perceptron
 from ...policy.networks.estimators import VELOCITY
 from ..configuration import HimConfiguration, TrainingConfiguration
 from ..networks import Widths
-from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO, estimator_arguments
+from .estimation import EstimatorActor, EstimatorLosses, EstimatorPPO
 
 
 class HimActor(EstimatorActor):
     """The deployed network, the encoder of next states, and the prototypes."""
 
+    deployed = "him"
     response: torch.Tensor
 
     def __init__(self, configuration: TrainingConfiguration, widths: Widths) -> None:
-        """Build all parts.
-
-        Raises:
-            ConfigurationError: settings that do not fit.
-        """
-        network, arguments = configuration.network, estimator_arguments(configuration, widths)
-        super().__init__(network, architecture="him", arguments=arguments)
+        super().__init__(configuration, widths)
+        network = configuration.network
         kept = [i for i in range(VELOCITY + widths.frame) if i - VELOCITY not in widths.command_entries]
         self.register_buffer("response", torch.tensor(kept), persistent=False)
         self.target_encoder = multilayer_perceptron((len(kept), *network.teacher_hidden, network.latent_width))
@@ -71,7 +66,7 @@ class HimLosses(EstimatorLosses):
 def swapped_prediction(
     source: torch.Tensor, target: torch.Tensor, counts: torch.Tensor, settings: HimConfiguration
 ) -> torch.Tensor:
-    """Mean cross entropy of each side's prediction with the other side's code.
+    """Return the mean cross entropy of each side's prediction with the other side's code.
 
     Args:
         source: cosines of the embeddings with the prototypes, (B, K).
@@ -86,8 +81,8 @@ def swapped_prediction(
 
 @torch.no_grad()
 def sinkhorn(scores: torch.Tensor, counts: torch.Tensor, settings: HimConfiguration) -> torch.Tensor:
-    """Codes (B, K) that add up to one for each sample and, nearly, to B / K for each prototype: Sinkhorn-Knopp on
-    exp(scores / sharpness).
+    """Return codes (B, K) that add up to one for each sample and, nearly, to B / K for each prototype: Sinkhorn-Knopp on exp(scores /
+    sharpness).
 
     Args:
         scores: cosines, (B, K).

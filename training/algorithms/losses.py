@@ -17,16 +17,16 @@ POLICY_LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
 
 
 class Losses:
-    """Computes losses from row indices; what both phases need beside the rollout is prepared once for each.
+    """Computes losses from row indices; tensors that both phases need beside the rollout are prepared once for each.
 
-    First the policy learns while the student's encoder stands still, so that the student's latents are those of the
-    rollout; then the encoder learns by supervision, which a method adds: ``prepare_student`` and ``student``.
+    First the policy learns while the student's encoder stands still, so that the student's latents are those of the rollout; then the
+    encoder learns by supervision, which a method adds: ``prepare_student`` and ``student``.
     """
 
     policy_names: Sequence[str] = POLICY_LOSSES
-    """What ``policy`` reports."""
+    """Names of the figures that ``policy`` returns."""
     student_names: Sequence[str]
-    """What ``student`` reports."""
+    """Names of the figures that ``student`` returns."""
 
     def __init__(
         self,
@@ -41,7 +41,7 @@ class Losses:
         """Allocate.
 
         Args:
-            actor: student, exploration noise, and what else learns with them.
+            actor: student, exploration noise, and the networks that learn with them.
             mirror: mirror maps on the storage's device, None without symmetry.
             cached_casts: whether weights in bfloat16 may be kept within a pass; they would outlive the weights in a CUDA graph.
         """
@@ -54,7 +54,7 @@ class Losses:
             self.mirrored_latent = torch.zeros_like(storage.student_latent.flatten(0, 1))
 
     def autocast(self) -> AbstractContextManager[Any]:
-        """Matrix products in bfloat16, where that is the precision."""
+        """Return a context with matrix products in bfloat16, where that is the precision."""
         return torch.autocast(
             self.device.type,
             dtype=torch.bfloat16,
@@ -63,17 +63,17 @@ class Losses:
         )
 
     def prepare_policy(self) -> None:
-        """The student's latents of mirror images, before the policy learns."""
+        """Compute the student's latents of mirror images, before the policy learns."""
         if (mirror := self.mirror) is not None:
             history = self.storage.student_history.flatten(0, 1)
             self.fill(self.mirrored_latent, lambda rows: self.actor.student_latent(mirror.history(history[rows]))[0])
 
     def prepare_student(self) -> None:
-        """What the student learns from, before it learns."""
+        """Prepare the student's targets, before it learns."""
         raise NotImplementedError
 
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Supervised loss of rows of the flattened student-only buffers, and ``student_names``, detached."""
+        """Return the supervised loss of rows of the flattened student-only buffers, and ``student_names``, detached."""
         raise NotImplementedError
 
     def fill(self, target: torch.Tensor, compute: Callable[[slice], torch.Tensor], chunk: int = 65_536) -> None:
@@ -84,7 +84,7 @@ class Losses:
                 target[rows].copy_(compute(rows))
 
     def latents(self, privileged: Sequence[torch.Tensor], stored: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """What the actor is given of each block of samples, in order.
+        """Return the actor's latents for each block of samples, in order.
 
         Args:
             privileged: of the blocks, each (B, P): those of a rollout's groups, then their mirror images where there are any.
@@ -94,7 +94,7 @@ class Losses:
         return list(stored)
 
     def with_images(self, values: torch.Tensor, mapping: MirrorMap | None) -> torch.Tensor:
-        """Values (B, D) of which the first half is mirrored, or which are followed by their mirror images, as the symmetry asks for."""
+        """Return values (B, D) with the first half mirrored, or with their mirror images appended, as the symmetry asks for."""
         if mapping is None:
             return values
         if self.settings.symmetry == "alternate":
@@ -102,10 +102,10 @@ class Losses:
         return torch.cat((values, mapping(values)))
 
     def policy(self, *groups: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """PPO loss of rows of the flattened storage, and ``policy_names``, detached.
+        """Return the PPO loss of rows of the flattened storage, and ``policy_names``, detached.
 
-        The surrogate is the sum of the means over each group, so that the fewer student samples count as much as the teacher's;
-        value loss and entropy are means over all.
+        The surrogate is the sum of the means over each group, so that the fewer student samples count as much as the teacher's; value
+        loss and entropy are means over all.
         """
         storage, mirror, settings = self.storage, self.mirror, self.settings
         sizes = [len(rows) for rows in groups]
@@ -149,7 +149,7 @@ class Losses:
         elif mirror is not None and augment:
             mean = distribution.deterministic_output(decision)
             asymmetry = (mean[len(rows) :] - mirror.action(mean[: len(rows)].detach())).square().mean()
-            # A mirrored sample counts as drawn from the mirrored policy, whose probability is that of the original.
+            # A mirrored sample counts as drawn from the mirrored policy, with the original's probability.
             distribution.update(decision)
             actions = torch.cat((actions, mirror.action(actions)))
             advantages, old_log_prob, returns, old_values = (
@@ -168,14 +168,14 @@ class Losses:
     def balanced(
         self, loss: torch.Tensor, metrics: torch.Tensor, weights: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The policy's loss and figures with those of the weights (B, K) of an actor's experts."""
+        """Return the policy's loss and figures with those of the weights (B, K) of an actor's experts."""
         del weights
         return loss, metrics
 
 
 def load_balance(weights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Load balancing loss of a mixture's weights (B, K), the squared distance of their means from equal shares (paper, load
-    balancing loss), and the largest share.
+    """Load balancing loss of a mixture's weights (B, K), the squared distance of their means from equal shares (paper, load balancing
+    loss), and the largest share.
     """
     share = weights.float().mean(dim=0)
     return (share - 1.0 / len(share)).square().sum(), share.max()

@@ -1,5 +1,5 @@
-"""MCP (paper, ablation): CTS with a plain student encoder, and an actor that multiplies Gaussian primitives (Peng et al., "MCP:
-Learning Composable Hierarchical Control with Multiplicative Compositional Policies", 2019).
+"""MCP (paper, ablation): CTS with a plain student encoder, and an actor that multiplies Gaussian primitives (Peng et al., "MCP: Learning
+Composable Hierarchical Control with Multiplicative Compositional Policies", 2019).
 
 The actions' standard deviation is that of the product: it differs from state to state, and no parameter of its own holds it.
 """
@@ -18,8 +18,8 @@ class McpActor(ComposedActor):
     """An actor that multiplies the primitives' distributions."""
 
     def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, None]:
-        """Mean and standard deviation of the actions, (N, 2, J); see ``StudentActor``. The critic needs no weights, and no loss
-        keeps them balanced.
+        """Return the mean and standard deviation of the actions, (N, 2, J); see ``StudentActor``. The critic needs no weights, and no
+        loss keeps them balanced.
         """
         (mean, deviation), _ = self.composed(latent, policy)
         return torch.stack((mean, deviation), dim=-2), None
@@ -50,5 +50,5 @@ class Mcp(CTS):
 
     @property
     def action_std(self) -> torch.Tensor:
-        """Mean standard deviation of the exploration noise in the rollout, (J,)."""
+        """Return the mean standard deviation of the exploration noise in the rollout, (J,)."""
         return self.storage.action_std.mean(dim=(0, 1))

@@ -1,5 +1,5 @@
-"""What optimizers are given: gradients of one minibatch, shared among processes and made fit without asking the device, and
-moments out of a checkpoint, which somebody else may have written: what does not fit is found before a step.
+"""Prepare gradients and moments for the optimizers: gradients of one minibatch, averaged over the processes without asking the device,
+and moments out of a checkpoint, perhaps a stranger's, which are checked before a step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class FlatGradients:
         """Allocate; ``extra`` numbers travel with the gradients."""
         self._parameters = parameters
         self.values = torch.zeros(sum(p.numel() for p in parameters) + extra, device=parameters[0].device)
-        """What the processes average."""
+        """Numbers that the processes average."""
         sizes = [p.numel() for p in parameters]
         self._gradients, self.extra = self.values.split([sum(sizes), extra])
         views = self._gradients.split(sizes)
@@ -46,10 +46,10 @@ class FlatGradients:
 
 
 def take_step(optimizer: torch.optim.Optimizer, gradients: FlatGradients, limit: float, sums: torch.Tensor) -> None:
-    """Step along gathered gradients whose joint norm is at most ``limit``; gradients that are not finite are dropped.
+    """Step along gathered gradients, their joint norm limited; gradients that are not finite are dropped.
 
     Args:
-        sums: grows by what travelled with the gradients, their norm, and 1.0 if they were dropped, (extra + 2,).
+        sums: grows by the extra numbers, the gradients' norm, and 1.0 if they were dropped, (extra + 2,).
     """
     norm, skipped = gradients.clip(limit)
     optimizer.step()
@@ -57,7 +57,7 @@ def take_step(optimizer: torch.optim.Optimizer, gradients: FlatGradients, limit:
 
 
 def load_moments(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> float:
-    """Take over what an Adam's ``state_dict()`` says of its moments; its settings stay those of this run.
+    """Take over the moments of an Adam's ``state_dict()``; its settings stay those of this run.
 
     Args:
         optimizer: of the same parameters.

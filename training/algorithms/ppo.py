@@ -1,7 +1,7 @@
-"""What all methods share: PPO on a rollout, then supervised learning of the deployed network's encoder on the same rollout.
+"""Share PPO on a rollout, then supervised learning of the deployed network's encoder on the same rollout, among all methods.
 
-A method is a class derived from ``PPO``: its networks, what the actor is given of an observation, and the losses
-(``losses.Losses``) of the encoder. Nothing in the passes waits for the device.
+A method is a class derived from ``PPO``: its networks, the actor's inputs, and the losses (``losses.Losses``) of
+the encoder. Nothing in the passes waits for the device.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ...policy.foreign.fence.archive import LARGEST_FILE
 from ..configuration import AlgorithmConfiguration, ConfigurationError, TrainingConfiguration
 from ..environment.schedules import RampTable
 from ..networks import StudentActor, ValueNetwork, Widths
-from ..run.processes import Processes
+from ..processes import Processes
 from .bootstrap import Bootstrap
 from .losses import Losses
 from .optimization import FlatGradients, load_moments, take_step
@@ -36,7 +36,7 @@ class PPO:
     losses_class: ClassVar[type[Losses]]
     """Losses of the method."""
     has_teacher: ClassVar[bool] = False
-    """Whether a teacher acts in some environments (``student_period``)."""
+    """True if a teacher acts in some environments (``student_period``)."""
     estimated: ClassVar[int] = 0
     """Entries of the next state before its frame, the base's velocity, that an encoder estimates beside its latent; 0 for none."""
 
@@ -114,8 +114,7 @@ class PPO:
         """Build networks, storage and algorithm for an environment.
 
         Args:
-            observations: the groups ``policy`` (N, F), ``history`` (N, H·F) frame by frame, oldest first, and
-                ``privileged`` (N, P).
+            observations: the groups ``policy`` (N, F), ``history`` (N, H·F) frame by frame, oldest first, and ``privileged`` (N, P).
             num_actions: width J of an action.
             command_entries: entries of a frame that hold the command.
             mirror: mirror maps, needed for symmetry.
@@ -157,7 +156,7 @@ class PPO:
 
     @classmethod
     def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
-        """The method's actor and critic.
+        """Return the method's actor and critic.
 
         Raises:
             ConfigurationError: settings that do not fit.
@@ -166,7 +165,7 @@ class PPO:
 
     @classmethod
     def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:
-        """The method's storage of a rollout."""
+        """Return the method's storage of a rollout."""
         period = configuration.algorithm.student_period if cls.has_teacher else 1
         return RolloutStorage(
             EnvironmentSplit.build(widths.environments, period, device),
@@ -179,7 +178,7 @@ class PPO:
 
     @property
     def learning_rate(self) -> float:
-        """Present learning rate of the policy optimizer; reading it waits for the device."""
+        """Return the present learning rate of the policy optimizer; reading it waits for the device."""
         return float(self._rate.item())
 
     @learning_rate.setter
@@ -188,7 +187,7 @@ class PPO:
 
     @property
     def action_std(self) -> torch.Tensor:
-        """Standard deviation of the exploration noise, (J,)."""
+        """Return the standard deviation of the exploration noise, (J,)."""
         std: torch.Tensor = self.actor.output_std
         return std
 
@@ -199,20 +198,18 @@ class PPO:
         self._desired_kl.copy_(desired_kl)
 
     def follow_student(self, iterations: int) -> None:
-        """Spend the next iterations on what a bare policy lacks, while it stands still (see ``bootstrap``)."""
+        """Spend the next iterations on the networks that a bare policy lacks, while it stands still (see ``bootstrap``)."""
         self.bootstrap = self.make_bootstrap(iterations) if iterations > 0 else None
 
     def make_bootstrap(self, iterations: int) -> Bootstrap:
-        """The learner of what a bare policy lacks."""
+        """Return the learner of the networks that a bare policy lacks."""
         raise NotImplementedError
 
     # Rollout
 
     @torch.no_grad()
     def act(self, obs: TensorDict) -> torch.Tensor:
-        """Sample and store actions, (N, J) in environment order: a teacher's in its environments, the student's in the
-        others.
-        """
+        """Sample and store actions, (N, J) in environment order: a teacher's in its environments, the student's in the others."""
         split, actor = self.storage.split, self.actor
         # Indexing copies, so an environment may reuse the memory of its observations.
         policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
@@ -241,7 +238,7 @@ class PPO:
     def latents(
         self, obs: TensorDict, privileged: torch.Tensor, history: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the actor is given, (N, L) in block order, and the students' part of it, (Ns, L), as it is to be stored.
+        """Return the actor's latents, (N, L) in block order, and the students' part of them, (Ns, L), as it is to be stored.
 
         Args:
             obs: all groups, in environment order.
@@ -251,8 +248,8 @@ class PPO:
         raise NotImplementedError
 
     def store_outcome(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, Any]) -> None:
-        """Store the outcome of the actions, (N,) each in environment order. An episode that ends by ``time_outs`` is
-        worth its last value beyond.
+        """Store the outcome of the actions, (N,) each in environment order. An episode that ends by ``time_outs`` is worth its last value
+        beyond.
         """
         storage, order = self.storage, self.storage.split.order
         rewards = rewards[order]
@@ -264,7 +261,7 @@ class PPO:
 
     @torch.no_grad()
     def compute_returns(self, obs: TensorDict) -> None:
-        """Returns and advantages; advantages are normalized over all samples together."""
+        """Compute returns and advantages; advantages are normalized over all samples together."""
         split = self.storage.split
         policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
         history = obs["history"][split.order[split.num_teacher :]]
@@ -274,7 +271,7 @@ class PPO:
         self.storage.compute_returns(last_values, discount=settings.discount, gae_lambda=settings.gae_lambda)
 
     def last_values(self, policy: torch.Tensor, privileged: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
-        """Values (N, 1) of the states after the rollout: frames (N, F) and states (N, P) in block order, the students' histories
+        """Return values (N, 1) of the states after the rollout: frames (N, F) and states (N, P) in block order, the students' histories
         (Ns, H·F).
         """
         raise NotImplementedError
@@ -288,16 +285,17 @@ class PPO:
             wait: called once all work is asked for, to wait for the device.
 
         Returns:
-            Means over the minibatches, by name; ``skipped_minibatches`` counts those whose gradients were not finite
-            and were dropped.
+            Means over the minibatches, by name; ``skipped_minibatches`` counts those that were dropped because their gradients were not
+            finite.
         """
-        self.storage.step = self.steps = 0
-        if self.bootstrap is not None:
-            losses = self.bootstrap.update()
-            if self.bootstrap.over:
-                self.bootstrap = None
-            return losses
         storage, settings = self.storage, self.configuration
+        storage.step = self.steps = 0
+        if (bootstrap := self.bootstrap) is not None:
+            self.losses.prepare_student()
+            self.pass_over(storage.minibatch_rows(settings.minibatches), bootstrap.step)
+            losses = bootstrap.finish()
+            self.bootstrap = None if bootstrap.over else bootstrap
+            return losses
         self._policy_metrics.zero_()
         self._student_metrics.zero_()
         groups = storage.minibatch_rows(settings.minibatches)
@@ -333,11 +331,11 @@ class PPO:
         return means | {"skipped_minibatches": skipped}
 
     def without_meaning(self) -> tuple[str, ...]:
-        """Figures of the student's loss that mean nothing with these networks."""
+        """Return figures of the student's loss that mean nothing with these networks."""
         return ()
 
     def _prepare_steps(self) -> None:
-        """Make the steps on one minibatch: gradients, their mean over the processes, and what follows from them."""
+        """Make the steps on one minibatch: gradients, their mean over the processes, and the step along them."""
         losses = self.losses
         self._policy_gradients = FlatGradients(self._policy_parameters, extra=len(losses.policy_names))
         self._student_gradients = FlatGradients(self.actor.student_parameters(), extra=len(losses.student_names))
@@ -355,9 +353,9 @@ class PPO:
         *,
         graphs: bool = True,
     ) -> Callable[..., None]:
-        """One step of two halves: gradients of a loss of rows, and what follows from them. Between several processes each half is a
-        CUDA graph of its own, where there are any and ``graphs`` says so: a message inside a graph could not be given up when a
-        process is lost.
+        """Join two halves to one step: gradients of a loss of rows, and the step along them. Between several processes each half is a
+        CUDA graph of its own, where there are any and ``graphs`` allows it: a message inside a graph could not be given up when a process
+        is lost.
         """
 
         def compute(*rows: torch.Tensor) -> None:
@@ -395,7 +393,7 @@ class PPO:
         take_step(self.student_optimizer, self._student_gradients, limit, self._student_metrics)
 
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
-        """rsl_rl's rule, on the device: slower above twice the desired divergence, faster below half of it."""
+        """Adapt the learning rate on the device as rsl_rl does: slower above twice the desired divergence, faster below half of it."""
         if not self._adapts:
             return
         low, high = self.configuration.learning_rate_range
@@ -407,7 +405,7 @@ class PPO:
     # Checkpoints
 
     def save(self) -> dict[str, Any]:
-        """State of all networks and of both optimizers, under rsl_rl's names, and of ``bootstrap`` while it lasts."""
+        """Return the state of all networks and of both optimizers, under rsl_rl's names, and of ``bootstrap`` while it lasts."""
         bare = {} if self.bootstrap is None else {"bootstrap": self.bootstrap.save()}
         return bare | {
             "actor_state_dict": self.actor.state_dict(),
@@ -417,7 +415,7 @@ class PPO:
         }
 
     def load(self, state: Mapping[str, Any], *, optimizers: bool = True) -> None:
-        """Take over what ``save`` returned.
+        """Take over a state of ``save``.
 
         Raises:
             RuntimeError, LookupError, ValueError, TypeError, AttributeError: it does not fit.

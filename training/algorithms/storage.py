@@ -11,7 +11,7 @@ from ..networks import Widths
 
 
 def split_sizes(num_envs: int, period: int) -> tuple[int, int]:
-    """How many of ``num_envs`` environments are the teacher's and the student's, every ``period``-th one.
+    """Return the numbers of the teacher's and of the student's environments; the student has every ``period``-th one.
 
     Raises:
         ConfigurationError: too few environments for at least one of each.
@@ -40,11 +40,10 @@ def check_minibatches(num_minibatches: int, *, steps: int, teachers: int, studen
 
 @dataclass(frozen=True)
 class EnvironmentSplit:
-    """Which environments belong to the teacher and which to the student.
+    """Environments of the teacher and of the student.
 
-    Environment i is a student's if i is a multiple of ``period`` (so every contiguous range of environments, and with
-    it every kind of terrain, holds both); with a period of 1 all are. Blocks: rows ``[0, num_teacher)`` are the teacher's,
-    the rest the student's.
+    Environment i is a student's if i is a multiple of ``period`` (so every contiguous range of environments, and with it every kind of
+    terrain, holds both); with a period of 1 all are. Blocks: rows ``[0, num_teacher)`` are the teacher's, the rest the student's.
     """
 
     num_teacher: int
@@ -73,10 +72,9 @@ class EnvironmentSplit:
 class RolloutStorage:
     """One rollout: T steps of N environments in block order, in memory that stays where it is (CUDA graphs rely on it).
 
-    Histories are kept for student rows only: the teacher never looks at them, and they are the widest group. Student
-    latents are kept because the student encoder does not change before the PPO passes are over, so they need not be
-    computed again in every minibatch. Minibatches are row indices into the flattened storage; nothing is copied until
-    a minibatch is used.
+    Histories are kept for student rows only: the teacher never looks at them, and they are the widest group. Student latents are kept
+    because the student encoder does not change before the PPO passes are over, so they need not be computed again in every minibatch.
+    Minibatches are row indices into the flattened storage; nothing is copied until a minibatch is used.
     """
 
     def __init__(
@@ -112,7 +110,7 @@ class RolloutStorage:
         self.returns = zeros(self.num_envs)
         self.advantages = zeros(self.num_envs)
         self.next_state = zeros(split.num_student, next_state_width)
-        """What the students' next state is predicted as, where a method does."""
+        """Targets of the students' predicted next state, for methods that predict one."""
 
     def add(self, **entries: torch.Tensor) -> None:
         """Store entries of the present step by name, each (rows, …) in block order."""
@@ -120,7 +118,7 @@ class RolloutStorage:
             getattr(self, name)[self.step].copy_(value)
 
     def compute_returns(self, last_values: torch.Tensor, *, discount: float, gae_lambda: float) -> None:
-        """Generalized advantage estimation (Schulman et al., 2016); advantages are normalized over all samples.
+        """Estimate advantages (Schulman et al., 2016, generalized advantage estimation), normalized over all samples.
 
         Args:
             last_values: values of the states after the last step, (N,).
@@ -141,7 +139,7 @@ class RolloutStorage:
 
         Returns:
             Teacher rows (M, T·Nt // M), where there is a teacher, and student rows (M, T·Ns // M), int64, both into the
-            storage flattened over time and block-ordered environments; what does not divide evenly is left out.
+            storage flattened over time and block-ordered environments; the remainder of the division is left out.
 
         Raises:
             ConfigurationError: there are fewer student or teacher samples than minibatches.
@@ -158,5 +156,5 @@ class RolloutStorage:
         return tuple(draw(count, first) for count, first in ((teachers, 0), (students, teachers)) if count)
 
     def student_rows(self, rows: torch.Tensor) -> torch.Tensor:
-        """Rows of the flattened student-only buffers that belong to student rows of the flattened storage."""
+        """Return rows of the flattened student-only buffers that belong to student rows of the flattened storage."""
         return rows // self.num_envs * self.split.num_student + rows % self.num_envs - self.split.num_teacher

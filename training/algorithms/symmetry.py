@@ -14,6 +14,7 @@ from itertools import accumulate
 import torch
 
 from ...policy.contract import PolicyContract
+from ...policy.observation_table import Observation, observation
 from ...robots.base import Robot
 from ...robots.body_plan import mirror_image
 from ..environment.configuration import ObservationConfiguration
@@ -60,9 +61,6 @@ class MirrorMap:
 
 
 VECTOR = MirrorMap.signs(1.0, -1.0, 1.0)
-AXIAL_VECTOR = MirrorMap.signs(-1.0, 1.0, -1.0)
-PLANAR_COMMAND = MirrorMap.signs(1.0, -1.0, -1.0)
-"""Forward, lateral and yaw speed."""
 
 
 def mirror_points(points: torch.Tensor) -> MirrorMap:
@@ -117,16 +115,7 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
         replace(robot, joint_names=contract.joint_names, default_joint_position=contract.default_joint_position)
     )
     joints = MirrorMap(torch.tensor(image.joint), torch.tensor(image.sign))
-    terms = {
-        "base_linear_velocity_b": VECTOR,
-        "base_angular_velocity_b": AXIAL_VECTOR,
-        "projected_gravity_b": VECTOR,
-        "command": PLANAR_COMMAND,
-        "joint_position": joints,
-        "joint_velocity": joints,
-        "last_action": joints,
-    }
-    frame = MirrorMap.joined([terms[term.name] for term in contract.observation])
+    frame = MirrorMap.joined([_image(observation(term.name), joints) for term in contract.observation])
     feet = MirrorMap(torch.tensor(image.foot), torch.ones(len(image.foot)))
     scan = scan_pattern(observations.scan_length, observations.scan_width, observations.scan_spacing, "cpu")
     return Mirror(
@@ -135,6 +124,23 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
         privileged=MirrorMap.joined([VECTOR, frame, feet, joints, joints, mirror_points(scan)]),
         action=joints,
     )
+
+
+def _image(seen: Observation, joints: MirrorMap) -> MirrorMap:
+    """Return the mirror map of one observation.
+
+    Raises:
+        SymmetryError: its mirror image is not known.
+    """
+    if seen.mirror is None:
+        raise SymmetryError(
+            f"The mirror image of the observation '{seen.name}' is not known; give it mirror, or set "
+            "training.algorithm.symmetry=none."
+        )
+    if seen.mirror == "joints":
+        return joints
+    source = seen.mirror_source or range(len(seen.mirror))
+    return MirrorMap(torch.tensor(tuple(source)), torch.tensor(seen.mirror))
 
 
 def passes(count: int, *, alternate: bool) -> Iterator[Callable[[torch.Tensor], torch.Tensor]]:

@@ -1,5 +1,5 @@
-"""Velocity commands: the curriculum of ranges, and the dynamic, extreme, opposite and stationary draws (paper,
-command design); and crossings, which last an episode.
+"""Velocity commands: the curriculum of ranges, and the dynamic, extreme, opposite and stationary draws (paper, command design); and
+crossings, which last an episode.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ class CommandDraw:
     steps: torch.Tensor
     """Control steps for which the command holds, (N,) int64, at least 1."""
     extreme: torch.Tensor
-    """Whether the command is an extreme one, (N,) bool."""
+    """True for extreme commands, (N,) bool."""
     holds_heading: torch.Tensor
-    """Whether it is a straight one, whose heading is to be held, (N,) bool."""
+    """True for straight commands, during which the heading is held, (N,) bool."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """What commands may be, for each world: the stage's range capped by the terrain's limits."""
+    """Range of commands for each world: the stage's, capped by the terrain's limits."""
 
     low: torch.Tensor
     """Lowest command of every axis, (N, 3)."""
     high: torch.Tensor
     """Highest command of every axis, (N, 3)."""
     downward: torch.Tensor
-    """How far the linear axes go below zero [m/s], (N, 2)."""
+    """Largest backward and rightward speeds [m/s], (N, 2)."""
     either: torch.Tensor
     """Linear speed that is allowed in both directions [m/s], (N, 2)."""
     reach: torch.Tensor
@@ -61,7 +61,7 @@ _RANGE_WIDTHS = (3, 3, 2, 2, 1)
 def _range_table(
     configuration: CommandConfiguration, terrain_limits: Sequence[tuple[float, float, float]], period: float
 ) -> torch.Tensor:
-    """``Ranges`` of every stage and kind of terrain, (stages, kinds, columns): looked up, not computed, in every step."""
+    """Return ``Ranges`` of every stage and kind of terrain, (stages, kinds, columns): looked up, not computed, in every step."""
     stages = [(s.forward, s.lateral, s.yaw) for s in configuration.drawn_stages]
     bounds, limit = (
         torch.tensor(stages, dtype=torch.float32)[:, None],
@@ -77,7 +77,7 @@ def _range_table(
 def largest_commands(
     configuration: CommandConfiguration, terrain_limits: Sequence[tuple[float, float, float]]
 ) -> tuple[float, float, float]:
-    """Largest forward, lateral [m/s] and yaw [rad/s] speed that any stage draws on any kind of terrain."""
+    """Return the largest forward, lateral [m/s] and yaw [rad/s] speed that any stage draws on any kind of terrain."""
     ranges = [(stage.forward, stage.lateral, stage.yaw) for stage in configuration.drawn_stages]
     drawn = [max(abs(bound) for stage in ranges for bound in stage[axis]) for axis in range(3)]
     allowed = [max(limits[axis] for limits in terrain_limits) for axis in range(3)]
@@ -137,7 +137,7 @@ class CommandGenerator:
         self._interval = torch.tensor(self.interval_steps, device=device)
 
     def ranges(self, kind: torch.Tensor, progress: torch.Tensor) -> Ranges:
-        """What the present stage allows each world."""
+        """Return the range that the present stage allows each world."""
         stage = (progress >= self._begins).sum() - 1
         rows = self._table.index_select(0, stage.reshape(1)).squeeze(0)[kind]
         low, high, downward, either, reach = rows.split(_RANGE_WIDTHS, dim=1)
@@ -214,7 +214,7 @@ class CommandGenerator:
         return CommandDraw(command=drawn, steps=steps, extreme=is_extreme, holds_heading=holds_heading)
 
     def held_yaw_rate(self, off: torch.Tensor, *, kind: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
-        """Yaw rates that lead back to the commanded heading [rad/s], (N,).
+        """Return yaw rates that lead back to the commanded heading [rad/s], (N,).
 
         Args:
             off: angle from the robot's own heading to the commanded one [rad], (N,).
@@ -231,7 +231,7 @@ class CommandGenerator:
         way: torch.Tensor,
         remaining: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Uniform linear speeds that are at least what the rest of the episode needs, (N, 2), and yaw rates, (N, 1)."""
+        """Return uniform linear speeds that are at least as fast as the rest of the episode needs, (N, 2), and yaw rates, (N, 1)."""
         magnitude, low, high = uniform["command_magnitude"], ranges.low, ranges.high
         command = low + magnitude * (high - low)
         if not self._configuration.dynamic:

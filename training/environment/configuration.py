@@ -1,8 +1,7 @@
 """Settings of the training environment.
 
-Progress is a fraction of the run: environment steps taken so far (per environment) over
-``ScheduleConfiguration.horizon_steps``. Defaults are chosen for policies that transfer; ``docs/training-choices.md`` lists
-every difference from the published code and its reason.
+Progress is a fraction of the run: environment steps taken so far (per environment) over ``ScheduleConfiguration.horizon_steps``. Defaults
+are chosen for policies that transfer; ``docs/training-choices.md`` lists every difference from the published code and its reason.
 """
 
 from __future__ import annotations
@@ -15,55 +14,32 @@ from pydantic import Field
 from ...backends.base import TRAINING_PHYSICS, PhysicsOptions
 from ...files.parsing import Count, NotNegative, Positive, Seed, Share
 from ...robots.base import Angle, Damping, Inertia, Torque
+from ..configuration import Ramp, Range, check_rising
+from .reward_configuration import DEFAULT_REWARDS, Extent, Metres, RewardConfiguration
+from .reward_configuration import (
+    OwnReward as OwnReward,
+)
 from .terrain_configuration import TRAINING_TERRAIN, TerrainConfiguration
 
-Range = tuple[float, float]
 _Factor = Annotated[float, Field(ge=0.0, le=100.0)]
 _SpeedFactor = Annotated[float, Field(ge=0.01, le=100.0)]
 _Friction = Annotated[float, Field(ge=0.0, le=10.0)]
 _Kilograms = Annotated[float, Field(ge=-1_000.0, le=1_000.0)]
 _Shift = Annotated[float, Field(ge=-10.0, le=10.0)]
 _Delay = Annotated[float, Field(ge=0.0, le=1.0)]
-_Extent = Annotated[float, Field(ge=0.0, le=10.0)]
-_Metres = Annotated[float, Field(gt=0.0, le=100.0)]
-
-
-def _check_rising(configuration: object, *names: str) -> None:
-    """Refuse ranges that end below their beginning.
-
-    Raises:
-        ValueError: one sentence.
-    """
-    for name in names:
-        low, high = getattr(configuration, name)
-        if low > high:
-            raise ValueError(f"{name} is {low:g} to {high:g}; it must rise")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ramp:
-    """A number that moves linearly from ``start`` to ``end`` between two fractions of the run and stays there."""
-
-    start: float
-    """Value until ``begin``."""
-    end: float
-    """Value from ``until`` on."""
-    begin: Share = 0.0
-    """Fraction of the run at which the change begins."""
-    until: Share = 1.0
-    """Fraction of the run at which the change is complete."""
+_STATIONARY = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScheduleConfiguration:
-    """What "a fraction of the run" means."""
+    """Number of steps of a whole run, and the fraction of it at which the run begins."""
 
     horizon_steps: Count = 240_000
-    """Environment steps, per environment, of the whole run, of which every ramp and stage is a fraction. A task sets it to the
-    steps of its iterations, unless it is given on the command line."""
+    """Environment steps, per environment, of the whole run; every ramp and stage is a fraction of it. A task sets it to the steps of its
+    iterations, unless it is given on the command line."""
     begin: Share = 0.0
-    """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin
-    with the commands of a robot that cannot walk yet."""
+    """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin with the commands of a
+    robot that cannot walk yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,18 +57,6 @@ class JointConfiguration:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnReward:
-    """A reward term of one's own."""
-
-    name: str
-    """Name in the log and in settings."""
-    function: str
-    """``module:function`` of ``StepInputs`` to one number for each world, (N,)."""
-    weight: Ramp | float
-    """Weight per second; penalties are negative."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class OwnTermination:
     """An end of episodes of one's own."""
 
@@ -101,7 +65,7 @@ class OwnTermination:
     function: str
     """``module:function`` of ``StepInputs`` and ``TerminationConfiguration`` to (N,) bool."""
     time_out: bool = False
-    """Whether the end is no failure: what would have followed is bootstrapped."""
+    """True if the end is no failure: the learner bootstraps the missing future."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,8 +85,8 @@ class OwnEvent:
     name: str
     """Name in settings."""
     function: str
-    """``module:function`` of the environment and the worlds whose episode begins, (N,) bool; called in every step after
-    resets and pushes."""
+    """``module:function`` of the environment and a mask of the worlds that begin an episode, (N,) bool; called in every step after resets
+    and pushes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,119 +105,31 @@ class NoiseConfiguration:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationConfiguration:
-    """What the networks see."""
+    """Inputs of the networks."""
 
     history_length: Annotated[int, Field(ge=1, le=1000)] = 5
     """Frames in the student's history, the current one included."""
     history_start: Literal["zeros", "repeat"] = "repeat"
-    """What the history holds at the start of an episode: ``repeat`` for copies of the first frame, as the robot's own
-    controller fills it, or ``zeros`` as published. It becomes part of the policy contract."""
+    """Contents of the history at the start of an episode: ``repeat`` for copies of the first frame, as the robot's own controller fills
+    it, or ``zeros`` as published. It becomes part of the policy contract."""
     noise: NoiseConfiguration = NoiseConfiguration()
-    scan_length: _Metres = 1.6
+    scan_length: Metres = 1.6
     """Extent of the height scan along the heading [m]."""
-    scan_width: _Metres = 1.0
+    scan_width: Metres = 1.0
     """Extent of the height scan across the heading [m]."""
-    scan_spacing: _Metres = 0.1
+    scan_spacing: Metres = 0.1
     """Distance between scan points [m]."""
     foot_force_scale: Positive = 1e-3
     """Factor on the feet's contact forces, which teacher and critic see [1/N]."""
     height_offset: float = 0.5
     """Height of the base over the ground that a scan entry of 0 stands for [m]."""
-    scan_cell: _Metres = 0.05
+    scan_cell: Metres = 0.05
     """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
+    policy: tuple[str, ...] = ()
+    """Observations that the policy sees behind the standard ones: names of installed ones, or ``module:name`` of a
+    ``policy.observation_table.Observation`` of one's own, which this process alone knows. They become part of the policy contract."""
     own: tuple[OwnObservation, ...] = ()
-    """Entries of one's own behind those of ``privileged``. The mirror images of ``training.algorithm.symmetry`` do not
-    know them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RewardConfiguration:
-    """Weights of the reward terms, per second: each step's term is multiplied by its weight and the control period. 0
-    leaves a term out.
-
-    Formulas are in ``rewards.py``; the paper's table of rewards is the source where nothing else is said.
-    """
-
-    linear_tracking: float = 1.0
-    """Tracking of the commanded horizontal velocity."""
-    yaw_tracking: float = 0.5
-    """Tracking of the commanded yaw rate."""
-    progress: float = 0.0
-    """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an
-    obstacle."""
-    progress_along: Literal["command", "straight", "base"] = "straight"
-    """Heading at which ``progress``, being stuck and the commanded way to the next level count: ``straight`` for the robot's own
-    when the command was drawn, with straight commands, which hold it, and for whichever heading the robot has now in arcs;
-    ``command`` for the first always, turned by the yaw rate commanded since, from which a robot that turns at another rate drifts
-    away without seeing how far; ``base`` for the second always, with which turning away from a step costs nothing."""
-    vertical_velocity: Ramp = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
-    """Squared vertical velocity; fades once the robot walks, since climbing needs it."""
-    roll_pitch_rate: float = -0.05
-    """Squared roll and pitch rates."""
-    joint_acceleration: float = -2.5e-7
-    """Squared joint accelerations."""
-    joint_power: float = -2e-5
-    """Absolute mechanical power."""
-    torque: float = -1e-4
-    """Squared motor torques."""
-    base_height: Ramp = Ramp(start=-1.0, end=-10.0, begin=0.0, until=0.2)
-    """Squared error of the base's height over the ground below the trunk; grows against sagging."""
-    action_rate: float = -0.01
-    """Squared first difference of the actions."""
-    action_smoothness: float = -0.01
-    """Squared second difference of the actions."""
-    collision: float = -1.0
-    """Number of thighs, calves and what hangs on them that touch something."""
-    base_collision: float = 0.0
-    """The base touches something; head and chin too."""
-    joint_limits: float = -2.0
-    """Joint angle beyond the soft limits [rad]."""
-    joint_speed_limits: float = 0.0
-    """Joint speed beyond the soft limit of the motor's own [rad/s]. In suites without a limit of torque over speed, as the
-    published one, a policy may otherwise move its legs faster than the robot's motors can."""
-    foot_regulation: float = -0.05
-    """Squared foot speed close to the ground."""
-    hip_regulation: float = -0.05
-    """Absolute deviation of the hips from the standing pose [rad]."""
-    hip_symmetry: float = 0.0
-    """Left-right asymmetry of the hips at forward commands; the paper's fast task."""
-    roll: float = 0.0
-    """Squared sideways component of gravity; the gauge's orientation metric looks at roll alone."""
-    torque_change: float = 0.0
-    """Squared change of the motor torques between control steps [N²·m²]; the gauge's smoothness metric."""
-    stand_still: float = 0.0
-    """Absolute deviation from the standing pose [rad] under the zero command."""
-    termination: float = 0.0
-    """Falls, counted once and not per second."""
-
-    tracking_sigma: Positive = 0.25
-    """Width of the tracking kernels, exp(-error²/sigma) [m²/s² and rad²/s²]."""
-    dynamic_sigma: bool = True
-    """Whether sigma grows with command and terrain level (paper, dynamic velocity tracking precision adjustment)."""
-    sigma_linear_range: Range = (0.5, 1.5)
-    """Commanded speed between which sigma grows to the terrain's largest [m/s]."""
-    sigma_yaw_range: Range = (1.0, 2.0)
-    """Commanded yaw rate between which sigma grows to the terrain's largest [rad/s]."""
-    base_height_target: _Metres = 0.38
-    """[m]."""
-    trunk_area: tuple[_Extent, _Extent] = (0.4, 0.3)
-    """Length and width of the area below the base whose mean ground the base's height is measured from [m]; points of the
-    height scan count."""
-    foot_height_scale: Positive = 0.025
-    """Foot regulation fades with foot height over this share of ``base_height_target``."""
-    foot_height_over: Literal["foot", "base"] = "foot"
-    """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
-    collision_force: float = 0.1
-    """Contact force from which a thigh, a calf or the base counts as touching [N]."""
-    soft_limit: Share = 0.9
-    """Share of a joint's range, about its middle, that is free of the joint-limit penalty."""
-    soft_speed_limit: Share = 0.9
-    """Share of the motors' no-load speed that is free of the penalty on joint speeds."""
-    own: tuple[OwnReward, ...] = ()
-    """Terms of one's own."""
-
-    def __post_init__(self) -> None:
-        _check_rising(self, "sigma_linear_range", "sigma_yaw_range")
+    """Entries of one's own behind those of ``privileged``. The mirror images of ``training.algorithm.symmetry`` do not know them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,12 +146,12 @@ class CommandStage:
     """Yaw rate [rad/s]."""
 
     def __post_init__(self) -> None:
-        _check_rising(self, "forward", "lateral", "yaw")
+        check_rising(self, "forward", "lateral", "yaw")
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommandConfiguration:
-    """What the robot is told to do (paper, command design)."""
+    """Commands of the robot (paper, command design)."""
 
     stages: tuple[CommandStage, ...] = (
         CommandStage(begin=0.0, forward=(-0.5, 0.5), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),
@@ -284,29 +160,27 @@ class CommandConfiguration:
     )
     """Ranges over the run; a terrain's own limits cap every stage."""
     curriculum: bool = True
-    """Whether commands go through the stages; otherwise they are drawn from the last one's ranges throughout (paper, command
-    curriculum)."""
+    """Draw commands from stage after stage; otherwise from the last stage's ranges throughout (paper, command curriculum)."""
     interval: Positive = 5.0
     """Time between two draws [s]."""
     dynamic: bool = True
-    """Whether the smallest speed drawn makes sure that the robot can still leave its tile in the rest of the episode (paper, dynamic
-    command sampling)."""
+    """Raise the smallest speed drawn until the robot can still leave its tile in the rest of the episode (paper, dynamic command
+    sampling)."""
     required_distance: float = 5.0
     """Distance that the commands of an episode shall add up to at least [m] (``dynamic``)."""
     straight_probability: Share = 0.3
-    """Share of the uniform draws with zero yaw rate. Published: 0; the gauge's commands are all straight or a pure
-    turn."""
+    """Share of the uniform draws with zero yaw rate. Published: 0; the gauge's commands are all straight or a pure turn."""
     heading_gain: NotNegative = 0.0
-    """Yaw rate commanded in straight draws for each radian by which the robot is off the heading it had when the command was drawn
-    [1/s], within the range: a robot that turned away is told to turn back. 0 commands no yaw there."""
+    """Yaw rate commanded in straight draws for each radian by which the robot is off the heading it had when the command was drawn [1/s],
+    within the range: a robot that turned away is told to turn back. 0 commands no yaw there."""
     extreme_probability: Share = 0.2
     """Share of draws with every axis at a limit or zero."""
     extreme_zero_probability: tuple[float, float, float] = (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0)
-    """Chance of the forward, lateral and yaw speed of an extreme command to be zero. Published: 0, 0 and 1/3, and 0, 1
-    and 1/3 for the fast task."""
+    """Chance of the forward, lateral and yaw speed of an extreme command to be zero. Published: 0, 0 and 1/3, and 0, 1 and 1/3 for the
+    fast task."""
     flip_probability: Share = 0.2
     """Chance that an extreme command is followed by its opposite."""
-    stationary_probability: Ramp = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
+    stationary_probability: Ramp = _STATIONARY
     """Share of stationary draws, without linear velocity."""
     stationary_yaw_probability: Share = 0.25
     """Chance that a stationary command keeps its yaw rate, so that the robot turns on the spot. Published: always."""
@@ -320,13 +194,13 @@ class CommandConfiguration:
 
     @property
     def drawn_stages(self) -> tuple[CommandStage, ...]:
-        """The stages that commands go through."""
+        """Return the stages that commands go through."""
         return self.stages if self.curriculum else tuple(replace(stage, begin=0.0) for stage in self.stages[-1:])
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResetConfiguration:
-    """How episodes start."""
+    """Start of an episode."""
 
     joint_scale: Range = (0.5, 1.5)
     """Factor on the standing pose, per joint, within the joint limits."""
@@ -334,16 +208,16 @@ class ResetConfiguration:
     """Largest component of the base's linear [m/s] and angular [rad/s] velocity."""
     clearance: float | None = None
     """Height of the base over the highest ground below the robot [m]; None for the robot's ``stand_height``."""
-    footprint: tuple[_Extent, _Extent] = (0.5, 0.4)
-    """Length and width of what counts as below the robot there [m]."""
+    footprint: tuple[Extent, Extent] = (0.5, 0.4)
+    """Length and width of the area below the robot in which ``clearance`` is measured [m]."""
 
     def __post_init__(self) -> None:
-        _check_rising(self, "joint_scale")
+        check_rising(self, "joint_scale")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfiguration:
-    """Ranges of what differs between worlds (paper, domain randomization table), uniform."""
+    """Ranges of the differences between worlds (paper, domain randomization table), uniform."""
 
     friction: tuple[_Friction, _Friction] = (0.2, 1.25)
     """Effective sliding friction, once per world. Published: 0.5 to 1.5; the gauge judges 0.2 to 1.0."""
@@ -367,7 +241,7 @@ class RandomizationConfiguration:
     """Time for which the previous target still acts [s], in whole substeps, every control step."""
 
     def __post_init__(self) -> None:
-        _check_rising(self, *(f.name for f in fields(self)))
+        check_rising(self, *(f.name for f in fields(self)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -381,12 +255,12 @@ class PushConfiguration:
     angular: NotNegative = 0.6
     """Largest change of the angular velocity per axis [rad/s]."""
     add: bool = True
-    """Whether the change is added; otherwise it replaces the velocity, as published, which stops a fast robot dead."""
+    """Add the change to the velocity; otherwise it replaces the velocity, as published, which stops a fast robot dead."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TerminationConfiguration:
-    """What ends an episode early (``training/environment/terminations.py``)."""
+    """Conditions that end an episode early (``training/environment/terminations.py``)."""
 
     trunk_contact: NotNegative | None = None
     """Force of the ground on the trunk, head and chin apart, that ends an episode [N]. None for never."""
@@ -395,8 +269,8 @@ class TerminationConfiguration:
     joint_velocity: Positive = 150.0
     """Joint speed beyond anything real, which counts as a diverged world [rad/s]."""
     stuck: Positive | None = None
-    """Time without progress after which a robot that did as commanded before is stuck [s]: its episode ends as a failure and moves
-    the level down. None for never."""
+    """Time without progress after which a robot that did as commanded before is stuck [s]: its episode ends as a failure and moves the
+    level down. None for never."""
     stuck_from: NotNegative = 0.1
     """Fraction of the run from which being stuck ends episodes: a robot that cannot walk yet is always stuck."""
     own: tuple[OwnTermination, ...] = ()
@@ -419,7 +293,7 @@ class EnvironmentConfiguration:
     joints: JointConfiguration = JointConfiguration()
     schedule: ScheduleConfiguration = ScheduleConfiguration()
     observations: ObservationConfiguration = ObservationConfiguration()
-    rewards: RewardConfiguration = RewardConfiguration()
+    rewards: RewardConfiguration = DEFAULT_REWARDS
     commands: CommandConfiguration = CommandConfiguration()
     terrain: TerrainConfiguration = TRAINING_TERRAIN
     reset: ResetConfiguration = ResetConfiguration()

@@ -1,4 +1,4 @@
-"""Which tile each world stands on, and when its level changes (paper, game-inspired curriculum).
+"""Choose each world's tile, and change its level (paper, game-inspired curriculum).
 
 All tiles of all kinds and levels are one palette of terrains; a new level is another terrain index at the next reset.
 """
@@ -29,17 +29,16 @@ class TrainingPalette:
     tiles: tuple[TileConfiguration, ...]
     """Kinds in use; a kind's number is its place here."""
     index: torch.Tensor
-    """Terrain index of every kind, level and variant, (K, L, V) int64; tiles repeat where a kind has no levels or no
-    chance."""
+    """Terrain index of every kind, level and variant, (K, L, V) int64; tiles repeat where a kind has no levels or no chance."""
 
     @property
     def num_levels(self) -> int:
-        """Levels per kind, L."""
+        """Return the levels per kind, L."""
         return self.index.shape[1]
 
 
 def build_palette(configuration: TerrainConfiguration) -> TrainingPalette:
-    """Build the tiles of every kind whose share is not zero.
+    """Build the tiles of every kind with a share above zero.
 
     Raises:
         TerrainError: unknown kind, or more levels than tiles have.
@@ -64,8 +63,8 @@ def build_palette(configuration: TerrainConfiguration) -> TrainingPalette:
 
 
 def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
-    """Kind of every world, (N,) int64: contiguous blocks in proportion to the shares, so that teacher and student
-    share every kind.
+    """Return the kind of every world, (N,) int64: contiguous blocks in proportion to the shares, so that teacher and student share every
+    kind.
 
     Raises:
         ConfigurationError: shares that are negative or all zero.
@@ -81,7 +80,7 @@ def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
 
 
 class Levels:
-    """Which tile each world stands on."""
+    """Level and tile of each world."""
 
     def __init__(self, configuration: TerrainConfiguration, palette: TrainingPalette, kind: torch.Tensor) -> None:
         """Put the tiles' indices on the device.
@@ -108,7 +107,7 @@ class Levels:
     def move(
         self, memory: EnvironmentMemory, uniform: UniformColumns, worlds: torch.Tensor, failed: torch.Tensor
     ) -> None:
-        """Level and tile of the next episode of the masked worlds, of which some ``failed``, both (N,) bool."""
+        """Move the masked worlds to the level and tile of their next episode; ``failed`` marks those with a failure; both (N,) bool."""
         level = self._rule(
             self._settings,
             level=memory.level,
@@ -140,10 +139,10 @@ def next_level(
     fallen: torch.Tensor,
     uniform: torch.Tensor,
 ) -> torch.Tensor:
-    """Level of the next episode, were this one over.
+    """Return the level of the next episode, were this one over.
 
-    Up after leaving the middle of the tile far enough; down after a fall, or with too little of the commanded way
-    made. Who masters the last level starts anywhere again, so that easy tiles are not forgotten.
+    Up after leaving the middle of the tile far enough; down after a fall, or with too little of the commanded way made. A robot that
+    masters the last level starts anywhere again, so that easy tiles are not forgotten.
 
     Args:
         level: present level from 0, (N,) int64.

@@ -1,4 +1,4 @@
-"""What differs between worlds, and from episode to episode in one world (paper, domain randomization table)."""
+"""Draw the physical differences between worlds and between a world's episodes (paper, domain randomization table)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_speed", "motor
 def draw_bodies(
     ranges: RandomizationConfiguration, num_envs: int, num_bodies: int, generator: torch.Generator
 ) -> dict[str, torch.Tensor]:
-    """What is drawn once per world, on the generator's device, by the names of ``Randomization``: effective sliding friction (N,),
-    what is added to the base's mass [kg] (N,), factors on the other bodies' masses (N, bodies), and the shift of the base's centre
-    of mass [m] (N, 3).
+    """Draw once per world, on the generator's device, by the names of ``Randomization``: effective sliding friction (N,), mass added to
+    the base [kg] (N,), factors on the other bodies' masses (N, bodies), and the shift of the base's centre of mass [m] (N, 3).
     """
 
     def between(bounds: Range, *shape: int) -> torch.Tensor:
@@ -43,12 +42,12 @@ class MotorParameters:
         "motor_speed": 1.0,
         "motor_offset": 0.0,
     }
-    """Fields of ``Randomization`` in the order of ``MOTOR_COLUMNS``, as motors are that nobody varies; offsets in rad."""
+    """Fields of ``Randomization`` in the order of ``MOTOR_COLUMNS``, for motors without randomization; offsets in rad."""
 
     def __init__(
         self, ranges: RandomizationConfiguration, num_envs: int, num_joints: int, device: torch.device | str
     ) -> None:
-        """Motors as the robot's parameter set says."""
+        """Prepare motors as the robot's parameter set says."""
         bounds = [getattr(ranges, name) for name in MOTOR_COLUMNS]
         self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
         self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]
@@ -60,12 +59,12 @@ class MotorParameters:
         """All of them, (N, 5, J)."""
 
     def redraw(self, uniform: torch.Tensor, worlds: torch.Tensor) -> None:
-        """New values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
+        """Draw new values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
         drawn = uniform.view(self.values.shape) * self._span + self._low
         torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
 
     def apply(self, backend: PhysicsBackend) -> None:
-        """Write all worlds' values into the physics, of what varies: an engine need not be able to do the rest.
+        """Write all worlds' values that vary into the physics: an engine need not support the others.
 
         All rows are written every time: selecting the rows of a mask would wait for the device to count them.
         """
@@ -73,5 +72,5 @@ class MotorParameters:
         backend.randomize(Randomization(**{name: values[name] for name in self._varied}))
 
     def by_name(self) -> dict[str, torch.Tensor]:
-        """The values by the names of ``Randomization``, (N, J) each."""
+        """Return the values by the names of ``Randomization``, (N, J) each."""
         return dict(zip(self.NEUTRAL, self.values.unbind(1), strict=True))

@@ -1,9 +1,8 @@
-"""The training environment: rsl_rl's ``VecEnv`` on any physics backend.
+"""Simulate the training environment: rsl_rl's ``VecEnv`` on any physics backend.
 
-One step, in order: the action becomes joint targets with a drawn latency; the physics advances one control period;
-rewards, ends, curriculum and commands are judged on the new state; worlds whose episode is over are reset and others
-pushed; observations are made of the state after that, so that the first observation of an episode is fresh. Nothing
-in a step waits for the device.
+One step, in order: the action becomes joint targets with a drawn latency; the physics advances one control period; rewards, ends,
+curriculum and commands are judged on the new state; worlds at the end of an episode are reset and others pushed; observations are made of
+the state after that, so that the first observation of an episode is fresh. Nothing in a step waits for the device.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from ...backends.base import Randomization, ResetState, Scene
 from ...backends.graphs import WARM_UP, RecordedFunction
 from ...backends.registry import make_backend
 from ...files.parsing import shown
-from ...policy.contract import History, PolicyContract, standard_contract
+from ...policy.contract import History, ObservationTerm, PolicyContract, standard_contract
 from ...policy.robot_of import REMEMBERED
 from ...robots.base import JointParameters, Robot
 from ...robots.identity import identify
@@ -35,7 +34,7 @@ from .events import EpisodeStart
 from .height_scan import heading
 from .memory import copied, fitting, restore
 from .observations import Observations
-from .own_terms import resolve_own
+from .own_terms import policy_observations, resolve_own
 from .step import EnvironmentStep, StepResult
 from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
 
@@ -69,13 +68,12 @@ class TrainingEnvironment(VecEnv):
             device: torch device of the physics and of everything else.
             threads: CPU threads for engines that use them.
             capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
-            fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels
-                into a few; numbers differ in the last digits. None: on a GPU, unless a function of one's own cannot be
-                compiled, which ``unfused`` then says.
+            fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels into a few; numbers
+                differ in the last digits. None: on a GPU, unless a function of one's own cannot be compiled, which ``unfused`` then says.
 
         Raises:
-            ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device, or ``fuse`` for a
-                function that cannot be compiled.
+            ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device, or ``fuse`` for a function that
+                cannot be compiled.
             BackendError: the engine cannot do what is asked.
         """
         if capture and torch.device(device).type != "cuda":
@@ -150,14 +148,12 @@ class TrainingEnvironment(VecEnv):
 
     @property
     def progress(self) -> torch.Tensor:
-        """Fraction of the run that schedules are at, a scalar tensor."""
+        """Return the fraction of the run that schedules are at, a scalar tensor."""
         return self.parts.progress()
 
     @staticmethod
     def _start_levels(configuration: EnvironmentConfiguration) -> torch.Tensor:
-        """Levels at the start: random, since a pattern over the worlds would give the student's only every second
-        level.
-        """
+        """Draw the levels at the start at random, since a pattern over the worlds would give the student's only every second level."""
         terrain = configuration.terrain
         highest = min(terrain.highest_start_level, terrain.levels - 1) if terrain.curriculum else terrain.levels - 1
         random = torch.Generator().manual_seed(configuration.seed)
@@ -180,7 +176,7 @@ class TrainingEnvironment(VecEnv):
 
     @contextmanager
     def _trial(self) -> Iterator[None]:
-        """Inside, both torch parts may run: what that changes is put back."""
+        """Let both torch parts run inside the context; their changes are put back."""
         memory, motors = self.parts.memory.by_name(), self.parts.motors.by_name()
         before = copied(memory), copied(motors)
         try:
@@ -224,7 +220,7 @@ class TrainingEnvironment(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Control steps of every world's present episode, (N,) int64. Assigning copies into the same tensor."""
+        """Return control steps of every world's present episode, (N,) int64. Assigning copies into the same tensor."""
         return self.parts.memory.episode_length
 
     @episode_length_buf.setter
@@ -232,7 +228,7 @@ class TrainingEnvironment(VecEnv):
         self.parts.memory.episode_length.copy_(value)
 
     def get_observations(self) -> TensorDict:
-        """Present observations, copies."""
+        """Return present observations, copies."""
         return self._pack(self._observations.clone())
 
     @torch.no_grad()
@@ -299,15 +295,15 @@ class TrainingEnvironment(VecEnv):
         return TensorDict(dict(vars(observations)), batch_size=[self.num_envs], device=self.device)
 
     def _log(self) -> dict[str, torch.Tensor]:
-        """What happened since the last log, as tensors on the device."""
+        """Return the figures since the last log, as tensors on the device."""
         log = self.parts.log.read(self.parts.memory, self.parts.progress())
         return log | {"Physics/overflow_worlds": self.backend.state.overflowed.sum().float()}
 
     # --- resuming ---------------------------------------------------------------------------------------------------
 
     def progress_dict(self) -> dict[str, Any]:
-        """What a run has reached, without its running episodes: step counter, levels, and the bodies that were drawn,
-        for which the levels were found.
+        """Return the progress of a run without its running episodes: step counter, levels, and the bodies that were drawn, since the
+        levels were found with them.
         """
         return {
             "version": STATE_VERSION,
@@ -318,12 +314,11 @@ class TrainingEnvironment(VecEnv):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that continuing needs: memory, random state, randomization, observations, and poses and
-        velocities of the physics.
+        """Return everything that continuing needs: memory, random state, randomization, observations, and poses and velocities of the
+        physics.
 
-        The physics itself is put back by a reset: what an engine carries from step to step beside positions,
-        velocities and targets (a solver's warm start, contact caches) is lost. On an engine without such memory,
-        continuing equals never having stopped.
+        The physics itself is put back by a reset: what an engine carries from step to step beside positions, velocities and targets (a
+        solver's warm start, contact caches) is lost. On an engine without such memory, continuing equals never having stopped.
         """
         state = self.backend.state
         return {
@@ -338,8 +333,8 @@ class TrainingEnvironment(VecEnv):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``, or begin new episodes from ``progress_dict``. The environment must have been
-        built with the same configuration.
+        """Continue from ``state_dict``, or begin new episodes from ``progress_dict``. The environment must have been built with the same
+        configuration.
 
         Raises:
             ValueError: the state is of another version or of another environment.
@@ -404,17 +399,13 @@ class TrainingEnvironment(VecEnv):
 
     @staticmethod
     def _require_below(numbers: torch.Tensor, count: int, name: str) -> None:
-        """Refuse saved numbers of things that are not there: engines read memory by them, unchecked.
-
-        Raises:
-            ValueError: one is negative or not below ``count``.
-        """
+        """Refuse saved numbers of things that are not there: engines read memory by them, unchecked."""
         if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < count:
             raise ValueError(f"the saved environment does not fit: '{name}' is not between 0 and {count - 1}")
 
 
 def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
-    """The joint constants of the training physics.
+    """Return the joint constants of the training physics.
 
     Raises:
         ConfigurationError: the robot has no such parameter set.
@@ -436,15 +427,23 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
 def training_contract(
     robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
 ) -> PolicyContract:
-    """The interface of a policy trained here: one frame of observation, the gains, the control period and the largest
+    """Return the interface of a policy trained here: one frame of observation, the gains, the control period and the largest
     commands of the training.
+
+    Raises:
+        ConfigurationError: an observation of one's own is not there, or breaks a rule.
     """
     tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
     provenance = {REMEMBERED: identify(robot, configuration.robot)}
+    standard = standard_contract(
+        robot, history=History(start=configuration.observations.history_start), provenance=provenance
+    )
+    more = tuple(
+        ObservationTerm(name=each.name, scale=each.scale) for each in policy_observations(configuration.observations)
+    )
     return replace(
-        standard_contract(
-            robot, history=History(start=configuration.observations.history_start), provenance=provenance
-        ),
+        standard,
+        observation=standard.observation + more,
         command_limits=largest_commands(configuration.commands, [tile.command_limits for tile in tiles]),
         stiffness=parameters.stiffness,
         damping=parameters.damping,

@@ -1,4 +1,4 @@
-"""What is logged of episodes: rewards and ends by name, tracking errors, levels."""
+"""Log episodes: rewards and ends by name, tracking errors, levels."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class EpisodeLog:
     def record(
         self, memory: EnvironmentMemory, inputs: StepInputs, rewards: torch.Tensor, ends: Ends, done: torch.Tensor
     ) -> None:
-        """Add a step: weighted rewards (N, terms), and whose episode is over, (N,) bool."""
+        """Add a step: weighted rewards (N, terms), and a mask of the episodes that are over, (N,) bool."""
         memory.episode_rewards.add_(rewards)
         memory.episode_steps.add_(1.0)
         linear = (inputs.command[:, :2] - inputs.base_linear_velocity_b[:, :2]).norm(dim=1)
@@ -59,7 +59,7 @@ class EpisodeLog:
         memory.diverged_total.add_(inputs.diverged.sum())
 
     def read(self, memory: EnvironmentMemory, progress: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Means since the last reading, as tensors on the device; sums start anew."""
+        """Return means since the last reading, as tensors on the device; sums start anew."""
         values = torch.cat(
             (
                 memory.finished_rewards / (memory.finished_steps * self._period),

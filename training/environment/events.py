@@ -1,7 +1,6 @@
-"""What happens to the physics beside the robot's own doing: starts of episodes, pushes, and late actions.
+"""Change the physics from outside: starts of episodes, pushes, and late actions.
 
-What differs between worlds and is drawn with them is in ``domain_randomization.py``. All draws are functions of uniform
-numbers, without branches on data.
+Differences between worlds are drawn in ``domain_randomization.py``. All draws are functions of uniform numbers, without branches on data.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from .terrain_configuration import TerrainConfiguration
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeStart:
-    """How the masked worlds begin their next episode."""
+    """Draw the start of the masked worlds' next episode."""
 
     worlds: torch.Tensor
     """(N,) bool."""
@@ -76,8 +75,8 @@ class EpisodeStarts:
         )
 
     def __call__(self, worlds: torch.Tensor, memory: EnvironmentMemory, uniform: UniformColumns) -> EpisodeStart:
-        """A start for the masked worlds, above the highest ground below the robot; the memory learns whether their
-        episode counts for the curriculum.
+        """Return a start for the masked worlds, above the highest ground below the robot; the memory learns whether their episode counts
+        for the curriculum.
         """
         spread = uniform["spread"][:, 0] < self._terrain.spread_probability
         torch.where(worlds, ~spread, memory.moves_level, out=memory.moves_level)
@@ -114,7 +113,7 @@ class Pushes:
     def __call__(
         self, done: torch.Tensor, state: PhysicsState, memory: EnvironmentMemory, uniform: UniformColumns
     ) -> Push | None:
-        """Pushes of the worlds whose clock says so and whose episode goes on; None where there are none at all."""
+        """Return the pushes of worlds that are due and go on; None where no world is ever pushed."""
         if self.steps == 0:
             return None
         due = ((memory.episode_length + memory.push_phase) % self.steps == 0) & ~done
@@ -132,7 +131,7 @@ class Latency:
         self._first, self._last = (min(round(t / physics.timestep), physics.substeps) for t in configuration.delay)
 
     def __call__(self, uniform: UniformColumns) -> torch.Tensor | None:
-        """Substeps, (N,) int64; None if there is no latency."""
+        """Return substeps, (N,) int64; None if there is no latency."""
         if self._last == 0:
             return None
         spread = self._last - self._first

@@ -1,8 +1,7 @@
 """Ground heights on the device: one small raster per terrain of the palette, read by all worlds at once.
 
-A raster holds ``Terrain.height`` at nodes of a square grid about the terrain's origin. A query takes the nearest
-node: riser edges stay vertical, at most half a cell from where they are, and one query is one gather. Beyond the
-raster the height of its edge continues.
+A raster holds ``Terrain.height`` at nodes of a square grid about the terrain's origin. A query takes the nearest node: riser edges stay
+vertical, at most half a cell from where they are, and one query is one gather. Beyond the raster the height of its edge continues.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class HeightRasters:
         self._heights = torch.from_numpy(heights).to(device).reshape(-1)
 
     def height(self, terrain_index: torch.Tensor, points_xy: torch.Tensor) -> torch.Tensor:
-        """Ground height below points.
+        """Return the ground height below points.
 
         Args:
             terrain_index: terrain of each world, (N,) int64.
@@ -57,7 +56,7 @@ class HeightRasters:
 
 
 def scan_pattern(length: float, width: float, spacing: float, device: torch.device | str) -> torch.Tensor:
-    """Points of the height scan about the base, (P, 2) [m]: x along the heading is the slow index, both ascending."""
+    """Return points of the height scan about the base, (P, 2) [m]: x along the heading is the slow index, both ascending."""
     columns, rows = round(length / spacing) + 1, round(width / spacing) + 1
     x = (torch.arange(columns, dtype=torch.float32) - (columns - 1) / 2) * spacing
     y = (torch.arange(rows, dtype=torch.float32) - (rows - 1) / 2) * spacing
@@ -65,21 +64,19 @@ def scan_pattern(length: float, width: float, spacing: float, device: torch.devi
 
 
 def heading(quaternion: torch.Tensor) -> torch.Tensor:
-    """Unit vector of the body's x axis in the world's xy plane, (cos yaw, sin yaw), from quaternions wxyz (N, 4) to
-    (N, 2).
-    """
+    """Return the unit vector of the body's x axis in the world's xy plane, (cos yaw, sin yaw), from quaternions wxyz (N, 4) to (N, 2)."""
     return _heading(quaternion, quaternion[:, 2:].square())
 
 
 def heading_and_upright(quaternion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """``heading``, (N, 2), and the cosine of the angle between the body's z axis and the world's, (N,)."""
+    """Return ``heading``, (N, 2), and the cosine of the angle between the body's z axis and the world's, (N,)."""
     squares = quaternion[:, 1:].square()
     upright = torch.rsub(squares[:, 0] + squares[:, 1], 1.0, alpha=2.0)
     return _heading(quaternion, squares[:, 1:]), upright
 
 
 def _heading(quaternion: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
-    """``heading`` with the squares of y and z, (N, 2), at hand."""
+    """Return ``heading`` with the squares of y and z, (N, 2), at hand."""
     mixed = quaternion[:, :2, None] * quaternion[:, None, 2:]  # wy, wz; xy, xz
     forward = torch.rsub(squares[:, 0] + squares[:, 1], 1.0, alpha=2.0)
     direction = torch.stack((forward, 2.0 * (mixed[:, 1, 0] + mixed[:, 0, 1])), dim=-1)
@@ -87,7 +84,7 @@ def _heading(quaternion: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
 
 
 def place_pattern(pattern: torch.Tensor, position_xy: torch.Tensor, heading_xy: torch.Tensor) -> torch.Tensor:
-    """A pattern of points turned to a heading and moved to a position.
+    """Return a pattern of points turned to a heading and moved to a position.
 
     Args:
         pattern: points about the base, (P, 2) [m].

@@ -1,6 +1,4 @@
-"""Everything the training environment remembers from step to step, in one place, so that saving it is saving all of
-it.
-"""
+"""Everything the training environment remembers from step to step, in one place, so that saving it is saving all of it."""
 
 from __future__ import annotations
 
@@ -33,7 +31,7 @@ SUMS = ("finished_rewards", "finished_steps", "finished_ends", "metric_sums", "m
 def _block(
     numbers: Callable[..., torch.Tensor], *shape: int, names: Sequence[str], widths: Sequence[int | None]
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """A tensor, and views of its neighbouring columns by name; a width of None is a column without an axis of its own."""
+    """Return a tensor, and views of its neighbouring columns by name; a width of None is a column without an axis of its own."""
     whole = numbers(*shape, sum(1 if width is None else width for width in widths))
     parts = whole.split([1 if width is None else width for width in widths], dim=-1)
     views = [part.squeeze(-1) if width is None else part for part, width in zip(parts, widths, strict=True)]
@@ -56,24 +54,24 @@ class EnvironmentMemory:
     terrain_index: torch.Tensor
     """Terrain of the present episode, (N,) int64."""
     moves_level: torch.Tensor
-    """Whether the present episode counts for the curriculum, (N,) bool."""
+    """True if the present episode counts for the curriculum, (N,) bool."""
     farthest: torch.Tensor
     """Largest distance from the tile's middle in this episode, larger of |x| and |y| [m], (N,)."""
     commanded_way: torch.Tensor
-    """Where the commands of this episode would have led, at the commanded headings [m], (N, 2)."""
+    """Position to which the commands of this episode would have led, at the commanded headings [m], (N, 2)."""
     commanded_farthest: torch.Tensor
     """Largest distance of ``commanded_way`` from its start [m], (N,)."""
     command: torch.Tensor
     """Present command, (N, 3)."""
     commanded_heading: torch.Tensor
-    """Where the robot should be heading: its own heading when the command was drawn, turned by the yaw rate commanded since; unit
-    vector in the world's xy plane, (N, 2)."""
+    """Heading that the commands ask for: the robot's own when the command was drawn, turned by the yaw rates commanded since; unit vector
+    in the world's xy plane, (N, 2)."""
     command_steps: torch.Tensor
     """Control steps until the next draw, (N,) int64."""
     command_extreme: torch.Tensor
-    """Whether the present command is an extreme one, (N,) bool."""
+    """True for extreme commands, (N,) bool."""
     holds_heading: torch.Tensor
-    """Whether the present command is a straight one, which leaves the commanded heading as it is, (N,) bool."""
+    """True for straight commands, which leave the commanded heading as it is, (N,) bool."""
     issued: torch.Tensor
     """Sum of the linear commands issued in this episode [m/s], (N, 2)."""
     shortfall: torch.Tensor
@@ -91,7 +89,7 @@ class EnvironmentMemory:
     foot_force: torch.Tensor
     """Norm of each foot's contact force after the last step [N], (N, F)."""
     just_reset: torch.Tensor
-    """Worlds whose episode has just begun, (N,) bool."""
+    """Worlds at the first step of an episode, (N,) bool."""
     history: torch.Tensor
     """Last frames with their noise, oldest first, (N, H, frame width)."""
     push_phase: torch.Tensor
@@ -105,7 +103,7 @@ class EnvironmentMemory:
     finished_steps: torch.Tensor
     """Their control steps, scalar."""
     finished_ends: torch.Tensor
-    """How many of them ended in which way, (E,)."""
+    """Number of ends by reason, (E,)."""
     metric_sums: torch.Tensor
     """Sums over worlds and steps since the last log, (M,)."""
     metric_steps: torch.Tensor
@@ -116,8 +114,8 @@ class EnvironmentMemory:
     """Diverged worlds that were reset in the run, scalar int64."""
 
     episode: torch.Tensor
-    """The numbers that are zero when an episode begins, one row for each world, (N, …): ``EPISODE`` are its columns, so that one
-    kernel clears them all."""
+    """The numbers that are zero when an episode begins, one row for each world, (N, …): ``EPISODE`` are its columns, so that one kernel
+    clears them all."""
     sums: torch.Tensor
     """All sums since the last log in one row: ``SUMS`` are its columns."""
 
@@ -135,7 +133,7 @@ class EnvironmentMemory:
         metrics: int,
         device: torch.device | str,
     ) -> EnvironmentMemory:
-        """Zeros of the right shapes."""
+        """Return zeros of the right shapes."""
 
         def numbers(*shape: int) -> torch.Tensor:
             return torch.zeros(shape, device=device)
@@ -172,14 +170,14 @@ class EnvironmentMemory:
         )
 
     def turn_commanded_heading(self, period: float) -> None:
-        """Turn it by what the present command asks for in a control period [s]."""
+        """Turn it by the present command's yaw rate over a control period [s]."""
         angle = (self.command[:, 2] * period).masked_fill(self.holds_heading, 0.0)
         cos, sin = torch.cos(angle), torch.sin(angle)
         x, y = self.commanded_heading.unbind(1)
         self.commanded_heading.copy_(torch.stack((cos * x - sin * y, sin * x + cos * y), dim=1))
 
     def remember(self, inputs: StepInputs) -> None:
-        """Keep what the next step compares itself with."""
+        """Keep the tensors that the next step compares itself with."""
         self.previous_action.copy_(self.action)
         self.action.copy_(inputs.action)
         self.joint_acceleration.copy_(inputs.joint_acceleration)
@@ -188,19 +186,19 @@ class EnvironmentMemory:
         self.foot_force.copy_(inputs.state.foot_contact_force_w.norm(dim=-1))
 
     def begin_episode(self, worlds: torch.Tensor) -> None:
-        """Clear what belongs to one episode in the masked worlds, (N,) bool."""
+        """Clear the tensors of one episode in the masked worlds, (N,) bool."""
         self.episode.masked_fill_(worlds[:, None], 0.0)
         self.episode_length.masked_fill_(worlds, 0)
         self.command_extreme.masked_fill_(worlds, False)
         self.just_reset.copy_(worlds)
 
     def by_name(self) -> dict[str, torch.Tensor]:
-        """Everything but the tensors of which others are columns."""
+        """Return all tensors except views, the columns of others."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("episode", "sums")}
 
 
 def copied(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Copies by name."""
+    """Return copies by name."""
     return {name: value.clone() for name, value in tensors.items()}
 
 
@@ -215,7 +213,7 @@ def restore(saved: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> No
 
 
 def fitting(saved: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Saved tensors by the names of present ones, each with the type and on the device of that one.
+    """Return saved tensors by the names of present ones, each with the type and on the device of that one.
 
     Raises:
         ValueError: one is missing, is no tensor or has another shape.

@@ -14,6 +14,7 @@ import torch
 from ...backends.base import PhysicsState
 from ...policy.contract import PolicyContract
 from ...policy.observation import ObservationBuilder
+from ...policy.observation_table import observation
 from ...robots.rotation import rotate_inverse
 from .configuration import NoiseConfiguration, ObservationConfiguration
 from .height_scan import HeightRasters, heading, place_pattern
@@ -32,7 +33,7 @@ def noise_amplitude(contract: PolicyContract, noise: NoiseConfiguration, device:
     scales = [
         torch.tensor(term.scale).abs().expand(width) for term, width in zip(terms, contract.term_widths, strict=True)
     ]
-    half_widths = [getattr(noise, term.name.removesuffix("_b"), 0.0) for term in terms]
+    half_widths = [observation(term.name).half_width(noise) for term in terms]
     return torch.cat([scale * half_width for scale, half_width in zip(scales, half_widths, strict=True)]).to(device)
 
 

@@ -1,9 +1,8 @@
-"""Terms of one's own: functions that settings name, so that a task adds rewards, terminations, observations and events
-without touching the environment's loop.
+"""Terms of one's own: functions that settings name, so that a task adds rewards, terminations, observations and events without touching
+the environment's loop.
 
-A function is named ``module:function``; the module must be importable where the run is started and resumed. ``docs/``
-has a worked example. Names that come out of a checkpoint, perhaps a stranger's, are imported only where they are trusted
-(``foreign_functions``).
+A function is named ``module:function``; the module must be importable where the run is started and resumed. ``docs/`` has a worked
+example. Names that come out of a checkpoint, perhaps a stranger's, are imported only where they are trusted (``foreign_functions``).
 """
 
 from __future__ import annotations
@@ -16,7 +15,9 @@ import torch
 
 from ...files.parsing import one_line, shown
 from ...files.plugins import imported, raised
+from ...policy.observation_table import STANDARD, Observation, ObservationError, observation, register
 from ..configuration import ConfigurationError, to_plain
+from .configuration import ObservationConfiguration
 
 Kind = TypeVar("Kind")
 _PACKAGE = __name__.partition(".")[0]
@@ -42,7 +43,7 @@ class _Named(Protocol):
 
 
 def resolve(path: str, setting: str) -> Callable[..., Any]:
-    """The function or class at ``module:name``. What it raises when it is called, and is not of this package, is one sentence.
+    """Return the function or class at ``module:name``; calling a user's turns its exceptions into one sentence.
 
     Raises:
         ConfigurationError: there is no such module or function, or importing it fails.
@@ -63,20 +64,31 @@ def _found(path: str, setting: str) -> Callable[..., Any]:
     return found  # type: ignore[no-any-return]
 
 
+def find_class(path: str, setting: str, base: type[Kind]) -> type[Kind]:
+    """Return the class at ``module:name`` itself.
+
+    Raises:
+        ConfigurationError: there is no such module or class, or it is not derived from ``base``.
+    """
+    found = _found(_present(path), setting)
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise ConfigurationError(
+            f"{setting} is {shown(path)}; it must be a class derived from {base.__module__}:{base.__name__}"
+        )
+    return found
+
+
 def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> Callable[..., Kind]:
-    """The class at ``module:name``.
+    """Return the class at ``module:name``.
 
     Args:
-        base: what it must be derived from.
-        methods: what is called of its instances.
+        base: class that it must be derived from.
+        methods: names of its instances' called methods.
 
     Raises:
         ConfigurationError: as ``resolve``, or it is no such class.
     """
-    path = _present(path)
-    found, where = _found(path, setting), f"{setting} is {shown(path)}"
-    if not isinstance(found, type) or not issubclass(found, base):
-        raise ConfigurationError(f"{where}; it must be a class derived from {base.__module__}:{base.__name__}")
+    found, where = find_class(path, setting, base), f"{setting} is {shown(_present(path))}"
     if _own(path):
         return found
 
@@ -97,13 +109,12 @@ def resolve_own(
     gives: Callable[[Any, Any], bool] | None = None,
     rule: str = "",
 ) -> dict[str, Callable[..., Any]]:
-    """The functions of all terms by name.
+    """Return the functions of all terms by name.
 
     Args:
         taken: names that they cannot have.
-        gives: whether a function's result is what it must be, from its first argument and the result; None where nothing is
-            looked at.
-        rule: how a sentence says that.
+        gives: checks a function's result, from its first argument and the result; None for no check.
+        rule: the check in words.
 
     Raises:
         ConfigurationError: a name is used twice, or a function is not there.
@@ -119,10 +130,33 @@ def resolve_own(
     return functions
 
 
+def policy_observations(settings: ObservationConfiguration) -> list[Observation]:
+    """Return the policy's observations behind the standard ones; those of ``module:name`` become known in this process.
+
+    Raises:
+        ConfigurationError: an observation is not there, is named twice, or breaks a rule.
+    """
+    found: list[Observation] = []
+    for path in settings.policy:
+        where = f"environment.observations.policy has {shown(path)}"
+        try:
+            made = imported(path, f"{where}, but", ConfigurationError) if ":" in path else observation(path)
+            if not isinstance(made, Observation):
+                raise ConfigurationError(
+                    f"{where}; it must be a gaitgauge.policy.observation_table.Observation, not {shown(made)}"
+                )
+            found.append(register(made) if ":" in path else made)
+        except ObservationError as error:
+            raise ConfigurationError(f"{where}: {error}") from error
+        if made.name in STANDARD or any(made.name == other.name for other in found[:-1]):
+            raise ConfigurationError(f"{where}, and the policy has '{made.name}' already; name it once")
+    return found
+
+
 def _checked(
     function: Callable[..., Any], where: str, gives: Callable[[Any, Any], bool] | None, rule: str
 ) -> Callable[..., Any]:
-    """A function whose results are looked at."""
+    """Return a function that checks its results."""
     if gives is None:
         return function
 
@@ -138,17 +172,21 @@ def _checked(
     return checked
 
 
-def guarded(call: Callable[..., Any], where: str) -> Callable[..., Any]:
-    """Somebody's code, of which whatever it raises, its wish to end the program included, is one sentence.
+def guarded(
+    call: Callable[..., Any], where: str, passed_on: tuple[type[BaseException], ...] = ()
+) -> Callable[..., Any]:
+    """Return a user's function with its exceptions, and its attempts to end the program, turned into one sentence.
 
     Args:
         where: the beginning of the sentence.
+        passed_on: exceptions that stay as they are, as ``ConfigurationError`` does.
     """
+    kept: tuple[type[BaseException], ...] = (ConfigurationError, *passed_on)
 
     def called(*arguments: Any, **named: Any) -> Any:
         try:
             return call(*arguments, **named)
-        except ConfigurationError:
+        except kept:
             raise
         except (Exception, SystemExit) as error:
             raise ConfigurationError(f"{where}, which {raised(error)}; mend it") from error
@@ -157,7 +195,7 @@ def guarded(call: Callable[..., Any], where: str) -> Callable[..., Any]:
 
 
 def foreign_functions(settings: Any, known: Any) -> list[str]:
-    """What settings would import: every ``module:function`` in them that is neither the package's own nor named in ``known``.
+    """Return every ``module:function`` that settings would import and that is neither the package's own nor named in ``known``.
 
     Args:
         settings: frozen dataclasses, of any depth, or plain data.
@@ -168,7 +206,7 @@ def foreign_functions(settings: Any, known: Any) -> list[str]:
 
 
 def _names(value: Any) -> Iterator[str]:
-    """All texts with a colon, so that a field that is added some day is not forgotten here."""
+    """Return all texts with a colon, so that a field that is added some day is not forgotten here."""
     if isinstance(value, dict | list | tuple):
         for entry in value.values() if isinstance(value, dict) else value:
             yield from _names(entry)
@@ -177,7 +215,7 @@ def _names(value: Any) -> Iterator[str]:
 
 
 def _own(path: str) -> bool:
-    """Whether a module of this package defines the function; what it imported from elsewhere is not its own."""
+    """Return True if a module of this package defines the function; functions that it imported from elsewhere are not its own."""
     module, _, name = _present(path).partition(":")
     if not module.startswith(f"{_PACKAGE}.training."):
         return False

@@ -1,8 +1,7 @@
 """One draw of uniform numbers per step, handed out by name.
 
-A single kernel fills all random numbers that a step may need, whether or not it uses them. So a captured step is a
-pure function of its inputs, random numbers do not depend on what happened in other worlds, and one generator state is
-all that a checkpoint needs.
+A single kernel fills all random numbers that a step may need, whether or not it uses them. So a captured step is a pure function of its
+inputs, random numbers do not depend on what happened in other worlds, and one generator state is all that a checkpoint needs.
 """
 
 from __future__ import annotations
@@ -31,17 +30,17 @@ class UniformColumns:
         torch.mul(self.values, 2.0, out=self._signed).sub_(1.0)
 
     def __getitem__(self, name: str) -> torch.Tensor:
-        """Numbers of one name, (N, width), a view."""
+        """Return the numbers of one name, (N, width), a view."""
         return self.values[:, self._slices[name]]
 
     def signed(self, name: str) -> torch.Tensor:
-        """The same numbers stretched over [-1, 1), a view."""
+        """Return the same numbers stretched over [-1, 1), a view."""
         return self._signed[:, self._slices[name]]
 
     def span(self, first: str, last: str) -> torch.Tensor:
-        """Numbers of neighbouring names, (N, their widths together), a view."""
+        """Return the numbers of neighbouring names, (N, their widths together), a view."""
         return self.values[:, self._slices[first].start : self._slices[last].stop]
 
     def between(self, name: str, low: float, high: float) -> torch.Tensor:
-        """Numbers of one name, uniform between two bounds, (N, width)."""
+        """Return the numbers of one name, uniform between two bounds, (N, width)."""
         return self[name] * (high - low) + low

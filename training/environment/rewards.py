@@ -1,8 +1,7 @@
-"""Reward terms. Each is a function of ``StepInputs`` that returns one number per world, unweighted;
-``REWARD_TERMS`` names them.
+"""Reward terms. Each is a function of ``StepInputs`` that returns one number per world, unweighted; ``REWARD_TERMS`` names them.
 
-Formulas follow the paper's table of rewards in the reading of the published code; where they differ,
-``docs/training-choices.md`` says which was taken.
+Formulas follow the paper's table of rewards in the reading of the published code; where they differ, ``docs/training-choices.md`` says
+which was taken.
 """
 
 from __future__ import annotations
@@ -12,8 +11,9 @@ from collections.abc import Callable, Mapping
 import torch
 
 from ...robots.rotation import projected_gravity
-from .configuration import Ramp, RewardConfiguration
+from ..configuration import Ramp
 from .own_terms import resolve_own
+from .reward_configuration import RewardWeights
 from .schedules import RampTable
 from .step_inputs import StepInputs
 
@@ -41,8 +41,8 @@ def progress(inputs: StepInputs) -> torch.Tensor:
 
 
 def progress_share(inputs: StepInputs) -> torch.Tensor:
-    """Share of the commanded speed that the robot has along the command, within ±1; without a meaning below
-    ``SLOWEST_COMMAND``. A robot that turned away from the commanded heading has to make its way from where it is.
+    """Share of the commanded speed that the robot has along the command, within ±1; without a meaning below ``SLOWEST_COMMAND``. A robot
+    that turned away from the commanded heading has to make its way from where it is.
     """
     command, wanted = inputs.command[:, :2], inputs.commanded_heading_xy
     (forward, lateral), (x, y) = inputs.base_linear_velocity_b[:, :2].unbind(1), inputs.heading_xy.unbind(1)
@@ -53,7 +53,7 @@ def progress_share(inputs: StepInputs) -> torch.Tensor:
 
 
 def commanded_to_move(command: torch.Tensor) -> torch.Tensor:
-    """Whether the linear command is fast enough to ask for progress, (N,) bool."""
+    """Return True where the linear command is fast enough to ask for progress, (N,) bool."""
     return command[:, :2].square().sum(dim=1) >= SLOWEST_COMMAND**2
 
 
@@ -109,9 +109,7 @@ def base_collision(inputs: StepInputs) -> torch.Tensor:
 
 
 def joint_limits(inputs: StepInputs) -> torch.Tensor:
-    """Sum of the angles beyond the soft limits [rad]. The paper counts joints; the code's angle has a slope to
-    follow.
-    """
+    """Sum of the angles beyond the soft limits [rad]. The paper counts joints; the code's angle has a slope to follow."""
     below = (inputs.soft_lower - inputs.joint_position).clamp_min(0.0)
     above = (inputs.joint_position - inputs.soft_upper).clamp_min(0.0)
     return (below + above).sum(dim=1)
@@ -136,9 +134,7 @@ def hip_regulation(inputs: StepInputs) -> torch.Tensor:
 
 
 def hip_symmetry(inputs: StepInputs) -> torch.Tensor:
-    """|vx*| / ‖command‖ · Σ |left hip − mirror image of the right one|, angles from the standing pose [rad]; 0 for the zero
-    command.
-    """
+    """|vx*| / ‖command‖ · Σ |left hip − mirror image of the right one|, angles from the standing pose [rad]; 0 for the zero command."""
     deviation = (inputs.joint_position - inputs.default_joint_position)[:, inputs.hip_pairs]
     asymmetry = (deviation[..., 0] - inputs.hip_signs * deviation[..., 1]).abs().sum(dim=1)
     share = inputs.command[:, 0].abs() / inputs.command.norm(dim=1).clamp_min(1e-6)
@@ -195,13 +191,13 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
         termination,
     )
 }
-"""All terms by the names of their weights in ``RewardConfiguration``, which adds those of one's own."""
+"""All terms by the names of their weights in ``RewardWeights``, which adds those of one's own."""
 
 
 class RewardFunction:
-    """The weighted sum of the terms whose weight is not zero."""
+    """Weighted sum of the terms with a weight other than zero."""
 
-    def __init__(self, configuration: RewardConfiguration, control_period: float, device: torch.device | str) -> None:
+    def __init__(self, configuration: RewardWeights, control_period: float, device: torch.device | str) -> None:
         """Choose the terms and put their weights on the device.
 
         Raises:

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from ..configuration import ConfigurationError
-from .configuration import Ramp
+from ..configuration import ConfigurationError, Ramp
 
 
 class RampTable:
@@ -34,5 +33,5 @@ class RampTable:
         self._start, self._change, self._begin, self._rate = (t.contiguous() for t in (start, change, begin, rate))
 
     def at(self, progress: torch.Tensor) -> torch.Tensor:
-        """Values (R,) at a fraction of the run, a scalar tensor."""
+        """Return values (R,) at a fraction of the run, a scalar tensor."""
         return self._start + self._change * ((progress - self._begin) * self._rate).clamp(0.0, 1.0)

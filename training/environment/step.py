@@ -1,9 +1,9 @@
-"""The torch part of an environment step, as a list of its parts: what a step led to, ends, rewards, log, levels, pushes, the next
+"""The torch part of an environment step, as a list of its parts: inputs, ends, rewards, log, levels, pushes, the next
 episodes; and observing.
 
-Two functions without arguments, ``after_physics`` and ``observe``, read fixed tensors (inputs, memory, uniform
-numbers) and have static shapes, no random state and no branch on data, so that each can be captured in a CUDA graph.
-Between them the environment resets, randomizes and pushes the physics.
+Two functions without arguments, ``after_physics`` and ``observe``, read fixed tensors (inputs, memory, uniform numbers) and have static
+shapes, no random state and no branch on data, so that each can be captured in a CUDA graph. Between them the environment resets,
+randomizes and pushes the physics.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .terminations import Terminations
 
 @dataclass(frozen=True, kw_only=True)
 class StepResult:
-    """What came of a step."""
+    """Results of a step."""
 
     reward: torch.Tensor
     """(N,)."""
@@ -44,7 +44,7 @@ class StepResult:
     time_out: torch.Tensor
     """Ends that are no failure, (N,) bool."""
     start: EpisodeStart
-    """The next episodes of the worlds whose episode is over."""
+    """Starts of the next episodes, for worlds at the end of one."""
     push: Push | None
     """Pushed bases, None where there are no pushes."""
 
@@ -157,19 +157,19 @@ class EnvironmentStep:
         )
 
     def targets(self) -> torch.Tensor:
-        """Joint targets of the present action [rad], (N, J)."""
+        """Return the joint targets of the present action [rad], (N, J)."""
         return self._builder.targets(self.action)
 
     def delay(self) -> torch.Tensor | None:
-        """Substeps for which the previous target still acts, (N,) int64; None if there is no latency."""
+        """Return substeps for which the previous target still acts, (N,) int64; None if there is no latency."""
         return self.latency(self.uniform)
 
     def progress(self) -> torch.Tensor:
-        """Fraction of the run, scalar."""
+        """Return the fraction of the run, scalar."""
         return self.memory.step.float() * (1.0 / self.configuration.schedule.horizon_steps)
 
     def after_physics(self) -> StepResult:
-        """Judge the step, update the memory, and prepare the next episode of the worlds whose episode is over."""
+        """Judge the step, update the memory, and prepare the next episode of worlds at the end of one."""
         memory = self.memory
         memory.step.add_(1)
         memory.episode_length.add_(1)
@@ -191,8 +191,8 @@ class EnvironmentStep:
     def begin_episodes(
         self, worlds: torch.Tensor, failed: torch.Tensor, progress: torch.Tensor, heading_xy: torch.Tensor
     ) -> EpisodeStart:
-        """Draw the next episode of the masked worlds, and new commands where they are due; the memory is updated in
-        place. ``heading_xy`` are the headings at which the other worlds' episodes go on, (N, 2).
+        """Draw the next episode of the masked worlds, and new commands where they are due; the memory is updated in place. ``heading_xy``
+        are the headings at which the other worlds' episodes go on, (N, 2).
         """
         memory, uniform = self.memory, self.uniform
         self.levels.move(memory, uniform, worlds, failed)
@@ -207,7 +207,7 @@ class EnvironmentStep:
         return start
 
     def _hold_heading(self, own: torch.Tensor, progress: torch.Tensor) -> None:
-        """Command yaw rates that lead straight commands back to their heading; ``own`` are the robots' headings, (N, 2)."""
+        """Write the command yaw rates that lead straight commands back to their heading; ``own`` are the robots' headings, (N, 2)."""
         memory, wanted = self.memory, self.memory.commanded_heading
         off = torch.atan2(own[:, 0] * wanted[:, 1] - own[:, 1] * wanted[:, 0], (own * wanted).sum(dim=1))
         yaw = self.commands.held_yaw_rate(off, kind=self.kind, progress=progress)
@@ -235,5 +235,5 @@ class EnvironmentStep:
         return due
 
     def observe(self) -> Observations:
-        """Observations of the present state, which is fresh for worlds that were just reset or pushed."""
+        """Return observations of the present state, which is fresh for worlds that were just reset or pushed."""
         return self.observer(self.inputs, self.memory, self.uniform)

@@ -1,4 +1,4 @@
-"""What functions of rewards and terminations look at."""
+"""Inputs of the functions of rewards and terminations."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ AFTER_RESET = AFTER_STEP[:6]
 
 
 def static_inputs(state: PhysicsState) -> PhysicsState:
-    """Tensors that physics states are copied into: as ``state`` in shape, floating point as float32."""
+    """Return tensors that physics states are copied into: as ``state`` in shape, floating point as float32."""
     values = {f.name: getattr(state, f.name).clone() for f in fields(PhysicsState)}
     return PhysicsState(**{name: v.float() if v.is_floating_point() else v for name, v in values.items()})
 
 
 @dataclass(kw_only=True)
 class StepInputs:
-    """What a control step led to, before any reset. N worlds, J joints, F feet."""
+    """State after a control step, before any reset. N worlds, J joints, F feet."""
 
     base_linear_velocity_b: torch.Tensor
     """[m/s], (N, 3)."""
@@ -57,7 +57,7 @@ class StepInputs:
     joint_acceleration: torch.Tensor
     """Change of velocity over the control step [rad/s²], (N, J)."""
     joint_torque: torch.Tensor
-    """Of the last substep [N·m], (N, J)."""
+    """Torque of the last substep [N·m], (N, J)."""
     previous_joint_torque: torch.Tensor
     """The same, one control step earlier."""
     default_joint_position: torch.Tensor
@@ -103,20 +103,19 @@ class StepInputs:
     shortfall: torch.Tensor
     """Share of the commanded speed that is missing of late, an exponential average, (N,)."""
     diverged: torch.Tensor
-    """Worlds whose physics is not sound any more, (N,) bool."""
+    """Worlds with diverged physics, (N,) bool."""
     progress: torch.Tensor
     """Fraction of the run, scalar."""
     heading_xy: torch.Tensor
     """Unit vector of the base's x axis in the world's xy plane, (N, 2)."""
     commanded_heading_xy: torch.Tensor
-    """Where the robot should be heading, as ``heading_xy``, (N, 2): ``RewardConfiguration.progress_along`` says whether its heading
-    when the command was drawn, turned by the yaw rate commanded since, or its own."""
+    """Heading that the command refers to, as ``heading_xy``, (N, 2); see ``RewardShapes.progress_along``."""
     period: float
     """Control period [s]."""
     state: PhysicsState
-    """The physics, for whatever else a function needs."""
+    """The whole physics."""
     failed: torch.Tensor
-    """Worlds whose episode ends as a failure, (N,) bool; the terminations put it here, so that rewards know it."""
+    """Episodes that end as a failure, (N,) bool; the terminations write it, so that rewards can read it."""
     base_height_target: float
     """[m]."""
     foot_height_length: float

@@ -1,4 +1,4 @@
-"""Turns the physics after a control step into what rewards and terminations look at."""
+"""Turn the physics after a control step into the inputs of rewards and terminations."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class StepReader:
             scan: points of the height scan about the base [m], (P, 2).
 
         Raises:
-            ConfigurationError: no point of the scan is below the trunk, or joint speeds are judged of motors whose no-load
-                speeds nobody knows.
+            ConfigurationError: no point of the scan is below the trunk, or joint speeds of motors with an unknown no-load speed are
+                judged.
         """
         self._settings, self._rasters = configuration.rewards, rasters
         self._joint_velocity_limit = configuration.termination.joint_velocity
@@ -101,7 +101,7 @@ class StepReader:
         return torch.tensor(found, dtype=torch.int64, device=self._device)
 
     def sigma(self, memory: EnvironmentMemory) -> torch.Tensor:
-        """Tracking width of every command axis, (N, 3) (paper, dynamic velocity tracking precision adjustment)."""
+        """Return the tracking width of every command axis, (N, 3) (paper, dynamic velocity tracking precision adjustment)."""
         base = self._settings.tracking_sigma
         command = memory.command
         if not self._settings.dynamic_sigma:
@@ -110,7 +110,7 @@ class StepReader:
         return base + speed * (self._difficulty[memory.level] * self._sigma_growth)[:, None]
 
     def _commanded_heading(self, memory: EnvironmentMemory, heading_xy: torch.Tensor) -> torch.Tensor:
-        """``StepInputs.commanded_heading_xy``, where ``heading_xy`` are the robots' own."""
+        """Return ``StepInputs.commanded_heading_xy``, where ``heading_xy`` are the robots' own."""
         along = self._settings.progress_along
         if along == "base":
             return heading_xy
@@ -121,11 +121,11 @@ class StepReader:
     def __call__(
         self, state: PhysicsState, memory: EnvironmentMemory, action: torch.Tensor, progress: torch.Tensor
     ) -> StepInputs:
-        """What the step led to.
+        """Return the inputs of rewards and terminations after a step.
 
         Args:
             state: physics after the step.
-            memory: what was before it, and the counters, which are the step's.
+            memory: state before it, and the counters of the step.
             action: raw action of the step, (N, J).
             progress: fraction of the run, scalar.
         """

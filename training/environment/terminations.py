@@ -1,8 +1,5 @@
-"""Ends of episodes. Each rule is a function of ``StepInputs`` and the settings that says which worlds' episode is over;
-``TERMINATIONS`` names them.
-
-An end is a failure, or a time-out, whose missing future the learner bootstraps. A failure lowers the level, unless the
-physics failed.
+"""End episodes. Each rule is a function of ``StepInputs`` and the settings to a mask of worlds; ``TERMINATIONS`` names them. An end is a
+failure, or a time-out: the learner then bootstraps the missing future. A failure lowers the level, unless the physics failed.
 """
 
 from __future__ import annotations
@@ -26,39 +23,39 @@ Rule = Callable[[StepInputs, TerminationConfiguration], torch.Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class Termination:
-    """A rule, and what its end means."""
+    """A rule, and the kind of its end."""
 
     rule: Rule
-    """Which worlds' episode is over, (N,) bool."""
+    """Episodes that are over, (N,) bool."""
     time_out: bool = False
-    """Whether the end is no failure."""
+    """True if the end is no failure."""
 
 
 def time_out(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
-    """The longest episode is over."""
+    """Return True where the longest episode is over."""
     return inputs.episode_length >= inputs.max_episode_length
 
 
 def left_tile(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
-    """The robot has left its tile behind."""
+    """Return True where the robot has left its tile behind."""
     return inputs.distance > inputs.leave_distance
 
 
 def trunk_contact(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
-    """The ground presses on the trunk, head and chin apart, harder than ``trunk_contact`` newtons."""
+    """Return True where the ground presses on the trunk, head and chin apart, harder than ``trunk_contact`` newtons."""
     assert settings.trunk_contact is not None
     return inputs.trunk_contact_force_w.norm(dim=-1) > settings.trunk_contact
 
 
 def tilt(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
-    """The base leans by more than ``tilt`` radians."""
+    """Return True where the base leans by more than ``tilt`` radians."""
     assert settings.tilt is not None
     return inputs.upright < math.cos(settings.tilt)
 
 
 def stuck(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
-    """Nearly all of the commanded speed has been missing for about ``stuck`` seconds: an average that began at 0 has come
-    to ``STUCK_SHORTFALL`` after this much time at a standstill.
+    """Return True where nearly all of the commanded speed has been missing for about ``stuck`` seconds: an average that began at 0 has
+    come to ``STUCK_SHORTFALL`` after this much time at a standstill.
     """
     assert settings.stuck is not None
     missing = torch.where(commanded_to_move(inputs.command), 1.0 - progress_share(inputs), 0.0).nan_to_num(0.0)
@@ -67,7 +64,7 @@ def stuck(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tenso
 
 
 def diverged(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
-    """The physics is not sound any more: no fault of the policy."""
+    """Return True where the physics has diverged: no fault of the policy."""
     return inputs.diverged
 
 
@@ -79,12 +76,12 @@ TERMINATIONS: dict[str, Termination] = {
     "stuck": Termination(rule=stuck),
     "diverged": Termination(rule=diverged),
 }
-"""All rules by name. A rule whose setting of the same name is None is left out; ``own`` adds more."""
+"""All rules by name. A rule is left out where its setting, of the same name, is None; ``own`` adds more."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ends:
-    """Which episodes are over, and why."""
+    """Ends of episodes, with their reasons."""
 
     failed: torch.Tensor
     """(N,) bool."""
@@ -119,7 +116,7 @@ class Terminations:
         self._time_outs = sum(t.time_out for t in used.values())
 
     def __call__(self, inputs: StepInputs) -> Ends:
-        """Ends of every world's episode; ``inputs.failed`` is set."""
+        """Return the ends of every world's episode, and set ``inputs.failed``."""
         flags = torch.stack([rule(inputs, self._settings) for rule in self._rules], dim=1)
         time_outs, failures = flags[:, : self._time_outs], flags[:, self._time_outs :]
         inputs.failed = failed = failures.any(dim=1)

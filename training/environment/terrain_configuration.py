@@ -27,7 +27,7 @@ class TileConfiguration:
     sigma: Positive
     """Largest tracking sigma on this kind (``RewardConfiguration.dynamic_sigma``)."""
     ends: bool = True
-    """Whether the kind has an edge: at which ``TerrainConfiguration.leave_distance`` acts, and which crossings lead to."""
+    """True if the kind has an edge, at which ``TerrainConfiguration.leave_distance`` acts and to which crossings lead."""
 
 
 _MODERATE, _SLOW, _STRAIGHT = (1.5, 1.0, 1.5), (1.0, 1.0, 1.5), (1.0, 0.5, 1.5)
@@ -45,13 +45,13 @@ ALL_TILES = (
     TileConfiguration(name="obstacles", share=0.13, command_limits=_STRAIGHT, sigma=0.75),
     FLAT_TILE,
 )
-"""Every kind. Sigmas are the published ones (bars have that of obstacles), limits too but for slower sideways commands on stairs
-upwards, bars and obstacles; waves and all that is to be climbed have more than their published share, slopes and flat less."""
+"""Every kind. Sigmas are the published ones (bars have that of obstacles), limits too but for slower sideways commands on stairs upwards,
+bars and obstacles; waves and all that is to be climbed have more than their published share, slopes and flat less."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainConfiguration:
-    """Which ground, and how it gets harder."""
+    """Kinds of ground, and their levels."""
 
     tiles: tuple[TileConfiguration, ...] = ALL_TILES
     """Kinds of training tile."""
@@ -64,7 +64,7 @@ class TerrainConfiguration:
     seed: Seed = 0
     """Seed of the tiles' chance."""
     curriculum: bool = True
-    """Whether levels follow success; otherwise every episode draws its level."""
+    """Let levels follow success; otherwise every episode draws its level."""
     highest_start_level: Annotated[int, Field(ge=0, lt=NUM_TILE_LEVELS)] = 5
     """Levels at the start are uniform from 0 to this, or to the last of ``levels``."""
     promotion_distance: _Distance = 4.0
@@ -72,15 +72,14 @@ class TerrainConfiguration:
     demotion_share: Share = 0.5
     """Share of the commanded way below which the level falls."""
     demote_falls: bool = True
-    """Whether a fall before promotion lowers the level whatever the distance."""
+    """Lower the level after a fall before promotion, at any distance."""
     leave_distance: _Distance | None = 4.75
-    """Distance from the tile's middle at which an episode is cut short as a time-out [m]; None for never. Beyond the
-    edge there is only level ground, on which the published robots had the next tile."""
+    """Distance from the tile's middle at which an episode is cut short as a time-out [m]; None for never. Beyond the edge there is only
+    level ground, on which the published robots had the next tile."""
     spawn_jitter: _Spread = 1.0
     """Episodes start up to this far from the tile's middle, in x and in y [m]."""
     spread_probability: Share = 0.1
-    """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; they do not move
-    levels."""
+    """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; they do not move levels."""
     spread_distance: _Spread = 3.0
     """Those episodes start up to this far from the tile's middle, in x and in y [m]."""
     level_rule: str = "gaitgauge.training.environment.curriculum:next_level"

@@ -1,11 +1,11 @@
-"""The average of the weights over the later part of a run, which is what is played, gauged and exported.
+"""Average the weights over the later part of a run: these are played, gauged and exported.
 
-Checkpoints at the end of a run differ by chance, and the mean of their weights is better than each of them (Polyak and
-Juditsky, "Acceleration of Stochastic Approximation by Averaging", 1992; Izmailov et al., "Averaging Weights Leads to Wider
-Optima and Better Generalization", 2018). The average here is that of Shamir and Zhang, "Stochastic Gradient Descent for
-Non-smooth Optimization", 2013 (polynomial-decay averaging): after t iterations those of iteration i count about in proportion to
-i to the power η. It needs one copy of the weights, forgets the untrained network within a few iterations, and its window grows
-with the run, so that one number fits short and long runs alike.
+Checkpoints at the end of a run differ by chance, and the mean of their weights is better than each of them (Polyak and Juditsky,
+"Acceleration of Stochastic Approximation by Averaging", 1992; Izmailov et al., "Averaging Weights Leads to Wider Optima and Better
+Generalization", 2018). The average here is that of Shamir and Zhang, "Stochastic Gradient Descent for Non-smooth Optimization", 2013
+(polynomial-decay averaging): after t iterations those of iteration i count about in proportion to i to the power η. It needs one copy of
+the weights, forgets the untrained network within a few iterations, and its window grows with the run, so that one number fits short and
+long runs alike.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class WeightAverage:
 
         Args:
             modules: by the name that their state has in checkpoints. Their parameters must stay in the memory where they are.
-            age: how far back the averaged weights lie in the mean, as a fraction of the iterations done, 1 / (η + 2); 0 for
-                the weights of the last iteration alone, 0.5 for the plain mean over the whole run.
+            age: how far back the averaged weights lie in the mean, as a fraction of the iterations done, 1 / (η + 2); 0 for the weights
+                of the last iteration alone, 0.5 for the plain mean over the whole run.
         """
         self._age = age
         self._count = 0
@@ -47,13 +47,11 @@ class WeightAverage:
             torch._foreach_lerp_(means, self._now, share)
 
     def state_dict(self) -> dict[str, Any]:
-        """What ``load_state_dict`` takes: the averaged modules' state dictionaries, which later updates change, and of how many
-        iterations they are averages.
-        """
+        """Return the averaged modules' state dictionaries, which later updates change, and the number of averaged iterations."""
         return {"iterations": self._count, **self._states}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:
-        """Continue from what ``state_dict`` returned; None begins with the present weights.
+        """Continue from a ``state_dict``; None begins with the present weights.
 
         Raises:
             ValueError: weights of another shape.

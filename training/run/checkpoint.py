@@ -1,9 +1,9 @@
 """Checkpoints: a policy file that also holds everything a run needs to continue as if it had never stopped.
 
-A checkpoint is a file of ``policy.native``'s format (contract, network, averaged weights of the student), so every command
-that takes a policy takes it. Beside these it has rsl_rl's usual entries (``actor_state_dict`` … ``iter``; the weights after the
-last update), ``average`` (the averaged networks) and ``training``, what only a resumed run reads. It holds tensors and plain data
-only and is read without the ability to run code.
+A checkpoint is a file of ``policy.native``'s format (contract, network, averaged weights of the student), so every command that takes a
+policy takes it. Beside these it has rsl_rl's usual entries (``actor_state_dict`` … ``iter``; the weights after the last update),
+``average`` (the averaged networks) and ``training``, what only a resumed run reads. It holds tensors and plain data only and is read
+without the ability to run code.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class CheckpointError(RuntimeError):
 
 
 def checkpoint_entries(contract: PolicyContract, network: StoredNetwork, extra: Mapping[str, Any]) -> dict[str, Any]:
-    """The dictionary of a checkpoint: the entries of a policy file, and ``extra``.
+    """Return the dictionary of a checkpoint: the entries of a policy file, and ``extra``.
 
     Raises:
         CheckpointError: ``extra`` holds something other than tensors and plain data, or takes a name of the policy
@@ -62,7 +62,7 @@ def checkpoint_entries(contract: PolicyContract, network: StoredNetwork, extra: 
 
 
 def _require_plain(name: str, value: Any) -> None:
-    """Refuse what could not be read back without running code."""
+    """Refuse values that could not be read back without running code."""
     if value is None or isinstance(value, bool | int | float | str | torch.Tensor):
         return
     if isinstance(value, Mapping):
@@ -79,7 +79,7 @@ def _require_plain(name: str, value: Any) -> None:
 
 
 def write_checkpoint(path: Path, entries: Mapping[str, Any]) -> None:
-    """Write a file that appears whole or not at all; whatever was there before survives a failure.
+    """Write a file that appears whole or not at all; an earlier file survives a failure.
 
     Raises:
         CheckpointError: the file cannot be written, for example because the disk is full.
@@ -111,7 +111,7 @@ def _whole(path: Path) -> Iterator[Path]:
 
 
 def rank_file(path: Path, rank: int) -> Path:
-    """Where process ``rank`` of a run keeps its part of a checkpoint."""
+    """Return the file with the part of process ``rank`` of a checkpoint."""
     return path.with_suffix(f".rank{rank}{path.suffix}")
 
 
@@ -120,10 +120,10 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: s
 
     Args:
         training_state: whether it must hold what training needs to continue; otherwise a policy file will do.
-        purpose: what it is read for, in the sentences on what is wrong.
+        purpose: of reading it, for the sentences on errors.
 
     Raises:
-        CheckpointError: no such file, damaged, no policy of this project, or a policy without what training needs.
+        CheckpointError: no such file, damaged, no policy of this project, or a policy without training state.
     """
     cannot = f"Cannot {purpose} '{one_line(path)}': it"
     entries = _load(Path(path), purpose)
@@ -132,7 +132,9 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: s
     if policy:
         _check_policy(entries, str(path), purpose)
     if not training_state and training is None and policy:
-        return entries
+        entries = _with_training_part(entries, Path(path), cannot)
+        if (training := entries.get("training")) is None:
+            return entries
     if not training_state and not policy:
         raise CheckpointError(
             f"{cannot} holds no networks of this project; give a model_<iteration>.pt of a training run or a .gauge.pt."
@@ -154,7 +156,7 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: s
 
 @dataclass(frozen=True, kw_only=True)
 class RunNumbers:
-    """What a checkpoint says of its run in numbers and names."""
+    """Numbers and names of a checkpoint's run."""
 
     task: Text
     iteration: Annotated[int, Field(ge=0, lt=2**53)]
@@ -168,7 +170,7 @@ class RunNumbers:
 
 
 def run_numbers(entries: Mapping[str, Any], path: Path) -> RunNumbers:
-    """The numbers of a checkpoint that ``read_checkpoint`` read with its training state.
+    """Return the numbers of a checkpoint that ``read_checkpoint`` read with its training state.
 
     Raises:
         CheckpointError: one is missing, of the wrong type or out of range.
@@ -181,8 +183,8 @@ def run_numbers(entries: Mapping[str, Any], path: Path) -> RunNumbers:
 
 
 def read_rank(path: Path, rank: int, written: Any) -> dict[str, Any] | None:
-    """What process ``rank`` of a run kept beside a checkpoint; None if there is nothing that was ``written`` with it: the first
-    process may have been the only one that came to write, or the checkpoint is a copy.
+    """Read the part of process ``rank`` of a checkpoint; None if none was ``written`` with it: the first process may have been the only
+    one that came to write, or the checkpoint is a copy.
 
     Raises:
         CheckpointError: the file is damaged or holds more than tensors and plain data.
@@ -208,7 +210,7 @@ def _load(file: Path, purpose: str) -> dict[str, Any]:
 
 
 def _check_policy(entries: Mapping[str, Any], source: str, purpose: str) -> None:
-    """Refuse a checkpoint whose policy is damaged, or a program: training goes on with weights."""
+    """Refuse a checkpoint with a damaged policy, or with a program: training goes on with weights."""
     try:
         _, network = read_policy(entries, source=source)
     except PolicyError as error:
@@ -221,25 +223,68 @@ def _check_policy(entries: Mapping[str, Any], source: str, purpose: str) -> None
 
 
 def reached(entries: Mapping[str, Any]) -> float:
-    """Fraction of its schedules that the run of a checkpoint or policy file had gone through; 1 where the file does not
-    say: who trains on from a finished policy wants what it was trained for at the end.
+    """Return the fraction of its schedules that the run of a file had gone through; 1 where the file does not say: a finished policy goes
+    on with the end of its schedules.
     """
     return min(float(entries.get("training", {}).get("progress", 1.0)), 1.0)
 
 
 def learned_networks(entries: Mapping[str, Any], *, raw: bool = False) -> Mapping[str, Any]:
-    """``actor_state_dict`` and ``critic_state_dict`` of a checkpoint: the averages where it has any, unless ``raw``."""
+    """Return ``actor_state_dict`` and ``critic_state_dict`` of a checkpoint: the averages where it has any, unless ``raw``."""
     return entries if raw else entries.get("average", entries)
 
 
 def student_state(actor: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The deployed network's part of an actor's state dictionary."""
+    """Return the deployed network's part of an actor's state dictionary."""
     return {n.removeprefix("student."): value for n, value in actor.items() if n.startswith("student.")}
 
 
+def training_part(policy: Path) -> Path:
+    """Return where the networks that only training needs lie beside a policy file: ``go2.training.pt`` of ``go2.gauge.pt``."""
+    return policy.with_name(f"{policy.name.removesuffix('.pt').removesuffix('.gauge')}.training.pt")
+
+
+def write_apart(source: str | Path, destination: Path) -> None:
+    """Write a file of ``trim_checkpoint`` in two: a policy file with what plays, and what only training reads beside it.
+
+    Raises:
+        CheckpointError: ``source`` is no such file, or one of the two cannot be written.
+    """
+    entries = read_checkpoint(source, training_state=False, purpose="use")
+    if "training" not in entries or "average" in entries:
+        raise CheckpointError(
+            f"Cannot use '{source}': it is no policy with teacher and critic; write one with import --trainable."
+        )
+    whole = {name: entries[name] for name in ("format", "version", "contract", "network", "state_dict")}
+    actor = entries["actor_state_dict"]
+    more = {n: value for n, value in actor.items() if not n.startswith("student.")}
+    rest: dict[str, Any] = {
+        name: entries[name] for name in ("critic_state_dict", "iter", "bootstrap", "training") if name in entries
+    }
+    write_checkpoint(destination, whole)
+    write_checkpoint(training_part(destination), {"policy": checksum(entries), "actor_state_dict": more, **rest})
+
+
+def _with_training_part(entries: dict[str, Any], path: Path, cannot: str) -> dict[str, Any]:
+    """Return a policy file's entries with what ``write_apart`` put beside it, where there is such a file.
+
+    Raises:
+        CheckpointError: the file beside it is damaged, or belongs to another policy.
+    """
+    part = training_part(path)
+    if part == path or not part.is_file():
+        return entries
+    beside = _load(part, "start from")
+    if beside.get("policy") != checksum(entries):
+        raise CheckpointError(f"{cannot} is not the policy that '{one_line(part)}' belongs to; move that file away.")
+    with edited(f"Cannot start from '{path}': '{one_line(part)}' beside it", CheckpointError, RuntimeError):
+        student = {f"student.{name}": value for name, value in entries["state_dict"].items()}
+        return {**entries, **beside, "actor_state_dict": {**beside["actor_state_dict"], **student}}
+
+
 def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False) -> None:
-    """Write a checkpoint's networks without what only resuming needs: a policy file from which training can begin anew
-    (``--init-from``), with its teacher and its critic.
+    """Write a checkpoint's networks without the state for resuming: a policy file from which training can begin anew (``--init-from``),
+    with its teacher and its critic.
 
     Args:
         raw: the weights after the last update instead of their average.

@@ -1,8 +1,8 @@
 """``python -m gaitgauge.training.run.child MODULE …`` is ``python -m MODULE …`` in a process that does not outlive its parent.
 
-A parent that is killed by SIGKILL can tell nobody. It gives its children a pipe as standard input
-(``side_process.parent_pipe``), in which nothing is ever written: with the parent, however it ends, the system closes the other end.
-The child then gets SIGTERM: a training writes a checkpoint, whatever else there is just ends.
+A parent that is killed by SIGKILL can tell nobody. It gives its children a pipe as standard input (``side_process.parent_pipe``), in
+which nothing is ever written: with the parent, however it ends, the system closes the other end. The child then gets SIGTERM: a training
+writes a checkpoint, whatever else there is just ends.
 """
 
 from __future__ import annotations

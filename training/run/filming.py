@@ -35,7 +35,7 @@ class Filmer:
     def take(
         self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False
     ) -> tuple[list[tuple[Path, int]], str]:
-        """Videos that were finished since the last call, with their iterations; and a sentence for people, if there is one.
+        """Return videos that were finished since the last call, with their iterations; and a sentence for people, if there is one.
 
         Args:
             seconds: longest wait for those that are pending [s].
@@ -62,9 +62,9 @@ class Filmer:
 
     @property
     def pending(self) -> int:
-        """How many videos are still to come."""
+        """Number of videos still to come."""
         return self._side.pending
 
     def close(self) -> None:
-        """Give up what is pending."""
+        """Give up pending videos."""
         self._side.close()

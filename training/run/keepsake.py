@@ -1,7 +1,7 @@
-"""The last good state of what a run learns, in the host's memory: what is left when another process is lost.
+"""Keep the last good state of a run's networks in the host's memory: it is left when another process is lost.
 
-A GPU that waits for a message from a lost process answers no more, so its memory is copied out after every iteration; the
-copy runs while the next rollout begins.
+A GPU that waits for a message from a lost process answers no more, so its memory is copied out after every iteration; the copy runs while
+the next rollout begins.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ class Keepsake:
             self._done.record(torch.cuda.current_stream(device))
 
     def take(self) -> Mapping[str, Any] | None:
-        """The copy, None if there is none."""
+        """Return the copy, None if there is none."""
         if self._done is not None:
             self._done.synchronize()
         return self._copy
 
 
 def host_copy(tree: Mapping[str, Any], device: torch.device | str) -> Mapping[str, Any]:
-    """A copy of a tree in the host's memory."""
+    """Return a copy of a tree in the host's memory."""
     copy: Mapping[str, Any] = _copied(tree, None)
     if torch.device(device).type == "cuda":
         torch.cuda.current_stream(device).synchronize()

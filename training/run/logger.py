@@ -1,4 +1,4 @@
-"""What a run logs: rsl_rl's scalars under rsl_rl's names, collected on the device, through rsl_rl's writers."""
+"""Log a run: rsl_rl's scalars under rsl_rl's names, collected on the device, through rsl_rl's writers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def check_logger(name: str) -> None:
     """Refuse a logger that cannot work here.
 
     Raises:
-        ConfigurationError: its package is not installed, or it does not know whose account to use.
+        ConfigurationError: its package is not installed, or it has no account to use.
     """
     if name not in _SERVICES:
         return
@@ -83,7 +83,7 @@ class RunLogger:
         device: str,
         has_teacher: bool = True,
     ) -> None:
-        """Without a writer nothing is written.
+        """Prepare; without a writer nothing is written.
 
         Args:
             configuration: steps of an iteration, and every which environment is a student's.
@@ -103,7 +103,7 @@ class RunLogger:
         """Their lengths [control steps]."""
         self.group_returns: dict[str, deque[float]] = {name: deque(maxlen=WINDOW) for name in ("teacher", "student")}
         self.scalars: dict[str, float] = {}
-        """What the last iteration wrote, by key."""
+        """Scalars of the last iteration, by key."""
         self.reward_sum = torch.zeros(num_envs, device=device)
         self.episode_length = torch.zeros(num_envs, device=device)
         self._finished = torch.zeros(steps, num_envs, dtype=torch.bool, device=device)
@@ -133,9 +133,7 @@ class RunLogger:
             self._entries.append((tuple(entries), torch.stack([v.to(device, torch.float32) for v in values])))
 
     def collect(self) -> dict[str, float]:
-        """Take the iteration's finished episodes and mean ``log`` entries to the host; entries that are NaN in a step
-        do not count.
-        """
+        """Take the iteration's finished episodes and mean ``log`` entries to the host; entries that are NaN in a step do not count."""
         rows = self._finished.nonzero()
         finished = torch.stack(
             (self._returns[self._finished], self._lengths[self._finished], rows[:, 1].float()), dim=1
@@ -193,12 +191,12 @@ class RunLogger:
 
     @property
     def _in_order(self) -> bool:
-        """Whether the writer's service takes steps in rising order only."""
+        """True if the writer's service takes steps in rising order only."""
         return hasattr(self.writer, "save_model")
 
     def write(self, scalars: Mapping[str, float], iteration: int) -> None:
-        """Write scalars if there is a writer. What comes late, such as a score, is at the present iteration where the
-        service drops what is behind it.
+        """Write scalars if there is a writer. A late figure, such as a score, is written at the present iteration where the service drops
+        earlier ones.
         """
         if self._in_order:
             iteration = self._latest = max(iteration, self._latest)
@@ -215,7 +213,7 @@ class RunLogger:
                 self.writer.save_video(path, max(iteration, self._latest))
 
     def flush(self) -> None:
-        """Bring what was written to the disk."""
+        """Flush the writer to the disk."""
         if self.writer is not None:
             self.writer.flush()
 
@@ -228,7 +226,7 @@ class RunLogger:
         self.writer = None
 
     def state_dict(self) -> dict[str, Any]:
-        """What continues across a resume: totals, running episodes and the window of finished ones."""
+        """Return the state that continues across a resume: totals, running episodes and the window of finished ones."""
         return {
             "total_steps": self.total_steps,
             "total_time": self.total_time,
@@ -240,7 +238,7 @@ class RunLogger:
         }
 
     def load_state_dict(self, state: Mapping[str, Any], *, running: bool) -> None:
-        """Take over what ``state_dict`` returned.
+        """Take over a ``state_dict``.
 
         Args:
             running: whether the environments' episodes run on; theirs are then taken over too.
@@ -259,5 +257,5 @@ class RunLogger:
 
 
 def _window(values: Iterable[Any]) -> deque[float]:
-    """The last of some numbers."""
+    """Return the last of some numbers."""
     return deque(map(float, values), maxlen=WINDOW)

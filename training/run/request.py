@@ -1,4 +1,4 @@
-"""Say what is to be trained. The command line and the Python API are made of these fields."""
+"""Describe a training. The command line and the Python API are made of these fields."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ...files import MOST_THREADS
 from ...files.choices import PLACE, PLAYED, SCORES, SPAN, WRITTEN, Choice
 
 LOG_ROOT = Path("logs/rsl_rl")
-"""Where training runs lie: ``<LOG_ROOT>/<experiment>/<run>/``."""
+"""Root of the training runs: ``<LOG_ROOT>/<experiment>/<run>/``."""
 QUICK_SUITE = "quick"
 """Suite of the scores of checkpoints."""
 
@@ -115,6 +115,20 @@ class TrainRequest:
         Le(MOST_THREADS),
         Choice("CPU threads of the side process. Default: half of the machine.", SCORES),
     ] = None
+
+    def own_overrides(self) -> list[str]:
+        """Return options and settings as overrides, options first, so that a setting spelled out wins."""
+        options = {
+            "environment.num_envs": self.num_envs,
+            "environment.seed": self.seed,
+            "training.run.seed": self.seed,
+            "training.run.iterations": self.iterations,
+            "training.run.run_name": self.run_name,
+            "training.run.gauge_interval": self.score_every,
+            "training.run.video_interval": self.video_every,
+            "training.run.logger": self.logger,
+        }
+        return [f"{key}={value}" for key, value in options.items() if value is not None] + list(self.overrides)
 
     def __post_init__(self) -> None:
         """Check the types and ranges of all fields."""

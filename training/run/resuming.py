@@ -1,4 +1,4 @@
-"""What of a run goes into its checkpoints, and how a run continues from one or begins with its networks."""
+"""Write a run into checkpoints, continue it from one, or begin a run with the networks of one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -16,8 +16,9 @@ from ...policy.finding import latest_checkpoint
 from ...policy.native import StoredNetwork
 from ...policy.networks.estimators import VELOCITY
 from ..algorithms.bootstrap import iterations_left
-from ..algorithms.methods import METHODS
+from ..algorithms.methods import find_method
 from ..networks import Widths, command_entries
+from ..tasks import Task
 from .checkpoint import (
     TRAINING_VERSION,
     CheckpointError,
@@ -34,55 +35,52 @@ from .checkpoint import (
 from .keepsake import host_copy
 from .run_directory import read_run_json
 from .seeding import random_state, restore_random_state
-
-if TYPE_CHECKING:
-    from ..tasks import Task
-    from .runner import TrainingRunner
+from .state import RunState
 
 
 class TrainingDivergedError(RuntimeError):
-    """Too many numbers are not finite for training to go on; the message says which and what survives."""
+    """Too many numbers are not finite for training to go on; the message names them and the surviving checkpoint."""
 
 
-def what_is_left(run: Path | None) -> str:
-    """A sentence on the last checkpoint of a run directory, behind another one; empty where there is none."""
+def intact_checkpoint(run: Path | None) -> str:
+    """Return a sentence on the last checkpoint of a run directory, behind another one; empty where there is none."""
     last = None if run is None else latest_checkpoint(run)
     return "" if last is None else f" The last checkpoint, '{last}', is intact."
 
 
-def stored_network(runner: TrainingRunner, average: Mapping[str, Any] | None = None) -> StoredNetwork:
-    """The student as it is deployed: with averaged weights."""
-    actor = runner.alg.actor
-    weights = student_state((average or runner.average.state_dict())["actor_state_dict"])
+def stored_network(run: RunState, average: Mapping[str, Any] | None = None) -> StoredNetwork:
+    """Return the student as it is deployed: with averaged weights."""
+    actor = run.alg.actor
+    weights = student_state((average or run.average.state_dict())["actor_state_dict"])
     return StoredNetwork(architecture=actor.architecture, arguments=actor.arguments, state_dict=weights)
 
 
-def save_run(runner: TrainingRunner, path: Path) -> None:
+def save_run(run: RunState, path: Path) -> None:
     """Write a checkpoint; other processes than the first write only their own environment and random states beside it.
 
     Raises:
         TrainingDivergedError: a weight is not finite.
         CheckpointError: the file cannot be written.
     """
-    kept = "state_dict" if runner.configuration.run.keep_episodes else "progress_dict"
+    kept = "state_dict" if run.configuration.run.keep_episodes else "progress_dict"
     local = {
-        "random": random_state(runner.device),
-        "environment": getattr(runner.env, kept)() if hasattr(runner.env, kept) else None,
-        "num_envs": runner.env.num_envs,
-        "log": runner.logger.state_dict(),
+        "random": random_state(run.device),
+        "environment": getattr(run.env, kept)() if hasattr(run.env, kept) else None,
+        "num_envs": run.env.num_envs,
+        "log": run.logger.state_dict(),
     }
-    if runner.processes.several:
-        local["written"] = f"{runner.learning} {runner.iteration}"
-    if runner.processes.rank != 0:
-        write_checkpoint(rank_file(path, runner.processes.rank), local)
+    if run.processes.several:
+        local["written"] = f"{run.learning} {run.iteration}"
+    if run.processes.rank != 0:
+        write_checkpoint(rank_file(path, run.processes.rank), local)
         return
-    learned = host_copy(runner.learned(), runner.device)
-    write_learned(runner, path, learned, local | {"world_size": runner.processes.count})
-    runner.logger.send(path, runner.iteration)
+    learned = host_copy(run.learned(), run.device)
+    write_learned(run, path, learned, local | {"world_size": run.processes.count})
+    run.logger.send(path, run.iteration)
 
 
-def write_learned(runner: TrainingRunner, path: Path, learned: Mapping[str, Any], local: Mapping[str, Any]) -> None:
-    """Write a checkpoint of what was learned, in the host's memory, and of what this process holds beside it.
+def write_learned(run: RunState, path: Path, learned: Mapping[str, Any], local: Mapping[str, Any]) -> None:
+    """Write a checkpoint of learned networks, in the host's memory, and of this process's own state.
 
     Raises:
         TrainingDivergedError: a weight is not finite.
@@ -91,84 +89,84 @@ def write_learned(runner: TrainingRunner, path: Path, learned: Mapping[str, Any]
     for part in ("actor_state_dict", "critic_state_dict"):
         if not all(bool(torch.isfinite(value).all()) for value in learned[part].values()):
             raise TrainingDivergedError(
-                f"A weight in {part} is not finite; '{path}' was not written.{what_is_left(path.parent)}"
+                f"A weight in {part} is not finite; '{path}' was not written.{intact_checkpoint(path.parent)}"
             )
     training = {
         **local,
         "version": TRAINING_VERSION,
-        "task": runner.task,
-        "settings": runner.settings,
-        "progress": float(getattr(runner.env, "progress", 1.0)),
-        "best_score": runner.best_score,
-        "best_iteration": runner.best_iteration,
+        "task": run.task,
+        "settings": run.settings,
+        "progress": float(getattr(run.env, "progress", 1.0)),
+        "best_score": run.best_score,
+        "best_iteration": run.best_iteration,
     }
-    provenance = dict(runner.contract.provenance) | {
-        "task": runner.task,
-        "run": runner.log_dir.name if runner.log_dir else "",
-        "iteration": runner.iteration,
-        "environment_steps": runner.logger.total_steps,
+    provenance = dict(run.contract.provenance) | {
+        "task": run.task,
+        "run": run.log_dir.name if run.log_dir else "",
+        "iteration": run.iteration,
+        "environment_steps": run.logger.total_steps,
     }
-    contract = replace(runner.contract, provenance=provenance)
-    extra = {**learned, "iter": runner.iteration, "infos": None, "training": training}
-    write_checkpoint(path, checkpoint_entries(contract, stored_network(runner, learned["average"]), extra))
+    contract = replace(run.contract, provenance=provenance)
+    extra = {**learned, "iter": run.iteration, "infos": None, "training": training}
+    write_checkpoint(path, checkpoint_entries(contract, stored_network(run, learned["average"]), extra))
 
 
-def resume_run(runner: TrainingRunner, path: Path) -> None:
+def resume_run(run: RunState, path: Path) -> None:
     """Continue from a checkpoint as if the run had never stopped.
 
     Episodes start anew, at the point of the schedules and on the levels that the checkpoint knows, where the environment has no
-    ``load_state_dict``, the number of processes is another one, or a process finds no part of its own beside the checkpoint; this
-    is said through the runner's ``message``.
+    ``load_state_dict``, the number of processes is another one, or a process finds no part of its own beside the checkpoint; this is said
+    through the runner's ``message``.
 
     Raises:
         CheckpointError: damaged, of another task, contract, network or number of environments.
     """
     entries = read_checkpoint(path)
     numbers = run_numbers(entries, path)
-    _check_fits(runner, path, entries, numbers)
+    _check_fits(run, path, entries, numbers)
     with edited(f"Cannot resume from '{path}': its training state", CheckpointError, RuntimeError):
-        whole = _take_over(runner, path, entries, numbers)
-    if numbers.world_size == runner.processes.count and (
-        lacking := runner.processes.largest(0 if whole else runner.processes.rank)
+        whole = _take_over(run, path, entries, numbers)
+    if numbers.world_size == run.processes.count and (
+        lacking := run.processes.largest(0 if whole else run.processes.rank)
     ):
-        runner.message(
+        run.message(
             f"'{path}' has no part of process {lacking} beside it that was written with it: episodes of such a process "
             "start anew, on the levels of the first."
         )
 
 
-def _take_over(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> bool:
-    """Returns whether this process had a part of the checkpoint to itself."""
+def _take_over(run: RunState, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> bool:
+    """Return True if this process had a part of the checkpoint to itself."""
     training = entries["training"]
     try:
-        runner.alg.load(entries)
+        run.alg.load(entries)
     except (RuntimeError, KeyError, ValueError) as error:
         raise _misfit("resume", path, error) from error
-    runner.average.load_state_dict(entries.get("average"))
+    run.average.load_state_dict(entries.get("average"))
     if "average" not in entries:
-        runner.message(f"'{path}' holds no average of weights: it begins here.")
-    runner.iteration = numbers.iteration
-    runner.best_score, runner.best_iteration = numbers.best_score, numbers.best_iteration
+        run.message(f"'{path}' holds no average of weights: it begins here.")
+    run.iteration = numbers.iteration
+    run.best_score, run.best_iteration = numbers.best_score, numbers.best_iteration
     # A score may have come back, and best.pt been replaced, after the checkpoint was written.
-    noted = read_run_json(runner.log_dir) if runner.log_dir else {}
-    if (score := noted.get("best_score")) is not None and (runner.best_score is None or score > runner.best_score):
-        runner.best_score, runner.best_iteration = score, noted.get("best_iteration")
+    noted = read_run_json(run.log_dir) if run.log_dir else {}
+    if (score := noted.get("best_score")) is not None and (run.best_score is None or score > run.best_score):
+        run.best_score, run.best_iteration = score, noted.get("best_iteration")
     local: Mapping[str, Any] | None = None
-    if numbers.world_size == runner.processes.count:
-        rank = runner.processes.rank
+    if numbers.world_size == run.processes.count:
+        rank = run.processes.rank
         local = read_rank(path, rank, training.get("written")) if rank else training
     if local is not None:
-        runner.fresh = not (_load_environment(runner, path, local["environment"]) and _runs_on(runner, local))
-        restore_random_state(_table(local["random"]), runner.device)
+        run.fresh = not (_load_environment(run, path, local["environment"]) and _runs_on(run, local))
+        restore_random_state(_table(local["random"]), run.device)
     else:
-        where = _begin_anew(runner, path, training, numbers)
-        runner.fresh = True
-        if numbers.world_size != runner.processes.count:
-            runner.message(
+        where = _begin_anew(run, path, training, numbers)
+        run.fresh = True
+        if numbers.world_size != run.processes.count:
+            run.message(
                 f"'{path}' was written by {numbers.world_size or 'what was left of several'} processes, not "
-                f"{runner.processes.count}: episodes start anew{where}."
+                f"{run.processes.count}: episodes start anew{where}."
             )
-    runner.logger.load_state_dict(_table((training if local is None else local)["log"]), running=not runner.fresh)
+    run.logger.load_state_dict(_table((training if local is None else local)["log"]), running=not run.fresh)
     return local is not None
 
 
@@ -178,41 +176,41 @@ def _table(value: Any) -> Mapping[str, Any]:
     return value
 
 
-def begin_with(runner: TrainingRunner, path: Path) -> None:
+def begin_with(run: RunState, path: Path) -> None:
     """Begin with the averaged networks of another run's checkpoint; optimizers, counters and episodes start anew.
 
-    A policy file without training state gives the student alone; the first ``run.bootstrap_iterations`` then find
-    a teacher and a critic for it. A checkpoint that was written among them has some of them left, which come first here, too.
+    A policy file without training state gives the student alone; the first ``run.bootstrap_iterations`` then find a teacher and a critic
+    for it. A checkpoint that was written among them has some of them left, which come first here, too.
 
     Raises:
         CheckpointError: damaged, of other joints or another observation, or of other networks.
     """
     entries = read_checkpoint(path, training_state=False, purpose="start from")
     with edited(f"Cannot start from '{path}': it", CheckpointError, RuntimeError):
-        _begin(runner, path, entries)
+        _begin(run, path, entries)
 
 
-def _begin(runner: TrainingRunner, path: Path, entries: Mapping[str, Any]) -> None:
+def _begin(run: RunState, path: Path, entries: Mapping[str, Any]) -> None:
     theirs = PolicyContract.from_json(entries["contract"])
     for name in ("joint_names", "observation", "action_scale", "default_joint_position"):
-        if getattr(theirs, name) != getattr(runner.contract, name):
+        if getattr(theirs, name) != getattr(run.contract, name):
             raise CheckpointError(
                 f"Cannot start from '{path}': its {name} is {one_line(getattr(theirs, name))}, this run's is "
-                f"{one_line(getattr(runner.contract, name))}."
+                f"{one_line(getattr(run.contract, name))}."
             )
     if bare := "training" not in entries:
-        left = runner.configuration.run.bootstrap_iterations
+        left = run.configuration.run.bootstrap_iterations
     else:
         left = iterations_left(entries["bootstrap"]) if "bootstrap" in entries else 0
     try:
         if bare:
-            runner.alg.actor.student.load_state_dict(entries["state_dict"])
+            run.alg.actor.student.load_state_dict(entries["state_dict"])
         else:
-            runner.alg.load(learned_networks(entries), optimizers=False)
-        runner.alg.follow_student(left)
+            run.alg.load(learned_networks(entries), optimizers=False)
+        run.alg.follow_student(left)
     except (RuntimeError, KeyError, ValueError) as error:
         raise _misfit("start", path, error) from error
-    runner.average.load_state_dict(None)
+    run.average.load_state_dict(None)
 
 
 def _misfit(verb: str, path: Path, error: Exception) -> CheckpointError:
@@ -221,12 +219,12 @@ def _misfit(verb: str, path: Path, error: Exception) -> CheckpointError:
     )
 
 
-def _load_environment(runner: TrainingRunner, path: Path, state: Any) -> bool:
-    if state is None or not hasattr(runner.env, "load_state_dict"):
-        runner.message(f"'{path}' holds no state of the environment: episodes start anew.")
+def _load_environment(run: RunState, path: Path, state: Any) -> bool:
+    if state is None or not hasattr(run.env, "load_state_dict"):
+        run.message(f"'{path}' holds no state of the environment: episodes start anew.")
         return False
     try:
-        runner.env.load_state_dict(_table(state))
+        run.env.load_state_dict(_table(state))
     except (ValueError, KeyError, RuntimeError) as error:
         raise CheckpointError(
             f"Cannot resume from '{path}': its environment does not fit this run's settings: {one_line(error)}"
@@ -234,26 +232,26 @@ def _load_environment(runner: TrainingRunner, path: Path, state: Any) -> bool:
     return True
 
 
-def _runs_on(runner: TrainingRunner, local: Mapping[str, Any]) -> bool:
-    """Whether a checkpoint holds running episodes; of an environment of another kind, the settings tell."""
+def _runs_on(run: RunState, local: Mapping[str, Any]) -> bool:
+    """Return True if a checkpoint holds running episodes; for an environment of another kind, the settings tell."""
     state = local["environment"]
-    return "memory" in state if "bodies" in state else runner.configuration.run.keep_episodes
+    return "memory" in state if "bodies" in state else run.configuration.run.keep_episodes
 
 
-def _begin_anew(runner: TrainingRunner, path: Path, training: Mapping[str, Any], numbers: RunNumbers) -> str:
-    """Begin new episodes where the run was: at its point of the schedules, on the levels of its first process, whose worlds
-    have the same kinds of tiles as any other's.
+def _begin_anew(run: RunState, path: Path, training: Mapping[str, Any], numbers: RunNumbers) -> str:
+    """Begin new episodes where the run was: at its point of the schedules, on the levels of its first process: the worlds of every
+    process have the same kinds of tiles.
 
     Returns:
         Where that is, the rest of a sentence; empty for an environment that has neither.
     """
-    env: Any = runner.env
+    env: Any = run.env
     own = env.progress_dict() if hasattr(env, "progress_dict") else {}
     if not own.keys() >= {"step", "level"}:
         return ""
     state = _table(training["environment"]) if training.get("environment") is not None else {}
     reached = _table(state.get("memory", state))
-    done = numbers.iteration * runner.configuration.run.steps_per_iteration
+    done = numbers.iteration * run.configuration.run.steps_per_iteration
     if "step" in reached:
         own["step"] = reached["step"]
     elif "progress" in training:
@@ -262,20 +260,20 @@ def _begin_anew(runner: TrainingRunner, path: Path, training: Mapping[str, Any],
         own["step"] = own["step"] + done
     own["level"] = reached.get("level", own["level"])
     own["common_step_counter"] = state.get("common_step_counter", done)
-    _load_environment(runner, path, own)
+    _load_environment(run, path, own)
     levels = "on the levels reached and " if "level" in reached else ""
     return f", {levels}at {100.0 * float(env.progress):.0f} % of the schedules"
 
 
-def _check_fits(runner: TrainingRunner, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> None:
-    if numbers.task != runner.task:
+def _check_fits(run: RunState, path: Path, entries: Mapping[str, Any], numbers: RunNumbers) -> None:
+    if numbers.task != run.task:
         raise CheckpointError(
-            f"Cannot resume from '{path}': it is of task '{numbers.task}', this run trains '{runner.task}'."
+            f"Cannot resume from '{path}': it is of task '{numbers.task}', this run trains '{run.task}'."
         )
-    if lines := difference(PolicyContract.from_json(entries["contract"]), runner.contract):
+    if lines := difference(PolicyContract.from_json(entries["contract"]), run.contract):
         first = lines.splitlines()[0]
         raise CheckpointError(f"Cannot resume from '{path}': its policy contract differs from this task's: {first}")
-    check_environments(path, numbers.num_envs, runner.env.num_envs)
+    check_environments(path, numbers.num_envs, run.env.num_envs)
 
 
 def check_environments(path: Path, theirs: int, mine: int) -> None:
@@ -292,7 +290,7 @@ def check_environments(path: Path, theirs: int, mine: int) -> None:
 
 
 def check_network(path: Path, entries: Mapping[str, Any], task: Task, verb: str) -> None:
-    """Refuse to ``resume`` or ``start`` from a file whose network is not the one that a task trains; nothing is built for it.
+    """Refuse to ``resume`` or ``start`` from a file with another network than a task trains; nothing is built for it.
 
     Raises:
         CheckpointError: it is not.
@@ -304,12 +302,12 @@ def check_network(path: Path, entries: Mapping[str, Any], task: Task, verb: str)
         environments=1,
         frame=contract.frame_width,
         history=task.environment.observations.history_length,
-        privileged=VELOCITY + contract.frame_width,  # seen by what only training has
+        privileged=VELOCITY + contract.frame_width,  # seen by the teacher and the critic alone
         actions=len(contract.joint_names),
         command_entries=command_entries(contract),
     )
     with torch.device("meta"):
-        mine, _ = METHODS[training.algorithm.method].networks(training, widths)
+        mine, _ = find_method(training.algorithm.method).networks(training, widths)
     with edited(cannot, CheckpointError):
         its, given = str(entries["network"]["architecture"]), dict(json.loads(entries["network"]["arguments"]))
     own = mine.arguments

@@ -1,7 +1,7 @@
 """The folder that a training run leaves behind, laid out as users of rsl_rl and Isaac Lab know it.
 
-``logs/rsl_rl/<experiment>/<YYYY-MM-DD_HH-MM-SS>[_<run_name>]/`` with ``model_<iteration>.pt``, ``best.pt`` (chosen by
-the gauge's score), ``params/env.yaml`` and ``params/agent.yaml``, ``run.json`` and TensorBoard's event files.
+``logs/rsl_rl/<experiment>/<YYYY-MM-DD_HH-MM-SS>[_<run_name>]/`` with ``model_<iteration>.pt``, ``best.pt`` (chosen by the gauge's score),
+``params/env.yaml`` and ``params/agent.yaml``, ``run.json`` and TensorBoard's event files.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def new_run_directory(root: Path, experiment: str, run_name: str = "", now: date
 def find_checkpoint(
     choice: str, *, experiment: str, task: str = "", root: Path = LOG_ROOT, others: Sequence[str] = ()
 ) -> Path:
-    """The checkpoint that ``--resume`` or ``--init-from`` names: ``latest`` (of the experiment), a run directory (its last), or a
+    """Return the checkpoint that ``--resume`` or ``--init-from`` names: ``latest`` (of the experiment), a run directory (its last), or a
     file; ``others`` are the names that the option takes besides.
 
     Raises:
@@ -104,7 +104,7 @@ def write_parameters(run: Path, *, environment: Any, agent: Any) -> None:
 def describe_run(
     *, task: str, backend: str, num_envs: int, seed: int, device: str, contract: PolicyContract
 ) -> dict[str, Any]:
-    """What ``run.json`` says about where and with what a run was made."""
+    """Return the entries of ``run.json`` on the place and the parts of a run."""
     return {
         "task": task,
         "backend": backend,
@@ -117,7 +117,7 @@ def describe_run(
 
 @dataclass(frozen=True, kw_only=True)
 class _Noted:
-    """What readers of a ``run.json`` take for granted."""
+    """Entries that readers of a ``run.json`` rely on."""
 
     task: Text = ""
     outcome: Text = ""
@@ -130,7 +130,7 @@ class _Noted:
 
 
 def read_run_json(run: Path) -> dict[str, Any]:
-    """Entries of a run directory's ``run.json``, none if there is no such file.
+    """Return the entries of a run directory's ``run.json``, none if there is no such file.
 
     Raises:
         CheckpointError: it is damaged.
@@ -144,7 +144,7 @@ def read_run_json(run: Path) -> dict[str, Any]:
 
 
 def refuse_links(run: Path) -> None:
-    """Refuse to go on in a run directory that leads elsewhere: training writes to its folders, whoever made them.
+    """Refuse to go on in a run directory that leads elsewhere: training writes to its folders.
 
     Raises:
         CheckpointError: there is a link to a folder, or a link in one of its folders.

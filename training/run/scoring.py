@@ -7,9 +7,9 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from ...files.parsing import edited, read_results
+from ...files.parsing import read_results
+from ...gauge.result import Result
 from ...gauge.suite import load_suite
 from .side_process import CHILD_PROGRAM, Finished, Job, SideProcess
 
@@ -19,7 +19,7 @@ GAUGE_FOLDER = "gauge"
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreReport:
-    """What became of one submitted checkpoint."""
+    """The scores of one submitted checkpoint, or the reason why there are none."""
 
     path: Path
     iteration: int
@@ -61,7 +61,7 @@ class Scorer:
 
     @property
     def pending(self) -> int:
-        """How many submitted checkpoints have not been reported."""
+        """Number of submitted checkpoints that have not been reported."""
         return self._side.pending
 
     def drain(self, seconds: float, stop: Callable[[], bool] = lambda: False) -> list[ScoreReport]:
@@ -82,25 +82,24 @@ def _report(finished: Finished) -> ScoreReport:
         failure = "skipped: gauging is slower than training; raise gauge_interval"
     elif not failure:
         try:
-            with edited("it", ValueError):
-                scores = scores_of(read_results(job.output, "results", ValueError))
+            scores = scores_of(Result.from_data(read_results(job.output, "results", ValueError), "it", ValueError))
         except ValueError as error:
             failure = f"the gauge's output {job.output} cannot be read: {error}"
     return ScoreReport(path=job.checkpoint, iteration=job.iteration, scores=scores, failure=failure)
 
 
-def scores_of(results: Any) -> Mapping[str, float]:
-    """What is worth a curve in a ``results.json``: the score, each terrain's level and score, the groups of metrics.
+def scores_of(result: Result) -> Mapping[str, float]:
+    """Return what is worth a curve in a result: the score, each terrain's level and score, the groups of metrics.
 
     Raises:
-        ValueError: the results hold no score.
+        ValueError: the result holds no score.
     """
-    if results.get("score") is None:
+    if result.score is None:
         raise ValueError("there is no score in it")
-    scores = {"score": float(results["score"])}
-    for terrain, row in results["terrains"].items():
-        if row.get("level") is not None:
-            scores[f"level/{terrain}"] = float(row["level"])
-        if "mean" in row:
-            scores[f"terrain/{terrain}"] = float(row["mean"])
-    return scores | {f"group/{name}": float(value) for name, value in results["groups"].items()}
+    scores = {"score": result.score}
+    for terrain, row in result.terrains.items():
+        if row.level is not None:
+            scores[f"level/{terrain}"] = row.level
+        if row.mean is not None:
+            scores[f"terrain/{terrain}"] = row.mean
+    return scores | {f"group/{name}": value for name, value in result.groups.items()}

@@ -23,7 +23,7 @@ def seed_everything(seed: int) -> None:
 
 
 def random_state(device: torch.device | str) -> dict[str, Any]:
-    """States of the global generators of Python, NumPy and PyTorch (CPU and ``device``), as tensors and plain data."""
+    """Return the states of the global generators of Python, NumPy and PyTorch (CPU and ``device``), as tensors and plain data."""
     version, words, gauss = random.getstate()
     name, keys, position, has_gauss, cached = np.random.get_state()  # type: ignore[misc]
     state: dict[str, Any] = {
@@ -43,7 +43,7 @@ def random_state(device: torch.device | str) -> dict[str, Any]:
 
 
 def restore_random_state(state: Mapping[str, Any], device: torch.device | str) -> None:
-    """Put back what ``random_state`` returned; a missing GPU state leaves that generator as it is.
+    """Put back a ``random_state``; a missing GPU state leaves that generator as it is.
 
     Raises:
         ValueError: NumPy's generator would read outside its own words.

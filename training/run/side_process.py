@@ -17,7 +17,7 @@ from ...files.parsing import one_line
 PROGRAM = (sys.executable, "-m", f"{__name__.partition('.')[0]}.cli.main")
 """This package's command line."""
 CHILD_PROGRAM = (*PROGRAM[:2], f"{__package__}.child", PROGRAM[-1])
-"""The same in a process whose standard input is ``parent_pipe()``: when this one is gone, it is asked to stop."""
+"""The same command line with ``parent_pipe()`` as standard input: it is asked to stop when this process is gone."""
 ENVIRONMENT: Mapping[str, str] = {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
 """A side process has no business on the GPU that trains."""
 
@@ -28,24 +28,24 @@ class Job:
 
     command: Sequence[str]
     checkpoint: Path
-    """What it is about."""
+    """Checkpoint that the command is about."""
     iteration: int
     output: Path
-    """Where its standard output goes."""
+    """File of its standard output."""
 
     @property
     def log(self) -> Path:
-        """Where its standard error goes."""
+        """Return file of its standard error."""
         return self.output.with_suffix(".log")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finished:
-    """What became of a job."""
+    """Result of a job."""
 
     job: Job
     failure: str
-    """Why it failed, in one sentence; empty if it did not."""
+    """Reason of a failure, in one sentence; empty for success."""
 
 
 class SideProcess:
@@ -64,7 +64,7 @@ class SideProcess:
         self._start_next()
 
     def poll(self) -> list[Finished]:
-        """Jobs that ended since the last call, without waiting."""
+        """Return jobs that ended since the last call, without waiting."""
         if self._running is not None:
             job, process = self._running
             if (code := process.poll()) is not None:
@@ -86,7 +86,7 @@ class SideProcess:
 
     @property
     def pending(self) -> int:
-        """How many submitted jobs have not been returned by ``poll``."""
+        """Number of submitted jobs that ``poll`` has not returned."""
         return len(self._waiting) + (self._running is not None) + len(self._finished)
 
     def close(self) -> None:
@@ -105,7 +105,7 @@ class SideProcess:
         try:
             job.output.parent.mkdir(parents=True, exist_ok=True)
             with job.output.open("wb") as out, job.log.open("wb") as log:
-                # A session of its own: Ctrl-C in the terminal is for the training, which decides what becomes of the rest.
+                # A session of its own: Ctrl-C in the terminal is for the training, which decides on the rest.
                 process = subprocess.Popen(
                     list(job.command),
                     stdin=parent_pipe(),
@@ -124,7 +124,7 @@ class SideProcess:
 
 @cache
 def parent_pipe() -> int:
-    """The standard input of ``CHILD_PROGRAM``: a pipe in which nothing is written, open as long as this process lives."""
+    """Return the standard input of ``CHILD_PROGRAM``: a pipe in which nothing is written, open as long as this process lives."""
     child_end, _ = os.pipe()
     return child_end
 

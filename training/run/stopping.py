@@ -1,4 +1,4 @@
-"""How a training run tells about itself, and how it is asked to stop."""
+"""Report a training run's progress, and handle the signals that ask it to stop."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from types import FrameType, TracebackType
 from typing import Any
 
 STOP_SIGNALS = tuple(known for known in signal.Signals if known.name in ("SIGTERM", "SIGINT", "SIGHUP"))
-"""What asks for an orderly stop; Windows has no SIGHUP."""
+"""Signals that ask for an orderly stop; Windows has no SIGHUP."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOutcome:
-    """How a call of ``learn`` ended."""
+    """Result of a call of ``learn``."""
 
     reason: str
     """``finished``, ``time`` (limit reached) or ``signal``."""
@@ -31,22 +31,22 @@ class TrainingOutcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """What a progress display gets after every iteration."""
+    """Figures for a progress display after every iteration."""
 
     iteration: int
     total_iterations: int
     elapsed: float
     """Wall-clock time of this call of ``learn`` [s]."""
     scalars: Mapping[str, float]
-    """What was logged, by key; see ``docs/training.md``."""
+    """Logged scalars by key."""
     best_score: float | None
     """Best score of the gauge so far."""
     best_iteration: int | None
 
 
 class StopSignals:
-    """While active, SIGTERM, SIGINT and SIGHUP ask for an orderly stop; a second SIGINT interrupts at once. Under ``nohup``, where
-    SIGHUP is ignored, it stays so.
+    """While active, SIGTERM, SIGINT and SIGHUP ask for an orderly stop; a second SIGINT interrupts at once. Under ``nohup``, where SIGHUP
+    is ignored, it stays so.
     """
 
     def __init__(self, message: Callable[[str], None], *, interrupts: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""One call of a sweep, from its plan to what is kept, with the folders that it writes to locked."""
+"""Carry out one call of a sweep, from its plan to the kept runs, with the folders that it writes to locked."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from .sharing import shared_gpus
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """What the folder of ``--keep`` has now."""
+    """Contents of the folder of ``--keep``."""
 
     labels: Sequence[str]
     """Runs that were kept by this call."""
     unkept: Mapping[str, str]
-    """Why runs could not be kept, by label, beside what failed before."""
+    """Reasons why runs could not be kept, by label, besides earlier failures."""
     there: int
-    """How many of the call's runs it holds."""
+    """Number of the call's runs that it holds."""
     to_gauge: int
-    """How many of these are not gauged yet."""
+    """Number of those that are not gauged yet."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepCall:
-    """What became of a call."""
+    """Result of a call."""
 
     runs: Sequence[SweepRun]
     refused: Mapping[str, str]
-    """Why entries cannot start, by name."""
+    """Reasons why entries cannot start, by name."""
     outcome: SweepOutcome
     found: Mapping[str, Any]
     """As ``fold_sweep``."""
@@ -46,7 +46,7 @@ class SweepCall:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Why runs failed, by label."""
+        """Return reasons why runs failed, by label."""
         return _failures(self.runs, self.found)
 
 
@@ -62,13 +62,13 @@ def work_through(
     keep: Path | None,
     say: Callable[[str], None],
 ) -> SweepCall | None:
-    """Do what is left of a sweep, write its tables, and keep what is trained.
+    """Do the rest of a sweep, write its tables, and keep trained runs.
 
     Args:
         folder: its own, absolute.
         threads, per_gpu, gauging, deadline: as of ``Jobs``.
-        report: write the tables of what is there, and start nothing.
-        keep: folder of what is kept; None for none.
+        report: write the tables of present results, and start nothing.
+        keep: folder of kept runs; None for none.
         say: called with a sentence now and then.
 
     Returns:
@@ -81,7 +81,7 @@ def work_through(
     if folder.exists() and not folder.is_dir():
         raise SweepError(f"'{folder}' is a file; give another folder with --out")
     make_folder(folder, SweepError)
-    if keep is not None:  # what is wrong with it is said before hours of training
+    if keep is not None:  # errors in it are reported before hours of training
         make_folder(keep, SweepError, option="--keep")
         if keep.samefile(folder):
             raise SweepError(f"--keep is '{keep}', the sweep's own folder; give another one")
@@ -131,7 +131,7 @@ def _failures(runs: Sequence[SweepRun], found: Mapping[str, Any]) -> dict[str, s
 
 
 def _keep(sweep: Sweep, runs: Sequence[SweepRun], folder: Path, failed: Mapping[str, str]) -> Kept:
-    """Keep what is trained in a folder, with a page and a table of all that it holds."""
+    """Keep trained runs in a folder, with a page and a table of all that it holds."""
     with _locked(folder):
         labels, unkept = keep_runs(sweep, runs, folder)
         there, refused = plan_runs(sweep, folder, to_train=False)

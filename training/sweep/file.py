@@ -1,4 +1,4 @@
-"""The file of a sweep: what is trained, with which seeds, and how it is judged."""
+"""Read the file of a sweep: trainings, seeds and how they are judged."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read_text
 from ...gauge.suite import SuiteError, load_suite
-from ..run.launch import DEFAULT_BACKEND
+from ..run.plan import DEFAULT_BACKEND
 
 NO_SUITE = "none"
 MOST_RUNS = 1000
@@ -16,7 +16,7 @@ MOST_RUNS = 1000
 
 
 class SweepError(ValueError):
-    """A sweep cannot be run; the message says what is wrong and what to change."""
+    """A sweep cannot be run; the message names the error and the change."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class SweepEntry:
     name: Name
     """Label in tables, and name of its folder."""
     task: Text
-    """What is trained (``gaitgauge list tasks``)."""
+    """Task (``gaitgauge list tasks``)."""
     settings: tuple[Text, ...] = ()
     """``key=value`` each, after those of the sweep."""
     seeds: tuple[Seed, ...] | None = None
@@ -34,9 +34,9 @@ class SweepEntry:
     backend: Text | None = None
     """Physics engine; None for that of the sweep."""
     device: Literal["cpu", "cuda"] | None = None
-    """Where it is trained; None for that of the sweep."""
+    """Physics engine; None for that of the sweep."""
     init_from: Text | None = None
-    """Shipped policy or checkpoint whose networks it begins with; None for that of the sweep."""
+    """Shipped policy or checkpoint with the first networks; None for that of the sweep."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,15 +56,15 @@ class Sweep:
     backend: Text = DEFAULT_BACKEND
     """Physics engine of the trainings."""
     device: Literal["cpu", "cuda"] | None = None
-    """Where they are trained; None for what the engine is made for."""
+    """Device; None for the engine's default."""
     init_from: Text | None = None
-    """Shipped policy or checkpoint whose networks the trainings begin with; None for nothing."""
+    """Shipped policy or checkpoint with the first networks of the trainings; None for untrained ones."""
     suite: Text = "gaitgauge-1"
     """Suite that gauges each run at its end, on MuJoCo."""
     training_suite: Text = "quick"
     """Suite that scores checkpoints while they train, for the learning curves; ``none`` for no scores."""
     checkpoint: Literal["last", "best"] = "last"
-    """What of a run is gauged: its last checkpoint, or the one that ``training_suite`` scored highest."""
+    """Checkpoint of a run that is gauged: its last, or the one that ``training_suite`` scored highest."""
 
     def __post_init__(self) -> None:
         if not self.entry:
@@ -81,7 +81,7 @@ class Sweep:
             raise ValueError(f"has {runs:,} trainings; at most {MOST_RUNS:,} are possible")
 
     def seeds_of(self, entry: SweepEntry) -> tuple[int, ...]:
-        """The entry's own seeds, or else the sweep's."""
+        """Return the entry's own seeds, or else the sweep's."""
         return self.seeds if entry.seeds is None else entry.seeds
 
 

@@ -11,9 +11,9 @@ from typing import Any
 from scipy.stats import ttest_ind
 
 from ...files.writing import json_text, write_atomically
-from ...gauge.chance.intervals import CONFIDENCE
 from ...gauge.report import charts
 from ...gauge.report.pages import page_template
+from ...gauge.result import CONFIDENCE
 from ...studies.compare.comparison import ComparisonError, compare, format_p, holm, load_result
 from ...studies.compare.report import write_comparison
 from .curves import Curve, by_figure, curves_csv, learning_curves
@@ -103,7 +103,7 @@ def _fill(row: dict[str, Any], sweep: Sweep, run: SweepRun, folder: Path) -> Non
     row["policy"] = str(policy.relative_to(folder)) if policy else None
     if results is not None and run.gauged(sweep):
         card = read_card(results)
-        row |= {name: card[name] for name in SCORES}
+        row |= {name: getattr(card, name) for name in SCORES}
         row |= {"state": "gauged", "results": str(results.relative_to(folder))}
 
 

@@ -35,12 +35,12 @@ _STOPPED = tuple(128 + number for number in STOP_SIGNALS)
 _PATIENCE = 120.0
 """Longest wait for processes that were asked to stop [s]: an iteration and its checkpoint."""
 _LAST_PATIENCE = 10.0
-"""Longest wait for processes that were interrupted [s], before they are killed: they end what runs beside them."""
+"""Longest wait for processes that were interrupted [s], before they are killed: they end their side processes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOutcome:
-    """How the processes of a sweep ended."""
+    """End of the processes of a sweep."""
 
     failures: Mapping[str, str]
     """One sentence for each run that failed, by label."""
@@ -59,7 +59,7 @@ class _Job:
 
 
 def visible_gpus() -> list[str]:
-    """The GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
+    """Return the GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
     count = torch.cuda.device_count()
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     return named.split(",")[:count] if named else [str(number) for number in range(count)]
@@ -90,7 +90,7 @@ class Jobs:
             gpus: as ``visible_gpus``, which is the default.
             per_gpu: trainings side by side on each GPU.
             sharing: variables in the environment of trainings on GPUs (``sharing.shared_gpus``).
-            gauging: options of ``evaluate`` on who plays a gauging; None for the threads.
+            gauging: options of ``evaluate`` on the workers of a gauging; None for the threads.
         """
         self._sweep, self._deadline, self._say = sweep, deadline, say
         self._gauging = ("--threads", str(threads)) if gauging is None else gauging
@@ -129,7 +129,7 @@ class Jobs:
 
     @contextmanager
     def _failing(self, run: SweepRun) -> Iterator[None]:
-        """Around what concerns one run: what goes wrong is its failure, and the others go on."""
+        """Turn an error of one run into its failure; the others go on."""
         try:
             yield
         except RUN_ERRORS as error:
@@ -137,7 +137,7 @@ class Jobs:
             self._say(f"{run.label} failed: {self._failures[run.label]}")
 
     def _is_left(self, run: SweepRun) -> bool:
-        """Whether a later call goes on with a run that has not failed."""
+        """Return True if a later call goes on with a run that has not failed."""
         if run.label not in self._failures:
             with self._failing(run):
                 return not (run.trained and run.gauged(self._sweep))
@@ -152,7 +152,7 @@ class Jobs:
                 self._to_gauge.append(run)
 
     def _start(self) -> bool:
-        """Start what there is a place for; whether anything is at work."""
+        """Start jobs in free places; returns True if any job is at work."""
         for run in list(self._to_train):
             taken = {job.place for job in self._live}
             free = [p for p in (self._places if run.on_gpu else ("the CPU",)) if p not in taken]
@@ -171,12 +171,7 @@ class Jobs:
         return bool(self._live)
 
     def _launch(self, run: SweepRun, command: Sequence[str], place: str, log: Path, how: str) -> None:
-        """Start a process, which keeps a lock until its end: the next sweep finds it if this one is killed.
-
-        Raises:
-            SweepError: a process that an earlier call left has the lock; or log or lock is a link, which may lead anywhere.
-            OSError: it cannot be started, or its log cannot be written.
-        """
+        """Start a process, which keeps a lock until its end: the next sweep finds it if this one is killed."""
         environment = {**os.environ, **self._places.get(place, ENVIRONMENT)}
         log.parent.mkdir(parents=True, exist_ok=True)
         for path in (log, own := log.with_suffix(".lock")):
@@ -204,18 +199,14 @@ class Jobs:
         self._say(f"{run.label} {how}")
 
     def _collect(self) -> None:
-        """Take what has ended and sort it on."""
+        """Take ended jobs and sort their runs on."""
         for job in [j for j in self._live if j.process.poll() is not None]:
             self._live.remove(job)
             with self._failing(job.run):
                 self._take_in(job.run, job.process.returncode, job.log, gauged=job.place == "gauge")
 
     def _take_in(self, run: SweepRun, code: int, log: Path, *, gauged: bool) -> None:
-        """What became of a process.
-
-        Raises:
-            SweepError: it failed.
-        """
+        """Handle the end of a process."""
         if code in _STOPPED and not gauged and run.directory:
             how = signal.Signals(code - 128).name
             self._say(
@@ -232,8 +223,8 @@ class Jobs:
             self._sort(run)
 
     def _stop(self, insisted: Callable[[], bool]) -> None:
-        """Ask what is at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk. Where they take
-        too long, or ``insisted`` says so, they are interrupted, and killed at last.
+        """Ask the jobs at work to stop, and wait: trainings write a checkpoint, a gauging has its episodes on disk. Where they take too
+        long, or at a second signal (``insisted``), they are interrupted, and killed at last.
         """
         for number, patience, waits in (
             (signal.SIGTERM, _PATIENCE, lambda: not insisted()),
@@ -250,11 +241,7 @@ class Jobs:
 
 
 def _take(lock: BinaryIO, doing: str) -> None:
-    """Lock a file for this process and for those that inherit it.
-
-    Raises:
-        SweepError: another process has it.
-    """
+    """Lock a file for this process and for those that inherit it."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -269,7 +256,7 @@ def _take(lock: BinaryIO, doing: str) -> None:
 
 
 def _reason(code: int, log: Path) -> str:
-    """Why a process failed: the signal that ended it, or the last sentence of its log."""
+    """Return the reason of a process's failure: the signal that ended it, or the last sentence of its log."""
     if code < 0:
         return "ended by " + next((known.name for known in signal.Signals if known == -code), f"signal {-code}")
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]

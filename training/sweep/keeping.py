@@ -1,8 +1,8 @@
-"""What is kept of runs that are trained, small enough to carry home and to commit.
+"""Keep trained runs in a form small enough to carry home and to commit.
 
 ``runs/<entry>/seed-<n>/kept/`` holds ``run.json`` with the settings, ``curves.csv``, ``policy.gauge.pt`` and, where it was gauged,
-``results.json``, a score card of that policy; no checkpoints, no episodes, no machine's name and no command. A sweep does not train
-such a run again: it gauges it where that is left, goes on with the others, and reports on all.
+``results.json``, a score card of that policy; no checkpoints, no episodes, no machine's name and no command. A sweep does not train such
+a run again: it gauges it where that is left, goes on with the others, and reports on all.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ def check_keep(runs: Sequence[SweepRun], folder: Path) -> None:
 
 
 def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Keep what is trained in another folder, beside what it holds already.
+    """Keep trained runs in another folder, beside its present ones.
 
     Args:
         folder: another one, of a sweep of the same trainings.
 
     Returns:
-        Labels of the runs that were kept now, what was kept before is left as it is; and why runs could not be kept, by label.
+        Labels of the runs that were kept now, without earlier ones; and reasons why runs could not be kept, by label.
     """
     kept, failures = [], {}
     for run in runs:
@@ -54,12 +54,12 @@ def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> tuple[lis
 
 
 def _in(folder: Path, run: SweepRun) -> SweepRun:
-    """A run's counterpart in the folder that it is kept in."""
+    """Return a run's counterpart in the folder that it is kept in."""
     return replace(run, folder=folder / "runs" / run.entry.name / f"seed-{run.seed}")
 
 
 def _keep(sweep: Sweep, run: SweepRun, target: SweepRun) -> bool:
-    """Write the small form of a run, whose description, by which it is known, comes last; False where it is there already."""
+    """Write the small form of a run, its description, which identifies it, last; False where it is there already."""
     target.claim(option="--keep")
     gauged, there, place = run.gauged(sweep), target.trained, target.folder / KEPT
     if there and (target.gauged(sweep) or not gauged):
@@ -80,17 +80,17 @@ def _keep(sweep: Sweep, run: SweepRun, target: SweepRun) -> bool:
     if results is not None and gauged:
         card = read_card(results)
         if policy is not None:
-            of_policy = {"path": KEPT_POLICY, "file_sha256": file_digest(str(place / KEPT_POLICY))}
-            card["policy"] = {**card["policy"], **of_policy}
-        card["provenance"] = without_place(card["provenance"])
-        write_atomically(place / RESULTS, json_text(card), SweepError)
+            kept = replace(card.policy, path=KEPT_POLICY, file_sha256=file_digest(str(place / KEPT_POLICY)))
+            card = replace(card, policy=kept)
+        card = replace(card, provenance=card.provenance.without_place())
+        write_atomically(place / RESULTS, json_text(card.to_data()), SweepError)
     done = run.description() | {"outcome": "finished", "kept_iteration": run.wanted_iteration(sweep)}
     write_atomically(place / "run.json", json_text(_for_everybody(done)), SweepError)
     return True
 
 
 def _for_everybody(description: Mapping[str, Any]) -> dict[str, Any]:
-    """What is said of a run without machine, commands and folders, those of its resumes too."""
+    """Return the description of a run without machine, commands and folders, in its resumes too."""
     found = without_place(description)
     if found.get("begun_with"):
         found["begun_with"] = Path(found["begun_with"]).name

@@ -1,4 +1,4 @@
-"""The runs of a sweep: what each is to be, how far it is, and the commands that take it further."""
+"""Describe the runs of a sweep: their settings, their progress, and the commands that take them further."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 from ...backends.base import BackendError, DeviceError
 from ...files.parsing import one_line, read_results, shown
 from ...files.writing import json_text, make_folder, write_atomically
+from ...gauge.result import Result
 from ...gauge.suite import SuiteError, load_suite
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
@@ -21,7 +22,7 @@ from ...studies.policies import file_digest
 from ..configuration import ConfigurationError
 from ..overrides import TaskError
 from ..run.checkpoint import CheckpointError
-from ..run.launch import prepare
+from ..run.plan import prepare
 from ..run.request import TrainRequest
 from ..run.run_directory import read_run_json
 from ..run.side_process import CHILD_PROGRAM
@@ -33,19 +34,19 @@ KEPT_CURVES = "curves.csv"
 KEPT_POLICY = "policy.gauge.pt"
 RESULTS = "results.json"
 SCORES = ("score", "score_interval", "level", "groups")
-"""What a table tells of results."""
+"""Entries of results that a table shows."""
 _SEEDS = ("training.run.seed", "environment.seed")
 """Settings that would be the same in all runs of an entry."""
 RUN_ERRORS = (SweepError, CheckpointError, ComparisonError, PolicyError, ContractError, OSError)
-"""What may be wrong with the files of one run; the others go on."""
+"""Errors in the files of one run; the others go on."""
 
 
 class DamagedNoteError(SweepError):
-    """What a run's folder says of its settings cannot be read; other runs of the entry are none the worse."""
+    """The settings noted in a run's folder cannot be read; other runs of the entry are not affected."""
 
 
 def what_failed(error: Exception) -> str:
-    """One sentence on one of ``RUN_ERRORS``."""
+    """Return one sentence on one of ``RUN_ERRORS``."""
     if not isinstance(error, OSError):
         return str(error)
     reason = (error.strerror or one_line(error)).lower()
@@ -59,18 +60,18 @@ class SweepRun:
     entry: SweepEntry
     seed: int
     settings: tuple[str, ...]
-    """Of sweep and entry."""
+    """Settings of sweep and entry."""
     backend: str
     on_gpu: bool
-    """Whether its engine runs on a GPU."""
+    """True if its engine runs on a GPU."""
     iterations: int
     """Updates of the whole run."""
     folder: Path
-    """Where its run directory and its gauging go."""
+    """Folder of its run directory and its gauging."""
     suite_digest: str
-    """Of the suite that gauges it."""
+    """Digest of the suite that gauges it."""
     init_from: str | None = None
-    """What it begins with; None for nothing."""
+    """Shipped policy or checkpoint with its first networks; None for untrained ones."""
 
     @property
     def label(self) -> str:
@@ -79,12 +80,12 @@ class SweepRun:
 
     @property
     def log(self) -> Path:
-        """What its training printed."""
+        """Return the output of its training."""
         return self.folder / "train.log"
 
     @property
     def directory(self) -> Path | None:
-        """Its run directory, the latest with a checkpoint, or what was kept of it; None before the first checkpoint."""
+        """Return its run directory, the latest with a checkpoint, or the kept form of it; None before the first checkpoint."""
         found = [run for run in self.folder.glob("logs/*/*") if latest_checkpoint(run)]
         if found:
             return max(found, key=lambda run: run.name)
@@ -99,7 +100,7 @@ class SweepRun:
 
     @property
     def trained(self) -> bool:
-        """Whether all of its iterations are done.
+        """True if all of its iterations are done.
 
         Raises:
             CheckpointError: its description is damaged.
@@ -109,7 +110,7 @@ class SweepRun:
         return finished and noted.get("iteration", 0) >= self.iterations
 
     def description(self) -> dict[str, Any]:
-        """Its ``run.json`` with the ``iteration`` of its last checkpoint; empty before the first.
+        """Return its ``run.json`` with the ``iteration`` of its last checkpoint; empty before the first.
 
         Raises:
             CheckpointError: it is damaged.
@@ -126,11 +127,11 @@ class SweepRun:
         return noted | ({} if last is None else {"iteration": int(last.stem.removeprefix("model_"))})
 
     def policy(self, sweep: Sweep) -> Path | None:
-        """What of it is gauged; None before it is trained, and where it was not kept.
+        """Return the file that is gauged; None before the run is trained, and where the file was not kept.
 
         Raises:
             SweepError: another checkpoint was kept than the sweep asks for.
-            CheckpointError, ComparisonError: what was kept is damaged.
+            CheckpointError, ComparisonError: a kept file is damaged.
         """
         run = self.directory
         if run is None:
@@ -142,7 +143,7 @@ class SweepRun:
         return best if sweep.checkpoint == "best" and best.is_file() else latest_checkpoint(run)
 
     def wanted_iteration(self, sweep: Sweep) -> int | None:
-        """Of the checkpoint that the sweep asks for, as the description notes it; None where it does not.
+        """Return the iteration of the checkpoint that the sweep asks for, as noted in the description; None where it is not.
 
         Raises:
             CheckpointError: the description is damaged.
@@ -154,8 +155,7 @@ class SweepRun:
     def _check_kept(self, sweep: Sweep) -> None:
         wanted, there = self.wanted_iteration(sweep), self.description().get("kept_iteration")
         if there is None and (self._kept / RESULTS).is_file():
-            provenance = read_card(self._kept)["policy"].get("provenance")
-            there = provenance.get("iteration") if isinstance(provenance, dict) else None
+            there = read_card(self._kept).policy.provenance.get("iteration")
         if there is not None and there != wanted:
             raise SweepError(
                 f"'{one_line(self._kept)}' keeps the policy of iteration {shown(there)}, and checkpoint '{sweep.checkpoint}' is that of "
@@ -163,10 +163,10 @@ class SweepRun:
             )
 
     def results(self, sweep: Sweep) -> Path | None:
-        """Where the gauging of its policy goes; None before it is trained. Results of another suite or policy keep their place.
+        """Return the folder of the gauging of its policy; None before it is trained. Results of another suite or policy keep their place.
 
         Raises:
-            SweepError: what was kept is of another checkpoint, or of another suite and without a policy.
+            SweepError: the kept file is of another checkpoint, or of another suite and without a policy.
             CheckpointError, ComparisonError: a file is damaged.
             OSError: its policy cannot be read.
         """
@@ -187,28 +187,30 @@ class SweepRun:
         return usual.with_name(f"{policy.stem}-{self.suite_digest[:8]}-{file_digest(str(policy))[:8]}")
 
     def _is_place(self, folder: Path, policy: Path | None) -> bool:
-        """Whether a folder is free for results of this suite and a policy's file, or has them or begun with them; None for any."""
+        """Return True if a folder is free for results of this suite and a policy's file, or has them or began with them; None stands for
+        any.
+        """
         if (folder / RESULTS).is_file():
             card = read_card(folder)
-            its = card["policy"]["file_sha256"]
-            return card["suite"]["digest"] == self.suite_digest and (policy is None or its == file_digest(str(policy)))
+            same_policy = policy is None or card.policy.file_sha256 == file_digest(str(policy))
+            return card.suite.digest == self.suite_digest and same_policy
         if policy is None or not (folder / "request.json").is_file():
             return True
         begun = read_results(folder / "request.json", "request", SweepError)
         return begun.get("suite_digest") == self.suite_digest and begun.get("policy") == _read_policy(policy).digest
 
     def gauged(self, sweep: Sweep) -> bool:
-        """Whether its policy has been gauged on this suite; raises as ``results``."""
+        """True if its policy has been gauged on this suite; raises as ``results``."""
         results = self.results(sweep)
         return results is not None and (results / RESULTS).is_file()
 
     @property
     def has_results(self) -> bool:
-        """Whether there are results of any suite and policy."""
+        """True if there are results of any suite and policy."""
         return (self._kept / RESULTS).is_file() or any(self.folder.glob(f"gauge/*/{RESULTS}"))
 
     def damage(self, sweep: Sweep) -> str:
-        """What is wrong with the checkpoint that it goes on from, or with what is gauged of it; empty where nothing is."""
+        """Return the damage of the checkpoint that it goes on from, or of the gauged file, as a sentence; empty for none."""
         run = self.directory
         try:
             for path in filter(None, {latest_checkpoint(run) if run else None, self.policy(sweep)}):
@@ -218,7 +220,7 @@ class SweepRun:
         return ""
 
     def training_command(self, sweep: Sweep, *, seconds: float | None, score_threads: int) -> list[str]:
-        """Begins the training or goes on with it; ``seconds`` is its wall-clock limit [s]."""
+        """Return the command that begins the training or goes on with it; ``seconds`` is its wall-clock limit [s]."""
         options = ["--no-score"]
         if sweep.training_suite != NO_SUITE:
             options = ["--score-suite", sweep.training_suite, "--score-threads", str(score_threads)]
@@ -233,20 +235,20 @@ class SweepRun:
         return [*CHILD_PROGRAM, "train", self.entry.task, *self.settings, *options]
 
     def gauging_command(self, sweep: Sweep, *, where: Sequence[str]) -> list[str]:
-        """Gauges its policy, or goes on with that; ``where`` are the options ``--threads`` and ``--cluster``."""
+        """Return the command that gauges its policy or goes on with that; ``where`` are the options ``--threads`` and ``--cluster``."""
         policy, results = self.policy(sweep), self.results(sweep)
         assert policy is not None and results is not None
         options = ["--suite", sweep.suite, *where, "--out", str(results), "--json", "--no-clip"]
         return [*CHILD_PROGRAM, "evaluate", str(policy), *options, *(["--resume"] if results.exists() else [])]
 
     def claim(self, *, option: str = "--out", note: bool = True) -> None:
-        """Check that its folder holds no training with other settings, and ``note`` there what it is trained with.
+        """Check that its folder holds no training with other settings, and ``note`` the present ones there.
 
         Args:
             option: which names the folder, for the sentence.
 
         Raises:
-            DamagedNoteError: what was noted there cannot be read.
+            DamagedNoteError: the note cannot be read.
             SweepError: the folder holds a training with other settings, or cannot be written to.
         """
         mine: Mapping[str, Any] = {
@@ -278,7 +280,7 @@ class SweepRun:
 
 
 def _named(note: Mapping[str, Any]) -> dict[str, Any]:
-    """What a run's note says, and each of its settings by its name."""
+    """Return the text of a run's note, and each of its settings by name."""
     settings = note.get("settings")
     return {**note, **(dict(str(s).partition("=")[::2] for s in settings) if isinstance(settings, list) else {})}
 
@@ -291,8 +293,8 @@ def _read_policy(path: Path) -> FilePolicy:
         raise SweepError(f"{error}; put it back, or remove it and call again: {how}") from error
 
 
-def read_card(folder: Path) -> dict[str, Any]:
-    """The results in a folder.
+def read_card(folder: Path) -> Result:
+    """Return the result in a folder.
 
     Raises:
         ComparisonError: there are none, or they are damaged.
@@ -300,7 +302,7 @@ def read_card(folder: Path) -> dict[str, Any]:
     try:
         card = load_result(folder)
         for name in SCORES:
-            if name not in card:
+            if name in card.lacking:
                 raise ComparisonError(f"results '{one_line(folder / RESULTS)}' lack {name}")
     except ComparisonError as error:
         raise ComparisonError(f"{error}; delete it and call again, which makes it anew") from error
@@ -308,7 +310,7 @@ def read_card(folder: Path) -> dict[str, Any]:
 
 
 def _is_trained(run: SweepRun) -> bool:
-    """Whether nothing of a run is left to train; one whose description is damaged is told of when it is to go on."""
+    """Return True if nothing of a run is left to train; a damaged description is reported when the run is to go on."""
     try:
         return run.trained
     except CheckpointError:
@@ -316,11 +318,7 @@ def _is_trained(run: SweepRun) -> bool:
 
 
 def _check_seeds(seeds: Sequence[int], settings: Sequence[str]) -> None:
-    """Refuse an entry whose runs would not differ.
-
-    Raises:
-        SweepError: it is one.
-    """
+    """Refuse an entry with runs that would not differ."""
     if not seeds or len(set(seeds)) < len(seeds):
         raise SweepError(f"seeds are {shown(list(seeds))}; give at least one, and each once")
     for setting in settings:
@@ -329,11 +327,12 @@ def _check_seeds(seeds: Sequence[int], settings: Sequence[str]) -> None:
 
 
 def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[list[SweepRun], dict[str, str]]:
-    """The runs of a sweep, those of the first seed first, and of each entry of which a run cannot start one sentence on why.
+    """Return the runs of a sweep, those of the first seed first, and for each entry with a run that cannot start one sentence on the
+    reason.
 
     Args:
-        to_train: whether this machine must be able to train what is left to train, which is noted in their folders. What was
-            trained elsewhere can be gauged and reported on any.
+        to_train: this machine must be able to train the rest, which is noted in their folders. Runs that were trained elsewhere can be
+            gauged and reported on any.
 
     Raises:
         SuiteError: no such suite.
@@ -373,7 +372,7 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
             if to_train and not all(map(_is_trained, own)):
                 try:
                     on_gpu = prepare(request).device.startswith("cuda")
-                except DeviceError as error:  # what was trained elsewhere can be gauged all the same
+                except DeviceError as error:  # runs that were trained elsewhere can be gauged all the same
                     change = 'device = "cpu"' if device else 'device = "cpu" (slow) or backend = "mujoco"'
                     refused[entry.name] = f"{error.reason}; write {change} in the sweep's file"
                     own = [run for run in own if _is_trained(run)]

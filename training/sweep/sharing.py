@@ -13,7 +13,7 @@ from pathlib import Path
 
 _PROGRAM = "nvidia-cuda-mps-control"
 _FOLDERS = ("/usr/local/nvidia/bin", "/usr/local/cuda/bin")
-"""Where it is looked for beside PATH."""
+"""Folders of the program besides PATH."""
 _DEFAULT_PIPES = Path("/tmp/nvidia-mps")  # NVIDIA's, where CUDA_MPS_PIPE_DIRECTORY is not set
 _PATIENCE = 20.0
 """Longest wait for the daemon [s]. It ends once no process uses it any more."""
@@ -55,7 +55,7 @@ def shared_gpus(say: Callable[[str], None]) -> Iterator[Mapping[str, str]]:
 
 
 def _is_there(pipes: Path) -> bool:
-    """Whether a daemon listens in this folder."""
+    """Return True if a daemon listens in this folder."""
     return (pipes / "control").exists()
 
 

@@ -1,10 +1,10 @@
-"""Newton's method of mujoco_warp in one kernel: a robot's whole solve by the 32 threads of a warp, out of shared memory.
+"""Run mujoco_warp's Newton solver in one kernel: 32 threads of a warp solve a robot in shared memory.
 
 mujoco_warp launches a dozen kernels for each iteration of its solver, which pass matrices of 18 x 18 through the GPU's memory.
-For robots of up to 32 degrees of freedom all of a solve fits on the chip: one launch, and each world stops when it is done. The
-method is mujoco_warp's, which is MuJoCo's: Newton's steps on the convex cost of accelerations, an exact search along each, the
-same criteria to stop. So its minimum, its options and its number of iterations are the same. What the kernel does not know
-(equalities, tendons, sparse models, sleeping bodies, the conjugate gradient) is left to mujoco_warp.
+For robots of up to 32 degrees of freedom a whole solve fits on the chip: one launch, and each world stops on its own. The method
+is mujoco_warp's and MuJoCo's: Newton's steps on the convex cost of accelerations, an exact search along each, the same criteria
+to stop. Minimum, options and number of iterations are therefore the same. mujoco_warp itself solves models with equalities,
+tendons, sparse matrices, sleeping bodies or the conjugate gradient.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .kernel import LANES, Problem, Sizes, Solution, solve_kernel
 
 
 def sizes_of(model: Model, data: Data) -> Sizes:
-    """What the kernel is compiled for."""
+    """Return the sizes that the kernel is compiled for."""
     return Sizes(
         dofs=model.nv,
         stride=model.nv_pad,
@@ -33,7 +33,7 @@ def sizes_of(model: Model, data: Data) -> Sizes:
 
 
 def knows(model: Model, data: Data) -> bool:
-    """Whether the kernel can solve worlds of this model."""
+    """Return whether the kernel can solve worlds of this model."""
     option = model.opt
     return (
         option.solver == SolverType.NEWTON
@@ -51,7 +51,7 @@ def knows(model: Model, data: Data) -> bool:
 
 
 def problem_of(model: Model, data: Data) -> Problem:
-    """What a solve reads, in mujoco_warp's arrays."""
+    """Return the input of a solve, in mujoco_warp's arrays."""
     option, rows, contact = model.opt, data.efc, data.contact
     return filled(
         Problem,
@@ -79,7 +79,7 @@ def problem_of(model: Model, data: Data) -> Problem:
 
 
 def solution_of(data: Data) -> Solution:
-    """What a solve writes, in mujoco_warp's arrays."""
+    """Return the output of a solve, in mujoco_warp's arrays."""
     return filled(
         Solution,
         acceleration=data.qacc,
@@ -93,7 +93,7 @@ def solution_of(data: Data) -> Solution:
 
 
 def solve(model: Model, data: Data) -> None:
-    """Find the accelerations and the forces of the constraints, here or in mujoco_warp."""
+    """Find the accelerations and the forces of the constraints, by the kernel or by mujoco_warp."""
     if not knows(model, data):
         plain_solve(model, data)
         return
@@ -110,9 +110,4 @@ def _install() -> None:
     solver.solve = solve
 
 
-FUSED_SOLVER = Repair(
-    project="mujoco-warp",
-    versions=">=3.17,<3.18",
-    fault="the speed of its solver",
-    install=_install,
-)
+FUSED_SOLVER = Repair(project="mujoco-warp", versions=">=3.17,<3.18", fault="the speed of its solver", install=_install)

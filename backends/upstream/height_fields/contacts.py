@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # ruff: noqa: RUF046, UP018
-"""Chooses a shape's contacts with a height field among those of its prisms, and writes them as mujoco_warp does."""
+"""Choose a shape's contacts with a height field among those of its prisms, and write them as mujoco_warp does."""
 
 # Warp reads the annotations of structs and kernels: no ``from __future__ import annotations`` here.
 import warp as wp
@@ -13,12 +13,12 @@ from .kernels import Lists, Shapes, Touch, margin_gap
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 _DOUBLE = wp.constant(1.0e-3)
-"""A further contact must be so far from those before it; mujoco_warp's number."""
+"""Least distance of a further contact from those before it, as in mujoco_warp."""
 
 
 @wp.struct
 class Materials:
-    """What mujoco_warp's model knows of contacts, by its own names."""
+    """Contact parameters of mujoco_warp's model, by its own names."""
 
     geom_condim: wp.array[int]
     geom_priority: wp.array[int]
@@ -60,7 +60,7 @@ class Contacts:
 
 @wp.func
 def write_touch(shapes: Shapes, materials: Materials, contacts: Contacts, pair: int, number: int, touch: Touch) -> None:
-    """One more of mujoco_warp's contacts."""
+    """Write one more of mujoco_warp's contacts."""
     geoms, ids, world = shapes.collision_pair[pair], shapes.collision_pairid[pair], shapes.collision_worldid[pair]
     margin, gap = margin_gap(shapes, pair)
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
@@ -119,7 +119,7 @@ def write_touch(shapes: Shapes, materials: Materials, contacts: Contacts, pair: 
 
 @wp.kernel
 def write_contacts(shapes: Shapes, lists: Lists, materials: Materials, contacts: Contacts) -> None:
-    """Of each pair's contacts write the deepest, the one farthest from it, and two that span the widest area with these."""
+    """Write four of each pair's contacts: the deepest, the farthest from it, and two that span the widest area with these."""
     pair = wp.tid()
     if pair >= shapes.ncollision[0]:
         return
@@ -142,7 +142,7 @@ def write_contacts(shapes: Shapes, lists: Lists, materials: Materials, contacts:
     normal, across, along = wp.vec3(), wp.vec3(), wp.vec3()
     while chosen >= 0 and number < 4:
         given = lists.prisms[first + chosen][1]
-        lists.prisms[first + chosen] = wp.vec2i(-1, given)  # not to be chosen again
+        lists.prisms[first + chosen] = wp.vec2i(-1, given)  # marks a chosen contact
         write_touch(shapes, materials, contacts, pair, number, lists.touches[given])
         position = lists.touches[given].position
         if number == 0:

@@ -2,10 +2,10 @@
 # ruff: noqa: RUF046, UP018, ANN201
 """Kernels that collide shapes with height fields: a thread for each prism, where mujoco_warp has one for each shape.
 
-``list_prisms`` lists what lies under each shape, ``test_prisms`` leaves out what a plane separates and solves spheres,
-``search_prisms`` finds the other contacts by GJK and EPA; ``write_contacts`` (in ``contacts.py``) chooses up to
-four for each shape. Places in the lists are given out in the order in which threads come by; nothing else depends on that
-order: a pair's prisms lie together, in the order of their numbers.
+``list_prisms`` lists the prisms under each shape, ``test_prisms`` drops those behind a separating plane and solves spheres,
+``search_prisms`` finds the other contacts by GJK and EPA; ``write_contacts`` (in ``contacts.py``) chooses up to four for each
+shape. Threads take places in the lists in any order, and nothing else depends on it: a pair's prisms lie together, in the order
+of their numbers.
 """
 
 # Warp reads the annotations of structs and kernels: no ``from __future__ import annotations`` here.
@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 PRISMS = wp.constant(0)
 """Index of a counter: listed prisms."""
 TOUCHES = wp.constant(1)
-"""Index of a counter: places for contacts that were given out."""
+"""Index of a counter: taken places for contacts."""
 SEARCHES = wp.constant(2)
 """Index of a counter: places that wait for a search."""
 _WARP = wp.constant(32)
@@ -33,7 +33,7 @@ _WARP = wp.constant(32)
 
 @wp.struct
 class Shapes:
-    """What the kernels read of mujoco_warp's model and data and of its broad phase; the fields' names are theirs."""
+    """Input from mujoco_warp's model, data and broad phase, by their own names."""
 
     ccd_tolerance: wp.array[float]
     geom_type: wp.array[int]
@@ -74,7 +74,7 @@ class Shapes:
 
 @wp.struct
 class Touch:
-    """Where a prism and a shape touch, in the world's frame; the distance is infinite where they do not."""
+    """Contact of a prism and a shape, in the world's frame; the distance is infinite for none."""
 
     distance: float
     position: wp.vec3
@@ -83,12 +83,12 @@ class Touch:
 
 @wp.struct
 class Lists:
-    """What the kernels hand to each other."""
+    """Lists that the kernels pass to each other."""
 
     counts: wp.array[int]
-    """Places given out in the lists below; more than there are where a list is full."""
+    """Taken places in the lists below; more than the capacity where a list is full."""
     spans: wp.array[wp.vec2i]
-    """First listed prism of each pair, and how many it has."""
+    """First listed prism and number of prisms of each pair."""
     prisms: wp.array[wp.vec2i]
     """Pair and number of a prism; after its test, pair and place of its contact or -1. Pair -1 marks a place left empty."""
     touches: wp.array[Touch]
@@ -110,7 +110,7 @@ class Scratch:
 
 @wp.func
 def report_overflow(shapes: Shapes, world: int, warn: bool):
-    """Mark a world of which contacts are lost."""
+    """Mark a world with lost contacts."""
     if warn:
         wp.printf("height field collision overflow: room for more contacts is needed, please increase naconmax\n")
     wp.atomic_or(shapes.overflow, world, int(OverflowType.HFIELD))
@@ -118,14 +118,14 @@ def report_overflow(shapes: Shapes, world: int, warn: bool):
 
 @wp.func
 def field_of(shapes: Shapes, pair: int) -> int:
-    """Height field of a pair's first geom."""
+    """Return the height field of a pair's first geom."""
     world = shapes.collision_worldid[pair]
     return shapes.geom_dataid[world % shapes.geom_dataid.shape[0], shapes.collision_pair[pair][0]]
 
 
 @wp.func
 def margin_gap(shapes: Shapes, pair: int):
-    """Contact margin and gap of a pair."""
+    """Return the contact margin and gap of a pair."""
     geoms, number = shapes.collision_pair[pair], shapes.collision_pairid[pair][0]
     world = shapes.collision_worldid[pair]
     return contact_margin_gap(
@@ -135,7 +135,7 @@ def margin_gap(shapes: Shapes, pair: int):
 
 @wp.func
 def reaches_up(shapes: Shapes, field: int, row: int, column: int, lift: float, bottom: float) -> int:
-    """Which of a cell's two prisms have a lifted corner as high as ``bottom``: the sum of 1 and 2."""
+    """Return the sum of 1 and 2 for the first and second of a cell's prisms that has a lifted corner as high as ``bottom``."""
     columns, scale = shapes.hfield_ncol[field], shapes.hfield_size[field][2]
     node = shapes.hfield_adr[field] + row * columns + column
     near, near_next = shapes.hfield_data[node], shapes.hfield_data[node + 1]
@@ -215,7 +215,7 @@ def list_prisms(shapes: Shapes, lists: Lists, warn: bool) -> None:
 
 @wp.func
 def listed_prism(shapes: Shapes, pair: int, number: int, margin: float) -> mat63:
-    """A prism of the field of a pair, lifted by the margin."""
+    """Return a prism of a pair's field, lifted by the margin."""
     field = field_of(shapes, pair)
     return prism_of(
         shapes.hfield_data,
@@ -230,7 +230,7 @@ def listed_prism(shapes: Shapes, pair: int, number: int, margin: float) -> mat63
 
 @wp.func
 def in_field_frame(shapes: Shapes, pair: int, kind: int, margin: float):
-    """The geoms of a pair as mujoco_warp's functions want them, in the field's frame; the prism is still to be filled in."""
+    """Return the geoms of a pair for mujoco_warp's functions, in the field's frame, without the prism."""
     geoms, world = shapes.collision_pair[pair], shapes.collision_worldid[pair]
     field, shape = geom_collision_pair_from_types(
         shapes.geom_dataid,
@@ -267,7 +267,7 @@ def in_field_frame(shapes: Shapes, pair: int, kind: int, margin: float):
 
 @wp.func
 def touch_of(shapes: Shapes, pair: int, distance: float, first: wp.vec3, second: wp.vec3) -> Touch:
-    """What a test of lifted field and inflated shape found, as a contact in the world's frame."""
+    """Return the result of a test of lifted field and inflated shape as a contact in the world's frame."""
     touch = Touch()
     touch.distance = wp.inf
     if distance <= TOUCH:
@@ -289,7 +289,7 @@ def prism_kernels(kinds: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel]:
 
     @wp.func
     def kind_of(shapes: Shapes, pair: int) -> int:
-        """Type of a pair's second geom, as a choice between constants."""
+        """Return the type of a pair's second geom, as a choice between constants."""
         found, kind = shapes.geom_type[shapes.collision_pair[pair][1]], int(wp.static(first_kind))
         for i in range(wp.static(number_of_kinds)):
             if found == wp.static(kinds[i]):
@@ -339,7 +339,7 @@ def prism_kernels(kinds: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel]:
         epa_iterations: int,
         warn_horizon: bool,
     ) -> None:
-        """Find the contacts that need GJK and EPA. Few searches are spread over many warps: together they would wait."""
+        """Find the contacts that need GJK and EPA; few searches are spread over many warps, where they do not wait for each other."""
         count, thread = lists.counts[SEARCHES], wp.tid()
         spread = wp.clamp(threads // wp.max(count, 1), 1, _WARP)
         worker, workers = thread // spread, threads // spread

@@ -1,9 +1,9 @@
 # mypy: ignore-errors
 # ruff: noqa: ANN201
-"""One prism of a height field and one shape: where they touch, as MuJoCo sees it. Functions for Warp's kernels.
+"""Collide one prism of a height field with one shape as MuJoCo does. Functions for Warp's kernels.
 
-A prism is what lies below one triangle of the field's surface, down to the field's base. All is in the field's frame, with
-the surface lifted by the contact margin and the shape inflated by half of it, as MuJoCo does.
+A prism lies below one triangle of the field's surface, down to the field's base. Everything is in the field's frame, with the
+surface lifted by the contact margin and the shape inflated by half of the margin, as in MuJoCo.
 """
 
 # Warp reads the annotations of functions: no ``from __future__ import annotations`` here.
@@ -16,17 +16,17 @@ from mujoco_warp._src.types import GeomType, mat63
 wp.set_module_options({"enable_backward": False})
 
 TOUCH = wp.constant(-1.0e-6)
-"""Distance between lifted field and inflated shape above which they do not touch [m]; single precision sees no less."""
+"""Largest distance of a contact between lifted field and inflated shape [m], the limit of single precision."""
 
 _CLEAR = wp.constant(1.0e-5)
-"""Gap to one of a prism's planes above which it does not touch [m]; wide enough for the rounding of positions."""
+"""Largest gap of a contact to one of a prism's planes [m]; wide enough for the rounding of positions."""
 
 
 @wp.func
 def field_point(
     heights: wp.array[float], start: int, columns: int, rows: int, size: wp.vec4, row: int, column: int, lift: float
 ) -> wp.vec3:
-    """A node of a field's surface, lifted."""
+    """Return a lifted node of a field's surface."""
     x = (2.0 * size[0]) / float(columns - 1) * float(column) - size[0]
     y = (2.0 * size[1]) / float(rows - 1) * float(row) - size[1]
     return wp.vec3(x, y, heights[start + row * columns + column] * size[2] + lift)
@@ -36,7 +36,7 @@ def field_point(
 def prism_of(
     heights: wp.array[float], start: int, columns: int, rows: int, size: wp.vec4, number: int, lift: float
 ) -> mat63:
-    """Corners of a prism, three at the base and three on top: two prisms to a cell, cells numbered along the rows."""
+    """Return a prism's corners, three at the base and three on top: two prisms to a cell, cells numbered along the rows."""
     second = number % 2
     row, column = (number // 2) // (columns - 1), (number // 2) % (columns - 1)
     # the diagonal of a cell goes from its corner with the lower column and the higher row to the opposite one
@@ -55,7 +55,7 @@ def prism_of(
 
 @wp.func
 def stays_clear(prism: mat63, geom: Geom, kind: int) -> bool:
-    """Whether the plane of the prism's top, or of a side, separates it from a shape."""
+    """Return whether the plane of the prism's top or of a side separates the prism from a shape."""
     top = wp.cross(prism[4] - prism[3], prism[5] - prism[3])
     top = wp.normalize(wp.where(top[2] < 0.0, -top, top))
     if wp.dot(plain_support(geom, kind, -top).point - prism[3], top) > _CLEAR:
@@ -73,7 +73,7 @@ def stays_clear(prism: mat63, geom: Geom, kind: int) -> bool:
 
 @wp.func
 def nearest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3) -> wp.vec3:
-    """The point of a triangle that is nearest to ``p``: under it on the plane, or else on one of the three edges."""
+    """Return the point of a triangle nearest to ``p``: under ``p`` on the plane, or else on one of the three edges."""
     normal = wp.cross(b - a, c - a)
     if (
         wp.dot(wp.cross(b - a, p - a), normal) >= 0.0
@@ -93,8 +93,8 @@ def nearest_on_triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3) -> wp.ve
 
 @wp.func
 def sphere_on_prism(prism: mat63, sphere: Geom):
-    """Distance and nearest points of prism and sphere in closed form, where that is so simple; the flag says whether."""
-    # of a triangle and all that lies straight below it, nothing is nearer to a point that looks down on the triangle
+    """Return a flag for a closed form, and by it distance and nearest points of prism and sphere."""
+    # for a point above a triangle, the nearest point of the prism below lies on the triangle
     first = nearest_on_triangle(prism[3], prism[4], prism[5], sphere.pos)
     apart = sphere.pos - first
     away = wp.length(apart)
@@ -105,8 +105,8 @@ def sphere_on_prism(prism: mat63, sphere: Geom):
 
 @wp.func
 def without_margin(distance: float, first: wp.vec3, second: wp.vec3, margin: float):
-    """Distance, middle and normal (out of the ground) of a contact of lifted field and inflated shape, both undone."""
-    # of shapes that overlap, the first's witness point lies ahead of the second's along the normal
+    """Return distance, middle and normal (out of the ground) of a contact, with lift and inflation undone."""
+    # where shapes overlap, the first shape's witness point lies ahead of the second's along the normal
     normal = wp.normalize(first - second)
     lift, inflation = margin * normal[2], 0.5 * margin
     middle = 0.5 * (first + second) - 0.5 * (lift - inflation) * normal
@@ -115,7 +115,7 @@ def without_margin(distance: float, first: wp.vec3, second: wp.vec3, margin: flo
 
 @wp.func
 def support(geom: Geom, kind: int, dir: wp.vec3) -> SupportPoint:
-    """mujoco_warp's support point, with one label for all vertices of a height field's prism."""
+    """Return mujoco_warp's support point, with one label for all vertices of a height field's prism."""
     point = plain_support(geom, kind, dir)
     if kind == int(GeomType.HFIELD):
         point.vertex_index = -1

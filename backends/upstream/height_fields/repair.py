@@ -1,22 +1,22 @@
-"""Repairs the height-field contacts of mujoco_warp 3.17, for every engine that steps it.
+"""Repair the height-field contacts of mujoco_warp 3.17, for every engine that steps it.
 
-Height fields are collided prism by prism, in a copy of MuJoCo's algorithm with three differences that matter:
+mujoco_warp collides height fields prism by prism, in a copy of MuJoCo's algorithm with three harmful differences:
 
 - The support function labels a prism's vertex as top or bottom by the sign of the search direction, not by the vertex. A
-  closest feature with both labels is taken for the prism's side, and its contact is replaced by a vertical one whose
-  depth is the unsigned height between the geom's lowest point and a corner of the prism. On uneven ground this happens
-  on top faces and edges, too: contacts that are centimetres too deep, or have a normal that points into the ground.
-- Prisms that are a little apart from the geom count as contacts, with the normal turned round: a foot is pulled down.
-- The field's surface is lifted by the contact margin and the geom inflated by half of it, but the distance between these
-  is reported: contacts would begin with a jolt, and feet stand that much too high.
+  closest feature with both labels counts as the prism's side, and a vertical contact takes its place, with the unsigned height
+  between the geom's lowest point and a corner of the prism as its depth. On uneven ground this happens on top faces and edges,
+  too: contacts are centimetres too deep, or have a normal into the ground.
+- Prisms that are a little apart from the geom count as contacts with a reversed normal, which pulls a foot down.
+- The field's surface is lifted by the contact margin and the geom inflated by half of it, and the distance between these is
+  reported: contacts begin with a jolt, and feet stand too high by as much.
 
-MuJoCo does none of this. Two functions of mujoco_warp are replaced: the support function, by one with one label for all
-vertices, so that the plain contact is used; and the narrow phase, by one that collides height fields itself, with no contact
-where a prism is apart, and distances without the margin, before mujoco_warp does the rest.
+The repair replaces two functions of mujoco_warp. The new support function has one label for all vertices, which keeps the plain
+contact. The new narrow phase collides height fields itself, without contacts of separate prisms and with distances without the
+margin, before mujoco_warp collides the rest.
 
-It also shares the work otherwise. A geom's prisms are tested by one thread, in turn, in mujoco_warp: of thousands of robots one
-always lies on the ground, and its thread is what all the others wait for. Here every prism has a thread of its own, and
-searches for a distance (GJK) are made only where no plane of the prism separates the two and no closed form is known.
+The new narrow phase is also faster. In mujoco_warp one thread tests a geom's prisms in turn: of thousands of robots one always
+lies on the ground, and all others wait for its thread. Here every prism has a thread, and searches for a distance (GJK) run only
+where no plane of the prism separates the two shapes and no closed form is known.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ from .contacts import Contacts, Materials, write_contacts
 from .prisms import support
 
 _PRISMS = (8, 64)
-"""Prisms that can be listed: for each contact that there is room for, and for each world besides."""
+"""Capacity for listed prisms, for each contact of the capacity and for each world."""
 _TOUCHES = (2, 64)
-"""Prisms that may touch, of all that are listed: likewise. More than become contacts, of which a shape has four at most."""
+"""Capacity for listed prisms that may touch, likewise; more than contacts, since a shape has four at most."""
 _WARP = 32
 """Threads that a GPU runs in step."""
 _SERIAL_THREADS = 64
-"""Threads on a CPU, where they run in turn."""
+"""Number of threads on a CPU, where they run in turn."""
 _TEST_THREADS = 512
 """Threads for each multiprocessor of a GPU that test prisms, each a few in turn."""
 SEARCH_THREADS = 256
-"""Threads for each multiprocessor that search: as many as fit at 255 registers. Each has its own scratch memory."""
+"""Threads for each multiprocessor that search, as many as fit at 255 registers, each with its own scratch memory."""
 
 
 def colliding_kinds(model: Model, table: list[tuple[GeomType, GeomType]]) -> tuple[int, ...]:
-    """Types of the geoms that may meet a height field in this model."""
+    """Return the types of the geoms that may meet a height field in this model."""
     counts = model.geom_pair_type_count
     return tuple(
         int(other)
@@ -62,7 +62,7 @@ def colliding_kinds(model: Model, table: list[tuple[GeomType, GeomType]]) -> tup
 
 
 def scratch_memory(rows: int, iterations: int) -> kernels.Scratch:
-    """Memory for polytopes that are expanded so many times."""
+    """Allocate memory for polytopes of so many expansions."""
     vertices, faces = 10 + 2 * iterations, 6 + MJ_MAX_EPAFACES * iterations
     points = wp.empty((rows, vertices + faces), dtype=wp.vec3)
     numbers = wp.empty((rows, vertices + faces + MJ_MAX_EPAHORIZON), dtype=int)
@@ -75,22 +75,16 @@ def scratch_memory(rows: int, iterations: int) -> kernels.Scratch:
 
 
 def scratch_bytes(iterations: int) -> int:
-    """Size of the memory of one search [bytes]."""
+    """Return the size of the memory of one search [bytes]."""
     with wp.ScopedDevice("cpu"):
         scratch = scratch_memory(1, iterations)
-    parts = (
-        scratch.vertices,
-        scratch.projections,
-        scratch.vertex_numbers,
-        scratch.faces,
-        scratch.horizon,
-        scratch.squares,
-    )
+    kind: Any = kernels.Scratch
+    parts = [getattr(scratch, name) for name in kind.vars]
     return sum(part.size * wp.types.type_size_in_bytes(part.dtype) for part in parts)
 
 
 def empty_lists(contacts: int, worlds: int) -> kernels.Lists:
-    """Lists for so many worlds with room for so many contacts together."""
+    """Allocate lists for so many worlds with room for so many contacts together."""
     prisms, touches = (each * contacts + spare * worlds for each, spare in (_PRISMS, _TOUCHES))
     return filled(
         kernels.Lists,
@@ -103,9 +97,9 @@ def empty_lists(contacts: int, worlds: int) -> kernels.Lists:
 
 
 def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: tuple[int, ...]) -> None:
-    """Write the contacts between height fields and geoms of these types; the lists are given back at the end.
+    """Write the contacts between height fields and geoms of these types.
 
-    Worlds of which contacts are lost, since a list is full, get mujoco_warp's alarm ``HFIELD``.
+    Worlds that lose contacts to a full list get mujoco_warp's alarm ``HFIELD``.
     """
     multiprocessors = data.ncollision.device.sm_count
     testing = multiprocessors * _TEST_THREADS or _SERIAL_THREADS
@@ -129,7 +123,7 @@ def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: t
 def convex_narrowphase(
     model: Model, data: Data, context: CollisionContext, table: list[tuple[GeomType, GeomType]]
 ) -> None:
-    """Collide height fields here, and all other convex shapes of the table in mujoco_warp."""
+    """Collide height fields with the repair's kernels, and all other convex shapes of the table in mujoco_warp."""
     kinds = colliding_kinds(model, table)
     if kinds:
         collide_fields(model, data, context, kinds)
@@ -142,8 +136,5 @@ def _install() -> None:
 
 
 HEIGHT_FIELDS = Repair(
-    project="mujoco-warp",
-    versions=">=3.17,<3.18",
-    fault="its contact with height fields",
-    install=_install,
+    project="mujoco-warp", versions=">=3.17,<3.18", fault="its contact with height fields", install=_install
 )

@@ -20,7 +20,7 @@ _ERRORS = (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, KeyErr
 
 
 def read_limited(path: Path) -> bytes:
-    """The content of a policy file or checkpoint.
+    """Return the content of a policy file or checkpoint.
 
     Raises:
         PolicyError: it cannot be read, is empty or larger than ``LARGEST_FILE``.
@@ -39,7 +39,7 @@ def read_limited(path: Path) -> bytes:
 
 
 def archive_names(data: bytes, *, source: str) -> frozenset[str]:
-    """Names of an archive's records, without the folder that holds them all.
+    """Return the names of an archive's records, without the folder that holds them all.
 
     Raises:
         PolicyError: not an archive.
@@ -52,7 +52,7 @@ def archive_names(data: bytes, *, source: str) -> frozenset[str]:
 
 
 def read_archive(data: bytes, *, source: str) -> dict[str, bytes]:
-    """All records of an archive by their names without the folder that holds them all.
+    """Return all records of an archive by their names without the folder that holds them all.
 
     Raises:
         PolicyError: not an archive of torch's form, damaged (a checksum is wrong), or larger than ``LARGEST_FILE`` unpacked.
@@ -98,7 +98,7 @@ def _records(archive: zipfile.ZipFile, source: str) -> dict[str, bytes]:
 
 
 def packed(records: Mapping[str, bytes]) -> bytes:
-    """The records as an archive that torch reads: what was checked is what is loaded, whatever else the file holds."""
+    """Return the records as an archive that torch reads: what was checked is what is loaded, whatever else the file holds."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, content in records.items():

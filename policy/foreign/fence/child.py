@@ -1,6 +1,6 @@
-"""The process in which a foreign program runs, and how its owner talks with it.
+"""Runs a foreign program in a process of its own, and talks with it.
 
-Observations and actions lie in memory that both see, and two semaphores say whose turn it is. Physics leaves little of either
+Observations and actions lie in memory that both see, and two semaphores pass the turn. Physics leaves little of either
 process in the processor's caches, so that a line of Python that a control step runs here costs microseconds: what it needs is
 laid out beforehand, and it is done in as few calls as will do. All other messages, and why a step failed, go through a
 connection. What comes back is never unpickled: a word, JSON, or numbers. The process ends when its owner does, when it takes too
@@ -46,7 +46,7 @@ _ROOM = 2**26  # of the memory that both see; what is not used takes none
 # Numbers at the beginning of that memory.
 _WANTED, _SESSION, _FAILS, _CORE, _HEAD = range(5)  # the core by its number and one; 0: any
 _HEAD_BYTES = 64
-_MESSAGE, _STEP, _STEP_AFTER_RESET = range(3)  # what may be wanted
+_MESSAGE, _STEP, _STEP_AFTER_RESET = range(3)  # the kinds of request
 _FINE, _FAILED = b"\0", b"\1"
 # What the other process's end looks like; a value: the semaphore has been raised to its most.
 _ENDED = (OSError, EOFError, ValueError)
@@ -159,7 +159,7 @@ class Child:
         self._dropped.append(number)
 
     def act(self, session: ChildSession, observation: torch.Tensor, forget: torch.Tensor | None) -> torch.Tensor:
-        """Actions (N, J) float32 for observations (N, W), after those of ``forget`` (N,) bool were reset.
+        """Return actions (N, J) float32 for observations (N, W), after those of ``forget`` (N,) bool were reset.
 
         Raises:
             PolicyError: the program fails, takes too long or too much memory.
@@ -235,7 +235,7 @@ class Child:
         return self._connection.recv_bytes(_LONGEST_REPLY)
 
     def _ended(self, error: Exception) -> PolicyError:
-        """Why the other process did not answer."""
+        """Return the reason that the other process did not answer."""
         if isinstance(error, TimeoutError):
             self._end()
             return PolicyError(f"'{self._source}' took over {_WALL_SECONDS} s for one step and was ended")
@@ -256,7 +256,7 @@ class Child:
 
 
 def _content(reply: bytes) -> bytes:
-    """What an answer holds.
+    """Return the content of an answer.
 
     Raises:
         PolicyError: that the program failed.
@@ -275,7 +275,7 @@ class ChildSession:
 
 
 def _shared_memory() -> tuple[Any, Any]:
-    """Memory that both processes see: for the owner, and as it is handed to the other one."""
+    """Return memory that both processes see: for the owner, and as it is handed to the other one."""
     if CONTEXT.get_start_method() == "fork":
         memory = mmap.mmap(-1, _HEAD_BYTES + _ROOM)
         return memory, memory
@@ -294,7 +294,7 @@ def _end(process: Any, connection: Connection, owner: int) -> None:
 def _run(
     make: Any, connection: Connection, parents: Connection, shared: Any, turns: Any, source: str, owner: int
 ) -> None:
-    """The process's whole life."""
+    """Run the process from its start to its end."""
     if parents.fileno() != connection.fileno():
         parents.close()
     torch.set_num_threads(1)
@@ -358,7 +358,7 @@ def _serve(make: Any, connection: Connection, memory: Any, turns: Any, source: s
 
 
 def _reason(error: Exception, source: str) -> bytes:
-    """Why the program failed, for its owner."""
+    """Return the reason that the program failed, for its owner."""
     if isinstance(error, PolicyError):
         reason = str(error)
     elif isinstance(error, MemoryError):

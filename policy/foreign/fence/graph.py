@@ -1,4 +1,4 @@
-"""ONNX files, read before onnxruntime sees them: which operators they use, and where their weights lie."""
+"""Reads ONNX files before onnxruntime sees them: their operators, and the place of their weights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .operators import ONNX_CONTRIBUTED, ONNX_OPERATORS
 MOST_NODES = 100_000
 """Most nodes of all graphs of a file."""
 ACTION_NAMES = ("actions", "action")
-"""What an output with the actions is called."""
+"""Name of an output with the actions."""
 _DEEPEST = 16
 _OWN_SETS = ("", "ai.onnx")
 # Where onnxruntime has operators of its own: those go before a file's functions of the same name.
@@ -24,7 +24,7 @@ _TAKEN_SETS = ("ai.onnx", "com.microsoft", "com.ms", "org.pytorch")
 
 
 def action_output(names: Sequence[str]) -> str:
-    """Which of a file's outputs holds the actions: the one of that name, else the first."""
+    """Return the output that holds the actions: the one of that name, else the first."""
     return next((name for name in ACTION_NAMES if name in names), names[0])
 
 
@@ -63,7 +63,7 @@ def check_graph(data: bytes, *, source: str, folder: Path | None) -> onnx.ModelP
 
 
 def _nodes(model: onnx.ModelProto, source: str) -> Iterator[onnx.NodeProto]:
-    """All nodes, those of functions and of graphs inside nodes included."""
+    """Yield all nodes, those of functions and of graphs inside nodes included."""
     for function in model.functions:
         if not function.domain or function.domain.lower().startswith(_TAKEN_SETS):
             where = f" in '{function.domain}'" if function.domain else ""
@@ -128,7 +128,7 @@ def _load_weights(model: onnx.ModelProto, source: str, folder: Path | None) -> N
 
 
 def _tensors(model: onnx.ModelProto, source: str) -> Iterator[onnx.TensorProto]:
-    """All tensors but the main graph's own weights."""
+    """Yield all tensors but the main graph's own weights."""
     for sparse in model.graph.sparse_initializer:
         yield from (sparse.values, sparse.indices)
     nodes = (node.attribute for node in _nodes(model, source))
@@ -145,7 +145,7 @@ def _tensors(model: onnx.ModelProto, source: str) -> Iterator[onnx.TensorProto]:
 
 
 def _beside(location: str, folder: Path, source: str) -> Path:
-    """The file of this name in a folder, which must really lie there.
+    """Return the file of this name in a folder, which must really lie there.
 
     Raises:
         PolicyError: it does not, or there is none.

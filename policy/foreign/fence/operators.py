@@ -1,4 +1,4 @@
-"""What a foreign program may use: operators on tensors, numbers, texts and lists, which compute and touch nothing else.
+"""Lists the operators of foreign programs: on tensors, numbers, texts and lists; they compute and touch nothing else.
 
 Whatever is absent is refused by its name. Absent on purpose: what opens files (``from_file``, ``save``), starts tasks or calls
 other machines, reaches into memory without checking (``set_``, ``resize_``, ``as_strided``, ``empty_strided``, and

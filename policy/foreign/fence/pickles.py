@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import pickletools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -52,15 +52,12 @@ class Name:
     name: str
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Call:
     """A function that would be called, or a class that would be built."""
 
     function: Name
     arguments: tuple[Any, ...]
-    state: Any = None
-    items: list[Any] = field(default_factory=list)
-    """Keys and values in turn of a mapping that is filled after it was made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +71,7 @@ class Storage:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Type of an entry."""
+        """Return the type of an entry."""
         return STORAGES[self.kind]
 
 
@@ -87,10 +84,8 @@ _MARK = object()
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What a pickle holds."""
+    """Hold the content of a pickle."""
 
-    value: Any
-    """Its object: plain data, ``Call``, ``Name`` and ``Storage``."""
     names: tuple[str, ...]
     """All names it mentions."""
     calls: tuple[Call, ...]
@@ -124,7 +119,8 @@ class _Machine:
             if number > MOST_OPERATIONS:
                 raise PickleError(f"'{self._source}' holds a pickle of over {MOST_OPERATIONS:,} operations")
             if operation.name == "STOP":
-                return Reading(value=self._stack.pop(), names=tuple(self._names), calls=tuple(self._calls))
+                self._stack.pop()  # its object; a pickle without one is damaged
+                return Reading(names=tuple(self._names), calls=tuple(self._calls))
             step = _STEPS.get(operation.name)
             if step is None:
                 raise PickleError(f"'{self._source}' holds the pickle operation {operation.name}, and was not loaded")
@@ -166,11 +162,9 @@ class _Machine:
         self.push(made)
 
     def build(self, _: Any) -> None:
-        state = self._stack.pop()
-        target = self._stack[-1]
-        if not isinstance(target, Call):
+        self._stack.pop()
+        if not isinstance(self._stack[-1], Call):
             raise PickleError(f"'{self._source}' holds a pickle that gives plain data a state, and was not loaded")
-        target.state = state
 
     def persistent(self, _: Any) -> None:
         identity = self._stack.pop()
@@ -179,13 +173,12 @@ class _Machine:
             shown = cls.name if isinstance(cls, Name) else "no storage"
             raise PickleError(f"'{self._source}' holds a storage of an unknown kind ({shown})")
         if not _whole(count) or count < 0:
-            raise PickleError(f"'{self._source}' holds a storage whose size is no number")
+            raise PickleError(f"'{self._source}' holds a storage with a size that is no number")
         self.push(Storage(cls.name, key, count))
 
     def set_items(self, pairs: list[Any]) -> None:
         target = self._stack[-1]
         if isinstance(target, Call):
-            target.items.extend(pairs)
             return
         for key, value in zip(pairs[::2], pairs[1::2], strict=True):
             # a key may be what a call makes; nothing here depends on it being found again
@@ -197,9 +190,7 @@ class _Machine:
 
     def extend(self, values: list[Any]) -> None:
         target = self._stack[-1]
-        if isinstance(target, Call):
-            target.items.extend(values)
-        else:
+        if not isinstance(target, Call):
             target.extend(values)
 
     def keep(self, index: int | None) -> None:
@@ -249,19 +240,8 @@ def _whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-@dataclass(frozen=True, eq=False)
-class StoredTensor:
-    """A dense tensor as an archive stores it."""
-
-    storage: Storage
-    offset: int
-    """Entries of its storage before its first."""
-    shape: tuple[int, ...]
-    stride: tuple[int, ...]
-
-
-def stored_tensor(call: Call, *, source: str) -> StoredTensor:
-    """The tensor that a call to torch's ``_rebuild_tensor_v2`` describes.
+def _stored_tensor(call: Call, source: str) -> tuple[Storage, tuple[int, ...]]:
+    """Return storage and shape of the tensor that a call to torch's ``_rebuild_tensor_v2`` describes.
 
     Raises:
         PolicyError: its numbers are no numbers, or it reaches beyond its storage.
@@ -279,7 +259,7 @@ def stored_tensor(call: Call, *, source: str) -> StoredTensor:
         raise PickleError(
             f"'{source}' holds a tensor of shape {list(shape)} that reaches beyond its {storage.count} stored entries"
         )
-    return StoredTensor(storage, offset, shape, stride)
+    return storage, shape
 
 
 def check_tensors(calls: Iterator[Call], sizes: Mapping[str, int], *, source: str) -> None:
@@ -294,11 +274,10 @@ def check_tensors(calls: Iterator[Call], sizes: Mapping[str, int], *, source: st
     """
     total = 0
     for call in calls:
-        tensor = stored_tensor(call, source=source)
-        storage = tensor.storage
+        storage, shape = _stored_tensor(call, source)
         if sizes.get(storage.key, -1) < storage.count * storage.dtype.itemsize:
             raise PickleError(f"'{source}' lacks the weights that it lists: record '{storage.key}' is missing or short")
-        total += math.prod(tensor.shape) * storage.dtype.itemsize
+        total += math.prod(shape) * storage.dtype.itemsize
         if total > LARGEST_FILE:
             raise PickleError(
                 f"'{source}' holds tensors of over {LARGEST_FILE // 2**20} MiB once they are spelled out; "

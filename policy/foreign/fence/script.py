@@ -1,4 +1,4 @@
-"""TorchScript files, read before torch loads them: what their code uses, and what they would allocate.
+"""Reads TorchScript files before torch loads them: the operators of their code, and the memory they would allocate.
 
 torch runs code of the file while it loads it (``__setstate__``). So the code is parsed here first, as the part of Python that
 it is. Every function that is called, and every word behind a point, has to be one of the archive's own or of a list of
@@ -51,7 +51,7 @@ _OWN_METHODS = frozenset({"forward", "__init__", "__getstate__", "__setstate__",
 
 @dataclass(frozen=True, kw_only=True)
 class ScriptFile:
-    """A TorchScript file whose code has been read."""
+    """Hold a TorchScript file after its code has been read."""
 
     data: bytes
     """The archive to load: what was read, and nothing else."""
@@ -118,7 +118,7 @@ def _check_code(trees: Mapping[str, ast.Module], source: str) -> None:
 
 
 class _Checker(ast.NodeVisitor):
-    """Walks through a file's code; whatever is not expected is refused."""
+    """Walk through a file's code and refuse whatever is not expected."""
 
     def __init__(self, methods: frozenset[str], source: str, file: str) -> None:
         self._methods, self._functions = methods, frozenset[str]()
@@ -136,7 +136,7 @@ class _Checker(ast.NodeVisitor):
                 self.refuse(f"import {alias.name}")
 
     def visit_Attribute(self, node: ast.Attribute) -> None:
-        """A chain that begins at ``torch``, ``ops`` or the archive's own classes is a name; any other is a value's."""
+        """Check a name: a chain that begins at ``torch``, ``ops`` or the archive's own classes is one, any other is a value's."""
         words = _words(node)
         if words is None:
             self.generic_visit(node)
@@ -154,7 +154,7 @@ class _Checker(ast.NodeVisitor):
             self.refuse(dotted)
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        """Variables that are called are functions of the archive's own, and never anything else in the same function."""
+        """Check that variables that are called are functions of the archive's own, and nothing else in the same function."""
         outside, self._functions = self._functions, _own_functions(node)
         self.generic_visit(node)
         self._functions = outside
@@ -197,7 +197,7 @@ _NODES = (
 
 
 def _words(node: ast.expr) -> list[str] | None:
-    """The words of a dotted name, None for an attribute of anything else."""
+    """Return the words of a dotted name, None for an attribute of anything else."""
     words = []
     while isinstance(node, ast.Attribute):
         words.append(node.attr)
@@ -206,7 +206,7 @@ def _words(node: ast.expr) -> list[str] | None:
 
 
 def _own_functions(function: ast.FunctionDef) -> frozenset[str]:
-    """Variables to which a function assigns classes and functions of the archive, by their names, and nothing else."""
+    """Return variables to which a function assigns classes and functions of the archive, by their names, and nothing else."""
     own: list[ast.Name] = []
     for node in ast.walk(function):
         if isinstance(node, ast.Assign) and len(node.targets) == 1 and isinstance(node.targets[0], ast.Name):
@@ -228,7 +228,7 @@ def _names_attribute(call: ast.Call) -> bool:
 
 
 def _attributes(trees: Iterable[ast.Module]) -> Iterable[str]:
-    """What the classes declare: ``history : Tensor``, or ``__annotations__["0"] = Tensor`` for what is no name."""
+    """Yield the attributes that the classes declare: ``history : Tensor``, or ``__annotations__["0"] = Tensor`` for what is no name."""
     for tree in trees:
         for made in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
             for line in made.body:
@@ -261,6 +261,6 @@ def _check_pickle(records: Mapping[str, bytes], name: str, source: str) -> None:
 
 
 def _texts(calls: Iterable[Call]) -> Iterable[str]:
-    """Texts among the arguments of calls: types are named there."""
+    """Yield the texts among the arguments of calls: types are named there."""
     for call in calls:
         yield from (a for a in call.arguments if isinstance(a, str))

@@ -1,0 +1,39 @@
+"""Packages import downwards, and no circle of modules exists; imports under TYPE_CHECKING and inside functions count."""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import gaitgauge
+
+ROOT = Path(gaitgauge.__path__[0])
+ORDER = ("files", "robots", "terrains", "backends", "policy", "gauge", "studies", "training", "cli")
+ROOMS = ("training", "training.environment", "training.algorithms", "training.tasks", "training.run", "training.sweep")
+FILES = {f.relative_to(ROOT).with_suffix("").parts: f for package in ORDER for f in (ROOT / package).rglob("*.py")}
+MODULES = {".".join(parts[:-1] if parts[-1] == "__init__" else parts): file for parts, file in FILES.items()}
+
+
+def imports(module: str) -> set[str]:
+    """Modules of the package that a module imports."""
+    found, here = set(), (*module.split("."), "")[: None if MODULES[module].name == "__init__.py" else -1]
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = ".".join(filter(None, (*here[: len(here) - node.level], node.module)))
+            found |= {f"{base}.{a.name}" if f"{base}.{a.name}" in MODULES else base for a in node.names}
+    return (found & MODULES.keys()) - {module}
+
+
+def room(module: str) -> str:
+    return module if MODULES[module].name == "__init__.py" else module.rpartition(".")[0]
+
+
+def test_packages_and_the_rooms_of_training_import_downwards():
+    pairs = [(module, used) for module in MODULES for used in imports(module)]
+    assert len(pairs) > 1000
+    assert [p for p in pairs if ORDER.index(p[0].split(".")[0]) < ORDER.index(p[1].split(".")[0])] == []
+    inside = [pair for pair in pairs if all(module.startswith("training") for module in pair)]
+    assert [p for p in inside if ROOMS.index(room(p[0])) < ROOMS.index(room(p[1]))] == []
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    TopologicalSorter({module: imports(module) for module in MODULES}).prepare()

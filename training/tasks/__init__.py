@@ -1,0 +1,277 @@
+"""The tasks that can be trained, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from types import MappingProxyType
+
+from ...files.parsing import one_line, shown
+from ...files.plugins import imported
+from ...robots import load_robot
+from ...robots.loading import robot_digest
+from ..configuration import AlgorithmConfiguration, NetworkConfiguration, Ramp, RunConfiguration, TrainingConfiguration
+from ..environment.configuration import (
+    CommandConfiguration,
+    CommandStage,
+    EnvironmentConfiguration,
+    RandomizationConfiguration,
+    TerminationConfiguration,
+)
+from ..environment.reward_configuration import RewardConfiguration
+from ..environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
+from ..overrides import TaskError, apply_overrides
+from .scaling import scaled
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Environment and method of a training, under a name."""
+
+    name: str
+    """Name on the command line."""
+    title: str
+    """One line for people."""
+    environment: EnvironmentConfiguration
+    """Settings of the environment."""
+    training: TrainingConfiguration
+    """Settings of the method and the run."""
+
+    def with_overrides(self, overrides: Iterable[str]) -> Task:
+        """Return the task with some settings changed: ``environment.…`` and ``training.…`` keys.
+
+        Raises:
+            TaskError: a key or value that does not fit.
+        """
+        settings = apply_overrides(_Settings(environment=self.environment, training=self.training), overrides)
+        return replace(self, environment=settings.environment, training=settings.training)
+
+    def for_robot(self, source: str) -> Task:
+        """Return the task for another robot than its own, a name or the path of a description, scaled by its sizes.
+
+        Raises:
+            RobotError: it cannot be found, or is wrong.
+        """
+        own, robot = load_robot(self.environment.robot, check=False), load_robot(source)
+        if robot_digest(robot) == robot_digest(own):
+            return self
+        environment, training = scaled(self.environment, self.training, source)
+        return replace(self, environment=environment, training=training)
+
+    def with_horizon(self) -> Task:
+        """Return the task with schedules spread over exactly the run's own iterations."""
+        run = self.training.run
+        schedule = replace(self.environment.schedule, horizon_steps=run.iterations * run.steps_per_iteration)
+        return replace(self, environment=replace(self.environment, schedule=schedule))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Settings:
+    """Settings that overrides may change."""
+
+    environment: EnvironmentConfiguration
+    training: TrainingConfiguration
+
+
+_MIRRORED = AlgorithmConfiguration(symmetry="augment", student_period=2)
+_ALL_TERRAINS = EnvironmentConfiguration(
+    num_envs=16384,
+    rewards=RewardConfiguration(
+        yaw_tracking=0.75,
+        progress=1.5,
+        collision=-0.25,
+        foot_regulation=-0.1,
+        foot_height_scale=0.05,
+    ),
+    commands=CommandConfiguration(straight_probability=0.5, heading_gain=1.0, crossing_probability=0.5),
+    termination=TerminationConfiguration(stuck=8.0),
+)
+_ALL_TERRAINS_LEARNING = AlgorithmConfiguration(
+    symmetry="alternate",
+    student_period=2,
+    # Exploration is worth more while the robot learns to walk and to climb than once it is to be precise.
+    entropy_coefficient=Ramp(start=0.01, end=0.002, begin=0.3, until=0.5),
+    # Large steps learn fast; small ones, which a trained policy loses least by, end the run.
+    desired_kl=Ramp(start=0.01, end=0.003, begin=0.4, until=0.8),
+)
+
+
+_ALL_TERRAINS_ITERATIONS = 5000
+"""Two billion steps of 16,384 worlds, in all."""
+
+
+_PLAIN = NetworkConfiguration(student_encoder="mlp")
+_MOE_NG = NetworkConfiguration(student_encoder="moe_ng")
+_AC_MOE = replace(_PLAIN, expert_width=128, actor_hidden=(512, 256), critic_hidden=(512, 256))
+_MCP = replace(_PLAIN, gate_hidden=(512, 256, 128))
+_HIM = replace(_PLAIN, latent_width=16, student_hidden=(128, 64), teacher_hidden=(128, 64))
+_DREAMWAQ = replace(_HIM, teacher_hidden=(64, 128, 48))
+
+_METHODS = (
+    ("go2-moe-cts", "cts", NetworkConfiguration(), "Mixture-of-Experts student (the paper's method)"),
+    ("go2-cts", "cts", _PLAIN, "plain student"),
+    ("go2-moe-ng", "cts", _MOE_NG, "experts that do not see the command (ablation MoE-NG)"),
+    ("go2-ac-moe", "ac_moe", _AC_MOE, "experts in actor and critic (ablation AC-MoE)"),
+    ("go2-mcp", "mcp", _MCP, "an actor that multiplies primitives (ablation MCP)"),
+    ("go2-him", "him", _HIM, "hybrid internal model (baseline HIM)"),
+    ("go2-dreamwaq", "dreamwaq", _DREAMWAQ, "variational estimator (baseline DreamWaQ)"),
+)
+"""The paper's method, its baselines and its ablations, with their own sizes: task, method, network, title."""
+
+
+def _on_all_terrains(name: str, method: str, network: NetworkConfiguration, title: str) -> Task:
+    """Return the task of a method on the environment that all methods share."""
+    return Task(
+        name=name,
+        title=f"Unitree Go2 on all terrains, {title}",
+        environment=_ALL_TERRAINS,
+        training=TrainingConfiguration(
+            algorithm=replace(_ALL_TERRAINS_LEARNING, method=method),
+            network=network,
+            run=RunConfiguration(experiment=name.replace("-", "_"), iterations=_ALL_TERRAINS_ITERATIONS),
+        ),
+    )
+
+
+_LEVEL_GROUND = TerrainConfiguration(
+    tiles=(FLAT_TILE,), levels=1, curriculum=False, leave_distance=None, spread_probability=0.0
+)
+_FLAT_ITERATIONS = 380
+
+
+def _flat() -> Task:
+    """Return a task that walks within three minutes of an H200: no terrain, and every stage early, since the whole run is a few hundred
+    iterations. Most of them must be spent on the fastest commands, and on the sudden reversals that the gauge asks for.
+    """
+    environment = EnvironmentConfiguration(
+        num_envs=8192,
+        terrain=_LEVEL_GROUND,
+        termination=TerminationConfiguration(trunk_contact=1.0),
+        commands=CommandConfiguration(
+            stages=(
+                CommandStage(begin=0.0, forward=(-1.0, 1.0), lateral=(-0.6, 0.6), yaw=(-1.0, 1.0)),
+                CommandStage(begin=0.15, forward=(-1.5, 1.5), lateral=(-1.0, 1.0), yaw=(-1.5, 1.5)),
+                CommandStage(begin=0.3, forward=(-2.0, 2.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
+            ),
+            interval=3.0,
+            dynamic=False,
+            extreme_probability=0.3,
+            flip_probability=0.5,
+        ),
+        rewards=RewardConfiguration(linear_tracking=2.0, yaw_tracking=1.0, base_height=Ramp(start=-5.0, end=-10.0)),
+    )
+    training = TrainingConfiguration(
+        # Compiling takes half a minute of a short run.
+        algorithm=replace(
+            _MIRRORED, compile_mode="none", entropy_coefficient=Ramp(start=0.01, end=0.003, begin=0.4, until=0.8)
+        ),
+        network=NetworkConfiguration(student_encoder="mlp"),
+        run=RunConfiguration(experiment="go2_flat", iterations=_FLAT_ITERATIONS, save_interval=100, gauge_interval=0),
+    )
+    return Task(
+        name="go2-flat", title="Unitree Go2 on level ground (quick)", environment=environment, training=training
+    )
+
+
+_SPRINT_ITERATIONS = 2000
+
+
+def _sprint() -> Task:
+    """Return the paper's fast task: commands of up to 4.5 m/s straight ahead, so that 4 m/s is not at the limit of what was learned.
+    Weights and the order of the stages are the published ones; each stage is a larger fraction of this shorter run. A robot has fallen
+    where its trunk touches level ground.
+    """
+    environment = EnvironmentConfiguration(
+        num_envs=8192,
+        terrain=replace(_LEVEL_GROUND, tiles=(replace(FLAT_TILE, command_limits=(4.5, 1.0, 2.0)),)),
+        termination=TerminationConfiguration(trunk_contact=1.0),
+        randomization=RandomizationConfiguration(friction=(0.4, 1.25)),
+        commands=CommandConfiguration(
+            stages=(
+                CommandStage(begin=0.0, forward=(-1.0, 1.0), lateral=(-1.0, 1.0), yaw=(-1.0, 1.0)),
+                CommandStage(begin=0.1, forward=(-2.0, 2.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
+                CommandStage(begin=0.2, forward=(-2.0, 3.0), lateral=(-1.0, 1.0), yaw=(-2.0, 2.0)),
+                CommandStage(begin=0.35, forward=(-2.0, 3.5), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),
+                CommandStage(begin=0.5, forward=(-2.0, 4.0), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),
+                CommandStage(begin=0.65, forward=(-2.0, 4.5), lateral=(-0.5, 0.5), yaw=(-1.0, 1.0)),
+            ),
+            interval=4.0,
+            dynamic=False,
+            straight_probability=0.5,
+            extreme_probability=0.3,
+            extreme_zero_probability=(0.0, 1.0, 1.0 / 3.0),
+        ),
+        rewards=RewardConfiguration(
+            linear_tracking=2.0,
+            # Far from the command the tracking kernel is flat: this is what makes a standing robot accelerate.
+            progress=1.0,
+            base_height_target=0.33,
+            hip_symmetry=-0.5,
+            dynamic_sigma=False,
+        ),
+    )
+    training = TrainingConfiguration(
+        algorithm=replace(_MIRRORED, entropy_coefficient=Ramp(start=0.01, end=0.003, begin=0.5, until=0.8)),
+        run=RunConfiguration(
+            experiment="go2_sprint", iterations=_SPRINT_ITERATIONS, save_interval=200, gauge_interval=0
+        ),
+    )
+    return Task(
+        name="go2-sprint",
+        title="Unitree Go2 at 4 m/s on level ground (the paper's fast task)",
+        environment=environment,
+        training=training,
+    )
+
+
+TASKS: Mapping[str, Task] = MappingProxyType(
+    {task.name: task for task in (*(_on_all_terrains(*row) for row in _METHODS), _flat(), _sprint())}
+)
+"""All tasks by name."""
+
+
+def _own_task(path: str) -> Task:
+    """Return the task at ``module:attribute``, under this name, by which a resumed run finds it again."""
+    found, (module, _, attribute) = imported(path, f"task {shown(path)}:", TaskError), path.partition(":")
+    if not isinstance(found, Task):
+        raise TaskError(f"task {shown(path)}: module {shown(module)} has no Task of the name {shown(attribute)}")
+    return replace(found, name=path)
+
+
+def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = None) -> Task:
+    """Return a task, for a robot, with settings changed.
+
+    Schedules are spread over the run's iterations, unless an override sets ``environment.schedule.horizon_steps``.
+
+    Args:
+        name: one of ``TASKS``, or ``module:attribute`` of a ``Task`` of one's own.
+        overrides: ``environment.…=value`` and ``training.…=value``, which change what is scaled for the robot.
+        robot: name or path of a robot; None for the task's own.
+
+    Raises:
+        TaskError: unknown task, or a key or value that does not fit.
+        RobotError: the robot cannot be found, or is wrong.
+    """
+    if ":" in name:
+        known = _own_task(name)
+    elif name in TASKS:
+        known = TASKS[name]
+    else:
+        near = get_close_matches(name, TASKS, n=3, cutoff=0.3)
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        raise TaskError(f"unknown task '{one_line(name, 80)}'; {hint}the tasks are: {', '.join(TASKS)}")
+    chosen = list(overrides)
+    named = [o for o in chosen if o.split("=", 1)[0].strip() == "environment.robot"]
+    if named and robot is not None:
+        raise TaskError(f"the robot is given twice, as '{robot}' and with environment.robot=; leave one out")
+    if named:  # the same as --robot
+        robot, chosen = named[-1].split("=", 1)[1].strip(), [o for o in chosen if o not in named]
+    if robot is not None:
+        known = known.for_robot(robot)
+    task = known.with_overrides(chosen)
+    own_horizon = any(o.split("=", 1)[0].strip() == "environment.schedule.horizon_steps" for o in chosen)
+    return task if own_horizon else task.with_horizon()
+
+
+__all__ = ["TASKS", "Task", "TaskError", "find_task"]
