@@ -282,7 +282,7 @@ def test_settings_are_listed_with_default_unit_and_meaning(run):
     lines = result.output.splitlines()
     assert max(map(len, lines)) <= 80
     group = lines.index(next(line for line in lines if line == "environment.observations"))
-    assert lines[group + 1] == "  What the networks see"
+    assert lines[group + 1] == "  Inputs of the networks"
     scan = lines.index("  scan_length = 1.6", group)
     assert lines[scan + 1] == "      Extent of the height scan along the heading [m]."
     assert "  num_envs = 64" in lines
