@@ -1,4 +1,4 @@
-"""The project as a library: judge, train and read policies from Python.
+"""Judge, train and read policies from Python.
 
 Each function does what the command of the same name does, with the same defaults, and raises the same one-sentence
 errors. Heavy packages are imported inside the functions.
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 
 class ResultsError(ValueError):
-    """A folder or file that holds no results; the message says what is wrong."""
+    """Refuse a folder or file that holds no results; the message says what is wrong."""
 
 
 class ArgumentError(TypeError):
-    """An argument of another type than it must have; the message names it."""
+    """Refuse an argument of the wrong type; the message names it."""
 
 
 def _need(kind: str, **given: Any) -> None:
@@ -131,12 +131,12 @@ def evaluate(
     watch: Callable[[Any], None] | None = None,
     **options: Any,
 ) -> Result:
-    """Judge a policy, as ``gaitgauge evaluate`` does; writes results, episodes and the report.
+    """Judge a policy, as ``gaitgauge evaluate`` does, and write results, episodes and the report.
 
     Args:
         policy: a file, or ``latest``, ``best`` or ``pretrained``; or a whole request in place of all options.
         out: output folder; None for ``results/<policy>-<suite>-<pipeline>``.
-        resume: go on with what the folder holds.
+        resume: go on with the run in the folder.
         watch: called a few times a second with a ``Status``.
         options: fields of ``gaitgauge.gauge.request.Request``: ``suite``, ``terrains``, ``frictions``, ``threads`` …
 
@@ -161,7 +161,7 @@ def compare(*results: Result | str | Path) -> Comparison:
     """Compare policies as ``gaitgauge compare`` does, without the evaluating.
 
     Args:
-        results: two or more of: what ``evaluate`` returned, results folders, copies of ``results.json``.
+        results: two or more of: objects that ``evaluate`` returned, results folders, copies of ``results.json``.
 
     Raises:
         ComparisonError: results that cannot be read, or were not made alike.
@@ -192,7 +192,7 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
         options: fields of ``gaitgauge.training.run.request.TrainRequest``.
 
     Returns:
-        How it ended, and the run directory.
+        The outcome, and the run directory.
 
     Raises:
         ArgumentError, TaskError, ConfigurationError, BackendError, SuiteError, CheckpointError: one sentence on what is wrong.

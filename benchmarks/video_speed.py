@@ -30,12 +30,13 @@ def main() -> None:
 
     from gaitgauge.cli.drawing import processes_for
     from gaitgauge.cli.recording import FRAME_TIME, Recording, record
+    from gaitgauge.cli.requests import PlayRequest
     from gaitgauge.cli.worlds import WorldMaker
 
     for name in names.get(options.quality, [options.quality]):
         quality = {"plain": PLAIN, "rich": RICH}[name]
         level = None if options.terrain == "flat" else options.level
-        maker = WorldMaker(backend="mujoco", device="cpu", seed=0, trust=False)
+        maker = WorldMaker(PlayRequest(policies=(), device="cpu"))
         session = maker.make("pretrained", options.terrain, level, 0.6, "pretrained")
         with tempfile.TemporaryDirectory() as folder:
             wanted = Recording(sessions=[session], seconds=options.seconds, video=Path(folder) / "a.mp4")

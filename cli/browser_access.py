@@ -1,4 +1,4 @@
-"""Who may reach the browser's viewer: this machine alone unless asked otherwise, and the viewer's own page alone."""
+"""Limit access to the browser's viewer: to this machine unless asked otherwise, and to the viewer's own page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import websockets.asyncio.server
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is this machine's own."""
+    """Return whether a host name or address is this machine's own."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -23,10 +23,10 @@ def is_loopback(host: str) -> bool:
 
 
 def check_host(host: str) -> None:
-    """Refuse what is no interface of this machine: the viewer's server would wait for it, and an empty name is every one.
+    """Refuse a host that is not an interface of this machine: the server would wait for it; an empty name means every interface.
 
     Raises:
-        OSError: it is none.
+        OSError: the host is not an interface of this machine.
     """
     if not host:
         raise OSError(errno.EINVAL, "an empty name would be every interface of this machine")
@@ -39,12 +39,9 @@ def check_host(host: str) -> None:
 
 
 def is_own_request(headers: Any, host: str) -> bool:
-    """Whether a request may come from the viewer's own page.
+    """Return whether a request with these headers may come from the viewer's own page.
 
-    Args:
-        headers: of the request, by name.
-        host: the interface that is listened on. On a loopback one a request must be addressed to this machine, so that no page
-            of another server gets here by giving its own name this machine's address.
+    On a loopback ``host`` a request must be addressed to this machine: another server's name may resolve to this machine's address.
     """
     addressed = headers.get("Host") or ""
     origin = headers.get("Origin")
@@ -55,9 +52,7 @@ def is_own_request(headers: Any, host: str) -> bool:
 
 @contextmanager
 def own_requests_only(host: str) -> Iterator[None]:
-    """Servers of web sockets that are started meanwhile refuse what does not come from their own page: viser takes any origin
-    and has no setting for it.
-    """
+    """Let web-socket servers that start meanwhile refuse requests from other pages; viser takes any origin, without a setting."""
     library: Any = websockets.asyncio.server
     original: Callable[..., Any] = library.serve
 

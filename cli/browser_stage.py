@@ -1,4 +1,4 @@
-"""A robot and its ground in the browser: geoms as meshes, one frame for each body."""
+"""Show a robot and its ground in the browser: geoms as meshes, one frame for each body."""
 
 from __future__ import annotations
 
@@ -19,28 +19,26 @@ _BESIDE = 1.6
 
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-    """The surface of a geom in its own frame, None for a plane or a shape that cannot be drawn here."""
-    size = model.geom_size[geom]
-    kind = mujoco.mjtGeom(model.geom_type[geom])
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return trimesh.creation.box(extents=2.0 * size)
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return trimesh.creation.icosphere(subdivisions=2, radius=size[0])
-    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
-        ball.apply_scale(size)
-        return ball
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return trimesh.creation.capsule(radius=size[0], height=2.0 * size[1], count=[16, 16])
-    if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
-        return _field_mesh(model, int(model.geom_dataid[geom]))
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        mesh = int(model.geom_dataid[geom])
-        corners = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
-        faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
-        return trimesh.Trimesh(model.mesh_vert[corners], model.mesh_face[faces])
+    """Return the surface of a geom in its own frame, None for a plane or a shape that cannot be drawn here."""
+    size, shapes, kinds = model.geom_size[geom], trimesh.creation, mujoco.mjtGeom
+    match mujoco.mjtGeom(model.geom_type[geom]):
+        case kinds.mjGEOM_BOX:
+            return shapes.box(extents=2.0 * size)
+        case kinds.mjGEOM_SPHERE:
+            return shapes.icosphere(subdivisions=2, radius=size[0])
+        case kinds.mjGEOM_ELLIPSOID:
+            return shapes.icosphere(subdivisions=3, radius=1.0).apply_scale(size)
+        case kinds.mjGEOM_CYLINDER:
+            return shapes.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
+        case kinds.mjGEOM_CAPSULE:
+            return shapes.capsule(radius=size[0], height=2.0 * size[1], count=[16, 16])
+        case kinds.mjGEOM_HFIELD:
+            return _field_mesh(model, int(model.geom_dataid[geom]))
+        case kinds.mjGEOM_MESH:
+            mesh = model.mesh(model.geom_dataid[geom])
+            corners = slice(mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0])
+            faces = slice(mesh.faceadr[0], mesh.faceadr[0] + mesh.facenum[0])
+            return trimesh.Trimesh(model.mesh_vert[corners], model.mesh_face[faces])
     return None
 
 
@@ -57,7 +55,7 @@ def _field_mesh(model: mujoco.MjModel, field: int) -> trimesh.Trimesh:
 
 
 def geom_color(model: mujoco.MjModel, geom: int) -> tuple[int, int, int]:
-    """Red, green and blue of a geom, 0 to 255."""
+    """Return red, green and blue of a geom, 0 to 255."""
     material = int(model.geom_matid[geom])
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
     red, green, blue = (round(255 * float(v)) for v in rgba[:3])
@@ -65,7 +63,7 @@ def geom_color(model: mujoco.MjModel, geom: int) -> tuple[int, int, int]:
 
 
 class Stage:
-    """One world in the browser. Its frame stands beside those of the other worlds; a frame for each body moves within it."""
+    """Show one world in the browser. Its frame stands beside those of the other worlds; a frame for each body moves within it."""
 
     def __init__(
         self, server: viser.ViserServer, session: PlaySession, name: str, aside: float, *, titled: bool
@@ -73,8 +71,8 @@ class Stage:
         """Send the geoms.
 
         Args:
-            session: whose robot and ground are shown.
-            aside: where the world stands along y [m].
+            session: gives robot and ground.
+            aside: position of the world along y [m].
             titled: write the policy's name above the robot.
         """
         self.session, self.aside = session, aside
@@ -102,7 +100,7 @@ class Stage:
         self.move()
 
     def move(self) -> None:
-        """Move the bodies to where they are now."""
+        """Move the bodies to their present poses."""
         show(self._model, self._data, self.session.position())
         for body, frame in self._frames.items():
             if body:
@@ -113,7 +111,7 @@ class Stage:
 
     @property
     def middle(self) -> np.ndarray:
-        """Where the robot is on the page, (3,) [m]."""
+        """Return the position of the robot on the page, (3,) [m]."""
         return self.session.position()[:3] + np.array([0.0, self.aside, 0.0])
 
     def remove(self) -> None:
@@ -122,7 +120,7 @@ class Stage:
 
 
 def distance_between(terrain: Terrain) -> float:
-    """How far apart worlds stand on the page [m]: close where their grounds look as one, else beside each other."""
+    """Return the distance between worlds on the page [m]: close where their grounds look as one, else beside each other."""
     ground = [box for box in terrain.boxes if not box.wall]
     tilted = any(abs(box.quaternion[1]) + abs(box.quaternion[3]) > 1e-9 for box in ground)
     spans = {(box.center[1] - box.half_size[1], box.center[1] + box.half_size[1]) for box in ground}

@@ -1,10 +1,10 @@
-"""The same in a browser, through viser: terrain, level, friction, policies and the command are chosen on the page."""
+"""Show robots in a browser, through viser: terrain, level, friction, policies and the command are chosen on the page."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,6 @@ from ..policy.base import PolicyError
 from ..policy.contract import ContractError
 from ..policy.finding import find_policy, shipped_policies
 from ..robots import RobotError
-from ..studies.naming import distinct_names
 from ..terrains.gauge_terrains import LEVELS
 from ..terrains.registry import TerrainError, gauge_terrain_names
 from .browser_access import check_host, is_loopback, own_requests_only
@@ -26,12 +25,13 @@ from .console import Terminal
 from .errors import UserError
 from .overlay import summary, table
 from .play_session import Command, PlaySession, clip
+from .requests import PlayRequest
 from .worlds import WorldMaker
 
 _REFRESH = 0.04
 """Time between two poses sent to the browser [s]."""
 _TOLD_EVERY = 0.2
-"""Time between two readings of speed and falls [s]."""
+"""Time between two readouts of speed and falls [s]."""
 _AIMING = 2.0
 """Time for which a new camera is aimed at the robots [s]."""
 _LOST = 4.0
@@ -39,12 +39,12 @@ _LOST = 4.0
 _FRICTIONS = (0.05, 1.5)
 _OF_RUNS = ("best", "latest")
 _REFUSALS = (PolicyError, ContractError, RobotError, TerrainError, BackendError, UserError)
-"""What may be wrong with a choice; the page says it and goes on as before."""
+"""Errors of a choice; the page shows them and goes on as before."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """What is chosen on the page and takes new worlds."""
+    """The choices on the page that take new worlds."""
 
     terrain: str
     level: int | None
@@ -53,7 +53,7 @@ class Choice:
 
 
 class Panel:
-    """Menus, sliders and buttons."""
+    """Hold menus, sliders and buttons."""
 
     def __init__(
         self, server: viser.ViserServer, chosen: Choice, sessions: Sequence[PlaySession], command: Command | None
@@ -63,16 +63,11 @@ class Panel:
         with gui.add_folder("ground"):
             self._terrains = list(dict.fromkeys([*gauge_terrain_names(), chosen.terrain]))
             self._terrain: Any = gui.add_dropdown("terrain", self._terrains, initial_value=chosen.terrain)
-            middle = WorldMaker.default_level("stairs_fd") or LEVELS[0]
-            self._level: Any = gui.add_slider(
-                "level", min=LEVELS[0], max=LEVELS[-1], step=1, initial_value=chosen.level or middle
-            )
-            least, most = _FRICTIONS
+            level = chosen.level or WorldMaker.default_level("stairs_fd") or LEVELS[0]
+            self._level: Any = gui.add_slider("level", LEVELS[0], LEVELS[-1], step=1, initial_value=level)
             friction = sessions[0].friction
-            self._frictions = min(least, friction), max(most, friction)
-            self._friction: Any = gui.add_slider(
-                "friction", min=self._frictions[0], max=self._frictions[1], step=0.05, initial_value=friction
-            )
+            self._frictions = least, most = min(_FRICTIONS[0], friction), max(_FRICTIONS[1], friction)
+            self._friction: Any = gui.add_slider("friction", least, most, step=0.05, initial_value=friction)
         self._names = _policies(chosen.policies)
         self._policies: list[Any] = []
         self._readings: list[Any] = []
@@ -91,9 +86,8 @@ class Panel:
             stand = gui.add_button("stand")
         self.follow: Any = gui.add_checkbox("camera follows", initial_value=True)
         self.restart = False
-        restart = gui.add_button("back to the start")
         stand.on_click(lambda _: self._stand())
-        restart.on_click(lambda _: setattr(self, "restart", True))
+        gui.add_button("back to the start").on_click(lambda _: setattr(self, "restart", True))
 
     def _stand(self) -> None:
         self.auto.value = False
@@ -102,7 +96,7 @@ class Panel:
 
     @property
     def chosen(self) -> Choice:
-        """What is chosen now, of what was offered: whoever reaches the server can send anything, another file among others."""
+        """Return the present choice, of the values offered: a client can send anything, the path of another file too."""
         terrain = _offered(self._terrain.value, self._terrains)
         self._level.disabled = terrain == "flat"
         level = None if terrain == "flat" else int(_within(self._level.value, LEVELS[0], LEVELS[-1]))
@@ -111,12 +105,12 @@ class Panel:
 
     @property
     def friction(self) -> float:
-        """Of the ground."""
+        """Return the friction coefficient of the ground."""
         return _within(self._friction.value, *self._frictions)
 
     @property
     def command(self) -> Command | None:
-        """What the sliders say, None for the robot's own way."""
+        """Return the command of the sliders, None where the robot finds its own way."""
         if self.auto.value:
             return None
         forward, lateral, yaw = (
@@ -125,21 +119,21 @@ class Panel:
         return forward, lateral, yaw
 
     def tell(self, sessions: Sequence[PlaySession]) -> None:
-        """Write down what is measured."""
+        """Write down command, speed and falls of each robot."""
         for reading, session in zip(self._readings, sessions, strict=True):
             readout = session.readout()
             head, *rows = (f"| {' | '.join(cells)} |" for cells in table(readout))
             reading.content = "\n".join((head, "| --- | ---: | ---: | ---: |", *rows, "", summary(readout)))
 
     def refit(self, sessions: Sequence[PlaySession]) -> None:
-        """Let the sliders end where the policies do."""
+        """Set the ends of the sliders to the limits of the policies."""
         self._reach = _limits(sessions)
         for slider, limit in zip(self._sliders, self._reach, strict=True):
             slider.value = max(-limit, min(limit, slider.value))
             slider.min, slider.max = -limit, limit
 
     def refuse(self, reason: str, chosen: Choice) -> None:
-        """Say what is wrong, and go back to what is shown."""
+        """Show the reason, and set the menus back to the worlds on the page."""
         for client in self._server.get_clients().values():
             client.add_notification("this cannot be shown", reason, color="red")
         self._terrain.value = chosen.terrain
@@ -150,24 +144,24 @@ class Panel:
 
 
 def _offered(value: object, options: Sequence[str]) -> str:
-    """A value of a menu, the first where it is none of it."""
+    """Return a value of a menu; the first one in place of a value that the menu lacks."""
     return value if isinstance(value, str) and value in options else options[0]
 
 
 def _within(value: Any, low: float, high: float) -> float:
-    """A value of a slider within its ends; the lower end for what is no number."""
+    """Return a value of a slider within its ends; the lower end in place of NaN."""
     number = float(value)
     return min(number, high) if number >= low else low
 
 
 def _limits(sessions: Sequence[PlaySession]) -> Command:
-    """The largest command that any of the policies takes; a slider needs some length."""
+    """Return the largest command that any of the policies takes; a slider needs some length."""
     forward, lateral, yaw = (max(0.05, *(s.limits[axis] for s in sessions)) for axis in range(3))
     return forward, lateral, yaw
 
 
 def _policies(chosen: Sequence[str]) -> list[str]:
-    """What the menu of policies offers: those that were named on the command line, and those that have names."""
+    """Return the menu of policies: those of the command line, and those that have names."""
     found = list(chosen)
     for name in (*shipped_policies(), *_OF_RUNS):
         with suppress(PolicyError):
@@ -177,10 +171,10 @@ def _policies(chosen: Sequence[str]) -> list[str]:
 
 
 class Page:
-    """The worlds on the page, side by side."""
+    """Hold the worlds on the page, side by side."""
 
     def __init__(self, server: viser.ViserServer, sessions: Sequence[PlaySession]) -> None:
-        """Show some; the page closes them when others come."""
+        """Show worlds; the page closes them when others replace them."""
         self._server = server
         self.stages: list[Stage] = []
         self.show(sessions)
@@ -190,17 +184,17 @@ class Page:
         self.close()
         apart = distance_between(sessions[0].terrain)
         for i, session in enumerate(sessions):
-            aside = apart * (0.5 * (len(sessions) - 1) - i)  # from left to right for who looks along x
+            aside = apart * (0.5 * (len(sessions) - 1) - i)  # from left to right, seen along x
             self.stages.append(Stage(self._server, session, f"world_{i}", aside, titled=len(sessions) > 1))
 
     @property
     def sessions(self) -> list[PlaySession]:
-        """Of all worlds."""
+        """Return the sessions of all worlds."""
         return [stage.session for stage in self.stages]
 
     @property
     def middle(self) -> np.ndarray:
-        """Of the robots, (3,) [m]."""
+        """Return the mean position of the robots, (3,) [m]."""
         return np.asarray(np.mean([stage.middle for stage in self.stages], axis=0))
 
     def close(self) -> None:
@@ -212,7 +206,7 @@ class Page:
 
 
 class Cameras:
-    """Those of all who look: aimed at the robots at first, then taken along, and otherwise theirs to move."""
+    """Move the cameras of all clients: each is aimed at the robots at first, and follows them if that is wanted."""
 
     def __init__(self, server: viser.ViserServer, page: Page) -> None:
         self._server, self._page = server, page
@@ -220,28 +214,27 @@ class Cameras:
         self._middle = page.middle
 
     def new_worlds(self) -> None:
-        """Aim all of them again."""
+        """Aim all cameras again."""
         self._aim_until.clear()
 
     def _aim(self, camera: Any) -> None:
-        """Look at the robots, from as far as it takes to see all of them."""
-        away = (
-            np.array([-1.2, -1.8, 0.9]) if len(self._page.stages) == 1 else self._farther * np.array([-2.0, 0.0, 1.1])
-        )
+        """Aim a camera at the robots, far enough away to see all of them."""
+        alone = len(self._page.stages) == 1
+        away = np.array([-1.2, -1.8, 0.9]) if alone else self._farther * np.array([-2.0, 0.0, 1.1])
         camera.position, camera.look_at = self._page.middle + away, self._page.middle
 
     @property
     def _farther(self) -> float:
-        """How much farther away than from a single robot."""
+        """Return the distance from the robots, relative to the distance from a single one."""
         return 1.0 + 0.8 * max(abs(stage.aside) for stage in self._page.stages)
 
     def follow(self, wanted: bool) -> None:
-        """Take them along with the robots, where that is wanted."""
+        """Move the cameras with the robots, where that is wanted."""
         middle, now = self._page.middle, time.monotonic()
         moved, self._middle = middle - self._middle, middle
-        self._aim(self._server.initial_camera)  # where browsers begin that come now, and where "reset view" leads
+        self._aim(self._server.initial_camera)  # for new browsers and for "reset view"
         for number, client in self._server.get_clients().items():
-            # A browser that has just come overwrites what it is told with where it was made to look first.
+            # A new browser overwrites the first camera that it is sent with its initial one.
             until = self._aim_until.setdefault(number, now + _AIMING)
             camera = client.camera
             if now < until:
@@ -249,31 +242,22 @@ class Cameras:
             elif wanted:
                 if np.linalg.norm(camera.look_at - middle) > _LOST * self._farther:
                     self._aim_until[number] = now + _AIMING
-                camera.position = camera.position + moved  # the point that it looks at comes along
+                camera.position = camera.position + moved  # viser moves the point that it looks at too
 
 
-def serve(
-    sessions: Sequence[PlaySession],
-    maker: WorldMaker,
-    chosen: Choice,
-    *,
-    command: Command | None,
-    seconds: float | None,
-    port: int,
-    host: str,
-) -> None:
-    """Serve the page until Ctrl-C or until the time is over.
+def serve(sessions: Sequence[PlaySession], maker: WorldMaker, chosen: Choice, asked: PlayRequest) -> None:
+    """Serve the page until Ctrl-C or until ``asked.seconds`` of simulated time are over.
 
     Args:
         sessions: the first worlds, one for each policy; all worlds are closed at the end.
-        maker: makes others when they are chosen on the page.
-        command: what the robots are told at first; None: to the target, or a tour.
-        seconds: simulated time until the end [s]; None: until Ctrl-C.
-        host: the interface that is listened on.
+        maker: makes the worlds that are chosen on the page.
+        chosen: the choice that made the first worlds.
+        asked: gives host, port, time and the robots' first command; without one they walk to the target, or on a tour.
 
     Raises:
-        UserError: the port is taken, or the host is none of this machine's.
+        UserError: the port is taken, or the host is not an interface of this machine.
     """
+    host, port = asked.host, asked.port
     try:
         check_host(host)
         with own_requests_only(host):
@@ -281,19 +265,20 @@ def serve(
     except OSError as error:
         for session in sessions:
             session.close()
+        reason = error.strerror or error
         raise UserError(
-            f"port {port} of '{one_line(host)}' cannot be used: {error.strerror or error}; choose another --port or --host"
+            f"port {port} of '{one_line(host)}' cannot be used: {reason}; choose another --port or --host"
         ) from error
     server.scene.set_up_direction("+z")
     server.scene.add_grid("/floor", width=40.0, height=40.0, cell_size=1.0, section_size=5.0)
-    panel, page = Panel(server, chosen, sessions, command), Page(server, sessions)
+    panel, page = Panel(server, chosen, sessions, asked.command), Page(server, sessions)
     console = Terminal()
     shown = "localhost" if is_loopback(host) else host
     console.say(f"open http://{shown}:{server.get_port()} in a browser; Ctrl-C ends")
     if not is_loopback(host):
         console.say(f"everybody who reaches {host} can steer this robot; leave --host out to serve this machine alone")
     try:
-        _run(server, panel, page, maker, chosen, seconds)
+        _run(server, panel, page, maker, chosen, asked.seconds)
     finally:
         page.close()
         server.stop()
@@ -302,14 +287,14 @@ def serve(
 def _run(
     server: viser.ViserServer, panel: Panel, page: Page, maker: WorldMaker, shown: Choice, seconds: float | None
 ) -> None:
-    """Play in real time what the panel says."""
+    """Play the choices of the panel in real time."""
     time_played, told = 0.0, -_TOLD_EVERY
     due, cameras = time.monotonic(), Cameras(server, page)
     while seconds is None or time_played < seconds - 1e-9:
         chosen = panel.chosen
         if chosen != shown:
             try:
-                page.show(_make(maker, chosen, panel.friction))
+                page.show(maker.make_all(chosen.policies, chosen.terrain, chosen.level, panel.friction))
             except _REFUSALS as error:
                 panel.refuse(str(error), shown)
             else:
@@ -336,15 +321,3 @@ def _run(
         cameras.follow(panel.follow.value)
         due = max(due + _REFRESH, time.monotonic() - _REFRESH)
         time.sleep(max(0.0, due - time.monotonic()))
-
-
-def _make(maker: WorldMaker, chosen: Choice, friction: float) -> list[PlaySession]:
-    """Worlds for a choice, all or none."""
-    with ExitStack() as stack:
-        sessions = []
-        for policy, label in zip(chosen.policies, distinct_names(chosen.policies), strict=True):
-            session = maker.make(policy, chosen.terrain, chosen.level, friction, label)
-            stack.callback(session.close)
-            sessions.append(session)
-        stack.pop_all()
-    return sessions

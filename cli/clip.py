@@ -1,6 +1,4 @@
-"""The film of the robot in a report: made by ``gaitgauge play`` in a process of its own, because MuJoCo chooses how to draw when
-it is imported.
-"""
+"""Film the robot for a report: ``gaitgauge play`` runs in a process of its own, because MuJoCo chooses its renderer on import."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ SECONDS = 6.0
 _LONGEST = 300.0
 """Longest time to make it [s]."""
 _SHOWIEST = ("stairs_fd", "obstacle", "wave", "slope_fd", "stairs_bd", "slope_bd")
-"""Terrains in the order in which they are preferred."""
+"""Terrains in the order of preference."""
 _PACKAGE = __name__.partition(".")[0]
 
 

@@ -1,6 +1,6 @@
 """Prepare the help of all commands: text as it is written, options in groups, examples at the end.
 
-In a command's docstring, what follows ``Examples:`` are command lines that its help ends with.
+The command lines below ``Examples:`` in a command's docstring become the end of its help.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.markup import escape
-from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
+from typer.core import TyperArgument, TyperGroup, TyperOption
 
 COMMAND_GROUPS: Mapping[str, tuple[str, ...]] = {
     "Judge": ("evaluate", "compare", "verify", "board"),
@@ -18,14 +18,14 @@ COMMAND_GROUPS: Mapping[str, tuple[str, ...]] = {
     "Use": ("play", "export", "import"),
     "Look": ("list", "doctor", "robot", "warmup"),
 }
-"""Groups of commands."""
+"""Commands by their heading in the help."""
 _FEW = 6
-"""So many options need no groups."""
+"""Options of a command up to which it needs no groups."""
 _EXAMPLES = "\n\nExamples:\n"
 
 
 class Program(TyperGroup):
-    """All commands, with their help made ready. Typer hands help texts to rich as markup, which would eat ``[m/s]``."""
+    """Group all commands and prepare their help. Typer hands help texts to rich as markup, which would eat ``[m/s]``."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -36,8 +36,7 @@ class Program(TyperGroup):
 
 
 def _prepare(command: Any) -> None:
-    """Mend the help of a command, or of a group of commands."""
-    assert isinstance(command, TyperCommand | TyperGroup)
+    """Prepare the help of a command, or of a group of commands."""
     text, _, examples = (command.help or "").partition(_EXAMPLES)
     command.help = escape(text)
     if examples:
@@ -46,9 +45,8 @@ def _prepare(command: Any) -> None:
     for parameter in command.params:
         if isinstance(parameter, TyperOption | TyperArgument) and parameter.help:
             parameter.help = escape(parameter.help)
-    if len(options) <= _FEW:
-        for option in options:
-            option.rich_help_panel = None
+    for option in options if len(options) <= _FEW else ():
+        option.rich_help_panel = None
     if isinstance(command, TyperGroup):
         for each in command.commands.values():
             _prepare(each)

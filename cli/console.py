@@ -1,4 +1,4 @@
-"""The terminal: names and sentences are printed as they are, never read as markup, and control characters never reach it."""
+"""Print to the terminal: text is never read as markup, and control characters never reach the terminal."""
 
 from __future__ import annotations
 
@@ -18,24 +18,21 @@ from rich.table import Table
 from rich.text import Text
 
 _PLAIN_WIDTH = 160
-"""Columns of a table where there is no terminal to ask; squeezed into a pipe's 80 it could not be read."""
-
-
+"""Columns of a table without a terminal; 80 would be too narrow to read."""
 _NOBODY_READS = (errno.EPIPE, errno.EIO)
-"""What writing fails with on a pipe without a reader and on a terminal that was closed."""
+"""Errors of writing to a pipe without a reader and to a closed terminal."""
 
 
 class Terminal(Console):
-    """A console for names that strangers chose. Styles are given beside the text, as ``style`` or ``Text``.
+    """Print names from untrusted files safely. Styles are given beside the text, as ``style`` or ``Text``.
 
-    Where nobody reads any more, a pipe without a reader or a terminal that was closed, what is said is lost and the command goes on.
+    On a pipe without a reader or a closed terminal the text is lost and the command goes on.
     """
 
     def __init__(self, *, stderr: bool = False, quiet: bool = False, may_lose: bool = False) -> None:
         """Print to standard output, or to standard error.
 
-        Args:
-            may_lose: whether the command goes on with a full disk behind its output, too; it always does on standard error.
+        With ``may_lose``, and always on standard error, the command goes on with a full disk behind its output, too.
         """
         super().__init__(stderr=stderr, quiet=quiet, markup=False, emoji=False, highlight=False)
         self._may_lose = may_lose or stderr
@@ -43,7 +40,7 @@ class Terminal(Console):
             self.width = _PLAIN_WIDTH
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print, after the notices that were held back."""
+        """Print after the held notices."""
         _notices.tell()
         super().print(*objects, **options)
 
@@ -58,12 +55,12 @@ class Terminal(Console):
             silence(self.file)
 
     def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
-        """What reaches the terminal: text of any kind, control characters escaped."""
+        """Yield text for the terminal, control characters escaped."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(printable(segment.text), segment.style)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Text as it is, control characters escaped."""
+        """Return text as it is, control characters escaped."""
         return super().render_str(printable(text), **options)
 
     def say(self, sentence: str | Text) -> None:
@@ -72,7 +69,7 @@ class Terminal(Console):
 
 
 def print_json(data: Any) -> None:
-    """Print what programs read, after the notices that were held back; lost where nobody reads any more."""
+    """Print JSON after the held notices; it is lost where nobody reads any more."""
     _notices.tell()
     try:
         print(json.dumps(data, indent=1), flush=True)
@@ -83,14 +80,14 @@ def print_json(data: Any) -> None:
 
 
 def printable(text: str) -> str:
-    """Text whose control characters, line ends apart, are escaped."""
+    """Return a text with its control characters, line ends apart, escaped."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 def silence(stream: IO[str]) -> None:
-    """Let a stream that cannot be written to lead nowhere: what is left in its buffer would fail again when the program ends."""
+    """Redirect a broken stream to the null device: its buffer would fail again when the program ends."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
@@ -104,29 +101,25 @@ def complain(sentence: str) -> None:
 
 
 class _Notices(logging.Handler):
-    """Keeps the package's warnings back until a command says something."""
+    """Hold the package's warnings back until a command prints."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
-        self._held: list[str] = []
+        self.held: list[str] = []
         self._process = os.getpid()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep one, or print it where nobody would ask for it: in a worker."""
-        self._held.append(record.getMessage())
+        """Hold a warning, or print it in a worker, which has no command."""
+        self.held.append(record.getMessage())
         if os.getpid() != self._process:
-            self._held = self._held[-1:]
+            self.held = self.held[-1:]
             self.tell()
 
     def tell(self) -> None:
-        """Print what was kept."""
-        held, self._held = self._held, []
+        """Print the held warnings."""
+        held, self.held = self.held, []
         for message in held:
             complain(message)
-
-    def forget(self) -> None:
-        """Drop what was kept."""
-        self._held = []
 
 
 _notices = _Notices()
@@ -134,19 +127,19 @@ _notices = _Notices()
 
 @contextmanager
 def held_notices() -> Iterator[None]:
-    """Around a command: its notices come before whatever else it says, and not at all where all that it says is an error."""
+    """Print a command's notices before its other output, and none where the only output is an error."""
     logger = logging.getLogger(__name__.partition(".")[0])
     logger.addHandler(_notices)
     try:
         yield
         _notices.tell()
     finally:
-        _notices.forget()
+        _notices.held.clear()
         logger.removeHandler(_notices)
 
 
 def make_table(title: str, *columns: str, numbers: bool = False) -> Table:
-    """A table with its title at the left; with ``numbers`` all columns but the first stand at the right."""
+    """Return a table with its title at the left; with ``numbers`` all columns but the first are right-aligned."""
     table = Table(title=title, title_justify="left")
     for i, name in enumerate(columns):
         table.add_column(name, justify="right" if numbers and i else "left", overflow="fold")
@@ -154,6 +147,6 @@ def make_table(title: str, *columns: str, numbers: bool = False) -> Table:
 
 
 def shell_command(arguments: Sequence[str] | None = None, *more: str) -> str:
-    """A command that can be pasted into a shell: this one, without ``--resume``, or one of the arguments given."""
+    """Return a command for a shell: this one, without ``--resume``, or one of the arguments given."""
     own = [a for a in sys.argv[1:] if a != "--resume"] if arguments is None else arguments
     return shlex.join(["gaitgauge", *own, *more])

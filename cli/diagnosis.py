@@ -1,75 +1,55 @@
-"""``gaitgauge doctor POLICY``: what looks wrong with how a policy is run."""
+"""Examine how a policy is run (``gaitgauge doctor POLICY``)."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+from ..files.choices import cpu_threads
 from ..files.writing import same_file, write_atomically
 from ..policy.foreign.adapters import assumptions
-from ..policy.loading import load_policy
-from ..policy.robot_of import robot_for
-from ..robots import load_robot
 from ..studies.doctor.alternatives import toml_lines
 from ..studies.doctor.diagnosis import Diagnosis, Outcome, diagnose
 from .console import Terminal, make_table, print_json
 from .errors import UserError
-from .policies import policy_file
+from .policies import open_policy
 from .progress import ProgressDisplay
+from .requests import DoctorRequest
 
 _SHOWN = 8
 """Changes that the table shows."""
-
-
 _SECONDS = 2.0
-"""How long each description is played unless the user says so [s]."""
+"""Time for which each description is played unless the user asks for another [s]."""
 
 
-def examine_policy(
-    choice: str,
-    *,
-    contract: Path | None,
-    robot: str | None,
-    seconds: float | None,
-    threads: int | None,
-    out: Path | None,
-    json_output: bool,
-    trust: bool,
-) -> bool:
-    """Play a policy as described and otherwise, print what looks wrong and how to mend it; False where something does.
-
-    Arguments are ``doctor``'s options.
+def examine_policy(choice: str, request: DoctorRequest) -> bool:
+    """Play a policy as described and otherwise, print what looks wrong and how to mend it; return False where something does.
 
     Raises:
         UserError: ``out`` is no ``.toml``, is ``contract`` or ``robot``, or cannot be written.
     """
-    if out is not None and out.suffix != ".toml":
-        raise UserError(f"--out is '{out}'; give a file that ends in .toml")
-    if out is not None and any(same_file(out, given) for given in (contract, robot) if given):
-        raise UserError(f"--out is '{out}', which is read as --contract or --robot; give another file")
-    if out is not None and not out.absolute().parent.is_dir():
-        raise UserError(f"folder '{out.parent}' of --out does not exist; create it first")
-    asked = None if robot is None else load_robot(robot)
-    policy = load_policy(policy_file(choice), asked, trust=trust, contract_file=contract)
-    body = robot_for(policy.contract, robot)
+    out, contract = request.out, request.contract
+    if out is not None:
+        if out.suffix != ".toml":
+            raise UserError(f"--out is '{out}'; give a file that ends in .toml")
+        if any(same_file(out, given) for given in (contract, request.robot) if given):
+            raise UserError(f"--out is '{out}', which is read as --contract or --robot; give another file")
+        if not out.absolute().parent.is_dir():
+            raise UserError(f"folder '{out.parent}' of --out does not exist; create it first")
+    policy, body = open_policy(choice, request.robot, trust=request.trust, contract_file=contract)
     with ProgressDisplay(Terminal(stderr=True), "playing as described and otherwise") as display:
 
         def report(mistakes: int, played: int, count: int) -> None:
-            text = (
-                f"{played} of {count} contracts that differ in {'one thing' if mistakes == 1 else f'{mistakes} things'}"
-            )
-            display.update(played / count, text)
+            things = "one thing" if mistakes == 1 else f"{mistakes} things"
+            display.update(played / count, f"{played} of {count} contracts that differ in {things}")
 
-        found = diagnose(
-            policy, body, seconds=seconds or _SECONDS, threads=threads or os.cpu_count() or 1, report=report
-        )
+        seconds, threads = request.seconds or _SECONDS, cpu_threads(request.threads)
+        found = diagnose(policy, body, seconds=seconds, threads=threads, report=report)
     lines = toml_lines(found.best.contract, policy.contract)
     if out is not None:
-        lines_of_file = [f"# {found.verdict()}", *toml_lines(found.best.contract)]
-        write_atomically(out, "\n".join(lines_of_file) + "\n", UserError)
-    if json_output:
+        whole = "\n".join([f"# {found.verdict()}", *toml_lines(found.best.contract)])
+        write_atomically(out, f"{whole}\n", UserError)
+    if request.json_output:
         print_json(_as_data(found, lines, assumptions(policy.contract)))
         return found.sound
     console = Terminal()
@@ -77,12 +57,10 @@ def examine_policy(
     console.say(found.verdict())
     if lines:
         console.say("lines of contract.toml to change:")
-        for line in lines:
-            console.say(f"  {line}")
+        console.say("\n".join(f"  {line}" for line in lines))
         if out is None:
-            console.say(
-                "--out contract.toml writes the whole file; then: gaitgauge import POLICY NAME.gauge.pt --contract contract.toml"
-            )
+            again = "gaitgauge import POLICY NAME.gauge.pt --contract contract.toml"
+            console.say(f"--out contract.toml writes the whole file; then: {again}")
     if out is not None:
         console.say(f"wrote {out}")
     return found.sound

@@ -1,6 +1,6 @@
-"""``gaitgauge doctor``: what this machine has, what it lacks, and what to do about it.
+"""Examine this machine: packages, devices, drawing, room, and what to do about what is missing (``gaitgauge doctor``).
 
-What could hang or kill the process (GPU drivers, OpenGL) is tried in a child process.
+GPU drivers and OpenGL, which could hang or kill the process, are tried in a child process.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 
-import typer
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.text import Text
@@ -26,6 +25,7 @@ from . import picture
 from .console import Terminal, make_table, print_json
 from .errors import UserError
 from .probe import ask
+from .requests import DoctorRequest
 
 OK, WARNING, PROBLEM = "ok", "warning", "problem"
 _STYLES = {OK: "green", WARNING: "yellow", PROBLEM: "bold red"}
@@ -37,59 +37,35 @@ _FREE_MEMORY = 4.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One row of the table."""
+    """Describe one row of the table."""
 
     what: str
     status: str
     """``ok``, ``warning`` (something optional is missing) or ``problem`` (the project does not work)."""
     found: str
     advice: str = ""
-    """What to do, where it is not ok."""
+    """Advice, where the status is not ok."""
 
 
-def run_doctor(
-    policy: str | None,
-    *,
-    contract: Path | None,
-    robot: str | None,
-    seconds: float | None,
-    threads: int | None,
-    out: Path | None,
-    json_output: bool,
-    trust: bool,
-) -> None:
-    """Examine this machine, or a policy as ``diagnosis.examine_policy`` does; exit code 1 where something is wrong.
+def run_doctor(request: DoctorRequest) -> bool:
+    """Examine this machine, or a policy as ``diagnosis.examine_policy`` does; return whether nothing is wrong.
 
     Raises:
         UserError: an option is for a policy, and none is named.
     """
-    if policy is None:
-        for_policies = {"contract": contract, "robot": robot, "out": out, "seconds": seconds, "trust": trust}
-        for name, value in for_policies.items():
-            if value:
-                raise UserError(
-                    f"--{name} is for the examination of a policy; name one: gaitgauge doctor POLICY --{name} …"
-                )
-        well = examine(json_output=json_output)
-    else:
+    if request.policy is not None:
         from .diagnosis import examine_policy
 
-        well = examine_policy(
-            policy,
-            contract=contract,
-            robot=robot,
-            seconds=seconds,
-            threads=threads,
-            out=out,
-            json_output=json_output,
-            trust=trust,
-        )
-    if not well:
-        raise typer.Exit(1)
+        return examine_policy(request.policy, request)
+    for name in ("contract", "robot", "out", "seconds", "trust"):
+        if getattr(request, name):
+            again = f"gaitgauge doctor POLICY --{name} …"
+            raise UserError(f"--{name} is for the examination of a policy; name one: {again}")
+    return examine(json_output=request.json_output)
 
 
 def examine(*, json_output: bool = False) -> bool:
-    """Print a table of all checks, or JSON; False if there is a problem."""
+    """Print a table of all checks, or JSON; return False if there is a problem."""
     console = Terminal(stderr=json_output)
     table = make_table("gaitgauge doctor", "check", "status", "found", "what to do")
     findings = []
@@ -112,20 +88,18 @@ def examine(*, json_output: bool = False) -> bool:
 
 
 def check_python() -> Iterator[Finding]:
-    """The interpreter's version."""
+    """Check the interpreter's version."""
     found = f"{platform.python_version()} in {sys.prefix}"
     try:
         wanted = SpecifierSet(metadata("gaitgauge")["Requires-Python"])
     except PackageNotFoundError:
         wanted = SpecifierSet()
-    if wanted.contains(platform.python_version(), prereleases=True):
-        yield Finding("Python", OK, found)
-    else:
-        yield Finding("Python", PROBLEM, found, f"use Python {wanted}")
+    good = wanted.contains(platform.python_version(), prereleases=True)
+    yield Finding("Python", OK, found) if good else Finding("Python", PROBLEM, found, f"use Python {wanted}")
 
 
 def check_packages() -> Iterator[Finding]:
-    """Each package that the project declares, against the range that it declares."""
+    """Check each package that the project declares against the range that it declares."""
     try:
         lines = requires("gaitgauge") or []
     except PackageNotFoundError:
@@ -161,7 +135,7 @@ print(json.dumps([torch.version.cuda, gpus]))
 
 
 def check_gpu() -> Iterator[Finding]:
-    """Whether torch can use a GPU, which training needs."""
+    """Check that torch can use a GPU, which training needs."""
     what, (answer, trouble) = "GPU (torch)", ask(_TORCH_PROBE)
     if trouble:
         yield Finding(what, PROBLEM, f"torch fails: {trouble}", "reinstall torch: make install")
@@ -182,14 +156,12 @@ def check_gpu() -> Iterator[Finding]:
 
 
 def _driver() -> str | None:
-    """Version of the NVIDIA driver, None where there is none."""
-    program = shutil.which("nvidia-smi")
-    if program is None:
+    """Return the version of the NVIDIA driver, None where there is none."""
+    if (program := shutil.which("nvidia-smi")) is None:
         return None
+    command = [program, "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
-        done = subprocess.run(
-            [program, "--query-gpu=driver_version", "--format=csv,noheader"], capture_output=True, text=True, timeout=20
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.splitlines()[0].strip() if done.returncode == 0 and done.stdout.strip() else None
@@ -204,7 +176,7 @@ print(json.dumps([str(d) for d in warp.get_devices()]))
 
 
 def check_warp() -> Iterator[Finding]:
-    """The devices of Warp, on which the training engines run."""
+    """Check the devices of Warp, on which the training engines run."""
     what, (answer, trouble) = "Warp devices", ask(_WARP_PROBE)
     if trouble:
         yield Finding(what, PROBLEM, f"Warp fails: {trouble}", "reinstall warp-lang: make install")
@@ -222,7 +194,7 @@ print(json.dumps([mujoco.__version__, mujoco.mj_versionString()]))
 
 
 def check_mujoco() -> Iterator[Finding]:
-    """Whether MuJoCo loads, with the batched stepping that the gauge runs on."""
+    """Check that MuJoCo loads, with the batched stepping that the gauge runs on."""
     what, (answer, trouble) = "MuJoCo engine", ask(_MUJOCO_PROBE)
     if trouble:
         yield Finding(what, PROBLEM, f"fails: {trouble}", "reinstall it: make install")
@@ -241,7 +213,7 @@ _PACKAGES_OF = {"egl": "libegl1 (and a GPU driver or libgl1-mesa-dri)", "osmesa"
 
 
 def check_rendering() -> Iterator[Finding]:
-    """Which of MuJoCo's ways to render without a window work; one is enough for videos."""
+    """Check MuJoCo's ways to render without a window; one is enough for videos."""
     works = {backend: not ask(picture.PROBE, MUJOCO_GL=backend)[1] for backend in picture.RENDERERS}
     for backend, good in works.items():
         what = f"rendering ({backend})"
@@ -255,21 +227,17 @@ def check_rendering() -> Iterator[Finding]:
 
 
 def check_display() -> Iterator[Finding]:
-    """Whether a window can be opened."""
-    if sys.platform in ("darwin", "win32"):
-        yield Finding("display", OK, "the system's own")
-        return
-    if display := os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    """Check that a window can be opened."""
+    own = "the system's own" if sys.platform in ("darwin", "win32") else None
+    if display := own or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         yield Finding("display", OK, display)
     else:
-        advice = (
-            "none is needed but for the viewer's window; in a browser it works without (viser), over ssh use ssh -X"
-        )
+        advice = "only the viewer's window needs one; over ssh use ssh -X, or --viewer viser for a browser"
         yield Finding("display", WARNING, "neither DISPLAY nor WAYLAND_DISPLAY is set", advice)
 
 
 def check_ffmpeg() -> Iterator[Finding]:
-    """The program that encodes videos."""
+    """Check the program that encodes videos."""
     if find_spec("imageio_ffmpeg") is None:
         yield Finding("ffmpeg", PROBLEM, "imageio-ffmpeg is not installed", "pip install imageio-ffmpeg")
         return
@@ -288,12 +256,11 @@ def check_ffmpeg() -> Iterator[Finding]:
 
 
 def check_room() -> Iterator[Finding]:
-    """Free disk and memory, and whether the folders of runs and results can be written."""
+    """Check free disk and memory, and that the folders of runs and results can be written."""
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     advice = "" if free >= _FREE_DISK else f"make room: a training run may write up to {_FREE_DISK:g} GB"
     yield Finding("free disk", WARNING if advice else OK, f"{free:.1f} GB in {Path.cwd()}", advice)
-    memory = _free_memory()
-    if memory is not None:
+    if (memory := _free_memory()) is not None:
         advice = "" if memory >= _FREE_MEMORY else f"close programs: the engines may want {_FREE_MEMORY:g} GB"
         yield Finding("free memory", WARNING if advice else OK, f"{memory:.1f} GB", advice)
     for name in ("logs", "results"):
@@ -301,7 +268,7 @@ def check_room() -> Iterator[Finding]:
 
 
 def _free_memory() -> float | None:
-    """Memory that programs can still get [GB], None where the system does not tell."""
+    """Return the memory that programs can still get [GB]; None where the system does not tell."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -311,7 +278,7 @@ def _free_memory() -> float | None:
 
 
 def _writable(folder: Path) -> Finding:
-    """Whether a folder, or the nearest one above it that exists, takes files."""
+    """Check that a folder, or the nearest one above it that exists, takes files."""
     there = folder.absolute()
     while not there.exists():
         there = there.parent
@@ -320,8 +287,7 @@ def _writable(folder: Path) -> Finding:
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
-        advice = f"make {there} writable, or work in another folder"
-        return Finding(what, PROBLEM, f"{there}: {error.strerror}", advice)
+        return Finding(what, PROBLEM, f"{there}: {error.strerror}", f"make {there} writable, or work in another folder")
     found = "writable" if there == folder.absolute() else "will be created when it is needed"
     return Finding(what, OK, found)
 

@@ -1,6 +1,4 @@
-"""Draws the pictures of a film: here where a GPU does it, in several processes where the processor does, since no picture needs
-another one.
-"""
+"""Draw the pictures of a film: in this process on a GPU, in several processes on the CPU, since pictures are independent."""
 
 from __future__ import annotations
 
@@ -11,6 +9,7 @@ from collections import deque
 from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -20,27 +19,28 @@ from .errors import UserError
 from .picture import PLAIN, Picture, Quality, Tile
 
 Note = TypeVar("Note")
+Poses = Sequence[tuple[np.ndarray, np.ndarray]]
 
 _MOST = 4
-"""Processes at most."""
+"""Largest number of processes."""
 _WORTH = 50
-"""Pictures for which it is worth to start another process."""
+"""Pictures that are worth another process."""
 _AHEAD = 3
 """Pictures that are asked for ahead of time, for each process."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shot(Generic[Note]):
-    """One picture that is to be drawn."""
+    """Describe one picture that is to be drawn."""
 
-    poses: Sequence[tuple[np.ndarray, np.ndarray]]
+    poses: Poses
     """Pose (7 + J,) of each robot, and the point (3,) at which its camera looks."""
     note: Note
-    """Comes back with the picture."""
+    """Returned with the picture."""
 
 
 def processes_for(pictures: int, quality: Quality) -> int:
-    """How many processes draw; 0: this one."""
+    """Return the number of processes that draw; 0: this one."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     wanted = min(_MOST, cores, pictures // _WORTH)
     return wanted if quality is PLAIN and wanted > 1 else 0
@@ -49,13 +49,13 @@ def processes_for(pictures: int, quality: Quality) -> int:
 def draw(
     tiles: Sequence[Tile], size: tuple[int, int], shots: Iterable[Shot[Note]], processes: int
 ) -> Generator[tuple[np.ndarray, Note], None, None]:
-    """Pictures of shots, in their order.
+    """Draw shots in their order.
 
     Args:
         tiles: the robots, from left to right.
         size: width and height of each tile [pixels].
-        shots: are taken as they are needed.
-        processes: what ``processes_for`` says.
+        shots: taken as they are needed.
+        processes: as ``processes_for`` returns it.
 
     Yields:
         (height, width of all tiles, 3) uint8, and the shot's note.
@@ -64,12 +64,10 @@ def draw(
         UserError: a process that draws was ended from outside.
     """
     if not processes:
-        artist = _Artist(tiles, size)
-        try:
+        with ExitStack() as stack:
+            pictures = [stack.enter_context(closing(Picture(tile, size=size))) for tile in tiles]
             for shot in shots:
-                yield artist.draw(shot.poses), shot.note
-        finally:
-            artist.close()
+                yield _draw_all(pictures, shot.poses), shot.note
         return
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's threads would only be in the way of the other processes
     pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (tiles, size))
@@ -83,38 +81,24 @@ def draw(
         for future, note in waiting:
             yield future.result(), note
     except BrokenProcessPool as error:
-        raise UserError(
-            "a process that draws was ended, perhaps for want of memory; ask for a shorter video"
-        ) from error
+        raise UserError("a drawing process ended, perhaps for want of memory; ask for a shorter video") from error
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-class _Artist:
-    """All tiles of one process."""
-
-    def __init__(self, tiles: Sequence[Tile], size: tuple[int, int]) -> None:
-        self._pictures = [Picture(tile, size=size) for tile in tiles]
-
-    def draw(self, poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        drawn = [picture.draw(*pose) for picture, pose in zip(self._pictures, poses, strict=True)]
-        return drawn[0] if len(drawn) == 1 else np.concatenate(drawn, axis=1)
-
-    def close(self) -> None:
-        for picture in self._pictures:
-            picture.close()
+def _draw_all(pictures: Sequence[Picture], poses: Poses) -> np.ndarray:
+    drawn = [picture.draw(*pose) for picture, pose in zip(pictures, poses, strict=True)]
+    return drawn[0] if len(drawn) == 1 else np.concatenate(drawn, axis=1)
 
 
-_artist: _Artist | None = None
-"""Of this process, where it only draws."""
+_pictures: list[Picture] = []
+"""Filled in a process that only draws."""
 
 
 def _begin(tiles: Sequence[Tile], size: tuple[int, int]) -> None:
-    global _artist
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's matter
-    _artist = _Artist(tiles, size)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
+    _pictures[:] = [Picture(tile, size=size) for tile in tiles]
 
 
-def _draw(poses: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    assert _artist is not None
-    return _artist.draw(poses)
+def _draw(poses: Poses) -> np.ndarray:
+    return _draw_all(_pictures, poses)

@@ -1,4 +1,4 @@
-"""Turns the project's errors into one sentence on standard error and an exit code; a bug keeps its traceback."""
+"""Turn the project's errors into one sentence on standard error and an exit code; a bug keeps its traceback."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ import typer
 from .console import complain, held_notices, silence
 
 _OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE, errno.EIO)
-"""What writing to standard output fails with; a process that cannot be started has no file's name either."""
+"""Errors of writing to standard output; a failed start of a process has no file name either."""
 
 
 class UserError(ValueError):
-    """Something the command line itself found wrong."""
+    """Report an error that the command line itself found."""
 
 
 def report_errors(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator of commands: errors that users can mend end with exit code 2, Ctrl-C with 130."""
+    """Decorate a command: errors that users can mend end with exit code 2, Ctrl-C with 130."""
 
     @functools.wraps(command)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -49,7 +49,7 @@ def report_errors(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def output_failures() -> Iterator[None]:
-    """Around the whole program: what commands do not see, help and version on a full disk, ends with exit code 2, too."""
+    """End with exit code 2 on output errors outside the commands, such as help or version on a full disk."""
     try:
         try:
             yield
@@ -61,16 +61,16 @@ def output_failures() -> Iterator[None]:
 
 
 def check_folder() -> None:
-    """End where the folder of the shell was removed: libraries say the oddest things there."""
+    """End where the current folder was removed: libraries raise misleading errors there."""
     try:
         os.getcwd()
     except OSError:
-        complain("gaitgauge: the folder that this was started in is not there any more; change to another one")
+        complain("gaitgauge: the current folder does not exist any more; change to another one")
         sys.exit(2)
 
 
 def system_failure(error: OSError) -> str:
-    """One sentence on what the operating system refused. Without a file's name, what writing fails with was of standard output."""
+    """Return one sentence on an error of the operating system. A write error without a file name is one of standard output."""
     reason = (error.strerror or str(error)).lower()
     if error.filename is not None:
         return f"'{os.fsdecode(error.filename)}': {reason}"
@@ -81,6 +81,6 @@ def system_failure(error: OSError) -> str:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether an error was raised on purpose, with a sentence for the user: its class is defined in this package."""
+    """Return whether an error was raised on purpose, with a sentence for the user: its class is defined in this package."""
     package = __name__.partition(".")[0]
     return any(kind.__module__.startswith(f"{package}.") for kind in type(error).__mro__)

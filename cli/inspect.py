@@ -1,4 +1,4 @@
-"""``gaitgauge import`` and ``gaitgauge list``: looks at policies and at what can be named on the command line."""
+"""Import policies and list what can be named on the command line (``gaitgauge import``, ``gaitgauge list``)."""
 
 from __future__ import annotations
 
@@ -16,77 +16,64 @@ from .errors import UserError
 
 if TYPE_CHECKING:
     from ..policy.contract import PolicyContract
+    from .requests import ImportRequest
 
 _HASH = 12
 """Digits of a contract's hash that are shown in lists; enough to tell policies apart by eye."""
 
 
-# ---- import ---------------------------------------------------------------------------------------------------------
-
-
-def import_file(
-    source: str,
-    destination: Path,
-    *,
-    force: bool,
-    trainable: bool,
-    raw: bool,
-    trust: bool,
-    contract: Path | None,
-    robot: str | None,
-) -> None:
-    """Write a foreign policy as the project's own file, and print its contract; arguments are the options of ``import``.
+def import_file(request: ImportRequest) -> None:
+    """Write a foreign policy as the project's own file, and print its contract.
 
     Raises:
         CheckpointError: ``trainable``, and the source is no training checkpoint.
         UserError: the destination exists and is not to be replaced, is the source, or is a folder.
         PolicyError, ContractError: the source is no policy, or the destination cannot be written.
     """
+    source, destination, contract, robot = request.source, request.destination, request.contract, request.robot
     if destination.is_dir():
-        raise UserError(
-            f"'{destination}' is a folder; give the file to write, for example '{destination}/policy.gauge.pt'"
-        )
+        example = f"{destination}/policy.gauge.pt"
+        raise UserError(f"'{destination}' is a folder; give the file to write, for example '{example}'")
     from ..policy.finding import find_policy
 
     if any(same_file(destination, given) for given in (find_policy(source), contract, robot) if given):
         raise UserError(f"'{destination}' is itself read for the import; give another file to write")
-    if destination.exists() and not force:
+    if destination.exists() and not request.force:
         raise UserError(f"'{destination}' already exists; give another name, or replace it with --force")
-    trainable = trainable or raw
-    for option, given in (("contract", contract), ("robot", robot)):
-        if trainable and given is not None:
-            raise UserError(f"a training checkpoint has its {option} inside; leave out --{option}")
     from ..policy.native import ForeignFile
 
-    if trainable:
+    if request.trainable or request.raw:
+        for option in ("contract", "robot"):
+            if getattr(request, option) is not None:
+                raise UserError(f"a training checkpoint has its {option} inside; leave out --{option}")
         from ..policy.loading import load_policy
         from ..training.run.checkpoint import trim_checkpoint
 
-        trim_checkpoint(find_policy(source), destination, raw=raw)
+        trim_checkpoint(find_policy(source), destination, raw=request.raw)
         policy = load_policy(str(destination))
     else:
         from ..policy.importing import import_policy
 
-        policy = import_policy(source, destination, robot, trust=trust, contract_file=contract)
+        policy = import_policy(source, destination, robot, trust=request.trust, contract_file=contract)
     console = Terminal()
     console.say(f"wrote {destination}")
     if contract is not None:
-        console.say(
-            f"it is run as {contract} says and the robot's standard where it says nothing; what {source} itself says is not used"
-        )
+        rest = f"the robot's standard where it says nothing; what {source} itself says is not used"
+        console.say(f"it is run as {contract} says and {rest}")
     if isinstance(policy.stored, ForeignFile):
         console.say("it carries the program of its source, not weights alone: commands that run it need --trust")
     console.print(contract_table(policy.contract))
 
 
 def contract_table(contract: PolicyContract) -> Table:
-    """A policy contract for people."""
+    """Return a policy contract as a table for people."""
     from ..policy.robot_of import REMEMBERED
 
     table = Table(show_header=False)
     table.add_column("field")
     table.add_column("value", overflow="fold")
     history = contract.history
+    frames = f"{history.length} frames, {history.order}, starts with {history.start}"
     rows = {
         "robot": contract.robot,
         "joints": f"{contract.num_joints}: {', '.join(contract.joint_names)}",
@@ -97,9 +84,7 @@ def contract_table(contract: PolicyContract) -> Table:
         "damping [N·m·s/rad]": _numbers(contract.damping),
         "control period [s]": f"{contract.control_period:g}",
         "observation": ", ".join(f"{t.name} × {_numbers(t.scale)}" for t in contract.observation),
-        "history": "current frame"
-        if history.length == 1
-        else f"{history.length} frames, {history.order}, starts with {history.start}",
+        "history": "current frame" if history.length == 1 else frames,
         "observation width": str(contract.observation_width),
         "command limits": "forward {:g} m/s, sideways {:g} m/s, turning {:g} rad/s".format(*contract.command_limits),
         "made from": ", ".join(f"{k} {v}" for k, v in contract.provenance.items() if k != REMEMBERED) or "unknown",
@@ -111,16 +96,13 @@ def contract_table(contract: PolicyContract) -> Table:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    """Numbers in short: one where all are equal."""
+    """Return numbers in short: one where all are equal."""
     shown = [f"{v:g}" for v in values]
     return shown[0] if len(set(shown)) == 1 else "(" + ", ".join(shown) + ")"
 
 
-# ---- list -----------------------------------------------------------------------------------------------------------
-
-
 def list_things(what: str) -> None:
-    """Print a table of what can be named: a key of ``LISTS``.
+    """Print a table of the names of a kind, a key of ``LISTS``.
 
     Raises:
         UserError: nothing of that name can be listed.
@@ -134,9 +116,8 @@ def list_things(what: str) -> None:
 def _robots() -> Table:
     from ..robots import RobotError, load_robot, robot_names
 
-    table = make_table(
-        "robots (--robot NAME, or a robot.toml)", "name", "title", "joints", "parameter sets", "speed limits"
-    )
+    columns = ("name", "title", "joints", "parameter sets", "speed limits")
+    table = make_table("robots (--robot NAME, or a robot.toml)", *columns)
     for name in robot_names():
         try:
             robot = load_robot(name, check=False)
@@ -150,7 +131,6 @@ def _robots() -> Table:
     return table
 
 
-# What the gauge's terrains are, and what their level changes.
 _TERRAINS = {
     "flat": "level ground, no targets",
     "slope_fd": "up a ramp, walking forward; steeper with the level",
@@ -160,6 +140,7 @@ _TERRAINS = {
     "wave": "rolling ground; higher waves with the level",
     "obstacle": "five bars across the way, 1 m long and 1 m apart; higher with the level",
 }
+"""The gauge's terrains and the effect of their level."""
 
 
 def _terrains() -> Table:
@@ -179,9 +160,8 @@ def _backends() -> Table:
 
     table = make_table("backends (--backend NAME)", "name", "available here", "runs on", "what it is")
     for each in list_backends():
-        available = (
-            "yes" if not each.missing else "no: pip install " + " ".join(p.replace("_", "-") for p in each.missing)
-        )
+        missing = " ".join(p.replace("_", "-") for p in each.missing)
+        available = f"no: pip install {missing}" if missing else "yes"
         table.add_row(each.name, available, each.device, each.note)
     return table
 
@@ -240,7 +220,7 @@ def _policies() -> Table:
 
 
 def _policy_row(path: Path) -> tuple[str, str, str, str]:
-    """File, robot, contract hash and time of a policy; what is wrong with it in the place of the robot."""
+    """Return file, robot, contract hash and time of a policy; an error stands in the place of the robot."""
     from ..policy.base import PolicyError
     from ..policy.contract import ContractError
     from ..policy.loading import load_policy
@@ -263,4 +243,4 @@ LISTS: dict[str, Callable[[], Table]] = {
     "policies": _policies,
     "tasks": _tasks,
 }
-"""What ``gaitgauge list`` can show."""
+"""Tables of ``gaitgauge list``, by kind."""

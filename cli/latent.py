@@ -1,33 +1,26 @@
-"""``gaitgauge latent``: how well terrains and commands can be told apart inside policies, in numbers and pictures."""
+"""Print how well terrains and commands can be told apart inside policies (``gaitgauge latent``)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..studies.latent.figures import SPACES, label
 from ..studies.latent.request import LatentRequest
 from ..studies.latent.study import PAIRS, study_latents
-from ..studies.naming import joined_names
 from .console import Terminal, make_table
-from .policies import policy_files
 from .studies import make_study
 
 
 def run_latent(request: LatentRequest, *, out: Path | None, json_output: bool) -> None:
     """Walk, look, print tables and where the files are; exit code 1 where something was left out."""
-    folder = out or Path("results") / f"latent-{joined_names(request.policies)}"
-    request = replace(request, policies=policy_files(request.policies))
-    files = ("latent.json", "latent.html")
-    make_study(
-        study_latents, request, folder, title="looking", show=print_latents, files=files, json_output=json_output
-    )
+    names = ("latent", "latent.json", "looking")
+    make_study(*names, study_latents, print_latents, request, out=out, json_output=json_output)
 
 
 def print_latents(console: Terminal, results: Mapping[str, Any]) -> None:
-    """A table for terrains and one for commands, then a sentence on the experts of each policy."""
+    """Print a table for terrains and one for commands, then a sentence on the experts of each policy."""
     for pair, words in PAIRS.items():
         columns = ("policy", "of what", "silhouette", "probe", "guessing", *map(label, results[pair]))
         table = make_table(f"{pair} told apart: {words}", *columns, numbers=True)
@@ -44,10 +37,8 @@ def print_latents(console: Terminal, results: Mapping[str, Any]) -> None:
             console.say(f"{entry['label']} has no experts, so there are no weights of them to show")
         else:
             count = len(next(iter(experts["terrains"].values())))
-            console.say(
-                f"{entry['label']}: {experts['at_once']:.1f} of {count} experts count at once, {experts['in_all']:.1f} in all"
-            )
+            shares = f"{experts['at_once']:.1f} of {count} experts count at once, {experts['in_all']:.1f} in all"
+            console.say(f"{entry['label']}: {shares}")
         if entry["falls"]:
-            console.say(
-                f"{entry['label']}: {entry['falls']} of {entry['walkers']} robots fell, and were not watched further"
-            )
+            fell = f"{entry['falls']} of {entry['walkers']} robots fell"
+            console.say(f"{entry['label']}: {fell}, and were not watched further")

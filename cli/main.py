@@ -1,4 +1,4 @@
-"""The command line. Heavy packages are imported inside the commands."""
+"""Assemble the command line. Heavy packages are imported inside the commands."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from .command_help import Program
-from .commands import experiments, judging, learning, looking, policies, robots
+from .commands import judging, learning, using
 from .errors import check_folder, output_failures
 
 app = typer.Typer(
@@ -19,7 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (judging, experiments, learning, policies, robots, looking):
+for group in (judging, learning, using):
     app.add_typer(group.app)
 
 
@@ -41,10 +41,10 @@ def gaitgauge(
 
 
 def main() -> None:
-    """Entry point of the ``gaitgauge`` command."""
+    """Run the ``gaitgauge`` command."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # where the terminal has no such letter
+            stream.reconfigure(errors="backslashreplace")  # where the terminal lacks a letter
     with output_failures():
         check_folder()
         app(args=[_kebab(a) for a in sys.argv[1:]])

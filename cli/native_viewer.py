@@ -1,33 +1,46 @@
-"""MuJoCo's own viewer, steered with the keyboard."""
+"""Show a robot in MuJoCo's own viewer, steered with the keyboard or a gamepad."""
 
 from __future__ import annotations
 
+import os
 import time
+from typing import Any
 
 import mujoco
 import mujoco.viewer
 
 from .console import Terminal
 from .errors import UserError
-from .gamepad import Gamepad
 from .overlay import summary, table
 from .picture import show
 from .play_session import Command, PlaySession, Readout, clip
 from .scenery import COLLISION_GROUP, visual_model
 
 # GLFW's numbers of keys that the viewer does not use itself.
-_UP, _DOWN, _LEFT, _RIGHT = 265, 264, 263, 262
-_HOME, _END, _ENTER, _INSERT, _DELETE = 268, 269, 257, 260, 261
+_UP, _DOWN, _LEFT, _RIGHT, _HOME, _END = 265, 264, 263, 262, 268, 269
+_ENTER, _INSERT, _DELETE = 257, 260, 261
 KEYS = (
     "up/down: faster forward/backward; left/right: turn; home/end: step to the left/right; enter: stand; "
     "delete: to the target or on tour; insert: back to the start"
 )
-_FORWARD_STEP, _LATERAL_STEP, _YAW_STEP = 0.1, 0.1, 0.25
-"""What one press adds to a command [m/s, m/s, rad/s]."""
+_STEPS: dict[int, Command] = {
+    _UP: (0.1, 0.0, 0.0),
+    _DOWN: (-0.1, 0.0, 0.0),
+    _LEFT: (0.0, 0.0, 0.25),
+    _RIGHT: (0.0, 0.0, -0.25),
+    _HOME: (0.0, 0.1, 0.0),
+    _END: (0.0, -0.1, 0.0),
+}
+"""Change of the command by one press of a key [m/s, m/s, rad/s]."""
+_STAND: Command = (0.0, 0.0, 0.0)
+_REST = 0.12
+"""Share of a stick's way about its middle that counts as rest."""
+_FULL = 32767.0
+"""SDL's value of a stick at its end."""
 
 
 class Keyboard:
-    """What the keys have asked for: None while the robot finds its own way."""
+    """Turn keys into commands; ``command`` is None while the robot finds its own way."""
 
     def __init__(self, limits: Command, command: Command | None) -> None:
         self.command = command
@@ -36,28 +49,86 @@ class Keyboard:
 
     def press(self, key: int) -> None:
         """Take a key by its GLFW number; others than ``KEYS`` mean nothing."""
-        steps = {
-            _UP: (_FORWARD_STEP, 0.0, 0.0),
-            _DOWN: (-_FORWARD_STEP, 0.0, 0.0),
-            _LEFT: (0.0, 0.0, _YAW_STEP),
-            _RIGHT: (0.0, 0.0, -_YAW_STEP),
-            _HOME: (0.0, _LATERAL_STEP, 0.0),
-            _END: (0.0, -_LATERAL_STEP, 0.0),
-        }
         if key == _INSERT:
             self.restart = True
         elif key == _DELETE:
             self.command = None
         elif key == _ENTER:
-            self.command = (0.0, 0.0, 0.0)
-        elif key in steps:
-            now = self.command or (0.0, 0.0, 0.0)
-            forward, lateral, yaw = (round(value + change, 3) for value, change in zip(now, steps[key], strict=True))
+            self.command = _STAND
+        elif key in _STEPS:
+            now = self.command or _STAND
+            forward, lateral, yaw = (round(value + change, 3) for value, change in zip(now, _STEPS[key], strict=True))
             self.command = clip((forward, lateral, yaw), self._limits)
 
 
+class Gamepad:
+    """Turn the sticks of the first gamepad into commands: left stick forward and sideways, right stick turning.
+
+    SDL maps gamepads of any make. Needs the extra ``gamepad``.
+    """
+
+    def __init__(self, limits: Command, driver: Any = None) -> None:
+        """Open it.
+
+        Args:
+            limits: commands with the sticks at their ends.
+            driver: stands in for pygame.
+
+        Raises:
+            UserError: the extra is not installed, or there is no gamepad.
+        """
+        self._pygame = driver if driver is not None else _pygame()
+        controllers = self._pygame._sdl2.controller
+        self._pygame.display.init()  # SDL reports events with a display only, even if it is a dummy
+        controllers.init()
+        known = [i for i in range(controllers.get_count()) if controllers.is_controller(i)]
+        if not known:
+            self.close()
+            raise UserError("there is no gamepad; connect one, or leave --gamepad out")
+        self._pad = controllers.Controller(known[0])
+        self._limits = limits
+        self._last = _STAND
+
+    def moved(self) -> Command | None:
+        """Return the command of the sticks if it has changed since the last call, else None: keys act until a stick moves."""
+        sdl = self._pygame
+        sdl.event.pump()
+        sticks = (sdl.CONTROLLER_AXIS_LEFTY, sdl.CONTROLLER_AXIS_LEFTX, sdl.CONTROLLER_AXIS_RIGHTX)
+        # SDL's axes point down and to the right, the robot's forward, to the left and to the left.
+        forward, lateral, yaw = (
+            -_without_rest(self._pad.get_axis(stick) / _FULL) * limit
+            for stick, limit in zip(sticks, self._limits, strict=True)
+        )
+        last, self._last = self._last, (forward, lateral, yaw)
+        return None if self._last == last else self._last
+
+    def close(self) -> None:
+        """Give the gamepad back."""
+        self._pygame.quit()
+
+
+def _without_rest(value: float) -> float:
+    """Return a stick's place from −1 to 1 with the middle cut out, so that a worn stick stands still; 0 and 1 stay."""
+    size = min(abs(value), 1.0)
+    if size <= _REST:
+        return 0.0
+    return (size - _REST) / (1.0 - _REST) * (1.0 if value > 0.0 else -1.0)
+
+
+def _pygame() -> Any:
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # the window is MuJoCo's
+    os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
+    try:
+        import pygame
+        import pygame._sdl2.controller
+    except ImportError as error:
+        raise UserError("--gamepad needs pygame; install it with: pip install 'gaitgauge[gamepad]'") from error
+    return pygame
+
+
 def texts(readout: Readout) -> tuple[str, str]:
-    """What stands in the window's corner, names and values; the window's font has no more than ASCII."""
+    """Return the texts of the window's corner, names and values; the window's font has no more than ASCII."""
     head, *rows = table(readout)
     lines = [
         (name, "  ".join(f"{value} {of}" for value, of in zip(values, head[1:], strict=True))) for name, *values in rows
@@ -67,7 +138,7 @@ def texts(readout: Readout) -> tuple[str, str]:
 
 
 def watch(session: PlaySession, command: Command | None, seconds: float | None, gamepad: Gamepad | None = None) -> None:
-    """Open the window; returns when it is closed or the time is over. Keys and gamepad steer, the last to act wins.
+    """Open the window, and return when it is closed or the time is over. Keys and gamepad steer; the last to act wins.
 
     Raises:
         UserError: the window cannot be opened.

@@ -1,4 +1,4 @@
-"""What stands in the picture: who walks where, what was asked for and what is measured."""
+"""Write into pictures: policy, place, command, measured speed, falls and time."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from .play_session import Command, Readout
 
 _DARK = (16, 20, 26)
 _SHARE = 0.62
-"""How much of what lies behind the text is covered."""
+"""Opacity of the panel behind the text."""
 _INK, _SOFT = (244, 246, 248), (176, 186, 196)
 
 
 def table(readout: Readout) -> list[tuple[str, str, str, str]]:
-    """Command and measured speed as rows of a table, the head first."""
+    """Return command and measured speed as rows of a table, the head first."""
     return [
         ("", "forward m/s", "left m/s", "turn rad/s"),
         ("command", *_numbers(readout.command)),
@@ -25,7 +25,7 @@ def table(readout: Readout) -> list[tuple[str, str, str, str]]:
 
 
 def summary(readout: Readout) -> str:
-    """Everything else in one line."""
+    """Return friction, falls, arrivals and time in one line."""
     falls = "1 fall" if readout.falls == 1 else f"{readout.falls} falls"
     times = "once" if readout.arrivals == 1 else f"{readout.arrivals} times"
     arrivals = f"  ·  {times} at the target" if readout.arrivals else ""
@@ -38,7 +38,7 @@ def _numbers(command: Command) -> tuple[str, str, str]:
 
 
 def annotate(picture: np.ndarray, readouts: Sequence[Readout]) -> np.ndarray:
-    """A picture with a panel for each robot, whose tiles stand side by side, (height, width, 3) uint8.
+    """Return a picture with a panel for each robot, the tiles side by side, (height, width, 3) uint8.
 
     Args:
         picture: (height, width, 3) uint8; is not changed.
@@ -82,7 +82,7 @@ def _panel(image: Image.Image, left: int, width: int, points: int, readout: Read
 
 
 def _fitting(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> str:
-    """As much of a text as there is room for [pixels]."""
+    """Return the part of a text that fits a width [pixels]."""
     if font.getlength(text) <= width:
         return text
     while text and font.getlength(text + "…") > width:

@@ -1,4 +1,4 @@
-"""Pictures without a display: MuJoCo's renderer off the screen, how much it may cost, and a camera that follows the robot."""
+"""Draw pictures without a display: MuJoCo's renderer off the screen, its quality, and a camera that follows the robot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 RENDERERS = ("egl", "osmesa")
 """Ways to draw without a display, the faster first; the value of MUJOCO_GL."""
 _ON_THE_CPU = ("llvmpipe", "softpipe", "swrast", "swiftshader")
-"""What drivers that draw without a GPU call themselves."""
+"""Names of drivers that draw without a GPU."""
 PROBE = """
 import json, mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
@@ -29,48 +29,36 @@ with mujoco.Renderer(model, 32, 32) as renderer:
     from OpenGL import GL
     print(json.dumps(GL.glGetString(GL.GL_RENDERER).decode()))
 """
-"""Draws a picture, or fails, and prints what the driver calls itself."""
+"""Draws a picture, or fails, and prints the driver's name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """What a picture may cost."""
+    """Limit the cost of a picture. The defaults are for a GPU."""
 
-    size: tuple[int, int]
+    size: tuple[int, int] = (1280, 720)
     """Width and height of a picture of one robot [pixels]."""
-    tile: tuple[int, int]
+    tile: tuple[int, int] = (640, 480)
     """Width and height of each picture where several stand side by side [pixels]."""
-    samples: int
+    samples: int = 4
     """Samples of each pixel, for smooth edges; 0 for one."""
-    shadow_pixels: int
+    shadow_pixels: int = 4096
     """Width of the map of the sun's shadow [pixels]."""
-    shadow_reach: float
-    """How far from the robot there are shadows [m]."""
-    ground_shadows: bool
-    """Whether the ground casts shadows too, beside the robot."""
-    reflections: bool
-    """Whether the floor shines; everything is drawn twice then."""
-    slices: int
-    """Corners on the circumference of what is round."""
-    stacks: int
-    """Rings along the axis of what is round."""
-    field_nodes: int
+    shadow_reach: float = 3.0
+    """Distance from the robot within which there are shadows [m]."""
+    ground_shadows: bool = True
+    """True if the ground casts shadows too, beside the robot."""
+    reflections: bool = True
+    """True if the floor shines; everything is drawn twice then."""
+    slices: int = 28
+    """Corners on the circumference of round shapes."""
+    stacks: int = 16
+    """Rings along the axis of round shapes."""
+    field_nodes: int = 1024
     """Nodes of a height field along each side, where so many show it as it is."""
 
 
-RICH = Quality(
-    size=(1280, 720),
-    tile=(640, 480),
-    samples=4,
-    shadow_pixels=4096,
-    shadow_reach=3.0,
-    ground_shadows=True,
-    reflections=True,
-    slices=28,
-    stacks=16,
-    field_nodes=1024,
-)
-"""For a GPU."""
+RICH = Quality()
 PLAIN = Quality(
     size=(960, 540),
     tile=(480, 360),
@@ -87,7 +75,7 @@ PLAIN = Quality(
 
 
 def choose_renderer() -> Quality:
-    """What can be drawn here; the way to do so is put into ``MUJOCO_GL``. Must be called before MuJoCo is imported.
+    """Return the quality that this machine can draw, and set ``MUJOCO_GL`` to the way; call it before MuJoCo is imported.
 
     Raises:
         UserError: nothing draws.
@@ -106,10 +94,10 @@ def choose_renderer() -> Quality:
 
 
 class Follower:
-    """The point at which a camera looks that follows a robot smoothly."""
+    """Follow a robot smoothly with the point at which a camera looks."""
 
     ABOVE = 0.06
-    """How far above the base it is, which leaves room for words above the robot [m]."""
+    """Height of the point above the base, which leaves room for words above the robot [m]."""
     LAG = 0.25
     """Time constant [s]."""
 
@@ -117,7 +105,7 @@ class Follower:
         self._at: np.ndarray | None = None
 
     def follow(self, position: np.ndarray, seconds: float) -> np.ndarray:
-        """Where to look at a pose (7 + J,), ``seconds`` after the one before; (3,) [m]."""
+        """Return the point for a pose (7 + J,), ``seconds`` after the previous one; (3,) [m]."""
         target = position[:3] + np.array([0.0, 0.0, self.ABOVE])
         # A robot that was put back to the start is not followed on its way there.
         if self._at is None or np.linalg.norm(target - self._at) > 1.5:
@@ -128,26 +116,26 @@ class Follower:
 
 @dataclass(frozen=True, kw_only=True)
 class Tile:
-    """One robot of a picture."""
+    """Describe one robot of a picture."""
 
     model: mujoco.MjModel
-    """What ``scenery.visual_model`` made."""
+    """Made by ``scenery.visual_model``."""
     heading: float
-    """Of the robot at the start [rad]."""
+    """Heading of the robot at the start [rad]."""
     leg_length: float
-    """Of the robot [m]."""
+    """Length of the robot's legs [m]."""
     ground_shadows: bool = True
-    """Whether the ground casts shadows too."""
+    """True if the ground casts shadows too."""
 
 
 class Picture:
-    """Draws a robot on its ground."""
+    """Draw a robot on its ground."""
 
     AZIMUTH = 55.0
     """Direction in which the camera looks, against the robot's first heading [deg]."""
     ELEVATION = -16.0
     DISTANCE = 4.46
-    """Of the camera, in lengths of the robot's legs."""
+    """Distance of the camera, in lengths of the robot's legs."""
 
     def __init__(self, tile: Tile, *, size: tuple[int, int]) -> None:
         """Prepare the renderer of a picture of this width and height [pixels]."""
@@ -165,7 +153,7 @@ class Picture:
         self._ground_shadows = tile.ground_shadows
 
     def draw(self, position: np.ndarray, looks_at: np.ndarray) -> np.ndarray:
-        """The picture of a pose (7 + J,) from a camera that looks at a point (3,) [m]; (height, width, 3) uint8."""
+        """Return the picture of a pose (7 + J,) from a camera that looks at a point (3,) [m]; (height, width, 3) uint8."""
         show(self._model, self._data, position)
         self._camera.lookat[:] = looks_at
         self._renderer.update_scene(self._data, self._camera, self._options)
@@ -174,7 +162,7 @@ class Picture:
         return self._renderer.render()
 
     def _take_shadows_from_ground(self) -> None:
-        """Call the ground decoration: MuJoCo draws shadows on that, and none of it."""
+        """Mark the ground as decoration: decoration receives shadows in MuJoCo and casts none."""
         import mujoco
 
         scene = self._renderer.scene

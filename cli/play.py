@@ -1,4 +1,4 @@
-"""``gaitgauge play``: watch policies walk, in a window, in a browser or in a video file."""
+"""Watch policies walk in a window, in a browser or in a video file (``gaitgauge play``)."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ from typing import TYPE_CHECKING
 from .console import Terminal
 from .errors import UserError
 from .picture import choose_renderer
-from .play_request import PlayRequest
 from .progress import ProgressDisplay
+from .requests import VIEWERS, PlayRequest
 from .video import CLIP_ENDINGS, VIDEO_ENDINGS, check_film_path
 
 if TYPE_CHECKING:
     from .play_session import PlaySession
 
-VIEWERS = ("native", "viser", "video")
 MOST = 4
 """Policies side by side."""
 _FASTEST = 100.0
-"""Speed that is told at most [m/s, rad/s]."""
+"""Largest speed of ``--command`` [m/s, rad/s]."""
 _SHORTEST, _LONGEST = 0.1, 3600.0
 _LONGEST_CLIP = 60.0
 """The encoder of a GIF keeps all its pictures in memory [s]."""
 _VIDEO_SECONDS = 10.0
-"""Length of a video where none is asked for [s]."""
+"""Length of a video by default [s]."""
 
 
 def run_play(asked: PlayRequest) -> None:
@@ -40,31 +39,25 @@ def run_play(asked: PlayRequest) -> None:
     """
     viewer = _check(asked)
     quality = choose_renderer() if viewer == "video" else None  # before MuJoCo is imported
-    from ..studies.naming import distinct_names
     from .play_session import beyond
     from .worlds import WorldMaker
 
-    console = Terminal()
-    maker = WorldMaker(
-        backend=asked.backend,
-        device=asked.device,
-        seed=asked.seed,
-        trust=asked.trust,
-        robot=asked.robot,
-        suite=asked.suite,
-    )
+    console, maker = Terminal(), WorldMaker(asked)
     level = maker.default_level(asked.terrain) if asked.level is None else asked.level
+    sessions = maker.make_all(asked.policies, asked.terrain, level, asked.friction)
+    for session in sessions:
+        console.say(f"{session.policy.path} on {session.readout().place}, {asked.backend}, friction {asked.friction:g}")
+        if asked.command and (sentence := beyond(asked.command, session.limits)):
+            console.say(f"{session.label}: {sentence}" if len(sessions) > 1 else sentence)
+    if viewer == "viser":
+        from .browser_viewer import Choice, serve
+
+        chosen = Choice(terrain=asked.terrain, level=level, policies=asked.policies)
+        serve(sessions, maker, chosen, asked)
+        return
     with ExitStack() as stack:
-        sessions = []
-        for choice, label in zip(asked.policies, distinct_names(asked.policies), strict=True):
-            session = maker.make(choice, asked.terrain, level, asked.friction, label)
+        for session in sessions:
             stack.callback(session.close)
-            sessions.append(session)
-            console.say(
-                f"{session.policy.path} on {session.readout().place}, {asked.backend}, friction {asked.friction:g}"
-            )
-            if asked.command and (sentence := beyond(asked.command, session.limits)):
-                console.say(f"{label}: {sentence}" if len(asked.policies) > 1 else sentence)
         if quality is not None:
             from .recording import Recording, record
 
@@ -74,40 +67,28 @@ def run_play(asked: PlayRequest) -> None:
             with ProgressDisplay(console, "recording") as display:
                 record(wanted, quality, lambda share: display.update(share, f"{share * seconds:.1f} of {seconds:g} s"))
             for path in filter(None, (video, asked.gif)):
-                console.say(f"wrote {path}, {seconds:g} s{_told(sessions)}")
-        elif viewer == "native":
-            from .gamepad import Gamepad
-            from .native_viewer import watch
+                console.say(f"wrote {path}, {seconds:g} s{_events(sessions)}")
+        else:
+            from .native_viewer import Gamepad, watch
 
             pad = Gamepad(sessions[0].limits) if asked.gamepad else None
-            try:
-                watch(sessions[0], asked.command, asked.seconds, pad)
-            finally:
-                if pad is not None:
-                    pad.close()
-        else:
-            from .browser_viewer import Choice, serve
-
-            stack.pop_all()  # the page closes them: it may play others by then
-            serve(
-                sessions,
-                maker,
-                Choice(terrain=asked.terrain, level=level, policies=asked.policies),
-                command=asked.command,
-                seconds=asked.seconds,
-                port=asked.port,
-                host=asked.host,
-            )
+            if pad is not None:
+                stack.callback(pad.close)
+            watch(sessions[0], asked.command, asked.seconds, pad)
 
 
-def _told(sessions: Sequence[PlaySession]) -> str:
-    """What happened meanwhile, where anything did."""
+def _events(sessions: Sequence[PlaySession]) -> str:
+    """Return how often robots fell and arrived, where any did."""
     counts = ((sum(s.falls for s in sessions), "falls"), (sum(s.arrivals for s in sessions), "times at the target"))
-    return "".join(f", {count} {what}" for count, what in counts if count)
+    return "".join(f", {count} {event}" for count, event in counts if count)
 
 
 def _check(asked: PlayRequest) -> str:
-    """The viewer that is asked for, or the best that this machine has; ``UserError`` for options that make no sense."""
+    """Return the viewer that is asked for, or the best that this machine has.
+
+    Raises:
+        UserError: options that make no sense.
+    """
     from ..gauge.pipelines import check_friction
 
     films = {"--out": (asked.out, VIDEO_ENDINGS), "--gif": (asked.gif, CLIP_ENDINGS)}
@@ -117,13 +98,12 @@ def _check(asked: PlayRequest) -> str:
     if asked.seconds is not None and not _SHORTEST <= asked.seconds <= longest:
         raise UserError(f"--seconds is {asked.seconds:g}; give {_SHORTEST:g} to {longest:g} seconds")
     if asked.gamepad and viewer != "native":
-        raise UserError(
-            f"--gamepad steers the window and the viewer is '{viewer}'; add --viewer native, or leave it out"
-        )
+        hint = "add --viewer native, or leave it out"
+        raise UserError(f"--gamepad steers the window and the viewer is '{viewer}'; {hint}")
     check_friction(asked.friction)
     if asked.command and not all(abs(speed) <= _FASTEST for speed in asked.command):
-        told = " ".join(f"{speed:g}" for speed in asked.command)
-        raise UserError(f"--command is {told}; give speeds from -{_FASTEST:g} to {_FASTEST:g}")
+        given = " ".join(f"{speed:g}" for speed in asked.command)
+        raise UserError(f"--command is {given}; give speeds from -{_FASTEST:g} to {_FASTEST:g}")
     if len(asked.policies) > MOST:
         raise UserError(f"{len(asked.policies)} policies are given; at most {MOST} are shown side by side")
     for option, (path, endings) in films.items():

@@ -1,4 +1,4 @@
-"""One robot with a policy on one terrain, step by step, with commands from outside: what every way to watch shares."""
+"""Play one robot with a policy on one terrain, step by step, with commands from outside, for every viewer."""
 
 from __future__ import annotations
 
@@ -31,13 +31,12 @@ Command = tuple[float, float, float]
 _SPEED_OVER = 0.3
 """Time over which the measured speed is averaged [s]."""
 _SETTLE = 0.4
-"""Time after a reset in which the robot is told to stand [s]."""
+"""Time after a reset in which the command is to stand [s]."""
 _FALLEN_TILT = 1.4
 """Tilt of the base at which the robot starts again [rad]."""
 _LONG_DOWN = 1.0
-"""How long a fallen robot is shown [s]."""
+"""Time for which a fallen robot is shown [s]."""
 
-# A walk that shows every direction: share of the command limits and time [s].
 _TOUR: tuple[tuple[Command, float], ...] = (
     ((0.5, 0.0, 0.0), 3.0),
     ((0.5, 0.0, 0.6), 3.0),
@@ -47,44 +46,45 @@ _TOUR: tuple[tuple[Command, float], ...] = (
     ((-0.4, 0.0, 0.0), 2.0),
     ((0.0, 0.0, 0.0), 1.5),
 )
+"""A walk that shows every direction: shares of the command limits, and time [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Readout:
-    """One robot at one instant, for people."""
+    """Describe one robot at one instant, for people."""
 
     label: str
-    """Of the policy."""
+    """Name of the policy."""
     place: str
     """Terrain and level."""
     friction: float
-    """Of the ground."""
+    """Friction coefficient of the ground."""
     time: float
-    """Simulated time in all [s]."""
+    """Total simulated time [s]."""
     command: Command
-    """What the policy is told."""
+    """Command to the policy."""
     speed: Command
-    """What the base does in its own heading, averaged over a moment."""
+    """Speed of the base in its own heading, averaged over a moment."""
     falls: int
-    """How often it lay on the ground."""
+    """Number of falls."""
     arrivals: int
-    """How often it was at the target."""
+    """Number of arrivals at the target."""
 
 
 @cache  # once for each policy
 def _doubt(policy: Policy) -> None:
-    """Say that a policy may be run otherwise than it was made for."""
+    """Warn that a policy may be run otherwise than it was made for."""
     logging.getLogger(__name__).warning("'%s': the robot falls at once; %s", policy.path, doubt(policy.contract))
 
 
 def clip(command: Command, limits: Command) -> Command:
-    """A command within limits."""
+    """Return a command within limits."""
     forward, lateral, yaw = (max(-most, min(most, value)) for value, most in zip(command, limits, strict=True))
     return forward, lateral, yaw
 
 
 def beyond(command: Command, limits: Command) -> str | None:
-    """A sentence on what of a command is beyond the limits of a policy, None where nothing is."""
+    """Return a sentence on the parts of a command beyond the limits of a policy, None where all are within."""
     parts = [
         f"{name} {value:g} {unit} (it was made for at most {most:g})"
         for name, unit, value, most in zip(
@@ -96,7 +96,7 @@ def beyond(command: Command, limits: Command) -> str | None:
 
 
 class PlaySession:
-    """A robot that walks until it is told to stop: it starts again after a fall and at the target."""
+    """Play a robot without end: it starts again after a fall and at the target."""
 
     def __init__(
         self,
@@ -129,7 +129,7 @@ class PlaySession:
             )
         self.policy, self.robot, self.terrain, self.period, self.label = policy, robot, terrain, period, label
         self.limits = policy.contract.command_limits
-        """Largest commands that the policy was made for."""
+        """Largest commands of the policy's contract."""
         self._own_limits = clip(suite.command_limits(terrain.family), self.limits)
         self._speed = min(suite.commands.target_speed.get(terrain.family, 0.5 * self._own_limits[0]), self.limits[0])
         self._model_order = model_joint_order(robot)
@@ -145,14 +145,14 @@ class PlaySession:
         self.set_friction(friction)
         self._random = np.random.default_rng(seed)
         self.time = 0.0
-        """Simulated time in all [s]."""
+        """Total simulated time [s]."""
         self.falls = 0
         self.arrivals = 0
         self.reset()
 
     @property
     def state(self) -> PhysicsState:
-        """State of the one world."""
+        """Return the state of the one world."""
         return self.backend.state
 
     def set_friction(self, friction: float) -> None:
@@ -169,13 +169,13 @@ class PlaySession:
         self.since_reset = 0.0
         """Simulated time since the robot was put to the start [s]."""
         self._down = 0.0
-        self._told = self._speed_now = (0.0, 0.0, 0.0)
+        self._command = self._speed_now = (0.0, 0.0, 0.0)
 
     def step(self, command: Command) -> None:
         """Advance one control period; a command beyond the limits of the policy is clipped."""
         if self.since_reset < _SETTLE:
             command = (0.0, 0.0, 0.0)
-        limited = self._told = clip(command, self.limits)
+        limited = self._command = clip(command, self.limits)
         self._walk.step(self._walk.tensor([limited]))
         self.time += self.period
         self.since_reset += self.period
@@ -192,21 +192,21 @@ class PlaySession:
         self._speed_now = (forward, lateral, yaw)
 
     def readout(self) -> Readout:
-        """What there is to be told of this instant."""
+        """Return the readout of this instant."""
         level = f" level {self.terrain.level}" if self.terrain.level else ""
         return Readout(
             label=self.label,
             place=f"{self.terrain.name}{level}",
             friction=self.friction,
             time=self.time,
-            command=self._told,
+            command=self._command,
             speed=self._speed_now,
             falls=self.falls,
             arrivals=self.arrivals,
         )
 
     def _start_again(self) -> None:
-        """Back to the start once the robot has lain on the ground for a while, or has reached the target."""
+        """Reset once the robot has lain on the ground for a while, or has reached the target."""
         if self.tilt > _FALLEN_TILT or bool(self.state.diverged[0]):
             self._down += self.period
             if self._down >= _LONG_DOWN or bool(self.state.diverged[0]):
@@ -222,25 +222,25 @@ class PlaySession:
 
     @property
     def tilt(self) -> float:
-        """Angle between the base's z axis and the world's [rad]."""
+        """Return the angle between the base's z axis and the world's [rad]."""
         return float(tilt(self.state.base_quaternion_w[0]))
 
     @property
     def target_distance(self) -> float:
-        """Horizontal distance from the base to the terrain's target [m]; infinite without one."""
+        """Return the horizontal distance from the base to the terrain's target [m]; infinite without one."""
         if self.terrain.target is None:
             return math.inf
         x, y, _ = self.state.base_position_w[0].tolist()
         return math.hypot(self.terrain.target[0] - x, self.terrain.target[1] - y)
 
     def position(self) -> NDArray[np.float64]:
-        """Position of the free joint and of the robot's joints, as MuJoCo orders them: (7 + J,)."""
+        """Return the positions of the free joint and of the robot's joints, in MuJoCo's order: (7 + J,)."""
         state = self.state
         parts = (state.base_position_w[0], state.base_quaternion_w[0], state.joint_position[0, self._model_order])
         return torch.cat([p.double() for p in parts]).cpu().numpy()
 
     def autopilot(self) -> Command:
-        """To the target where there is one, else a tour that shows every direction."""
+        """Return the command to the target where there is one, else of a tour that shows every direction."""
         if self.terrain.target is not None:
             offset = target_offset(self.state, self._walk.tensor([self.terrain.target]), "horizontal")
             command = target_command(

@@ -1,4 +1,4 @@
-"""Programs that may hang or take their process with them, drivers and OpenGL, are tried in a child process."""
+"""Try drivers and OpenGL, which may hang or kill their process, in a child process."""
 
 from __future__ import annotations
 
@@ -13,22 +13,15 @@ PATIENCE = 120.0
 
 
 def ask(program: str, **environment: str) -> tuple[Any, str]:
-    """Run a Python program in a child process.
-
-    Args:
-        environment: variables beside those of this process.
+    """Run a Python program in a child process, with more environment variables.
 
     Returns:
-        What it prints as JSON on its last line, and an empty text; or None, and what went wrong.
+        The JSON that it prints on its last line, and an empty text; or None, and a sentence on the failure.
     """
     try:
+        command, variables = [sys.executable, "-c", program], {**os.environ, **environment}
         done = subprocess.run(
-            [sys.executable, "-c", program],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=PATIENCE,
-            env={**os.environ, **environment},
+            command, capture_output=True, text=True, errors="replace", timeout=PATIENCE, env=variables, check=False
         )
     except subprocess.TimeoutExpired:
         return None, f"no answer within {PATIENCE:g} s"

@@ -1,4 +1,4 @@
-"""One progress display for all commands: a block with a bar on a terminal, a plain line now and then elsewhere."""
+"""Show progress: a block with a bar on a terminal, a plain line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _COLUMNS = 4
 
 
 class ProgressDisplay:
-    """A context manager; nothing is shown before the first ``update``."""
+    """Show the progress of a ``with`` block; nothing is shown before the first ``update``."""
 
     def __init__(self, console: Terminal, title: str) -> None:
         self._console = console
@@ -43,11 +43,11 @@ class ProgressDisplay:
             self._live.__exit__(*details)
 
     def update(self, share: float, text: str, details: Mapping[str, str] | None = None, *, last: bool = False) -> None:
-        """Show how far the work is, if it is time to.
+        """Show the progress, if the last update was long enough ago.
 
         Args:
             share: of the work that is done, 0 to 1.
-            last: show it whatever the time.
+            last: show it in any case.
         """
         now = time.monotonic()
         if now - self._last < (_REFRESH if self._live else _LOG_EVERY) and not last:
@@ -67,7 +67,7 @@ class ProgressDisplay:
 
 
 def duration(seconds: float) -> str:
-    """A time for people: ``1 h 05 min``, ``2 min 07 s``, ``30 s``."""
+    """Return a time for people: ``1 h 05 min``, ``2 min 07 s``, ``30 s``."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"

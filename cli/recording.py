@@ -1,4 +1,4 @@
-"""Videos and clips of one robot, or of several side by side, from the same pictures."""
+"""Film one robot, or several side by side: video and clip are made from the same pictures."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from .video import film
 FRAME_TIME = 0.04
 """Time between two pictures [s]."""
 CLIP_SIZE, CLIP_TILE = (480, 270), (320, 240)
-"""Width and height of the pictures of a GIF or WebP file: of one robot, and of each of several [pixels]."""
+"""Width and height of pictures in a GIF or WebP file, of one robot and of each of several [pixels]."""
 _CLIP_EVERY = 2
-"""Pictures that are drawn for each one of a clip."""
+"""Frames of a video for each frame of a clip."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """What is to be filmed."""
+    """Describe a film."""
 
     sessions: Sequence[PlaySession]
     """The robots, from left to right."""
     seconds: float
     """Length in simulated time [s]."""
     command: Command | None = None
-    """What all of them are told; None: to the target, or a tour."""
+    """Command of all robots; None: to the target, or a tour."""
     video: Path | None = None
     """An MP4 file."""
     clip: Path | None = None
@@ -46,8 +46,8 @@ def record(wanted: Recording, quality: Quality, progress: Callable[[float], None
     """Play and film.
 
     Args:
-        quality: what ``choose_renderer`` says.
-        progress: is told the share that is done.
+        quality: as ``choose_renderer`` returns it.
+        progress: gets the share that is done, 0 to 1.
 
     Raises:
         UserError: a file cannot be written.
@@ -73,10 +73,8 @@ def record(wanted: Recording, quality: Quality, progress: Callable[[float], None
         slower = 1.0 / (FRAME_TIME * _CLIP_EVERY)
         clip = wanted.clip and stack.enter_context(film(wanted.clip, fps=slower, size=small))
         processes = processes_for(frames // every * len(sessions), quality)
-        drawn = stack.enter_context(
-            closing(draw(tiles, tile, _shots(sessions, frames, every, wanted.command), processes))
-        )
-        for picture, (frame, readouts) in drawn:
+        drawn = draw(tiles, tile, _shots(sessions, frames, every, wanted.command), processes)
+        for picture, (frame, readouts) in stack.enter_context(closing(drawn)):
             if video:
                 video(annotate(picture, readouts))
             if clip and frame % _CLIP_EVERY == 0:
@@ -88,7 +86,7 @@ def record(wanted: Recording, quality: Quality, progress: Callable[[float], None
 def _shots(
     sessions: Sequence[PlaySession], frames: int, every: int, command: Command | None
 ) -> Iterator[Shot[tuple[int, list[Readout]]]]:
-    """Play, and say what is to be drawn: every so many frames."""
+    """Play, and yield what is to be drawn, every so many frames."""
     followers = [Follower() for _ in sessions]
     for frame in range(frames):
         for session in sessions:

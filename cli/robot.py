@@ -1,9 +1,9 @@
-"""``gaitgauge robot``: a first description of a robot of one's own, and every check of it as a sentence."""
+"""Describe a robot of one's own, and print every check of it as a sentence (``gaitgauge robot``)."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ _EVERYTHING = "everything"
 
 
 def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -> None:
-    """Write a first description, and print what was guessed. What cannot be described leaves everything as it was.
+    """Write a first description, and print the guesses. An error restores all files.
 
     Raises:
         UserError: there is a description, or a model with names, already.
@@ -41,34 +41,32 @@ def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -
     draft = draft_robot(model, name, folder=folder)
     if draft.model:
         _refuse_existing(own, force)
-    made = not folder.exists()
-    make_folder(folder, RobotError)
-    before: dict[Path, bytes | None] = {}
     mjcf = own.name if draft.model else os.path.relpath(model.resolve(), folder.resolve())
-    try:
+    with ExitStack() as undo:
+        made = not folder.exists()
+        make_folder(folder, RobotError)
+        if made:
+            undo.callback(folder.rmdir)
         for path, text in ((own, draft.model), (description, draft.text(mjcf))):
             if text:
                 earlier = path.read_bytes() if path.is_file() else None
                 write_atomically(path, text, RobotError)
-                before[path] = earlier
+                undo.callback(_restore, path, earlier)
         robot = load_robot_file(description)
-    except RobotError:
-        for path, earlier in before.items():
-            if earlier is None:
-                path.unlink(missing_ok=True)
-            else:
-                write_atomically(path, earlier, RobotError)
-        if made:
-            folder.rmdir()
-        raise
+        undo.pop_all()
     console = Terminal()
     console.say(f"wrote {description}: {robot.title}, {len(robot.foot_names)} legs, {robot.num_joints} joints")
     if draft.model:
         console.say(f"wrote {own}: the model with names, and feet, that the description needs")
-    console.say("guessed, so look at it:")
-    for guess in draft.guesses:
-        console.say(f"  {guess}")
+    console.say("\n  ".join(("guessed, so look at it:", *draft.guesses)))
     console.say(f"next:\n  {shell_command(['robot', 'check', str(description)])}")
+
+
+def _restore(path: Path, earlier: bytes | None) -> None:
+    if earlier is None:
+        path.unlink(missing_ok=True)
+    else:
+        write_atomically(path, earlier, RobotError)
 
 
 def _refuse_existing(path: Path, force: bool) -> None:
@@ -77,7 +75,7 @@ def _refuse_existing(path: Path, force: bool) -> None:
 
 
 def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_output: bool) -> bool:
-    """Print what every check finds, and draw the standing pose; False where something is wrong that everything needs.
+    """Print every check, and draw the standing pose; return False where a check failed that everything needs.
 
     Raises:
         UserError: the picture's name does not end in .png, or it is asked for and cannot be drawn.
@@ -96,10 +94,8 @@ def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_outp
     try:
         robot = load_robot(Path(asked) if os.path.isdir(asked) else asked, check=False)
         described = f"{robot.title}: the description is complete and its values are possible"
-        findings = [
-            Finding(check="description", passed=True, sentence=described, needed_for=_EVERYTHING),
-            *examine(robot),
-        ]
+        complete = Finding(check="description", passed=True, sentence=described, needed_for=_EVERYTHING)
+        findings = [complete, *examine(robot)]
     except RobotError as error:
         findings = [Finding(check="description", passed=False, sentence=str(error), needed_for=_EVERYTHING)]
     sound = all(f.passed for f in findings if f.needed_for == _EVERYTHING)
@@ -111,27 +107,20 @@ def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_outp
         rows = [asdict(f) for f in findings]
         print_json({"robot": asked, "sound": sound, "checks": rows, "picture": drawn and str(drawn)})
         return sound
-    _print(findings)
-    console = Terminal()
-    if drawn is not None:
-        console.say(f"picture {drawn}")
-    elif silent:
-        console.say(silent)
-    console.say("the robot is sound" if sound else "the robot cannot be used yet")
-    return sound
-
-
-def _print(findings: Sequence[Finding]) -> None:
     console = Terminal()
     for finding in findings:
         needed = finding.needed_for == _EVERYTHING
         word, style = ("pass", "green") if finding.passed else ("FAIL", "bold red") if needed else ("note", "yellow")
         more = "" if finding.passed or needed else f" ({finding.needed_for} needs it)"
         console.say(Text.assemble((word, style), f"  {finding.check}: {finding.sentence}{more}"))
+    if drawn is not None or silent:
+        console.say(f"picture {drawn}" if drawn else silent)
+    console.say("the robot is sound" if sound else "the robot cannot be used yet")
+    return sound
 
 
 def _draw(robot: Robot, quality: Quality, path: Path) -> None:
-    """Write a picture of the standing pose; ``UserError`` where it cannot be written."""
+    """Write a picture of the standing pose, or raise ``UserError``."""
     import imageio.v3
     import numpy as np
 
@@ -148,8 +137,7 @@ def _draw(robot: Robot, quality: Quality, path: Path) -> None:
     try:
         imageio.v3.imwrite(path, np.ascontiguousarray(picture.draw(position, position[:3])))
     except OSError as error:
-        raise UserError(
-            f"the picture '{path}' cannot be written: {error.strerror or error}; choose another --picture"
-        ) from error
+        reason = error.strerror or error
+        raise UserError(f"the picture '{path}' cannot be written: {reason}; choose another --picture") from error
     finally:
         picture.close()

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import functools
 import inspect
-import types
 from collections.abc import Callable
-from dataclasses import is_dataclass
+from dataclasses import MISSING, is_dataclass
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import typer
 from annotated_types import Ge, Le
 
-from ..files.choices import Choice, choice_of, choices, required
+from ..files.choices import choice_of, choices
 from . import completion
 from .errors import report_errors
 
@@ -31,22 +30,18 @@ def command(app: typer.Typer, name: str | None = None) -> Callable[[Command], Co
 
     def register(function: Command) -> Command:
         hints = get_type_hints(function, include_extras=True)
-        parameters: dict[str, inspect.Parameter] = {}
+        options: dict[str, tuple[Any, Any]] = {}
         requests: dict[str, type] = {}
-        repeated: set[str] = set()
         for parameter in inspect.signature(function).parameters.values():
             hint = hints[parameter.name]
-            found = {parameter.name: (parameter.default, hint)}
             if isinstance(hint, type) and is_dataclass(hint):
                 requests[parameter.name] = hint
-                found = {
-                    field: (parameter.empty if required(entry) else entry.default, kind)
-                    for field, (entry, kind) in choices(hint).items()
-                }
-            for option, (default, kind) in found.items():
-                parameters[option] = _parameter(option, kind, default)
-                if _is_repeated(kind):
-                    repeated.add(option)
+                for field, (default, kind) in choices(hint).items():
+                    options[field] = (parameter.empty if default is MISSING else default, kind)
+            else:
+                options[parameter.name] = (parameter.default, hint)
+        parameters = [_parameter(option, kind, default) for option, (default, kind) in options.items()]
+        repeated = {option for option, (_, kind) in options.items() if _is_repeated(kind)}
 
         def run(**given: Any) -> None:
             values = {option: tuple(value or ()) if option in repeated else value for option, value in given.items()}
@@ -57,8 +52,8 @@ def command(app: typer.Typer, name: str | None = None) -> Callable[[Command], Co
             function(**made, **values)
 
         functools.update_wrapper(run, function)
-        run.__annotations__ = {option: parameter.annotation for option, parameter in parameters.items()}
-        run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         app.command(name)(report_errors(run))
         return function
 
@@ -66,41 +61,31 @@ def command(app: typer.Typer, name: str | None = None) -> Callable[[Command], Co
 
 
 def _parameter(name: str, hint: Any, default: Any) -> inspect.Parameter:
-    """Return what Typer reads of one value: its type, the spelling of its option, help, group, limits and completion."""
+    """Return one value as Typer reads it: its type, the spelling of its option, help, group, limits and completion."""
     choice = choice_of(hint)
     assert choice is not None, f"{name} has no Choice"
-    kind = get_args(hint)[0]
-    details: dict[str, Any] = {
-        "help": choice.help,
-        "metavar": choice.metavar,
-        "rich_help_panel": choice.group,
-        "autocompletion": _completer(choice),
-    }
-    for limit in get_args(hint)[1:]:
+    kind, *limits = get_args(hint)
+    details: dict[str, Any] = {"help": choice.help, "metavar": choice.metavar, "rich_help_panel": choice.group}
+    for limit in limits:
         if isinstance(limit, Ge):
             details["min"] = limit.ge
         elif isinstance(limit, Le):
             details["max"] = limit.le
+    if values := choice.values:
+        details["autocompletion"] = completion.KINDS[values] if isinstance(values, str) else completion.of(*values)
+    argument, flags = choice.argument or default is inspect.Parameter.empty, choice.flags
+    if default is False and not flags:
+        flags = (f"--{name.replace('_', '-')}",)
     if _is_repeated(hint):
         kind = list[get_args(kind)[0]]  # type: ignore[misc]
-        default = inspect.Parameter.empty if default is inspect.Parameter.empty else None
-        kind = kind if default is inspect.Parameter.empty else Union[kind, None]  # noqa: UP007
-    if choice.argument:
-        info = typer.Argument(**details)
-    else:
-        info = typer.Option(*choice.flags, **details)
+        flags = flags or (f"--{name.removesuffix('s')}",)
+        if default is not inspect.Parameter.empty:
+            kind, default = Union[kind, None], None  # noqa: UP007
+    info = typer.Argument(**details) if argument else typer.Option(*flags, **details)
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
 
 
 def _is_repeated(hint: Any) -> bool:
     """Return whether a value is a tuple of any length, which the command line takes by repeating the option."""
-    kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-    if isinstance(kind, types.UnionType):
-        return False
+    kind = get_args(hint)[0]
     return get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis
-
-
-def _completer(choice: Choice) -> completion.Completer | None:
-    if not choice.values:
-        return None
-    return completion.KINDS[choice.values] if isinstance(choice.values, str) else completion.of(*choice.values)

@@ -1,4 +1,4 @@
-"""The robot and its ground as a MuJoCo model made to be looked at; the physics runs elsewhere and only poses are copied."""
+"""Make a MuJoCo model of a robot and its ground for drawing; the physics runs elsewhere and only poses are copied."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..terrains.base import FloatArray, Terrain
 from .picture import RICH, Quality
 
 VISUAL_GROUP = 2
-"""Geom group of what is seen of a robot."""
+"""Geom group of the visible shapes of a robot."""
 COLLISION_GROUP = 3
 FIELD_COLOR = (0.72, 0.76, 0.74, 1.0)
 BOX_COLORS = ((0.66, 0.70, 0.76, 1.0), (0.58, 0.62, 0.69, 1.0))
@@ -23,16 +23,11 @@ _FLOOR_REACH = 40.0
 _SAME_GROUND = 0.01
 """Difference in height that nobody sees [m]."""
 _EXTENT = 3.0
-"""Size of what is looked at [m]."""
+"""Size of the scene for MuJoCo's camera and shadows [m]."""
 
 
 def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> mujoco.MjModel:
-    """A model of robot, terrain, sky and light.
-
-    Args:
-        robot: whose ``qpos`` the model takes.
-        terrain: walls are left out, they would hide the robot.
-    """
+    """Return a model of robot, terrain, sky and light, with the robot's ``qpos``; walls, which would hide the robot, are left out."""
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     _set_light(spec, quality)
     for i, box in enumerate(box for box in terrain.boxes if not box.wall):
@@ -44,7 +39,7 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
         x, y = terrain.target[:2]
         place, color = [x, y, float(terrain.height(x, y)) + 0.006], [0.95, 0.45, 0.15, 1.0]
         _add_geom(spec, "target", mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.12, 0.004, 0.0], pos=place, rgba=color)
-    # Last, since drawing goes in this order: what steps hide of the floor need not be drawn.
+    # Last, since drawing goes in this order: parts of the floor under steps need not be drawn.
     _add_floor(spec, reflectance=0.04 if quality.reflections else 0.0)
     shown = any(geom.group == VISUAL_GROUP for geom in spec.geoms)
     for geom in list(spec.geoms):
@@ -54,7 +49,7 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
 
 
 def _add_geom(spec: mujoco.MjSpec, name: str, kind: mujoco.mjtGeom, **shape: Any) -> None:
-    """Add something to the world that nothing collides with."""
+    """Add a geom without collisions to the world."""
     spec.worldbody.add_geom(name=name, type=kind, contype=0, conaffinity=0, **shape)
 
 
@@ -75,38 +70,18 @@ def _set_light(spec: mujoco.MjSpec, quality: Quality) -> None:
     spec.stat.extent = _EXTENT
     visual.map.shadowclip = quality.shadow_reach / _EXTENT
     # The sun follows the robot: a shadow map that covers the whole ground would be too coarse.
-    sun = spec.worldbody.add_light(
-        name="sun",
-        pos=[0.0, 0.0, 4.0],
-        dir=[0.35, 0.45, -1.0],
-        diffuse=[0.62, 0.60, 0.56],
-        specular=[0.15, 0.15, 0.15],
-        castshadow=True,
-    )
+    colors = {"diffuse": [0.62, 0.60, 0.56], "specular": [0.15, 0.15, 0.15]}
+    sun = spec.worldbody.add_light(name="sun", pos=[0.0, 0.0, 4.0], dir=[0.35, 0.45, -1.0], castshadow=True, **colors)
     sun.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.45, 0.62, 0.82],
-        rgb2=[0.90, 0.94, 0.98],
-        width=512,
-        height=3072,
-    )
+    gradient = {"builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, "rgb1": [0.45, 0.62, 0.82], "rgb2": [0.90, 0.94, 0.98]}
+    spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=512, height=3072, **gradient)
 
 
 def _add_floor(spec: mujoco.MjSpec, reflectance: float) -> None:
-    texture = spec.add_texture(
-        name="checker",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.74, 0.77, 0.80],
-        rgb2=[0.66, 0.69, 0.73],
-        mark=mujoco.mjtMark.mjMARK_EDGE,
-        markrgb=[0.80, 0.83, 0.86],
-        width=512,
-        height=512,
-    )
+    squares = {"builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER, "rgb1": [0.74, 0.77, 0.80], "rgb2": [0.66, 0.69, 0.73]}
+    edges = {"mark": mujoco.mjtMark.mjMARK_EDGE, "markrgb": [0.80, 0.83, 0.86]}
+    kind = mujoco.mjtTexture.mjTEXTURE_2D
+    texture = spec.add_texture(name="checker", type=kind, width=512, height=512, **squares, **edges)
     material = spec.add_material(name="floor", texrepeat=[1.0, 1.0], texuniform=True, reflectance=reflectance)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
     _add_geom(spec, "floor", mujoco.mjtGeom.mjGEOM_PLANE, size=[_FLOOR_REACH, _FLOOR_REACH, 1.0], material="floor")
@@ -125,12 +100,7 @@ def _add_field(spec: mujoco.MjSpec, terrain: Terrain, most_nodes: int) -> None:
 
 
 def drawn_heights(heights: FloatArray, most_nodes: int) -> FloatArray:
-    """Heights with fewer nodes where these show the same ground, else as they are.
-
-    Args:
-        heights: at the nodes [m], (rows, columns).
-        most_nodes: rows and columns that are wanted at most.
-    """
+    """Return heights (rows, columns) [m] with at most ``most_nodes`` a side where these show the same ground, else as they are."""
     factors = [min(1.0, most_nodes / n) for n in heights.shape]
     fewer = zoom(heights, factors, order=1)
     back = zoom(fewer, [n / m for n, m in zip(heights.shape, fewer.shape, strict=True)], order=1)

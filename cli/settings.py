@@ -1,11 +1,11 @@
-"""``gaitgauge train``, as ``train`` does it, or with ``--list-settings`` every setting with its default, its unit and its meaning."""
+"""Print every setting of a task with its value and its meaning (``gaitgauge train --list-settings``)."""
 
 from __future__ import annotations
 
 import ast
 import inspect
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any
@@ -19,18 +19,13 @@ from .console import Terminal
 _WIDTH = 80
 
 
-def print_settings_of(request: TrainRequest) -> None:
-    """Print the settings of a task as the options beside it change them."""
-    print_settings(request.task, request.own_overrides(), request.robot)
-
-
-def print_settings(task: str, overrides: Sequence[str], robot: str | None = None) -> None:
-    """Print the settings of a task, for a robot and with some changed, group by group.
+def print_settings(request: TrainRequest) -> None:
+    """Print the settings of a task as the other options change them, group by group.
 
     Raises:
         TaskError: no such task, or a key or value that does not fit.
     """
-    chosen = find_task(task, overrides, robot=robot)
+    chosen = find_task(request.task, request.own_overrides(), robot=request.robot)
     console = Terminal()
 
     def say(text: str, indent: int, style: str = "") -> None:
@@ -49,7 +44,7 @@ def print_settings(task: str, overrides: Sequence[str], robot: str | None = None
 
 
 def _groups(path: str, node: Any, meaning: str = "") -> Iterator[tuple[str, str, list[tuple[str, str, str]]]]:
-    """A dataclass's own settings (name, value, meaning), then those of what it holds."""
+    """Yield a dataclass's own settings (name, value, meaning), then those of the dataclasses inside it."""
     texts = field_texts(node.__class__)
     plain = [(name, _shown(value), texts.get(name, "")) for name, value in _children(node) if not _holds_more(value)]
     if plain:
@@ -71,7 +66,7 @@ def _holds_more(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """A value as the command line takes it."""
+    """Return a value as the command line takes it."""
     if value is None or isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):
@@ -80,14 +75,14 @@ def _shown(value: Any) -> str:
 
 
 def _meaning(node: Any, text: str = "") -> str:
-    """The first sentence on a group: of the field that holds it, or of its class."""
+    """Return the first sentence on a group: of the field that holds it, or of its class."""
     words = text or " ".join((inspect.getdoc(node) or "").replace("``", "").split())
     return words.partition(". ")[0].rstrip(".")
 
 
 @cache
 def field_texts(kind: type[Any]) -> dict[str, str]:
-    """The text under each field of a dataclass, by field name."""
+    """Return the text under each field of a dataclass, by field name."""
     texts: dict[str, str] = {}
     for base in reversed([k for k in kind.__mro__ if is_dataclass(k)]):
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body

@@ -1,28 +1,31 @@
-"""What the commands that look at several policies have in common: folders, how to go on, what was left out."""
+"""Run work on several policies: lock the folder, say how to go on, name what was left out."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from ..files.writing import LOCK, lock_folder, make_folder
+from ..studies.naming import joined_names
 from ..studies.policies import lost_policy
 from .console import Terminal, print_json, shell_command
 from .errors import UserError
+from .policies import policy_files
 from .progress import ProgressDisplay
 
 
 @contextmanager
 def resumable(console: Terminal, title: str, folder: Path | None = None, *more: str) -> Iterator[ProgressDisplay]:
-    """A display around work that keeps what has finished: Ctrl-C says how to go on and ends with exit code 130.
+    """Show progress of work that keeps finished episodes: Ctrl-C says how to go on and ends with exit code 130.
 
     Args:
-        folder: where finished episodes are kept, where there is one such folder.
+        folder: of finished episodes, where there is a single one.
         more: arguments that the command needs to go on.
     """
     try:
@@ -30,14 +33,13 @@ def resumable(console: Terminal, title: str, folder: Path | None = None, *more: 
             yield display
     except KeyboardInterrupt:
         where = "" if folder is None else f" in {folder}"
-        again = shell_command(None, *more)
-        console.say(f"stopped; every finished episode is kept{where}. Go on with:\n  {again}")
+        console.say(f"stopped; every finished episode is kept{where}. Go on with:\n  {shell_command(None, *more)}")
         raise typer.Exit(130) from None
 
 
 @contextmanager
 def _own_folder(folder: Path) -> Iterator[None]:
-    """A folder for this process alone, created where it is not there; an error leaves none that it created.
+    """Lock a folder for this process, and create it where it is missing; an error removes a folder that was created.
 
     Raises:
         UserError: it is a file, cannot be written to, or another process has it.
@@ -60,20 +62,29 @@ def _own_folder(folder: Path) -> Iterator[None]:
 
 
 def make_study(
-    study: Callable[..., Mapping[str, Any]],
-    request: Any,
-    folder: Path,
-    *,
+    name: str,
+    data: str,
     title: str,
+    study: Callable[..., Mapping[str, Any]],
     show: Callable[[Terminal, Mapping[str, Any]], None],
-    files: tuple[str, str],
+    request: Any,
+    *,
+    out: Path | None,
     json_output: bool,
 ) -> None:
-    """Make a study policy by policy, print it and where its two ``files`` are; exit code 1 where something was left out."""
+    """Make a study policy by policy, print it and its files; exit code 1 where something was left out.
+
+    Args:
+        name: of the study: its page is ``<name>.html``, its folder by default ``results/<name>-<policies>``.
+        data: name of the file of its results.
+        title: of the progress display.
+    """
+    folder = out or Path("results") / f"{name}-{joined_names(request.policies)}"
+    request = replace(request, policies=policy_files(request.policies))
     errors = Terminal(stderr=True)
-    # the folder first: what is wrong with it is said before anything is played
+    # the folder first: an error in it is shown before anything is played
     with _own_folder(folder), ProgressDisplay(errors, title) as display:
-        if lost := lost_policy(folder / files[0], request.policies):
+        if lost := lost_policy(folder / data, request.policies):
             raise UserError(f"'{folder}' holds policy {lost}, which would be lost; give another folder with --out")
         results = study(
             request,
@@ -86,7 +97,7 @@ def make_study(
     else:
         console = Terminal()
         show(console, results)
-        console.say(f"results  {folder / files[0]}\npage     {folder / files[1]}")
+        console.say(f"results  {folder / data}\npage     {folder / name}.html")
     for refused in results["refused"]:
         errors.say(f"{refused['what']} was left out: {refused['reason']}")
     if results["refused"]:

@@ -1,4 +1,4 @@
-"""``gaitgauge train``: live progress, and how to go on when it stops."""
+"""Train with live progress, and say how to go on after a stop (``gaitgauge train``)."""
 
 from __future__ import annotations
 
@@ -25,17 +25,28 @@ from .progress import ProgressDisplay, duration
 _RATE_WINDOW = 20
 """Iterations over which the speed and the time left are averaged."""
 _LONGEST = 10_000 * 3600.0
-"""Of a time limit [s]."""
+"""Longest time limit [s]."""
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
+_SHOWN = (
+    ("steps/s", "Perf/total_fps", ",.0f"),
+    ("reward", "Train/mean_reward", ".2f"),
+    ("episode", "Train/mean_episode_length", ".0f"),
+    ("level", "Curriculum/mean_level", ".2f"),
+    ("value loss", "Loss/value", ".4f"),
+    ("surrogate", "Loss/surrogate", ".4f"),
+    ("latent", "Loss/latent", ".4f"),
+    ("std", "Policy/mean_std", ".2f"),
+)
+"""Scalars on the display: short name, key and format."""
 
 
 def run_training(request: TrainRequest, time: str | None) -> None:
-    """Train for at most ``time``, show progress, say how to go on; exits with the run's exit code."""
+    """Train for at most ``time``, show progress, say how to go on, and exit with the run's exit code."""
     began = clock.monotonic()
     seconds = None if time is None else parse_duration(time)
     plan = prepare(replace(request, seconds=seconds))
     task = request.task
-    # Of several processes, one for each GPU, the first speaks.
+    # Of several processes, one for each GPU, the first prints.
     console = Terminal(quiet=os.environ.get("RANK", "0") != "0", may_lose=True)
     steps = plan.task.training.run.steps_per_iteration * plan.task.environment.num_envs
 
@@ -62,21 +73,19 @@ def run_training(request: TrainRequest, time: str | None) -> None:
 
 
 def _start() -> tuple[str, str]:
-    """How as many processes as those of this run are started, in place of ``gaitgauge``, and what a reader must add."""
+    """Return the start of a command with as many processes as this run has, and a note on what the reader must add."""
     count = Processes.told().count
     if count == 1:
         return "gaitgauge", ""
     here = told_number("LOCAL_WORLD_SIZE", count)
-    several = 0 < here < count
-    machines = f"--nnodes {count // here} " if several else ""
-    return (
-        f"torchrun {machines}--nproc-per-node {here} -m gaitgauge.cli.main",
-        ", on every machine and with its --rdzv options" if several else "",
-    )
+    start = f"--nproc-per-node {here} -m gaitgauge.cli.main"
+    if 0 < here < count:
+        return f"torchrun --nnodes {count // here} {start}", ", on every machine and with its --rdzv options"
+    return f"torchrun {start}", ""
 
 
 def _again(plan: TrainPlan) -> list[str]:
-    """What a resume must be told anew, since checkpoints do not decide it: trust, where data go, and what is for one command alone."""
+    """Return options that a resumed run needs again because checkpoints do not hold them: trust, logger, device, threads, scores."""
     run, usual = plan.task.training.run, RunConfiguration()
     found = ["--trust"] if plan.needs_trust else []
     found += ["--logger", run.logger] if run.logger != usual.logger else []
@@ -90,16 +99,16 @@ def _again(plan: TrainPlan) -> list[str]:
             found.append(f"--{option}" if value else f"--no-{option}")
         else:
             found += [f"--{option}", str(value)]
-    return found + (
-        [f"training.run.logger_project={run.logger_project}"] if run.logger_project != usual.logger_project else []
-    )
+    if run.logger_project != usual.logger_project:
+        found.append(f"training.run.logger_project={run.logger_project}")
+    return found
 
 
 def parse_duration(text: str) -> float:
-    """Seconds of ``90``, ``90s``, ``9m``, ``2h`` or ``1h30m``.
+    """Return the seconds of ``90``, ``90s``, ``9m``, ``2h`` or ``1h30m``.
 
     Raises:
-        UserError: it is no duration, not above zero, or longer than anybody waits.
+        UserError: it is no duration, not above zero, or too long.
     """
     if re.fullmatch(r"\d+(\.\d+)?", text):
         seconds = float(text)
@@ -108,23 +117,22 @@ def parse_duration(text: str) -> float:
     else:
         raise UserError(f"--time is '{one_line(text, 80)}'; write seconds, or for example 9m, 2h or 1h30m")
     if not 0.0 < seconds <= _LONGEST:
-        raise UserError(
-            f"--time is '{one_line(text, 80)}'; it must be longer than 0 s and at most {_LONGEST / 3600:g} h"
-        )
+        most = f"{_LONGEST / 3600:g} h"
+        raise UserError(f"--time is '{one_line(text, 80)}'; it must be longer than 0 s and at most {most}")
     return seconds
 
 
 class _Watch:
-    """Tells the display of training's ``Progress``, and how long it still takes."""
+    """Show training's ``Progress`` and the time that is left."""
 
     def __init__(self, display: ProgressDisplay, deadline: float | None) -> None:
-        """``deadline``: value of ``time.monotonic()`` at which training stops, None for no limit."""
+        """Take the value of ``time.monotonic()`` at which training stops, None for no limit."""
         self._display = display
         self._deadline = deadline
         self._recent: deque[tuple[float, int]] = deque(maxlen=_RATE_WINDOW)
 
     def update(self, progress: Progress) -> None:
-        """Show one iteration, if it is time to."""
+        """Show one iteration."""
         now = clock.monotonic()
         self._recent.append((now, progress.iteration))
         done, total = progress.iteration, progress.total_iterations
@@ -132,7 +140,7 @@ class _Watch:
         self._display.update(done / total, text, _shown(progress), last=done >= total)
 
     def _left(self, progress: Progress, now: float) -> str:
-        """How long training still takes, for people."""
+        """Return the time that is left, for people."""
         remaining = progress.total_iterations - progress.iteration
         (first, start), (last, end) = self._recent[0], self._recent[-1]
         seconds = progress.elapsed / max(progress.iteration, 1) * remaining
@@ -146,27 +154,15 @@ class _Watch:
 
 
 def _shown(progress: Progress) -> dict[str, str]:
-    """What the display says of an iteration, by short name."""
+    """Return the figures of an iteration for the display, by short name."""
     scalars = progress.scalars
-    values: dict[str, str] = {}
-
-    def add(name: str, key: str, form: str) -> None:
-        if key in scalars:
-            values[name] = format(scalars[key], form)
-
+    values = {}
     if "Perf/total_steps" in scalars:
         values["steps"] = f"{scalars['Perf/total_steps'] / 1e6:.2f} M"
-    add("steps/s", "Perf/total_fps", ",.0f")
-    add("reward", "Train/mean_reward", ".2f")
-    add("episode", "Train/mean_episode_length", ".0f")
-    add("level", "Curriculum/mean_level", ".2f")
-    add("value loss", "Loss/value", ".4f")
-    add("surrogate", "Loss/surrogate", ".4f")
-    add("latent", "Loss/latent", ".4f")
-    add("std", "Policy/mean_std", ".2f")
-    gauge = [key for key in scalars if key.startswith("Gauge/") and key.endswith("/score")]
-    for key in gauge[:1]:
-        add("gauge", key, ".4f")
+    gauge = [("gauge", key, ".4f") for key in scalars if key.startswith("Gauge/") and key.endswith("/score")]
+    for name, key, form in (*_SHOWN, *gauge[:1]):
+        if key in scalars:
+            values[name] = format(scalars[key], form)
     if progress.best_score is not None:
         values["best gauge"] = f"{progress.best_score:.4f} at {progress.best_iteration}"
     return values

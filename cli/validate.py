@@ -1,8 +1,9 @@
-"""``gaitgauge validate``: tables of how far simulators are from reality, and of how they rank policies."""
+"""Print errors of simulators against reality, and their ranks of policies (``gaitgauge validate``)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from .errors import UserError
 
 
 def run_validation(tables: Sequence[Path], *, example_name: str | None, ranks_only: bool, json_output: bool) -> None:
-    """Validate and print."""
+    """Validate simulators and print errors and ranks."""
     if example_name is not None:
         if tables:
             raise UserError("an example has tables of its own; leave out either the files or --example")
@@ -31,7 +32,7 @@ def run_validation(tables: Sequence[Path], *, example_name: str | None, ranks_on
 
 
 def print_validation(console: Terminal, found: Mapping[str, Any]) -> None:
-    """Errors by command, metric and group of every simulator, then ranks."""
+    """Print errors by command, metric and group of every simulator, then ranks."""
     simulators = found["simulators"]
     for name, entry in simulators.items():
         if "errors" not in entry:
@@ -53,10 +54,8 @@ def print_validation(console: Terminal, found: Mapping[str, Any]) -> None:
         columns = [f"{name} {what}" for name in ranked for what in ("τ", "MMRV")]
         table = make_table(title, "motion, metric", *columns, numbers=True)
         for rows in zip(*ranked.values(), strict=True):
-            cells = [
-                c for r in rows for c in ("–" if r["tau"] is None else f"{r['tau']:+.3f}", f"{r['violation']:.4f}")
-            ]
+            pairs = [("–" if r["tau"] is None else f"{r['tau']:+.3f}", f"{r['violation']:.4f}") for r in rows]
             average = rows[0]["motion"] == AVERAGE
             label = AVERAGE if average else f"{rows[0]['motion']}, {rows[0]['metric']}"
-            table.add_row(label, *cells, style="bold" if average else None)
+            table.add_row(label, *chain(*pairs), style="bold" if average else None)
         console.print(table)

@@ -1,11 +1,11 @@
-"""Films: MP4 files, and GIF or WebP files that play by themselves in a page."""
+"""Write films: MP4 files, and GIF or WebP files that play by themselves in a page."""
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
 from tempfile import TemporaryFile
 
 import numpy as np
@@ -27,10 +27,10 @@ _CODECS: dict[str, tuple[str, str, list[str]]] = {
 
 
 def check_film_path(path: Path, option: str, endings: tuple[str, ...]) -> None:
-    """Refuse a file that cannot be.
+    """Refuse the name of a film that cannot be written.
 
     Raises:
-        UserError: the folder is not there, or the name ends in something else.
+        UserError: the folder does not exist, or the name has another ending.
     """
     if path.suffix.lower() not in endings:
         other = _OPTION_OF.get(path.suffix.lower())
@@ -45,12 +45,12 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
     """Write pictures to a file in the format that its ending names; the file gets its name when it is whole.
 
     Args:
-        path: one that ``check_film_path`` lets pass.
+        path: checked by ``check_film_path``.
         fps: pictures a second.
         size: width and height [pixels].
 
     Yields:
-        What adds a picture (height, width, 3) uint8, or raises ``UserError`` where it cannot be written.
+        A function that adds a picture (height, width, 3) uint8, and raises ``UserError`` where it cannot be written.
     """
     import imageio_ffmpeg
 
@@ -58,14 +58,9 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
     with replacing(path, UserError, ending=path.suffix) as partial, TemporaryFile() as complaints:
         pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size), "-r", f"{fps:g}", "-i", "-"]
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *pictures, "-an", "-c:v", codec]
-        # A session of its own: Ctrl-C in the terminal is for this command, which ends the film.
-        encoder = subprocess.Popen(
-            [*command, "-pix_fmt", pixels, *options, str(partial)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=complaints,
-            start_new_session=True,
-        )
+        # A session of its own: Ctrl-C in the terminal reaches this command, which ends the film.
+        command += ["-pix_fmt", pixels, *options, str(partial)]
+        encoder = Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=complaints, start_new_session=True)
         assert encoder.stdin is not None
         sent = encoder.stdin
 
@@ -83,7 +78,7 @@ def film(path: Path, *, fps: float, size: tuple[int, int]) -> Iterator[Callable[
 
         try:
             yield add
-            with suppress(OSError):  # it has ended by itself, and says why
+            with suppress(OSError):  # ended by itself; the failure follows
                 sent.close()
             if encoder.wait():
                 raise failure()

@@ -1,4 +1,4 @@
-"""``gaitgauge warmup``: kernels compiled before they are needed."""
+"""Compile kernels before they are needed (``gaitgauge warmup``)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SUITE = "gaitgauge-1"
 def run_warmup(
     architectures: Sequence[str], backends: Sequence[str], *, robot: str, cache: Path | None, threads: int | None
 ) -> None:
-    """Compile what training and evaluating need.
+    """Compile the kernels of training and evaluating.
 
     Args:
         robot: name or path; its numbers of joints and feet are part of the kernels.
@@ -36,9 +36,8 @@ def run_warmup(
     backends = backends or ("mujoco-warp",)
     for name in backends:
         if name.partition(":")[0] not in _ENGINES:
-            raise UserError(
-                f"the engine '{name}' has no kernels to compile; choose from: {', '.join(_ENGINES)} (--backend)"
-            )
+            known = ", ".join(_ENGINES)
+            raise UserError(f"the engine '{name}' has no kernels to compile; choose from: {known} (--backend)")
     if cache is not None:
         os.environ["WARP_CACHE_PATH"] = str(cache)  # before Warp is imported
     from ..backends.warp import warmup
@@ -59,15 +58,13 @@ def run_warmup(
             warmup.exercise_until_compiled(name, scenes, "cpu")
             with warmup.recorded_launches() as launched:
                 warmup.exercise(name, scenes, "cpu")
-        console.say(
-            f"{name}: {len(launched)} modules are launched (seen on the CPU in {time.perf_counter() - began:.0f} s)"
-        )
+        seconds = time.perf_counter() - began
+        console.say(f"{name}: {len(launched)} modules are launched (seen on the CPU in {seconds:.0f} s)")
         for number in numbers:
             with console.status(f"{name}: compiling for sm_{number} …"):
                 done = warmup.compile_for(number, launched, threads=threads or os.cpu_count() or 1)
-            console.say(
-                f"{name}, sm_{number}: {done.fresh} of {done.modules} compiled, the others were there ({done.seconds:.0f} s)"
-            )
+            counts = f"{done.fresh} of {done.modules} compiled, the others were there"
+            console.say(f"{name}, sm_{number}: {counts} ({done.seconds:.0f} s)")
     console.say(f"kernels are in {warmup.cache_folder()}")
     if cache is not None:
         console.say(f"programs find them with WARP_CACHE_PATH={cache}")
@@ -76,7 +73,7 @@ def run_warmup(
 
 
 def scenes_of(robot: Robot) -> list[Scene]:
-    """A few worlds as training and as the gauge have them, on level ground, on boxes and on a height field."""
+    """Return a few worlds of training and of the gauge, on level ground, on boxes and on a height field."""
     level = LEVELS[len(LEVELS) // 2]
     names = [n for n in gauge_terrain_names() if n in ("flat", "stairs_fd", "wave")]
     terrains = tuple(make_terrain(n, None if n == "flat" else level) for n in names)

@@ -1,60 +1,65 @@
-"""Makes worlds to be watched: from the names of a policy and a terrain to a robot that walks."""
+"""Make worlds to be watched: from the names of a policy and a terrain to a robot that walks."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import Any
 
 from ..backends.registry import choose_device
 from ..gauge.suite import load_suite
 from ..policy.base import Policy
-from ..policy.loading import load_policy
-from ..policy.robot_of import robot_for
-from ..robots import load_robot
+from ..robots import Robot
+from ..studies.naming import distinct_names
 from ..terrains.gauge_terrains import LEVELS
 from ..terrains.registry import gauge_terrain_names, make_terrain
 from .play_session import PlaySession
-from .policies import policy_file
+from .policies import open_policy
+from .requests import PlayRequest
 
 
 class WorldMaker:
-    """What all worlds of one command share. Policies are loaded once."""
+    """Make worlds as one ``gaitgauge play`` asks for them. Policies are loaded once."""
 
-    def __init__(
-        self,
-        *,
-        backend: str,
-        device: str | None,
-        seed: int,
-        trust: bool,
-        robot: str | None = None,
-        suite: str = "gaitgauge-1",
-    ) -> None:
-        """Take the options of ``gaitgauge play`` of these names.
+    def __init__(self, request: PlayRequest) -> None:
+        """Find device and suite.
 
         Raises:
             BackendError: no such engine or device.
             SuiteError: no such suite.
         """
-        self._trust, self._robot = trust, robot
-        where = choose_device(backend, device)
-        self._settings: dict[str, Any] = {"backend": backend, "device": where, "seed": seed, "suite": load_suite(suite)}
-        self._policies: dict[str, Policy] = {}
+        self._request = request
+        self._settings: dict[str, Any] = {
+            "backend": request.backend,
+            "device": choose_device(request.backend, request.device),
+            "seed": request.seed,
+            "suite": load_suite(request.suite),
+        }
+        self._policies: dict[str, tuple[Policy, Robot]] = {}
 
     def make(self, choice: str, terrain: str, level: int | None, friction: float, label: str) -> PlaySession:
-        """A robot with a policy on a terrain.
+        """Return a robot with a policy on a terrain.
 
         Raises:
             PolicyError, ContractError, TerrainError, BackendError, UserError: one sentence on what is wrong.
         """
         ground = make_terrain(terrain, level)
         if choice not in self._policies:
-            asked = None if self._robot is None else load_robot(self._robot)
-            self._policies[choice] = load_policy(policy_file(choice), asked, trust=self._trust)
-        policy = self._policies[choice]
-        body = robot_for(policy.contract, self._robot)
-        return PlaySession(policy, body, ground, friction=friction, label=label, **self._settings)
+            self._policies[choice] = open_policy(choice, self._request.robot, trust=self._request.trust)
+        policy, robot = self._policies[choice]
+        return PlaySession(policy, robot, ground, friction=friction, label=label, **self._settings)
+
+    def make_all(self, policies: Sequence[str], terrain: str, level: int | None, friction: float) -> list[PlaySession]:
+        """Return a world for each policy, or raise as ``make`` does and leave none."""
+        with ExitStack() as stack:
+            sessions = []
+            for policy, label in zip(policies, distinct_names(policies), strict=True):
+                sessions.append(self.make(policy, terrain, level, friction, label))
+                stack.callback(sessions[-1].close)
+            stack.pop_all()
+        return sessions
 
     @staticmethod
     def default_level(terrain: str) -> int | None:
-        """The level where none is given: the middle one, None for a terrain without levels."""
+        """Return the level where none is given: the middle one, None for a terrain without levels."""
         return LEVELS[len(LEVELS) // 2 - 1] if terrain != "flat" and terrain in gauge_terrain_names() else None

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Annotated, Any, get_type_hints
 
@@ -27,40 +27,40 @@ LARGEST_SEED = 2**63 - 2**32
 
 @dataclass(frozen=True)
 class Choice:
-    """An option of the command line. A request annotates each field that a user may choose with a ``Choice``."""
+    """Describe how the command line asks for a value. A request annotates each field that a user may choose with one.
+
+    A value without a default is a positional argument. Of several choices in one annotation the last counts.
+    """
 
     help: str
     """One sentence."""
     group: str | None = None
     """Heading in the help of a command with many options."""
-    flags: tuple[str, ...] = ()
-    """Spelling of the option; empty for the field's own name."""
-    metavar: str | None = None
     values: str | tuple[str, ...] = ()
-    """Values that the shell completes, or the kind of names (a function of ``cli/completion.py``)."""
+    """Values that the shell completes, or the kind of names (a key of ``cli/completion.py:KINDS``)."""
+    metavar: str | None = None
+    flags: tuple[str, ...] = ()
+    """Spelling of the option. Empty for the field's own name, in the singular where the option is repeated; a switch that is off
+    has no ``--no-`` form then.
+    """
     argument: bool = False
-    """True for a positional argument."""
+    """True for a positional argument with a default."""
 
 
-def choices(request: type) -> Mapping[str, tuple[Field[Any], Any]]:
-    """Return the fields of a request that a user may choose, with their annotated types, by name."""
+def choices(request: type) -> Mapping[str, tuple[Any, Any]]:
+    """Return defaults (``MISSING`` where there is none) and annotated types of a request's fields with a ``Choice``, by name."""
     hints = _hints(request)
-    return {f.name: (f, hints[f.name]) for f in fields(request) if choice_of(hints[f.name]) is not None}
+    return {f.name: (f.default, hints[f.name]) for f in fields(request) if choice_of(hints[f.name]) is not None}
 
 
 def choice_of(hint: Any) -> Choice | None:
-    """Return the ``Choice`` in an annotated type; None where there is none."""
-    return next((part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Choice)), None)
+    """Return the last ``Choice`` in an annotated type; None where there is none."""
+    return next((part for part in reversed(getattr(hint, "__metadata__", ())) if isinstance(part, Choice)), None)
 
 
 def cpu_threads(asked: int | None) -> int:
     """Return the requested number of CPU threads; None stands for all cores."""
     return asked or os.cpu_count() or 1
-
-
-def required(field: Field[Any]) -> bool:
-    """Return whether a field has no default."""
-    return field.default is MISSING and field.default_factory is MISSING
 
 
 @cache
@@ -69,42 +69,24 @@ def _hints(request: type) -> Mapping[str, Any]:
 
 
 _FILES = "own format, TorchScript, ONNX, rsl_rl), or latest, best, pretrained."
-PolicyName = Annotated[str, Choice(f"A policy file ({_FILES}", argument=True, metavar="POLICY", values="policies")]
-PolicyNames = Annotated[
-    tuple[str, ...],
-    Choice(f"One or more policy files ({_FILES}", argument=True, metavar="POLICY...", values="policies"),
-]
-Trust = Annotated[
-    bool, Choice("Run the program that a policy file of the project's own format carries inside.", flags=("--trust",))
-]
+_ONE, _MORE = f"A policy file ({_FILES}", f"One or more policy files ({_FILES}"
+_CLUSTER = (
+    "Ray cluster to play on, with all free CPUs or as many as --threads: auto, HOST:PORT or ray://HOST:PORT. "
+    "Results do not depend on it."
+)
+_THREADS = "CPU threads; results do not depend on them. Default: all cores."
+_ROBOT = "Robot name, or a robot.toml. Default: the robot that the policy is for."
+_DEVICE = "cpu or cuda; the default is what the engine is made for."
+PolicyName = Annotated[str, Choice(_ONE, None, "policies", "POLICY")]
+PolicyNames = Annotated[tuple[str, ...], Choice(_MORE, None, "policies", "POLICY...")]
+Trust = Annotated[bool, Choice("Run the program that a policy file of the project's own format carries inside.")]
 SuiteName = Annotated[
-    str, Choice("Suite name (see 'gaitgauge list suites') or a suite's .toml file.", PLAYED, values="suites")
+    str, Choice("Suite name (see 'gaitgauge list suites') or a suite's .toml file.", PLAYED, "suites")
 ]
-EngineName = Annotated[str, Choice("Physics engine, see 'gaitgauge list backends'.", PLACE, values="backends")]
-DeviceName = Annotated[
-    str | None, Choice("cpu or cuda; the default is what the engine is made for.", PLACE, values=("cpu", "cuda"))
-]
-RobotName = Annotated[
-    str | None,
-    Choice("Robot name, or a robot.toml. Default: the robot that the policy is for.", PLAYED, values="robots"),
-]
-TerrainNames = Annotated[
-    tuple[str, ...],
-    Choice("Terrain; repeatable. Default: the suite's.", PLAYED, flags=("--terrain",), values="terrains"),
-]
+EngineName = Annotated[str, Choice("Physics engine, see 'gaitgauge list backends'.", PLACE, "backends")]
+DeviceName = Annotated[str | None, Choice(_DEVICE, PLACE, ("cpu", "cuda"))]
+RobotName = Annotated[str | None, Choice(_ROBOT, PLAYED, "robots")]
+TerrainNames = Annotated[tuple[str, ...], Choice("Terrain; repeatable. Default: the suite's.", PLAYED, "terrains")]
 FirstSeed = Annotated[int, Ge(0), Le(LARGEST_SEED), Choice("Seed of the first robot; the others' follow it.", PLAYED)]
-ThreadCount = Annotated[
-    int | None,
-    Ge(1),
-    Le(MOST_THREADS),
-    Choice("CPU threads; results do not depend on them. Default: all cores.", PLACE),
-]
-ClusterAddress = Annotated[
-    str | None,
-    Choice(
-        "Ray cluster whose CPUs play, all that are free or as many as --threads: auto, HOST:PORT or ray://HOST:PORT. "
-        "Results do not depend on it.",
-        PLACE,
-        metavar="ADDRESS",
-    ),
-]
+ThreadCount = Annotated[int | None, Ge(1), Le(MOST_THREADS), Choice(_THREADS, PLACE)]
+ClusterAddress = Annotated[str | None, Choice(_CLUSTER, PLACE, metavar="ADDRESS")]

@@ -1,1 +1,1 @@
-"""The commands, by what they are for; each parses and calls one function of the module beside this package."""
+"""Commands by purpose; each parses its options and calls one function of a module beside this package."""

@@ -1,4 +1,4 @@
-"""Commands that judge: evaluate, compare, verify, board, validate, consistency."""
+"""Commands that judge and study: evaluate, compare, verify, board, validate, consistency, trial, latent."""
 
 from __future__ import annotations
 
@@ -7,23 +7,32 @@ from typing import Annotated
 
 import typer
 
-from ...files.choices import PLACE, PLAYED, WRITTEN, Choice, ThreadCount, Trust
+from ...files.choices import PLACE, WRITTEN, Choice
 from ...gauge.request import EvaluationOptions, Request
 from ...studies.consistency.request import StudyRequest
-from .. import options
+from ...studies.latent.request import LatentRequest
+from ...studies.trials.request import TrialRequest
 from ..errors import UserError
+from ..requests import Tables, VerifyRequest, output, resume
 from ..running import command
 
 app = typer.Typer()
+
+_CONTESTANTS = "Two or more of: policies, as for evaluate; results folders; results.json files and score cards."
+_ENGINES = "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005)."
+_COMPARED = "Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
+_TABLES = "The measured table, then one for each simulator (CSV; docs/guides/validate.md)."
+_EXAMPLE = Choice("Tables that ship with the project: paper.", values=("paper",), flags=("--example",))
+_SCALES = "Values are on different scales: compare the order of policies alone."
 
 
 @command(app)
 def evaluate(
     request: Request,
-    out: Annotated[Path | None, options.output("results/<policy>-<suite>-<pipeline>")] = None,
-    resume: Annotated[bool, options.resume("run")] = False,
+    out: Annotated[Path | None, output("results/<policy>-<suite>-<pipeline>")] = None,
+    resume: Annotated[bool, resume("run")] = False,
     clip: Annotated[bool, Choice("Film the robot for the report, where this machine can draw.")] = True,
-    json_output: options.Tables = False,
+    json_output: Tables = False,
 ) -> None:
     """Gauge a policy: terrains, levels, frictions, payloads, noise and latency, down to one score with its interval.
 
@@ -39,23 +48,10 @@ def evaluate(
 
 @command(app)
 def compare(
-    contestants: Annotated[
-        tuple[str, ...],
-        Choice(
-            "Two or more of: policies, as for evaluate; results folders; results.json files and score cards.",
-            argument=True,
-            metavar="A B...",
-            values="policies",
-        ),
-    ],
+    contestants: Annotated[tuple[str, ...], Choice(_CONTESTANTS, None, "policies", "A B...")],
     choices: EvaluationOptions,
-    out: Annotated[
-        Path | None,
-        Choice(
-            "Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/.", WRITTEN
-        ),
-    ] = None,
-    json_output: options.Tables = False,
+    out: Annotated[Path | None, Choice(_COMPARED, WRITTEN)] = None,
+    json_output: Tables = False,
 ) -> None:
     """Say which differences between policies are real. Policies are evaluated first; what has been played is not played again.
 
@@ -70,24 +66,7 @@ def compare(
 
 
 @command(app)
-def verify(
-    card: Annotated[
-        Path, Choice("A score card: results.json, a copy of it, or its folder.", argument=True, metavar="CARD")
-    ],
-    policy: Annotated[str | None, Choice("The policy's file, where it is not at the card's path.")] = None,
-    suite: Annotated[str | None, Choice("The card's suite file, where its suite does not ship.", PLAYED)] = None,
-    device: Annotated[str | None, Choice("cpu or cuda. Default: what the card's engine is made for.", PLACE)] = None,
-    threads: ThreadCount = None,
-    quick: Annotated[
-        bool, Choice("One environment of each terrain, at nominal friction and payload.", PLAYED, flags=("--quick",))
-    ] = False,
-    fresh: Annotated[
-        int | None, Choice("Play with other seeds, made from this number, instead of those that everybody knows.")
-    ] = None,
-    out: Annotated[Path | None, Choice("Folder of the replay. Default: results/verify-<card>.", WRITTEN)] = None,
-    json_output: Annotated[bool, Choice("Print JSON instead of sentences.", WRITTEN, flags=("--json",))] = False,
-    trust: Trust = False,
-) -> None:
+def verify(request: VerifyRequest) -> None:
     """Play a score card again and say whether it holds on this machine; exit code 1 where it does not.
 
     Examples:
@@ -97,25 +76,12 @@ def verify(
     """
     from ..verify import run_verification
 
-    run_verification(
-        card,
-        policy=policy,
-        suite=suite,
-        device=device,
-        threads=threads,
-        quick=quick,
-        fresh=fresh,
-        out=out,
-        json_output=json_output,
-        trust=trust,
-    )
+    run_verification(**vars(request))
 
 
 @command(app)
 def board(
-    folder: Annotated[
-        Path, Choice("Folder of score cards (*.json) or of evaluations.", argument=True, metavar="FOLDER")
-    ],
+    folder: Annotated[Path, Choice("Folder of score cards (*.json) or of evaluations.", metavar="FOLDER")],
     out: Annotated[Path | None, Choice("The page. Default: board.html in the folder.")] = None,
 ) -> None:
     """Make a leaderboard page of a folder of score cards.
@@ -133,22 +99,10 @@ def board(
 
 @command(app)
 def validate(
-    tables: Annotated[
-        tuple[Path, ...],
-        Choice(
-            "The measured table, then one for each simulator (CSV; docs/guides/validate.md).",
-            argument=True,
-            metavar="REAL SIM...",
-        ),
-    ] = (),
-    example_name: Annotated[
-        str | None,
-        Choice("Tables that ship with the project: paper.", flags=("--example",), values=("paper",)),
-    ] = None,
-    ranks_only: Annotated[
-        bool, Choice("Values are on different scales: compare the order of policies alone.", flags=("--ranks-only",))
-    ] = False,
-    json_output: options.Tables = False,
+    tables: Annotated[tuple[Path, ...], Choice(_TABLES, metavar="REAL SIM...", argument=True)] = (),
+    example_name: Annotated[str | None, _EXAMPLE] = None,
+    ranks_only: Annotated[bool, Choice(_SCALES)] = False,
+    json_output: Tables = False,
 ) -> None:
     """Hold predictions of simulators against measurements of a robot: errors by motion and metric, and ranks of policies.
 
@@ -164,17 +118,10 @@ def validate(
 @command(app)
 def consistency(
     request: StudyRequest,
-    backends: Annotated[
-        str,
-        Choice(
-            "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005).",
-            PLACE,
-            values="backends",
-        ),
-    ] = "mujoco,mujoco-warp,newton",
-    out: Annotated[Path | None, options.output("results/<policy>-<suite>-consistency")] = None,
-    resume: Annotated[bool, options.resume("study")] = False,
-    json_output: options.Tables = False,
+    backends: Annotated[str, Choice(_ENGINES, PLACE, "backends")] = "mujoco,mujoco-warp,newton",
+    out: Annotated[Path | None, output("results/<policy>-<suite>-consistency")] = None,
+    resume: Annotated[bool, resume("study")] = False,
+    json_output: Tables = False,
 ) -> None:
     """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why.
 
@@ -185,3 +132,37 @@ def consistency(
     from ..consistency import run_consistency
 
     run_consistency(request, backends, out=out, resume=resume, json_output=json_output)
+
+
+@command(app)
+def trial(
+    request: TrialRequest,
+    out: Annotated[Path | None, output("results/trial-<policies>")] = None,
+    json_output: Tables = False,
+) -> None:
+    """Send policies through field trials (pulls, stairs, drops, a sprint …) and count how many robots come through.
+
+    Examples:
+      gaitgauge trial pretrained --repeats 20
+      gaitgauge trial latest walk.onnx --scenario all
+    """
+    from ..trial import run_trial
+
+    run_trial(request, out=out, json_output=json_output)
+
+
+@command(app)
+def latent(
+    request: LatentRequest,
+    out: Annotated[Path | None, output("results/latent-<policies>")] = None,
+    json_output: Tables = False,
+) -> None:
+    """Look into policies: how well terrains and commands separate in the encoder's latent and in the experts' weights.
+
+    Examples:
+      gaitgauge latent pretrained
+      gaitgauge latent latest --terrain flat --terrain wave --seconds 3
+    """
+    from ..latent import run_latent
+
+    run_latent(request, out=out, json_output=json_output)

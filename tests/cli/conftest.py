@@ -6,6 +6,7 @@ import pytest
 import torch
 from gaitgauge.cli.main import app
 from gaitgauge.cli.play_session import PlaySession
+from gaitgauge.cli.requests import PlayRequest
 from gaitgauge.cli.worlds import WorldMaker
 from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
@@ -94,7 +95,7 @@ def session(policy: Path) -> Iterator[Callable[..., PlaySession]]:
     def make(
         terrain: str = "flat", level: int | None = None, friction: float = 0.8, policy: Path = policy, **options: str
     ) -> PlaySession:
-        maker = WorldMaker(backend="mujoco", device="cpu", seed=0, trust=False, **options)
+        maker = WorldMaker(PlayRequest(policies=(), device="cpu", **options))
         made.append(maker.make(str(policy), terrain, level, friction, "standing"))
         return made[-1]
 

@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 
 import pytest
 from gaitgauge.cli.command_help import COMMAND_GROUPS
-from gaitgauge.cli.commands import looking
+from gaitgauge.cli.commands import using
 from gaitgauge.cli.inspect import LISTS
 from gaitgauge.cli.main import app
 from typer.main import get_command
@@ -80,7 +80,7 @@ def test_long_helps_are_grouped():
 
 
 def test_what_can_be_listed_is_completed():
-    assert tuple(LISTS) == looking.LISTS
+    assert tuple(LISTS) == using.LISTS
 
 
 # ---- completion -----------------------------------------------------------------------------------------------------

@@ -264,7 +264,7 @@ class FakePads:
 
 
 def test_sticks():
-    from gaitgauge.cli.gamepad import Gamepad
+    from gaitgauge.cli.native_viewer import Gamepad
 
     driver = FakePads([False, True])
     pad = Gamepad((2.0, 1.0, 1.5), driver)
@@ -282,7 +282,7 @@ def test_sticks():
 
 def test_no_gamepad_and_no_extra(refused, policy, monkeypatch):
     from gaitgauge.cli.errors import UserError
-    from gaitgauge.cli.gamepad import Gamepad
+    from gaitgauge.cli.native_viewer import Gamepad
 
     driver = FakePads([False])
     with pytest.raises(UserError, match="there is no gamepad"):

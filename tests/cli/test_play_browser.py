@@ -11,12 +11,13 @@ from gaitgauge.cli.browser_stage import Stage, distance_between, geom_color, geo
 from gaitgauge.cli.browser_viewer import Choice, Panel, serve
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.play_session import PlaySession
+from gaitgauge.cli.requests import PlayRequest
 from gaitgauge.cli.worlds import WorldMaker
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.terrains.gauge_terrains import LEVELS
 from gaitgauge.terrains.registry import make_terrain
 
-MAKER = WorldMaker(backend="mujoco", device="cpu", seed=0, trust=False)
+MAKER = WorldMaker(PlayRequest(policies=(), device="cpu"))
 
 
 def free_port() -> int:
@@ -28,7 +29,7 @@ def free_port() -> int:
 def show(sessions: list[PlaySession], *, port: int, seconds: float = 0.1) -> None:
     """Serve robots that stand."""
     chosen = Choice(terrain="flat", level=None, policies=tuple(str(s.policy.path) for s in sessions))
-    serve(sessions, MAKER, chosen, command=(0.0, 0.0, 0.0), seconds=seconds, port=port, host="127.0.0.1")
+    serve(sessions, MAKER, chosen, PlayRequest(policies=(), command=(0.0, 0.0, 0.0), seconds=seconds, port=port))
 
 
 @pytest.mark.parametrize("host", ["", "/dev/zero", "a\nb", "\udcff", "x" * 500, "192.0.2.1"])
@@ -36,7 +37,7 @@ def test_what_is_no_interface_of_this_machine_is_refused(session, host):
     """An empty name was every interface, and the others were waited for without an end."""
     chosen = Choice(terrain="flat", level=None, policies=("latest",))
     with pytest.raises(UserError, match=r"cannot be used: .*; choose another --port or --host") as caught:
-        serve([session()], MAKER, chosen, command=None, seconds=0.1, port=free_port(), host=host)
+        serve([session()], MAKER, chosen, PlayRequest(policies=(), seconds=0.1, port=free_port(), host=host))
     assert str(caught.value).isprintable()
 
 

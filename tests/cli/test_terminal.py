@@ -191,9 +191,7 @@ def test_a_folder_that_was_removed_is_one_sentence(tmp_path):
     command = f"cd {tmp_path}/gone && rmdir ../gone && {sys.executable} -c '{PROGRAM}' list policies"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2
-    assert done.stderr.endswith(
-        "gaitgauge: the folder that this was started in is not there any more; change to another one\n"
-    )
+    assert done.stderr.endswith("gaitgauge: the current folder does not exist any more; change to another one\n")
 
 
 @pytest.mark.parametrize("arguments", ["list suites", "validate --example paper --json"])

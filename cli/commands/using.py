@@ -1,0 +1,151 @@
+"""Commands that use a policy, describe a robot, and look at what there is: export, play, import, robot, list, doctor, warmup."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ...files.choices import Choice, ThreadCount
+from ..requests import DoctorRequest, ExportRequest, ImportRequest, PlayRequest
+from ..running import command
+
+app = typer.Typer()
+robot = typer.Typer(no_args_is_help=True, help="Describe a robot of your own, and check it.")
+
+LISTS = ("robots", "terrains", "backends", "suites", "scenarios", "policies", "tasks")
+"""Kinds of names that can be listed."""
+_ARCHITECTURES = "GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU."
+_ENGINES = Choice("mujoco-warp or newton; repeatable. Default: mujoco-warp.", values=("mujoco-warp", "newton"))
+_CHECKED = Choice("A robot.toml, its folder, or a robot's name.", values="robots", metavar="PATH")
+
+
+@command(app)
+def export(request: ExportRequest) -> None:
+    """Write a policy as TorchScript, ONNX and deploy.yaml, each checked against it.
+
+    Examples:
+      gaitgauge export latest --out exported
+      gaitgauge export pretrained --layout unitree --out unitree
+    """
+    from ..export import run_export
+
+    run_export(request)
+
+
+@command(app)
+def play(request: PlayRequest) -> None:
+    """Watch policies walk: in MuJoCo's viewer, in a browser, or in a video file without a display.
+
+    Examples:
+      gaitgauge play pretrained --terrain stairs_fd --level 6
+      gaitgauge play latest --viewer viser --command 1 0 0
+      gaitgauge play old.gauge.pt new.gauge.pt --out walk.mp4
+    """
+    from ..play import run_play
+
+    run_play(request)
+
+
+@command(app, "import")
+def import_command(request: ImportRequest) -> None:
+    """Turn a foreign policy into the project's own file, with its contract.
+
+    Examples:
+      gaitgauge import policy.onnx walk.gauge.pt
+      gaitgauge import policy.pt walk.gauge.pt --contract contract.toml
+    """
+    from ..inspect import import_file
+
+    import_file(request)
+
+
+app.add_typer(robot, name="robot")
+
+
+@command(robot)
+def new(
+    model: Annotated[Path, Choice("MuJoCo model of the robot alone.", metavar="MODEL.xml")],
+    out: Annotated[Path | None, Choice("Folder of the robot.toml. Default: the model's.")] = None,
+    name: Annotated[str | None, Choice("Name of the robot. Default: the model's.")] = None,
+    force: Annotated[bool, Choice("Replace a robot.toml that is there.")] = False,
+) -> None:
+    """Write a first robot.toml from a MuJoCo model, and say what was guessed.
+
+    Examples:
+      gaitgauge robot new mine/mine.xml
+    """
+    from ..robot import new_robot
+
+    new_robot(model, out=out, name=name, force=force)
+
+
+@command(robot)
+def check(
+    robot: Annotated[str, _CHECKED],
+    picture: Annotated[Path | None, Choice("Picture of the standing pose (.png). Default: NAME-standing.png.")] = None,
+    no_picture: Annotated[bool, Choice("Draw nothing.")] = False,
+    json_output: Annotated[bool, Choice("Print JSON instead of sentences.", flags=("--json",))] = False,
+) -> None:
+    """Check a robot's description and model, and let it stand; exit code 1 where something is wrong.
+
+    Examples:
+      gaitgauge robot check mine/robot.toml
+      gaitgauge robot check go2 --no-picture
+    """
+    from ..robot import check_robot_files
+
+    if not check_robot_files(robot, picture=picture, draw=not no_picture, json_output=json_output):
+        raise typer.Exit(1)
+
+
+@command(app, "list")
+def list_command(
+    what: Annotated[str, Choice("robots, terrains, backends, suites, scenarios, policies or tasks.", None, LISTS)],
+) -> None:
+    """List what can be named on the command line.
+
+    Examples:
+      gaitgauge list suites
+      gaitgauge list policies
+    """
+    from ..inspect import list_things
+
+    list_things(what)
+
+
+@command(app)
+def doctor(request: DoctorRequest) -> None:
+    """Say what is wrong: with this machine, or with how a policy is run; exit code 1 where something is.
+
+    Of a policy it plays the description and every likely other one: joint order, scales, signs, history, gains, pose.
+
+    Examples:
+      gaitgauge doctor
+      gaitgauge doctor policy.onnx
+      gaitgauge doctor policy.onnx --contract contract.toml --out mended.toml
+    """
+    from ..doctor import run_doctor
+
+    if not run_doctor(request):
+        raise typer.Exit(1)
+
+
+@command(app)
+def warmup(
+    architectures: Annotated[tuple[str, ...], Choice(_ARCHITECTURES, flags=("--arch",))] = (),
+    backends: Annotated[tuple[str, ...], _ENGINES] = (),
+    robot: Annotated[str, Choice("Robot name, or a robot.toml.", None, "robots")] = "go2",
+    cache: Annotated[Path | None, Choice("Folder of the kernels. Default: Warp's own, or WARP_CACHE_PATH.")] = None,
+    threads: ThreadCount = None,
+) -> None:
+    """Compile the GPU kernels of training and evaluating before they are needed, also for a GPU that is not here.
+
+    Examples:
+      gaitgauge warmup
+      gaitgauge warmup --arch sm_90 --cache kernels
+    """
+    from ..warmup import run_warmup
+
+    run_warmup(architectures, backends, robot=robot, cache=cache, threads=threads)
