@@ -103,7 +103,7 @@ def test_a_description_is_not_replaced_unasked(refused, run, model):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("<freejoint/>", ""), "has 0 free joints; give its base, 'corpus', a <freejoint/>"),
+        (("<freejoint/>", ""), "has 0 free joints; give its base, 'corpus', and nothing else a <freejoint/>"),
         (
             ("<worldbody>", '<worldbody><geom name="floor" type="plane" size="1 1 1"/>'),
             "has a geom 'floor' in its worldbody",
