@@ -7,17 +7,7 @@ from typing import Annotated
 
 from annotated_types import Ge
 
-from ...files.choices import (
-    PLACE,
-    PLAYED,
-    Choice,
-    PolicyNames,
-    RobotName,
-    SuiteName,
-    TerrainNames,
-    ThreadCount,
-    Trust,
-)
+from ...files.choices import PLACE, PLAYED, Choice, PolicyNames, RobotName, SuiteName, TerrainNames, ThreadCount, Trust
 
 MARGIN = 0.02
 """Difference of quality that does not matter: it moves the score of a levelled terrain by 0.004, less than its repeatability."""
@@ -35,8 +25,7 @@ class StudyRequest:
     backends: tuple[str, ...] = ("mujoco", "mujoco-warp", "newton")
     """Engines, each as ``parse_variant`` reads it."""
     reference: Annotated[
-        str | None,
-        Choice("Engine that the others are compared with. Default: the first.", PLACE, values="backends"),
+        str | None, Choice("Engine that the others are compared with. Default: the first.", PLACE, values="backends")
     ] = None
     device: Annotated[str | None, Choice("cpu or cuda, for the engines that can use a GPU. Default: a GPU.", PLACE)] = (
         None
@@ -58,9 +47,7 @@ class StudyRequest:
     ] = ()
     seeds: Annotated[int | None, Choice("Number of seeds, at least 2. Default: 3; on a GPU 10.", PLAYED)] = None
     margin: Annotated[
-        float,
-        Ge(0.0),
-        Choice("Difference of quality that does not matter: below it engines are equivalent.", PLAYED),
+        float, Ge(0.0), Choice("Difference of quality that does not matter: below it engines are equivalent.", PLAYED)
     ] = MARGIN
     attribution: Annotated[bool, Choice("Switch one factor at a time and see what it does.", PLAYED)] = True
     factors: Annotated[

@@ -13,14 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, get_args
 
-from ...policy.contract import (
-    PER_JOINT,
-    ContractError,
-    HistoryOrder,
-    ObservationTerm,
-    PolicyContract,
-    reordered,
-)
+from ...policy.contract import PER_JOINT, ContractError, HistoryOrder, ObservationTerm, PolicyContract, reordered
 from ...policy.observation_table import observation
 from ...robots import Robot, RobotError
 from ...robots.body_plan import BodyPlan, body_plan

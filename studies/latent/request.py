@@ -26,8 +26,5 @@ class LatentRequest(PoliciesRequest):
     """Time for which every robot stands before its first command [s]."""
     seconds: Annotated[float, Ge(0.2), Le(60.0), Choice("How long every robot walks [s].", PLAYED)] = 5.0
     robots: Annotated[
-        int,
-        Ge(2),
-        Le(1000),
-        Choice("Robots for each terrain and command; the probe is tried on each in turn.", PLAYED),
+        int, Ge(2), Le(1000), Choice("Robots for each terrain and command; the probe is tried on each in turn.", PLAYED)
     ] = 4
