@@ -87,7 +87,7 @@ class Case:
 
 
 def standard_cases() -> list[Case]:
-    """What ``docs/performance.md`` asks about, most important first. Neighbours share a scene and are built once."""
+    """What ``docs/reports/2026-11-27-performance.md`` asks about, most important first. Neighbours share a scene and are built once."""
     whole, few = 2709, 189
     cases = [Case(scene="gauge-all", worlds=whole, kernels=True)]
     cases += [Case(scene="gauge-all", worlds=whole, iterations=i) for i in (50, 30, 20, 10)]

@@ -44,7 +44,7 @@ def load_policy(
 
     A file's content decides what it is, not its ending: the project's own format, TorchScript, ONNX, or a bare rsl_rl
     checkpoint. Of a TorchScript or ONNX file only operators that compute are run, in a process that can do nothing else
-    (``docs/security.md``).
+    (``docs/reference/security.md``).
 
     Args:
         path_or_name: a file, or a name (see ``find_policy``).

@@ -1,7 +1,7 @@
 """Settings of the networks, the learning algorithm and the training run.
 
 The numbers are those of concurrent teacher-student learning as published with its Mixture-of-Experts encoder;
-``docs/training-choices.md`` lists every deliberate difference.
+``docs/reference/training-settings.md`` lists every deliberate difference.
 """
 
 from __future__ import annotations

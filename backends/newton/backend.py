@@ -56,7 +56,7 @@ class NewtonBackend(WarpBackend):
         if solver not in SOLVERS:
             raise BackendError(
                 f"unknown Newton solver '{solver}'; 'newton:NAME' runs {' and '.join(SOLVERS)} "
-                "(docs/newton.md says why no others)"
+                "(docs/reference/backends.md says why no others)"
             )
         if SOLVERS[solver] is cls.adapter:
             return cls

@@ -1,7 +1,7 @@
 """Adapters of the Newton solvers that this project runs, with one small interface.
 
 To add a solver, measure that the robot stands and walks in it, declare its limits in ``capabilities``, and add it to ``SOLVERS``.
-``docs/newton.md`` holds measurements of other solvers.
+``docs/reference/backends.md`` holds measurements of other solvers.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Paired comparisons of two engines, or two settings of one: means with intervals, effect sizes, agreement of outcomes.
 
-Pure functions of arrays; formulas and assumptions are in ``docs/consistency.md``.
+Pure functions of arrays; formulas and assumptions are in ``docs/guides/consistency.md``.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def study(
 ) -> dict[str, Any]:
     """Carry out a study; every finished episode is on disk at once.
 
-    Returns the content of ``consistency.json`` (docs/consistency.md).
+    Returns the content of ``consistency.json`` (docs/guides/consistency.md).
 
     Args:
         request: what to compare, as it is or prepared already.

@@ -44,7 +44,7 @@ def study_latents(
 ) -> dict[str, Any]:
     """Look at the latents of some policies. What cannot be looked at is said under ``refused``; the others are.
 
-    Returns the content of ``latent.json`` (docs/latent.md).
+    Returns the content of ``latent.json`` (docs/guides/latent.md).
 
     Raises:
         LatentError: no policy has anything to look at.

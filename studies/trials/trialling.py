@@ -35,7 +35,7 @@ def run_trials(
 ) -> dict[str, Any]:
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 
-    Returns the content of ``trials.json`` (docs/trials.md).
+    Returns the content of ``trials.json`` (docs/guides/trials.md).
 
     Raises:
         BackendError, RobotError, ScenarioError: nothing of it can be done; or no such engine, device or robot.

@@ -1,6 +1,6 @@
 """Reward terms. Each is a function of ``StepInputs`` that returns one number per world, unweighted; ``REWARD_TERMS`` names them.
 
-Formulas follow the paper's table of rewards in the reading of the published code; where they differ, ``docs/training-choices.md`` says
+Formulas follow the paper's table of rewards in the reading of the published code; where they differ, ``docs/reference/training-settings.md`` says
 which was taken.
 """
 
