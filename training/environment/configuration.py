@@ -1,7 +1,8 @@
 """Settings of the training environment.
 
-Progress is a fraction of the run: environment steps taken so far (per environment) over ``ScheduleConfiguration.horizon_steps``. Defaults
-are chosen for policies that transfer; ``docs/reference/training-settings.md`` lists every difference from the published code and its reason.
+Progress is a fraction of the run: environment steps taken so far (per environment) over ``ScheduleConfiguration.horizon_steps``.
+Defaults are chosen for policies that transfer; ``docs/reference/training-settings.md`` lists every difference from the published
+code and its reason.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Reward terms. Each is a function of ``StepInputs`` that returns one number per world, unweighted; ``REWARD_TERMS`` names them.
 
-Formulas follow the paper's table of rewards in the reading of the published code; where they differ, ``docs/reference/training-settings.md`` says
-which was taken.
+Formulas follow the paper's table of rewards in the reading of the published code; where they differ,
+``docs/reference/training-settings.md`` names the choice.
 """
 
 from __future__ import annotations
