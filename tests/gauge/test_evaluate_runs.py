@@ -93,7 +93,7 @@ def test_an_engine_from_outside_gets_the_workers_that_it_declares(whole_run, tmp
     request, once = whole_run
     monkeypatch.setattr(FakeBackend, "parallel_processes", parallel)
     results = evaluate(replace(request, threads=2), tmp_path / "run")
-    assert results["provenance"]["processes"] == (2 if parallel else 1)
+    assert results.provenance.processes == (2 if parallel else 1)
     assert without_provenance(tmp_path / "run") == without_provenance(once)
     assert (tmp_path / "run" / "episodes.csv").read_bytes() == (once / "episodes.csv").read_bytes()
 

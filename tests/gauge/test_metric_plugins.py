@@ -60,9 +60,9 @@ def request_with(folder: Path, metric: str):
 def test_a_metric_from_outside_counts_in_the_score(tmp_path):
     request = request_with(tmp_path, "level_feet")
     results = evaluate(request, tmp_path / "run")
-    assert results["score"] is not None
-    assert 0.0 < results["metrics"]["level_feet"]["mean"] <= 1.0
-    assert results["groups"].keys() == {"tracking", "quality"}
+    assert results.score is not None
+    assert 0.0 < results.metrics["level_feet"].mean <= 1.0
+    assert results.groups.keys() == {"tracking", "quality"}
     write_report(tmp_path / "run")
     page = (tmp_path / "run" / "report.html").read_text()
     assert "level feet &lt;of all legs&gt;" in page

@@ -15,7 +15,8 @@ from gaitgauge.training.run.checkpoint import (
     write_apart,
     write_checkpoint,
 )
-from gaitgauge.training.run.launch import TrainRequest, prepare
+from gaitgauge.training.run.plan import prepare
+from gaitgauge.training.run.request import TrainRequest
 
 PLAYS = {"format", "version", "contract", "network", "state_dict", "checksum"}
 
