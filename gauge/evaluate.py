@@ -66,6 +66,8 @@ class Prepared:
     """A request that can be carried out, with the suite, robot and policy that it names."""
 
     request: Request
+    device: str
+    """Device of the engine: that of the request, else the one that the engine is made for."""
     suite: Suite
     robot: Robot
     policy: FilePolicy
@@ -93,10 +95,10 @@ def prepare(request: Request) -> Prepared:
     engine = find_backend(request.backend, device)
     if request.cluster is not None:
         check_address(request.cluster)
-        if not engine.parallel_processes or torch.device(request.device).type != "cpu":
+        if not engine.parallel_processes or torch.device(device).type != "cpu":
             raise ClusterError(
                 f"a cluster plays with an engine that runs as several processes on CPUs, which backend '{request.backend}' on "
-                f"'{request.device}' does not; leave out --cluster, --backend or --device"
+                f"'{device}' does not; leave out --cluster, --backend or --device"
             )
     terrains, level = _terrains(request, suite), request.level
     for friction in request.frictions:
@@ -127,6 +129,7 @@ def prepare(request: Request) -> Prepared:
     check_fit(suite, robot, policy.contract)
     return Prepared(
         request=request,
+        device=device,
         suite=suite,
         robot=robot,
         policy=policy,
@@ -176,7 +179,7 @@ def _terrains(request: Request, suite: Suite) -> list[str]:
 def identity(prepared: Prepared) -> dict[str, Any]:
     """Return what decides about the results: a folder that holds another run is refused."""
     request = prepared.request
-    return common_identity(prepared.suite, prepared.policy.digest, prepared.robot, request.device, prepared.seeds) | {
+    return common_identity(prepared.suite, prepared.policy.digest, prepared.robot, prepared.device, prepared.seeds) | {
         "pipeline": request.pipeline,
         "backend": request.backend,
         "robot": request.robot or prepared.robot.name,
@@ -224,7 +227,7 @@ def evaluate(
     began = time.perf_counter()
     prepared = request if isinstance(request, Prepared) else prepare(request)
     request, suite, rules = prepared.request, prepared.suite, prepared.rules
-    if torch.device(request.device).type == "cpu":
+    if torch.device(prepared.device).type == "cpu":
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
     planners = [partial(plan, environment, rules=rules) for environment in prepared.environments]
     on_progress = _watcher(prepared, watch, began)
@@ -258,11 +261,11 @@ def evaluate(
                 stiffness=motors.stiffness, damping=motors.damping, note=gains_note(suite, prepared.robot, contract)
             ),
             health=health([record for outcome in outcomes for record in outcome.records]),
-            solver=dict(find_backend(request.backend, request.device).solver_settings(suite.physics)),
+            solver=dict(find_backend(request.backend, prepared.device).solver_settings(suite.physics)),
             provenance=Provenance(
                 **provenance(
                     command=command,
-                    device=request.device,
+                    device=prepared.device,
                     threads=request.threads or count,
                     digests={
                         "policy": prepared.policy.digest,
@@ -296,12 +299,12 @@ def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None)
         for level in ([int(e.level)] if e.level is not None else range(1, suite.scoring.levels + 1))
     ]
     required = [episode for found in plans for episode in found.required]
-    on_gpu = torch.device(request.device).type != "cpu"
+    on_gpu = torch.device(prepared.device).type != "cpu"
     threads, most = request.threads or 1, len(required)
     if cluster is not None:
         count = max(min(request.threads or cluster.cpus, cluster.cpus, most), 1)
     else:
-        count = local_workers(request.backend, request.device, threads=threads, most=most)
+        count = local_workers(request.backend, prepared.device, threads=threads, most=most)
     if on_gpu:
         speculation = GPU_SPECULATION
         worlds = min(
@@ -321,7 +324,7 @@ def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None)
         robot=prepared.robot,
         places=tuple(dict.fromkeys(places)),
         worlds=worlds,
-        build=partial(make_backend, request.backend, device=request.device),
+        build=partial(make_backend, request.backend, device=prepared.device),
         threads=1 if cluster is not None else max(threads // count, 1),
     )
     return job, count, speculation

@@ -53,7 +53,7 @@ def prepare_replay(
     beside: Path | None = None,
     suite: str | None = None,
     device: str = "cpu",
-    threads: int = 1,
+    threads: int | None = 1,
     quick: bool = False,
     fresh: int | None = None,
     trust: bool = False,
