@@ -24,7 +24,7 @@ import import_public_cts
 import make_trot_policy
 import numpy as np
 import torch
-from gaitgauge.files.writing import json_text, write_atomically
+from gaitgauge.files.writing import write_atomically
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.report.page import write_report
 from gaitgauge.gauge.result import Result
@@ -138,7 +138,11 @@ def main() -> None:
             run = arguments.folder / f"{name}-{suite}"
             result = load_result(run) if arguments.made else play(name, suite, run, arguments)
             card = card_of(result, name, repeated, arguments.commit)
-            write_atomically(arguments.out / f"{run.name}.json", json_text(json.loads(json.dumps(card))), StoreError)
+            write_atomically(
+                arguments.out / f"{run.name}.json",
+                json.dumps(card, separators=(",", ":"), ensure_ascii=False) + "\n",
+                StoreError,
+            )
             low, high = card["tolerance"] or (float("nan"),) * 2
             where = "" if result.complete else f" ({result.coverage.text})"
             print(f"{name} {suite}: {result.score:.4f}, a replay within {low:.4f} to {high:.4f}{where}", flush=True)
