@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from rsl_rl.modules.distribution import Distribution, GaussianDistribution
@@ -94,10 +94,7 @@ def student_architecture(configuration: NetworkConfiguration, widths: Widths) ->
     Raises:
         ConfigurationError: ``moe_ng`` without a command in the frame, which its experts are not to see.
     """
-    common = {
-        **widths.arguments(configuration.latent_width),
-        "actor_hidden": list(configuration.actor_hidden),
-    }
+    common = {**widths.arguments(configuration.latent_width), "actor_hidden": list(configuration.actor_hidden)}
     if configuration.student_encoder == "mlp":
         return "cts", {**common, "encoder_hidden": list(configuration.student_hidden)}
     blind = list(widths.command_entries) if configuration.student_encoder == "moe_ng" else []
@@ -118,31 +115,18 @@ def student_architecture(configuration: NetworkConfiguration, widths: Widths) ->
 class StudentActor(nn.Module):
     """The deployed network, called student in every method, with its exploration noise; methods add parts for training."""
 
-    def __init__(
-        self,
-        configuration: NetworkConfiguration,
-        *,
-        architecture: str,
-        arguments: dict[str, Any],
-        distribution: type[Distribution] = GaussianDistribution,
-    ) -> None:
-        """Build student and noise.
+    noise: ClassVar[type[Distribution]] = GaussianDistribution
 
-        Args:
-            architecture: name in ``policy.networks.ARCHITECTURES`` of the student network.
-
-        Raises:
-            ConfigurationError: there is no such architecture.
-        """
+    def __init__(self, configuration: NetworkConfiguration, *, architecture: str, arguments: dict[str, Any]) -> None:
+        """Build noise and student, of an architecture in ``policy.networks.ARCHITECTURES``; ConfigurationError if it is not there."""
         super().__init__()
         if architecture not in ARCHITECTURES:
             raise ConfigurationError(
                 f"the deployed network is a {architecture!r}; allowed are {', '.join(ARCHITECTURES)}, which policies are played with"
             )
-        self.architecture = architecture
-        self.arguments = arguments
+        self.architecture, self.arguments = architecture, arguments
         self.student: Any = ARCHITECTURES[architecture](**arguments)
-        self.distribution: Any = distribution(
+        self.distribution: Any = self.noise(
             int(arguments["num_actions"]),
             init_std=configuration.initial_std,  # type: ignore[call-arg]
             std_range=(configuration.minimum_std, 1e6),  # type: ignore[call-arg]
@@ -184,12 +168,7 @@ class CtsActor(StudentActor):
     """Teacher encoder, student network (encoder and the shared actor) and exploration noise."""
 
     def __init__(self, configuration: NetworkConfiguration, *, privileged_width: int, **student: Any) -> None:
-        """Build all parts.
-
-        Args:
-            privileged_width: width of the teacher's input.
-            student: arguments of ``StudentActor``.
-        """
+        """Build all parts; ``privileged_width`` is that of the teacher's input, ``student`` are arguments of ``StudentActor``."""
         teacher = multilayer_perceptron((privileged_width, *configuration.teacher_hidden, configuration.latent_width))
         super().__init__(configuration, **student)
         self.teacher_encoder = teacher
@@ -243,8 +222,8 @@ class CtsCritic(ValueNetwork):
 
     def __init__(self, configuration: NetworkConfiguration, *, privileged_width: int) -> None:
         super().__init__()
-        inputs = configuration.latent_width + privileged_width
-        self.mlp = multilayer_perceptron((inputs, *configuration.critic_hidden, 1))
+        widths = (configuration.latent_width + privileged_width, *configuration.critic_hidden, 1)
+        self.mlp = multilayer_perceptron(widths)
 
     def value(
         self, latent: torch.Tensor, privileged: torch.Tensor, weights: torch.Tensor | None = None

@@ -7,11 +7,13 @@ experts, which is part of the policy's loss.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from ...policy.networks.layers import Experts, mixed
 from ..configuration import NetworkConfiguration, TrainingConfiguration
-from ..networks import ComposedActor, StudentActor, ValueNetwork, Widths, composed_arguments
+from ..networks import ComposedActor, ValueNetwork, Widths, composed_arguments
 from .cts import CTS, CtsLosses
 from .losses import POLICY_LOSSES, load_balance
 
@@ -64,14 +66,12 @@ class AcMoeLosses(CtsLosses):
 class AcMoe(CTS):
     """CTS with experts in actor and critic. See the module docstring."""
 
-    losses_class = AcMoeLosses
+    losses_class, actor_class, critic_class = AcMoeLosses, AcMoeActor, AcMoeCritic
 
     @classmethod
-    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
-        """See ``PPO``."""
-        arguments, network = composed_arguments(configuration, widths), configuration.network
-        actor = AcMoeActor(network, privileged_width=widths.privileged, architecture="ac_moe", arguments=arguments)
-        return actor, AcMoeCritic(network, privileged_width=widths.privileged)
+    def deployed(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[str, dict[str, Any]]:
+        """See ``CTS``."""
+        return "ac_moe", composed_arguments(configuration, widths)
 
     def values(self, latent: torch.Tensor, policy: torch.Tensor, privileged: torch.Tensor) -> torch.Tensor:
         """See ``CTS``."""

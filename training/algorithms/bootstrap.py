@@ -14,7 +14,7 @@ from torch import nn
 
 from ...files.parsing import shown
 from ..configuration import AlgorithmConfiguration
-from .optimization import FlatGradients, load_moments, take_step
+from .optimization import Learner, load_moments
 
 
 def iterations_left(state: Mapping[str, Any]) -> int:
@@ -49,14 +49,15 @@ class Bootstrap:
             losses: from the rows of a minibatch, one tensor for each group of environments, to one number for each name.
             joined: makes a step, as ``PPO.joined``.
         """
-        self._left, self._settings = iterations, settings
-        self._losses, self._names = losses, names
-        parameters = list(parameters)
-        self._gradients = FlatGradients(parameters, extra=len(names))
-        self._optimizer = torch.optim.Adam(parameters, lr=1e-3)
-        self._sums = torch.zeros(len(names) + 2, device=self._gradients.values.device)
+        self._left, self._settings, self._names = iterations, settings, names
+        self._learner = Learner(parameters, names, settings.max_gradient_norm, lr=1e-3)
+
+        def loss(*rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            found = losses(*rows)
+            return found.sum(), found.detach()
+
         # Not in CUDA graphs: it is over after a few iterations.
-        self.step = joined(self._loss, self._optimizer, self._gradients, self._apply, graphs=False)
+        self.step = joined(loss, self._learner, graphs=False)
         """Step on the rows of a minibatch."""
 
     @property
@@ -66,34 +67,18 @@ class Bootstrap:
 
     def save(self) -> dict[str, Any]:
         """Return the iterations left and the optimizer's moments."""
-        return {"left": self._left, "optimizer": self._optimizer.state_dict()}
+        return {"left": self._left, "optimizer": self._learner.optimizer.state_dict()}
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Take over a state that ``save`` returned.
-
-        Raises:
-            ValueError, LookupError, TypeError, AttributeError: it does not fit.
-        """
+        """Take over a state that ``save`` returned; raises as ``load_moments``."""
         self._left = iterations_left(state)
-        load_moments(self._optimizer, state["optimizer"])
+        load_moments(self._learner.optimizer, state["optimizer"])
 
     def finish(self) -> dict[str, float]:
-        """End an iteration, after all passes over its rollout.
-
-        Returns:
-            Means of the losses over the minibatches, by name; ``skipped_minibatches`` counts those with gradients that were not
-            finite and were dropped.
-        """
+        """End an iteration, after all passes over its rollout, and return figures as ``PPO.update``."""
         self._left -= 1
-        *sums, _, skipped = self._sums.tolist()
-        self._sums.zero_()
+        *sums, _, skipped = self._learner.sums.tolist()
+        self._learner.sums.zero_()
         total = self._settings.epochs * self._settings.minibatches
         means = {name: value / total for name, value in zip(self._names, sums, strict=True)}
         return means | {"skipped_minibatches": skipped}
-
-    def _loss(self, *rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        losses = self._losses(*rows)
-        return losses.sum(), losses.detach()
-
-    def _apply(self) -> None:
-        take_step(self._optimizer, self._gradients, self._settings.max_gradient_norm, self._sums)

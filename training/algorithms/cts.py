@@ -12,7 +12,7 @@ Both share one actor and one critic. Per iteration:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict
@@ -86,15 +86,22 @@ class CTS(PPO):
     """PPO with a concurrent student. See the module docstring."""
 
     losses_class = CtsLosses
+    actor_class: ClassVar[type[CtsActor]] = CtsActor
+    critic_class: ClassVar[Any] = CtsCritic
     has_teacher = True
+
+    @classmethod
+    def deployed(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[str, dict[str, Any]]:
+        """Return name and arguments of the student in ``policy.networks``; ConfigurationError for settings that do not fit."""
+        return student_architecture(configuration.network, widths)
 
     @classmethod
     def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
         """See ``PPO``."""
-        network = configuration.network
-        architecture, arguments = student_architecture(network, widths)
-        actor = CtsActor(network, privileged_width=widths.privileged, architecture=architecture, arguments=arguments)
-        return actor, CtsCritic(network, privileged_width=widths.privileged)
+        network, width = configuration.network, widths.privileged
+        architecture, arguments = cls.deployed(configuration, widths)
+        actor = cls.actor_class(network, privileged_width=width, architecture=architecture, arguments=arguments)
+        return actor, cls.critic_class(network, privileged_width=width)
 
     def latents(
         self, obs: TensorDict, privileged: torch.Tensor, history: torch.Tensor

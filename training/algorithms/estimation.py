@@ -25,21 +25,6 @@ from .ppo import PPO
 from .symmetry import VECTOR, MirrorMap
 
 
-def estimator_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
-    """Return the arguments of a network of ``policy.estimators``.
-
-    Raises:
-        ConfigurationError: the encoder is no plain one, or the privileged state does not begin with velocity and frame.
-    """
-    arguments = plain_arguments(configuration, widths, "has one encoder")
-    if widths.privileged < VELOCITY + widths.frame:
-        raise ConfigurationError(
-            f"The privileged observation is {widths.privileged} wide; the method {configuration.algorithm.method!r} needs the "
-            f"base's velocity and the frame without noise at its beginning, {VELOCITY + widths.frame} entries."
-        )
-    return {**arguments, "actor_hidden": list(configuration.network.actor_hidden)}
-
-
 class EstimatorActor(StudentActor):
     """A network that acts on its estimate, with exploration noise; methods add helpers of the encoder."""
 
@@ -50,9 +35,15 @@ class EstimatorActor(StudentActor):
         """Build the deployed network; methods add the encoder's helpers.
 
         Raises:
-            ConfigurationError: settings that do not fit.
+            ConfigurationError: the encoder is no plain one, or the privileged state does not begin with velocity and frame.
         """
-        arguments = estimator_arguments(configuration, widths)
+        arguments = plain_arguments(configuration, widths, "has one encoder")
+        if widths.privileged < VELOCITY + widths.frame:
+            raise ConfigurationError(
+                f"The privileged observation is {widths.privileged} wide; the method {configuration.algorithm.method!r} needs the "
+                f"base's velocity and the frame without noise at its beginning, {VELOCITY + widths.frame} entries."
+            )
+        arguments["actor_hidden"] = list(configuration.network.actor_hidden)
         super().__init__(configuration.network, architecture=self.deployed, arguments=arguments)
 
     def frames(self, history: torch.Tensor) -> torch.Tensor:
@@ -110,9 +101,6 @@ class EstimatorLosses(Losses):
                 self.mirrored_latent,
                 lambda rows: self.actor.acted_on(mirror.history(history[rows]), self.velocity_map(velocity[rows])),
             )
-
-    def prepare_student(self) -> None:
-        """Prepare nothing: all is in the rollout."""
 
     def velocities(self) -> torch.Tensor:
         """True velocity of the base of every sample, (T·N, 3)."""

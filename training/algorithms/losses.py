@@ -38,12 +38,8 @@ class Losses:
         mirror: Mirror | None,
         cached_casts: bool,
     ) -> None:
-        """Allocate.
-
-        Args:
-            actor: student, exploration noise, and the networks that learn with them.
-            mirror: mirror maps on the storage's device, None without symmetry.
-            cached_casts: whether weights in bfloat16 may be kept within a pass; they would outlive the weights in a CUDA graph.
+        """Allocate; the mirror maps are on the storage's device, None without symmetry. ``cached_casts`` keeps weights in bfloat16
+        within a pass: they would outlive the weights in a CUDA graph.
         """
         self.actor: Any = actor
         self.critic, self.storage, self.settings, self.mirror = critic, storage, settings, mirror
@@ -69,8 +65,7 @@ class Losses:
             self.fill(self.mirrored_latent, lambda rows: self.actor.student_latent(mirror.history(history[rows]))[0])
 
     def prepare_student(self) -> None:
-        """Prepare the student's targets, before it learns."""
-        raise NotImplementedError
+        """Prepare the student's targets, before it learns; nothing where the rollout holds them."""
 
     def student(self, rows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the supervised loss of rows of the flattened student-only buffers, and ``student_names``, detached."""

@@ -6,16 +6,20 @@ The actions' standard deviation is that of the product: it differs from state to
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from rsl_rl.modules.distribution import HeteroscedasticGaussianDistribution
 
 from ..configuration import ConfigurationError, TrainingConfiguration
-from ..networks import ComposedActor, CtsCritic, StudentActor, ValueNetwork, Widths, composed_arguments
+from ..networks import ComposedActor, Widths, composed_arguments
 from .cts import CTS
 
 
 class McpActor(ComposedActor):
     """An actor that multiplies the primitives' distributions."""
+
+    noise = HeteroscedasticGaussianDistribution
 
     def decide(self, latent: torch.Tensor, policy: torch.Tensor) -> tuple[torch.Tensor, None]:
         """Return the mean and standard deviation of the actions, (N, 2, J); see ``StudentActor``. The critic needs no weights, and no
@@ -28,25 +32,15 @@ class McpActor(ComposedActor):
 class Mcp(CTS):
     """CTS with multiplied primitives. See the module docstring."""
 
-    @classmethod
-    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
-        """See ``PPO``.
+    actor_class = McpActor
 
-        Raises:
-            ConfigurationError: there is no command to hide from the primitives.
-        """
+    @classmethod
+    def deployed(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[str, dict[str, Any]]:
+        """See ``CTS``."""
         if not widths.command_entries:
             raise ConfigurationError("The method 'mcp' hides the command from its primitives; the frame has none.")
-        arguments = composed_arguments(configuration, widths)
-        arguments["primitives_blind_to"] = list(widths.command_entries)
-        actor = McpActor(
-            configuration.network,
-            privileged_width=widths.privileged,
-            architecture="mcp",
-            arguments=arguments,
-            distribution=HeteroscedasticGaussianDistribution,
-        )
-        return actor, CtsCritic(configuration.network, privileged_width=widths.privileged)
+        blind = {"primitives_blind_to": list(widths.command_entries)}
+        return "mcp", composed_arguments(configuration, widths) | blind
 
     @property
     def action_std(self) -> torch.Tensor:

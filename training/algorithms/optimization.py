@@ -45,25 +45,26 @@ class FlatGradients:
         return norm, (~finite).float()
 
 
-def take_step(optimizer: torch.optim.Optimizer, gradients: FlatGradients, limit: float, sums: torch.Tensor) -> None:
-    """Step along gathered gradients, their joint norm limited; gradients that are not finite are dropped.
+class Learner:
+    """An Adam, the gradients of its parameters, and the figures of the loss that it steps along."""
 
-    Args:
-        sums: grows by the extra numbers, the gradients' norm, and 1.0 if they were dropped, (extra + 2,).
-    """
-    norm, skipped = gradients.clip(limit)
-    optimizer.step()
-    sums += torch.nan_to_num(torch.cat((gradients.extra, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
+    def __init__(self, parameters: Sequence[nn.Parameter], names: Sequence[str], limit: float, **settings: Any) -> None:
+        """Allocate; ``names`` are those of the figures, ``limit`` is that of the gradients' joint norm, ``settings`` are Adam's."""
+        self.optimizer = torch.optim.Adam(parameters, **settings)
+        self.gradients = FlatGradients(parameters, extra=len(names))
+        self.sums = torch.zeros(len(names) + 2, device=self.gradients.values.device)
+        """Sums over the steps of the figures and of the gradients' norms, and the number of dropped gradients, (names + 2,)."""
+        self._limit = limit
+
+    def step(self) -> None:
+        """Step along the gathered gradients, their joint norm limited; gradients that are not finite are dropped."""
+        norm, skipped = self.gradients.clip(self._limit)
+        self.optimizer.step()
+        self.sums += torch.nan_to_num(torch.cat((self.gradients.extra, torch.stack((norm, skipped)))), 0.0, 0.0, 0.0)
 
 
 def load_moments(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> float:
-    """Take over the moments of an Adam's ``state_dict()``; its settings stay those of this run.
-
-    Args:
-        optimizer: of the same parameters.
-
-    Returns:
-        The learning rate that it had, of the first group.
+    """Take over the moments of an Adam's ``state_dict()`` and return its learning rate; its settings stay those of this run.
 
     Raises:
         ValueError: moments of other parameters or shapes, or an impossible learning rate.

@@ -20,7 +20,7 @@ from ..networks import StudentActor, ValueNetwork, Widths
 from ..processes import Processes
 from .bootstrap import Bootstrap
 from .losses import Losses
-from .optimization import FlatGradients, load_moments, take_step
+from .optimization import Learner, load_moments
 from .storage import EnvironmentSplit, RolloutStorage
 from .symmetry import Mirror, passes
 
@@ -82,17 +82,15 @@ class PPO:
         )
         # The learning rate lives on the device, where the KL divergence is, so that adapting it needs no round trip.
         self._rate = torch.tensor(configuration.learning_rate, device=device)
-        self._policy_parameters = [*actor.policy_parameters(), *critic.parameters()]
-        self.optimizer = torch.optim.Adam(self._policy_parameters, lr=self._rate, fused=on_gpu, capturable=on_gpu)
-        self.student_optimizer = torch.optim.Adam(
-            actor.student_parameters(), lr=configuration.student_learning_rate, fused=on_gpu, capturable=on_gpu
-        )
+        learned, rate = [*actor.policy_parameters(), *critic.parameters()], configuration.student_learning_rate
+        limit, fast = configuration.max_gradient_norm, {"fused": on_gpu, "capturable": on_gpu}
+        self._policy = Learner(learned, self.losses.policy_names, limit, lr=self._rate, **fast)
+        self._student = Learner(actor.student_parameters(), self.losses.student_names, limit, lr=rate, **fast)
+        self.optimizer, self.student_optimizer = self._policy.optimizer, self._student.optimizer
         self._adapts = configuration.desired_kl is not None
         self._ramps = RampTable([configuration.entropy_coefficient, configuration.desired_kl or 0.0], device)
         self._desired_kl = torch.zeros((), device=device)
         self.follow(torch.zeros((), device=device))
-        self._policy_metrics = torch.zeros(len(self.losses.policy_names) + 2, device=device)
-        self._student_metrics = torch.zeros(len(self.losses.student_names) + 2, device=device)
         self._policy_loss, self._student_loss = self.losses.policy, self.losses.student
         mode = configuration.compile_mode
         if mode == "default" or (mode == "auto" and on_gpu):
@@ -296,8 +294,8 @@ class PPO:
             losses = bootstrap.finish()
             self.bootstrap = None if bootstrap.over else bootstrap
             return losses
-        self._policy_metrics.zero_()
-        self._student_metrics.zero_()
+        self._policy.sums.zero_()
+        self._student.sums.zero_()
         groups = storage.minibatch_rows(settings.minibatches)
         self.losses.prepare_policy()
         self.pass_over(groups, self._policy_step)
@@ -316,13 +314,11 @@ class PPO:
     def _report(self) -> dict[str, float]:
         """Read the counters back, the update's only wait for the device."""
         total = self.configuration.epochs * self.configuration.minibatches
-        sums = torch.cat((self._policy_metrics, self._student_metrics)).tolist()
-        names = (*self.losses.policy_names, "gradient_norm", "skipped")
-        policy = dict(zip(names, sums[: len(names)], strict=True))
-        names_of_student = (*self.losses.student_names, "gradient_norm", "skipped")
-        student = dict(zip(names_of_student, sums[len(names) :], strict=True))
-        skipped = policy.pop("skipped") + student.pop("skipped")
-        del student["gradient_norm"]
+        sums = torch.cat((self._policy.sums, self._student.sums)).tolist()
+        count = len(self.losses.policy_names)
+        policy = dict(zip((*self.losses.policy_names, "gradient_norm"), sums, strict=False))
+        student = dict(zip(self.losses.student_names, sums[count + 2 :], strict=False))
+        skipped = sums[count + 1] + sums[-1]
         if self.configuration.symmetry != "augment":  # no pair of images to compare
             del policy["symmetry"]
         for name in self.without_meaning():
@@ -336,34 +332,28 @@ class PPO:
 
     def _prepare_steps(self) -> None:
         """Make the steps on one minibatch: gradients, their mean over the processes, and the step along them."""
-        losses = self.losses
-        self._policy_gradients = FlatGradients(self._policy_parameters, extra=len(losses.policy_names))
-        self._student_gradients = FlatGradients(self.actor.student_parameters(), extra=len(losses.student_names))
-        self._policy_step = self.joined(self._policy_loss, self.optimizer, self._policy_gradients, self._apply_policy)
-        self._student_step = self.joined(
-            self._student_loss, self.student_optimizer, self._student_gradients, self._apply_student
-        )
+        kl = self._policy.gradients.extra[self.losses.policy_names.index("kl")]
+        self._policy_step = self.joined(self._policy_loss, self._policy, lambda: self._adapt_learning_rate(kl))
+        self._student_step = self.joined(self._student_loss, self._student)
 
     def joined(
-        self,
-        loss: Loss,
-        optimizer: torch.optim.Optimizer,
-        gradients: FlatGradients,
-        apply: Callable[[], None],
-        *,
-        graphs: bool = True,
+        self, loss: Loss, learner: Learner, prepare: Callable[[], None] = lambda: None, *, graphs: bool = True
     ) -> Callable[..., None]:
-        """Join two halves to one step: gradients of a loss of rows, and the step along them. Between several processes each half is a
-        CUDA graph of its own, where there are any and ``graphs`` allows it: a message inside a graph could not be given up when a process
-        is lost.
+        """Join two halves to one step: gradients of a loss of rows, and ``prepare`` and the step along them. Between several processes each
+        half is a CUDA graph of its own, where there are any and ``graphs`` allows it: a message inside a graph could not be given up when
+        a process is lost.
         """
 
         def compute(*rows: torch.Tensor) -> None:
             value, metrics = loss(*rows)
-            optimizer.zero_grad(set_to_none=True)
+            learner.optimizer.zero_grad(set_to_none=True)
             value.backward()
-            gradients.gather()
-            gradients.extra.copy_(metrics)
+            learner.gradients.gather()
+            learner.gradients.extra.copy_(metrics)
+
+        def apply() -> None:
+            prepare()
+            learner.step()
 
         def recorded(step: Callable[..., None]) -> Callable[..., None]:
             return RecordedFunction(step, self.device) if self._graphs and graphs else step
@@ -378,19 +368,10 @@ class PPO:
 
         def shared(*rows: torch.Tensor) -> None:
             first(*rows)
-            self.processes.average(gradients.values)
+            self.processes.average(learner.gradients.values)
             second()
 
         return shared
-
-    def _apply_policy(self) -> None:
-        self._adapt_learning_rate(self._policy_gradients.extra[self.losses.policy_names.index("kl")])
-        limit = self.configuration.max_gradient_norm
-        take_step(self.optimizer, self._policy_gradients, limit, self._policy_metrics)
-
-    def _apply_student(self) -> None:
-        limit = self.configuration.max_gradient_norm
-        take_step(self.student_optimizer, self._student_gradients, limit, self._student_metrics)
 
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
         """Adapt the learning rate on the device as rsl_rl does: slower above twice the desired divergence, faster below half of it."""
@@ -399,8 +380,7 @@ class PPO:
         low, high = self.configuration.learning_rate_range
         slower, faster = (self._rate / 1.5).clamp(min=low), (self._rate * 1.5).clamp(max=high)
         too_far, too_near = kl > 2.0 * self._desired_kl, (kl < 0.5 * self._desired_kl) & (kl > 0.0)
-        rate = torch.where(too_far, slower, torch.where(too_near, faster, self._rate))
-        self._rate.copy_(rate)
+        self._rate.copy_(torch.where(too_far, slower, torch.where(too_near, faster, self._rate)))
 
     # Checkpoints
 

@@ -91,24 +91,16 @@ class RolloutStorage:
         def zeros(envs: int, *width: int) -> torch.Tensor:
             return torch.zeros(num_steps, envs, *width, device=device)
 
-        self.split = split
-        self.num_steps = num_steps
-        self.num_envs = split.num_teacher + split.num_student
+        self.split, self.num_steps, self.num_envs = split, num_steps, split.num_teacher + split.num_student
         self.step = 0
         """Steps stored so far."""
         self.policy = zeros(self.num_envs, widths.frame)
         self.privileged = zeros(self.num_envs, widths.privileged)
         self.student_history = zeros(split.num_student, widths.history * widths.frame)
         self.student_latent = zeros(split.num_student, latent_width)
-        self.actions = zeros(self.num_envs, widths.actions)
-        self.action_mean = zeros(self.num_envs, widths.actions)
-        self.action_std = zeros(self.num_envs, widths.actions)
-        self.log_prob = zeros(self.num_envs)
-        self.values = zeros(self.num_envs)
-        self.rewards = zeros(self.num_envs)
-        self.dones = zeros(self.num_envs)
-        self.returns = zeros(self.num_envs)
-        self.advantages = zeros(self.num_envs)
+        self.actions, self.action_mean, self.action_std = (zeros(self.num_envs, widths.actions) for _ in range(3))
+        self.log_prob, self.values, self.returns, self.advantages = (zeros(self.num_envs) for _ in range(4))
+        self.rewards, self.dones = zeros(self.num_envs), zeros(self.num_envs)
         self.next_state = zeros(split.num_student, next_state_width)
         """Targets of the students' predicted next state, for methods that predict one."""
 
@@ -123,8 +115,7 @@ class RolloutStorage:
         Args:
             last_values: values of the states after the last step, (N,).
         """
-        advantage = torch.zeros_like(last_values)
-        following = last_values
+        advantage, following = torch.zeros_like(last_values), last_values
         for step in reversed(range(self.num_steps)):
             discounted = (1.0 - self.dones[step]) * discount
             error = self.rewards[step] + discounted * following - self.values[step]
@@ -150,8 +141,7 @@ class RolloutStorage:
         def draw(count: int, first: int) -> torch.Tensor:
             size = steps * count // num_minibatches
             shuffled = torch.randperm(steps * count, device=self.split.order.device)[: size * num_minibatches]
-            rows = shuffled // count * self.num_envs + shuffled % count + first
-            return rows.view(num_minibatches, size)
+            return (shuffled // count * self.num_envs + shuffled % count + first).view(num_minibatches, size)
 
         return tuple(draw(count, first) for count, first in ((teachers, 0), (students, teachers)) if count)
 

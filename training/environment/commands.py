@@ -225,11 +225,7 @@ class CommandGenerator:
         return torch.clamp(off * self._configuration.heading_gain, ranges.low[:, 2], ranges.high[:, 2])
 
     def _uniform(
-        self,
-        uniform: dict[str, torch.Tensor],
-        ranges: Ranges,
-        way: torch.Tensor,
-        remaining: torch.Tensor,
+        self, uniform: dict[str, torch.Tensor], ranges: Ranges, way: torch.Tensor, remaining: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return uniform linear speeds that are at least as fast as the rest of the episode needs, (N, 2), and yaw rates, (N, 1)."""
         magnitude, low, high = uniform["command_magnitude"], ranges.low, ranges.high

@@ -17,9 +17,7 @@ from ...files.parsing import Count, NotNegative, Positive, Seed, Share
 from ...robots.base import Angle, Damping, Inertia, Torque
 from ..configuration import Ramp, Range, check_rising
 from .reward_configuration import DEFAULT_REWARDS, Extent, Metres, RewardConfiguration
-from .reward_configuration import (
-    OwnReward as OwnReward,
-)
+from .reward_configuration import OwnReward as OwnReward
 from .terrain_configuration import TRAINING_TERRAIN, TerrainConfiguration
 
 _Factor = Annotated[float, Field(ge=0.0, le=100.0)]

@@ -22,8 +22,7 @@ class TrainRequest:
     """A training. None stands for the resumed run's choice, or else for the task's."""
 
     task: Annotated[
-        str,
-        Choice("What to learn, see 'gaitgauge list tasks'.", argument=True, metavar="TASK", values="tasks"),
+        str, Choice("What to learn, see 'gaitgauge list tasks'.", argument=True, metavar="TASK", values="tasks")
     ]
     overrides: Annotated[
         tuple[str, ...],
@@ -44,9 +43,7 @@ class TrainRequest:
     robot: Annotated[
         str | None,
         Choice(
-            "Robot name, or a robot.toml; the task is scaled by its size. Default: the task's.",
-            PLAYED,
-            values="robots",
+            "Robot name, or a robot.toml; the task is scaled by its size. Default: the task's.", PLAYED, values="robots"
         ),
     ] = None
     seed: Annotated[int | None, Choice("Seed of everything random. Default: the task's.", PLAYED)] = None
@@ -100,9 +97,7 @@ class TrainRequest:
         ),
     ] = None
     video_every: Annotated[
-        int | None,
-        Ge(1),
-        Choice("Iterations between two videos, made in a side process. Default: none.", WRITTEN),
+        int | None, Ge(1), Choice("Iterations between two videos, made in a side process. Default: none.", WRITTEN)
     ] = None
     score_every: Annotated[int | None, Ge(1), Choice("Iterations between two scores. Default: the task's.", SCORES)] = (
         None

@@ -20,10 +20,7 @@ from .curves import Curve, by_figure, curves_csv, learning_curves
 from .file import Sweep, SweepError
 from .runs import RUN_ERRORS, SCORES, SweepRun, read_card, what_failed
 
-_FOUND = (
-    *("environment_steps", "training_seconds", "best_training_score", "policy", "results"),
-    *SCORES,
-)
+_FOUND = (*("environment_steps", "training_seconds", "best_training_score", "policy", "results"), *SCORES)
 """What a row says of a run, None where there is nothing yet."""
 
 

@@ -345,12 +345,7 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
         device = entry.device or sweep.device
         init_from = sweep.init_from if entry.init_from is None else entry.init_from
         request = TrainRequest(
-            task=entry.task,
-            overrides=settings,
-            backend=backend,
-            device=device,
-            init_from=init_from,
-            score_suite=None,
+            task=entry.task, overrides=settings, backend=backend, device=device, init_from=init_from, score_suite=None
         )
         try:
             _check_seeds(sweep.seeds_of(entry), settings)

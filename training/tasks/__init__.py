@@ -78,11 +78,7 @@ _MIRRORED = AlgorithmConfiguration(symmetry="augment", student_period=2)
 _ALL_TERRAINS = EnvironmentConfiguration(
     num_envs=16384,
     rewards=RewardConfiguration(
-        yaw_tracking=0.75,
-        progress=1.5,
-        collision=-0.25,
-        foot_regulation=-0.1,
-        foot_height_scale=0.05,
+        yaw_tracking=0.75, progress=1.5, collision=-0.25, foot_regulation=-0.1, foot_height_scale=0.05
     ),
     commands=CommandConfiguration(straight_probability=0.5, heading_gain=1.0, crossing_probability=0.5),
     termination=TerminationConfiguration(stuck=8.0),

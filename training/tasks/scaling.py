@@ -96,8 +96,7 @@ def _scaled_environment(
         environment,
         robot=source,
         joints=replace(
-            environment.joints,
-            parameters=parameters if parameters in robot.parameters else robot.default_parameters,
+            environment.joints, parameters=parameters if parameters in robot.parameters else robot.default_parameters
         ),
         observations=replace(
             environment.observations,
