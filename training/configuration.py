@@ -24,12 +24,6 @@ METHODS: Mapping[str, str] = {
     "dreamwaq": "dreamwaq:Dreamwaq",
 }
 """Methods by name: file in ``training/algorithms`` and class, which ``algorithms.methods.find_method`` imports."""
-STUDENT_ENCODERS: tuple[str, ...] = ("mlp", "moe", "moe_ng")
-SYMMETRY_MODES: tuple[str, ...] = ("none", "augment", "alternate")
-PRECISIONS: tuple[str, ...] = ("float32", "tf32", "bfloat16")
-LOGGERS: tuple[str, ...] = ("tensorboard", "wandb", "neptune")
-COMPILE_MODES: tuple[str, ...] = ("auto", "none", "default")
-
 
 Range = tuple[float, float]
 _Rate = Annotated[float, Field(gt=0.0, le=1e3)]
@@ -107,7 +101,7 @@ class NetworkConfiguration:
     """Smallest standard deviation of the exploration noise."""
 
     def __post_init__(self) -> None:
-        _choose("student_encoder", self.student_encoder, STUDENT_ENCODERS)
+        _choose("student_encoder", self.student_encoder, ("mlp", "moe", "moe_ng"))
         _positive(self, "latent_width", "expert_count", "expert_width", "initial_std", "minimum_std")
 
 
@@ -189,9 +183,9 @@ class AlgorithmConfiguration:
     def __post_init__(self) -> None:
         if ":" not in self.method:
             _choose("method", self.method, (*METHODS, "module:name of a class of your own"))
-        _choose("symmetry", self.symmetry, SYMMETRY_MODES)
-        _choose("precision", self.precision, PRECISIONS)
-        _choose("compile_mode", self.compile_mode, COMPILE_MODES)
+        _choose("symmetry", self.symmetry, ("none", "augment", "alternate"))
+        _choose("precision", self.precision, ("float32", "tf32", "bfloat16"))
+        _choose("compile_mode", self.compile_mode, ("auto", "none", "default"))
         _positive(self, "epochs", "minibatches", "learning_rate", "student_learning_rate", "max_gradient_norm", "clip")
         if isinstance(self.desired_kl, Ramp) and not min(self.desired_kl.start, self.desired_kl.end) > 0:
             raise ConfigurationError(
@@ -251,7 +245,7 @@ class RunConfiguration:
             raise ConfigurationError(f"bootstrap_iterations is {self.bootstrap_iterations}; it must be at least 1.")
         if not 0.0 <= self.average_age <= 0.5:
             raise ConfigurationError(f"average_age is {self.average_age:g}; it must be between 0 (no average) and 0.5.")
-        _choose("logger", self.logger, LOGGERS)
+        _choose("logger", self.logger, ("tensorboard", "wandb", "neptune"))
         for name in ("gauge_interval", "video_interval"):
             if getattr(self, name) < 0:
                 raise ConfigurationError(f"{name} is {getattr(self, name)}; it must be 0 (never) or positive.")

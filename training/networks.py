@@ -73,11 +73,7 @@ def plain_arguments(configuration: TrainingConfiguration, widths: Widths, reason
 
 
 def composed_arguments(configuration: TrainingConfiguration, widths: Widths) -> dict[str, Any]:
-    """Return the arguments of a network of ``policy.composed``.
-
-    Raises:
-        ConfigurationError: the student's encoder is no plain one.
-    """
+    """Return the arguments of a network of ``policy.composed``. Raises ConfigurationError: the student's encoder is no plain one."""
     network = configuration.network
     return {
         **plain_arguments(configuration, widths, "has its experts in the actor"),

@@ -22,14 +22,8 @@ class TaskError(ValueError):
 
 
 def apply_overrides(configuration: Options, overrides: Iterable[str]) -> Options:
-    """Return a copy of a configuration with some settings changed.
-
-    Args:
-        configuration: a frozen dataclass, nested as deep as it likes.
-        overrides: ``key=value`` each; later ones win.
-
-    Raises:
-        TaskError: no ``=``, unknown key (with the nearest valid ones), or a value that does not fit.
+    """Return a copy of a frozen dataclass, nested as deep as it likes, with settings changed by ``key=value``; later ones win. Raises
+    TaskError: no ``=``, unknown key (with the nearest valid ones), or a value that does not fit.
     """
     for override in overrides:
         key, equals, value = override.partition("=")

@@ -27,11 +27,7 @@ PATIENCE_AFTER_SIGNAL = 10.0
 
 
 def told_number(name: str, default: int) -> int:
-    """Return a number that torchrun tells its processes in their environment.
-
-    Raises:
-        ConfigurationError: it is none.
-    """
+    """Return a number that torchrun tells its processes in their environment. Raises ConfigurationError: it is none."""
     text = os.environ.get(name, str(default))
     if not (text.isascii() and text.isdecimal() and len(text) < 7):
         raise ConfigurationError(
@@ -56,11 +52,7 @@ class Processes:
 
     @classmethod
     def told(cls) -> Processes:
-        """Read the variables that torchrun sets; no process is joined.
-
-        Raises:
-            ConfigurationError: it is nonsense.
-        """
+        """Read the variables that torchrun sets; no process is joined. Raises ConfigurationError: it is nonsense."""
         here = cls(rank=told_number("RANK", 0), count=told_number("WORLD_SIZE", 1))
         if here.rank >= here.count:
             raise ConfigurationError(
@@ -132,14 +124,8 @@ class Processes:
         return shared[0]
 
     def wait_for(self, device: torch.device | str, *, stopping: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a GPU has done its work, which it cannot while another process is missing.
-
-        Args:
-            device: nothing is waited for on a CPU.
-            stopping: whether this process was asked to stop.
-
-        Raises:
-            ProcessLostError: it took too long.
+        """Wait until a GPU has done its work, which it cannot while another process is missing; ``stopping`` tells that this process was
+        asked to stop. Raises ProcessLostError: it took too long.
         """
         if not self.several or torch.device(device).type != "cuda":
             return
@@ -163,11 +149,7 @@ def _heard() -> Iterator[None]:
 
 
 def own_device(asked: str | None, backend: str) -> str:
-    """Return the torch device of this process.
-
-    Raises:
-        ConfigurationError: there is no such device here.
-    """
+    """Return the torch device of this process. Raises ConfigurationError: there is no such device here."""
     asked = choose_device(backend) if asked is None else asked
     place, gpus = told_number("LOCAL_RANK", 0), torch.cuda.device_count()
     if asked == "cuda" and place >= gpus > 0:

@@ -42,12 +42,9 @@ class Bootstrap:
         names: Sequence[str],
         joined: Callable[..., Callable[..., None]],
     ) -> None:
-        """Prepare an optimizer of its own: the algorithm's starts fresh once the policy is followed.
-
-        Args:
-            parameters: of the missing networks.
-            losses: from the rows of a minibatch, one tensor for each group of environments, to one number for each name.
-            joined: makes a step, as ``PPO.joined``.
+        """Prepare an optimizer for the missing networks' ``parameters``: the algorithm's starts fresh once the policy is followed.
+        ``losses`` leads from the rows of a minibatch, one tensor for each group of environments, to one number for each name; ``joined`` is
+        ``PPO.joined``.
         """
         self._left, self._settings, self._names = iterations, settings, names
         self._learner = Learner(parameters, names, settings.max_gradient_norm, lr=1e-3)

@@ -66,12 +66,8 @@ class HimLosses(EstimatorLosses):
 def swapped_prediction(
     source: torch.Tensor, target: torch.Tensor, counts: torch.Tensor, settings: HimConfiguration
 ) -> torch.Tensor:
-    """Return the mean cross entropy of each side's prediction with the other side's code.
-
-    Args:
-        source: cosines of the embeddings with the prototypes, (B, K).
-        target: those of the next states' embeddings, (B, K).
-        counts: 1 for samples that count, else 0, (B,).
+    """Return the mean cross entropy of each side's prediction with the other side's code: the embeddings' cosines with the prototypes, (B,
+    K), and those of the next states' embeddings. ``counts`` is 1 for samples that count, else 0, (B,).
     """
     codes = [sinkhorn(scores, counts, settings) for scores in (source, target)]
     predictions = [functional.log_softmax(scores / settings.temperature, dim=-1) for scores in (source, target)]
@@ -82,11 +78,7 @@ def swapped_prediction(
 @torch.no_grad()
 def sinkhorn(scores: torch.Tensor, counts: torch.Tensor, settings: HimConfiguration) -> torch.Tensor:
     """Return codes (B, K) that add up to one for each sample and, nearly, to B / K for each prototype: Sinkhorn-Knopp on exp(scores /
-    sharpness).
-
-    Args:
-        scores: cosines, (B, K).
-        counts: 1 for samples that count, else 0, (B,); the others do not take part and have codes of zero.
+    sharpness) of cosines (B, K). ``counts`` is 1 for samples that count, else 0, (B,); the others do not take part and have codes of zero.
     """
     codes = torch.exp((scores - scores.max()) / settings.code_sharpness) * counts[:, None]
     for _ in range(settings.sinkhorn_iterations):

@@ -79,11 +79,8 @@ class Losses:
                 target[rows].copy_(compute(rows))
 
     def latents(self, privileged: Sequence[torch.Tensor], stored: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """Return the actor's latents for each block of samples, in order.
-
-        Args:
-            privileged: of the blocks, each (B, P): those of a rollout's groups, then their mirror images where there are any.
-            stored: the student's latents, (B, L) each, for the last group of each of these.
+        """Return the actor's latents for each block of samples, in order, from states (B, P) of the rollout's groups, and of their mirror
+        images where there are any, and from the student's stored latents, (B, L) each, of the last group of each of these.
         """
         del privileged
         return list(stored)

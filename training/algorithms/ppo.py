@@ -149,23 +149,8 @@ class PPO:
                 "Make training.network.* smaller."
             )
         actor, critic = cls.networks(configuration, widths)
-        storage = cls.rollout_storage(configuration, widths, device)
-        return cls(actor, critic, storage, configuration=settings, mirror=mirror, device=device, processes=processes)
-
-    @classmethod
-    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
-        """Return the method's actor and critic.
-
-        Raises:
-            ConfigurationError: settings that do not fit.
-        """
-        raise NotImplementedError
-
-    @classmethod
-    def rollout_storage(cls, configuration: TrainingConfiguration, widths: Widths, device: str) -> RolloutStorage:
-        """Return the method's storage of a rollout."""
-        period = configuration.algorithm.student_period if cls.has_teacher else 1
-        return RolloutStorage(
+        period = settings.student_period if cls.has_teacher else 1
+        storage = RolloutStorage(
             EnvironmentSplit.build(widths.environments, period, device),
             configuration.run.steps_per_iteration,
             widths,
@@ -173,6 +158,12 @@ class PPO:
             next_state_width=cls.estimated + widths.frame if cls.estimated else 0,
             device=device,
         )
+        return cls(actor, critic, storage, configuration=settings, mirror=mirror, device=device, processes=processes)
+
+    @classmethod
+    def networks(cls, configuration: TrainingConfiguration, widths: Widths) -> tuple[StudentActor, ValueNetwork]:
+        """Return the method's actor and critic. Raises ConfigurationError: settings that do not fit."""
+        raise NotImplementedError
 
     @property
     def learning_rate(self) -> float:
@@ -208,10 +199,9 @@ class PPO:
     @torch.no_grad()
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Sample and store actions, (N, J) in environment order: a teacher's in its environments, the student's in the others."""
-        split, actor = self.storage.split, self.actor
+        actor = self.actor
         # Indexing copies, so an environment may reuse the memory of its observations.
-        policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
-        history = obs["history"][split.order[split.num_teacher :]]
+        policy, privileged, history = self._in_blocks(obs)
         with self.losses.autocast():
             latent, student_latent = self.latents(obs, privileged, history)
             decision, weights = actor.decide(latent, policy)
@@ -231,17 +221,22 @@ class PPO:
             log_prob=actor.distribution.log_prob(actions),
             values=values.squeeze(-1),
         )
-        return actions[split.inverse]
+        return actions[self.storage.split.inverse]
+
+    def _in_blocks(self, obs: TensorDict) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return frames (N, F) and states (N, P) in block order, and the students' histories (Ns, H·F)."""
+        split = self.storage.split
+        return (
+            obs["policy"][split.order],
+            obs["privileged"][split.order],
+            obs["history"][split.order[split.num_teacher :]],
+        )
 
     def latents(
         self, obs: TensorDict, privileged: torch.Tensor, history: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the actor's latents, (N, L) in block order, and the students' part of them, (Ns, L), as it is to be stored.
-
-        Args:
-            obs: all groups, in environment order.
-            privileged: states, (N, P) in block order.
-            history: the students', (Ns, H·F).
+        """Return the actor's latents, (N, L) in block order, and the students' part of them, (Ns, L), as it is to be stored, from all
+        groups in environment order, the states (N, P) in block order, and the students' histories (Ns, H·F).
         """
         raise NotImplementedError
 
@@ -260,9 +255,7 @@ class PPO:
     @torch.no_grad()
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages; advantages are normalized over all samples together."""
-        split = self.storage.split
-        policy, privileged = obs["policy"][split.order], obs["privileged"][split.order]
-        history = obs["history"][split.order[split.num_teacher :]]
+        policy, privileged, history = self._in_blocks(obs)
         with self.losses.autocast():
             last_values = self.last_values(policy, privileged, history).float().squeeze(-1)
         settings = self.configuration
@@ -277,14 +270,8 @@ class PPO:
     # Update
 
     def update(self, wait: Callable[[], None] = lambda: None) -> dict[str, float]:
-        """Run all passes over the rollout.
-
-        Args:
-            wait: called once all work is asked for, to wait for the device.
-
-        Returns:
-            Means over the minibatches, by name; ``skipped_minibatches`` counts those that were dropped because their gradients were not
-            finite.
+        """Run all passes over the rollout; ``wait`` waits for the device, once all work is asked for. Return means over the minibatches, by
+        name; ``skipped_minibatches`` counts those that were dropped because their gradients were not finite.
         """
         storage, settings = self.storage, self.configuration
         storage.step = self.steps = 0
@@ -395,11 +382,7 @@ class PPO:
         }
 
     def load(self, state: Mapping[str, Any], *, optimizers: bool = True) -> None:
-        """Take over a state of ``save``.
-
-        Raises:
-            RuntimeError, LookupError, ValueError, TypeError, AttributeError: it does not fit.
-        """
+        """Take over a state of ``save``. Raises RuntimeError, LookupError, ValueError, TypeError, AttributeError: it does not fit."""
         self.actor.load_state_dict(state["actor_state_dict"])
         self.critic.load_state_dict(state["critic_state_dict"])
         if optimizers:

@@ -55,11 +55,7 @@ class EnvironmentSplit:
 
     @classmethod
     def build(cls, num_envs: int, period: int, device: torch.device | str) -> EnvironmentSplit:
-        """Split ``num_envs`` environments.
-
-        Raises:
-            ConfigurationError: too few environments for at least one of each.
-        """
+        """Split ``num_envs`` environments. Raises ConfigurationError: too few environments for at least one of each."""
         num_teacher, num_student = split_sizes(num_envs, period)
         index = torch.arange(num_envs, device=device)
         student = index % period == 0
@@ -110,10 +106,8 @@ class RolloutStorage:
             getattr(self, name)[self.step].copy_(value)
 
     def compute_returns(self, last_values: torch.Tensor, *, discount: float, gae_lambda: float) -> None:
-        """Estimate advantages (Schulman et al., 2016, generalized advantage estimation), normalized over all samples.
-
-        Args:
-            last_values: values of the states after the last step, (N,).
+        """Estimate advantages (Schulman et al., 2016, generalized advantage estimation), normalized over all samples, from the values of
+        the states after the last step, (N,).
         """
         advantage, following = torch.zeros_like(last_values), last_values
         for step in reversed(range(self.num_steps)):

@@ -48,11 +48,6 @@ class MirrorMap:
         return MirrorMap(self.index.to(device), self.sign.to(device))
 
     @classmethod
-    def signs(cls, *sign: float) -> MirrorMap:
-        """Entries that stay in place."""
-        return cls(torch.arange(len(sign)), torch.tensor(sign))
-
-    @classmethod
     def joined(cls, maps: Sequence[MirrorMap]) -> MirrorMap:
         """The map of the concatenation of several vectors."""
         offsets = accumulate((part.width for part in maps), initial=0)
@@ -60,7 +55,7 @@ class MirrorMap:
         return cls(index, torch.cat([part.sign for part in maps]))
 
 
-VECTOR = MirrorMap.signs(1.0, -1.0, 1.0)
+VECTOR = MirrorMap(torch.arange(3), torch.tensor((1.0, -1.0, 1.0)))
 
 
 def mirror_points(points: torch.Tensor) -> MirrorMap:
@@ -127,11 +122,7 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
 
 
 def _image(seen: Observation, joints: MirrorMap) -> MirrorMap:
-    """Return the mirror map of one observation.
-
-    Raises:
-        SymmetryError: its mirror image is not known.
-    """
+    """Return the mirror map of one observation. Raises SymmetryError: its mirror image is not known."""
     if seen.mirror is None:
         raise SymmetryError(
             f"The mirror image of the observation '{seen.name}' is not known; give it mirror, or set "

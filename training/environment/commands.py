@@ -63,10 +63,8 @@ def _range_table(
 ) -> torch.Tensor:
     """Return ``Ranges`` of every stage and kind of terrain, (stages, kinds, columns): looked up, not computed, in every step."""
     stages = [(s.forward, s.lateral, s.yaw) for s in configuration.drawn_stages]
-    bounds, limit = (
-        torch.tensor(stages, dtype=torch.float32)[:, None],
-        torch.tensor(terrain_limits, dtype=torch.float32),
-    )
+    bounds = torch.tensor(stages, dtype=torch.float32)[:, None]
+    limit = torch.tensor(terrain_limits, dtype=torch.float32)
     low, high = torch.maximum(bounds[..., 0], -limit), torch.minimum(bounds[..., 1], limit)
     downward = -low[..., :2]
     either = torch.minimum(downward, high[..., :2]).clamp_min(0.0)
@@ -130,8 +128,7 @@ class CommandGenerator:
         # A number below the first bound sets an axis to zero, else one below the second bound to its lower limit.
         self._zero_below = torch.tensor(configuration.extreme_zero_probability, device=device)
         self._low_below = 0.5 * (1.0 + self._zero_below)
-        self._period = control_period
-        self._length = max_episode_length
+        self._period, self._length = control_period, max_episode_length
         self.interval_steps = max(round(configuration.interval / control_period), 1)
         self._stationary_steps = round(configuration.stationary_longest / control_period)
         self._interval = torch.tensor(self.interval_steps, device=device)
@@ -165,8 +162,7 @@ class CommandGenerator:
             command: the present command, (N, 3).
             extreme: whether the present command is an extreme one, (N,) bool; False at the start of an episode.
         """
-        settings = self._configuration
-        ranges = self.ranges(kind, progress)
+        settings, ranges = self._configuration, self.ranges(kind, progress)
         low, high = ranges.low, ranges.high
         remaining = (self._length - episode_length).clamp_min(1)
         way = (settings.required_distance - issued.norm(dim=1) * settings.interval).clamp_min(0.0)
@@ -174,8 +170,7 @@ class CommandGenerator:
         kind_number = uniform["command_kind"]
         extreme_drawn, straight, flipped, turning = (kind_number < self._shares).unbind(1)
 
-        # Extreme: every axis at a limit or zero. Opposite: what the gauge does halfway through each of its diagonal
-        # commands.
+        # Extreme: every axis at a limit or zero. Opposite: what the gauge does halfway through each of its diagonal commands.
         corner = uniform["command_corner"]
         zero = corner < self._zero_below
         extremes = torch.where(corner < self._low_below, low, high).masked_fill(zero, 0.0)
@@ -214,12 +209,8 @@ class CommandGenerator:
         return CommandDraw(command=drawn, steps=steps, extreme=is_extreme, holds_heading=holds_heading)
 
     def held_yaw_rate(self, off: torch.Tensor, *, kind: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
-        """Return yaw rates that lead back to the commanded heading [rad/s], (N,).
-
-        Args:
-            off: angle from the robot's own heading to the commanded one [rad], (N,).
-            kind: kind of terrain, (N,) int64.
-            progress: fraction of the run, scalar.
+        """Return yaw rates that lead back to the commanded heading [rad/s], (N,), from its angle to the robot's own [rad], (N,), the kind
+        of terrain, (N,) int64, and the fraction of the run, a scalar.
         """
         ranges = self.ranges(kind, progress)
         return torch.clamp(off * self._configuration.heading_gain, ranges.low[:, 2], ranges.high[:, 2])

@@ -18,6 +18,7 @@ from ...robots.base import Angle, Damping, Inertia, Torque
 from ..configuration import Ramp, Range, check_rising
 from .reward_configuration import DEFAULT_REWARDS, Extent, Metres, RewardConfiguration
 from .reward_configuration import OwnReward as OwnReward
+from .reward_configuration import OwnTerm as OwnTerm
 from .terrain_configuration import TRAINING_TERRAIN, TerrainConfiguration
 
 _Factor = Annotated[float, Field(ge=0.0, le=100.0)]
@@ -56,36 +57,23 @@ class JointConfiguration:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnTermination:
-    """An end of episodes of one's own."""
+class OwnTermination(OwnTerm):
+    """An end of episodes of one's own: a function of ``StepInputs`` and ``TerminationConfiguration`` to (N,) bool."""
 
-    name: str
-    """Name in the log and in settings."""
-    function: str
-    """``module:function`` of ``StepInputs`` and ``TerminationConfiguration`` to (N,) bool."""
     time_out: bool = False
     """True if the end is no failure: the learner bootstraps the missing future."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnObservation:
-    """Something more that teacher and critic see."""
-
-    name: str
-    """Name in settings."""
-    function: str
-    """``module:function`` of ``ObservationInputs`` to (N, width), without noise, of the order of one."""
+class OwnObservation(OwnTerm):
+    """Something more that teacher and critic see: a function of ``ObservationInputs`` to (N, width), without noise, of the order of one."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnEvent:
-    """Something more that happens to the physics."""
-
-    name: str
-    """Name in settings."""
-    function: str
-    """``module:function`` of the environment and a mask of the worlds that begin an episode, (N,) bool; called in every step after resets
-    and pushes."""
+class OwnEvent(OwnTerm):
+    """Something more that happens to the physics: a function of the environment and a mask of the worlds that begin an episode, (N,) bool,
+    called in every step after resets and pushes.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)

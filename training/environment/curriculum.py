@@ -38,11 +38,7 @@ class TrainingPalette:
 
 
 def build_palette(configuration: TerrainConfiguration) -> TrainingPalette:
-    """Build the tiles of every kind with a share above zero.
-
-    Raises:
-        TerrainError: unknown kind, or more levels than tiles have.
-    """
+    """Build the tiles of every kind with a share above zero. Raises TerrainError: unknown kind, or more levels than tiles have."""
     tiles = tuple(t for t in configuration.tiles if t.share > 0)
     terrains: list[Terrain] = []
     index = torch.zeros(len(tiles), configuration.levels, configuration.variants, dtype=torch.int64)
@@ -73,8 +69,7 @@ def assign_kinds(shares: Sequence[float], num_envs: int) -> torch.Tensor:
         raise ConfigurationError(
             "environment.terrain.tiles.<kind>.share is 0 for every kind, or negative for one; give at least one kind a share above 0"
         )
-    total = sum(shares)
-    bounds = torch.tensor([sum(shares[: i + 1]) / total for i in range(len(shares))], dtype=torch.float64)
+    bounds = torch.tensor([sum(shares[: i + 1]) / sum(shares) for i in range(len(shares))], dtype=torch.float64)
     middle = (torch.arange(num_envs, dtype=torch.float64) + 0.5) / num_envs
     return torch.searchsorted(bounds[:-1].contiguous(), middle, right=True)
 
@@ -83,13 +78,8 @@ class Levels:
     """Level and tile of each world."""
 
     def __init__(self, configuration: TerrainConfiguration, palette: TrainingPalette, kind: torch.Tensor) -> None:
-        """Put the tiles' indices on the device.
-
-        Args:
-            kind: kind of tile of every world, (N,) int64.
-
-        Raises:
-            ConfigurationError: the level rule is not there.
+        """Put the tiles' indices on the device of ``kind``, each world's, (N,) int64. Raises ConfigurationError: the level rule is not
+        there.
         """
         self._settings, self._kind, self._num_levels = configuration, kind, palette.num_levels
         self._index = palette.index.to(kind.device)

@@ -90,8 +90,7 @@ class TrainingEnvironment(VecEnv):
                 f"environment.randomization.motor_speed is {slow:g} to {fast:g} while environment.physics.torque_speed_limit is "
                 "off, without which it does nothing; turn the limit on, or leave motor_speed at 1,1"
             )
-        self.cfg = configuration
-        self.configuration = configuration
+        self.cfg = self.configuration = configuration
         self.robot = load_robot(configuration.robot)
         parameters = joint_parameters(self.robot, configuration)
         self.palette = build_palette(configuration.terrain)
@@ -168,23 +167,20 @@ class TrainingEnvironment(VecEnv):
             memory.push_phase.random_(self.parts.pushes.steps, generator=self._generator)
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self.parts.uniform.draw()
-        nobody, headings = torch.zeros_like(everyone), memory.commanded_heading
-        start = self.parts.begin_episodes(everyone, nobody, self.parts.progress(), headings)
-        self._reset(start)
+        self._reset(self.parts.begin_episodes(everyone, ~everyone, self.progress, memory.commanded_heading))
         self._read(AFTER_STEP)
         self._observations = self.parts.observe().clone()
 
     @contextmanager
     def _trial(self) -> Iterator[None]:
         """Let both torch parts run inside the context; their changes are put back."""
-        memory, motors = self.parts.memory.by_name(), self.parts.motors.by_name()
-        before = copied(memory), copied(motors)
+        tensors = self.parts.memory.by_name() | {f"motors.{name}": v for name, v in self.parts.motors.by_name().items()}
+        before = copied(tensors)
         try:
             with torch.no_grad():
                 yield
         finally:
-            restore(before[0], memory)
-            restore(before[1], motors)
+            restore(before, tensors)
 
     def _fuse(self, *, required: bool) -> None:
         """Compile both torch parts; where that is impossible, refuse if it is ``required``, or say so in ``unfused``."""
@@ -201,9 +197,8 @@ class TrainingEnvironment(VecEnv):
             sentence = f"the environment's torch parts cannot be compiled ({shown(reason)})"
             if required:
                 raise ConfigurationError(f"{sentence}; use fuse=False, on the command line --no-fuse") from error
-            self.unfused = (
-                f"{sentence} and run as they are, which is slower; a function of your own in the task may be the cause"
-            )
+            cause = "a function of your own in the task may be the cause"
+            self.unfused = f"{sentence} and run as they are, which is slower; {cause}"
             return
         self._after_physics, self._observe = after_physics, observe
 
@@ -233,14 +228,8 @@ class TrainingEnvironment(VecEnv):
 
     @torch.no_grad()
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance all worlds by one control period.
-
-        Args:
-            actions: raw network outputs, (N, J).
-
-        Returns:
-            Observations; rewards (N,); dones (N,) int64; extras with ``time_outs`` (N,) float and, every
-            ``log_interval`` steps, ``log``. All are new tensors that no later step touches.
+        """Advance all worlds by one control period with raw network outputs, (N, J). Return observations; rewards (N,); dones (N,) int64;
+        extras with ``time_outs`` (N,) float and, every ``log_interval`` steps, ``log``. All are new tensors that no later step touches.
         """
         parts = self.parts
         parts.action.copy_(actions)
@@ -253,10 +242,8 @@ class TrainingEnvironment(VecEnv):
         if self.common_step_counter % self.configuration.log_interval == 0:
             extras["log"] = self._log()
         self._reset(result.start)
-        if (push := result.push) is not None:
-            self.backend.push(
-                push.worlds, linear_velocity_w=push.linear_velocity, angular_velocity_b=push.angular_velocity
-            )
+        if result.push is not None:
+            self.backend.push(**vars(result.push))
         for event in self._events:
             event(self, result.done)
         self._read(AFTER_RESET)
@@ -278,25 +265,16 @@ class TrainingEnvironment(VecEnv):
 
     def _reset(self, start: EpisodeStart) -> None:
         self.parts.motors.apply(self.backend)
-        self.backend.reset(
-            ResetState(
-                base_position=start.base_position,
-                base_quaternion=start.base_quaternion,
-                joint_position=start.joint_position,
-                base_linear_velocity=start.base_linear_velocity,
-                base_angular_velocity=start.base_angular_velocity,
-                held_target=self.parts.default_pose.expand(self.num_envs, -1),
-                terrain_index=self.parts.memory.terrain_index,
-            ),
-            start.worlds,
-        )
+        held = self.parts.default_pose.expand(self.num_envs, -1)
+        index = self.parts.memory.terrain_index
+        self.backend.reset(replace(start.state, held_target=held, terrain_index=index), start.worlds)
 
     def _pack(self, observations: Observations) -> TensorDict:
         return TensorDict(dict(vars(observations)), batch_size=[self.num_envs], device=self.device)
 
     def _log(self) -> dict[str, torch.Tensor]:
         """Return the figures since the last log, as tensors on the device."""
-        log = self.parts.log.read(self.parts.memory, self.parts.progress())
+        log = self.parts.log.read(self.parts.memory, self.progress)
         return log | {"Physics/overflow_worlds": self.backend.state.overflowed.sum().float()}
 
     # --- resuming ---------------------------------------------------------------------------------------------------
@@ -405,11 +383,7 @@ class TrainingEnvironment(VecEnv):
 
 
 def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
-    """Return the joint constants of the training physics.
-
-    Raises:
-        ConfigurationError: the robot has no such parameter set.
-    """
+    """Return the joint constants of the training physics. Raises ConfigurationError: the robot has no such parameter set."""
     settings = configuration.joints
     if settings.parameters not in robot.parameters:
         known = ", ".join(robot.parameters)

@@ -27,13 +27,8 @@ class EpisodeLog:
         kind: torch.Tensor,
         control_period: float,
     ) -> None:
-        """Name the columns.
-
-        Args:
-            rewards: names of the reward terms.
-            terminations: names of the rules that end episodes.
-            kind: kind of tile of every world, (N,) int64.
-            control_period: [s].
+        """Name the columns by reward terms and rules that end episodes; ``kind`` is the kind of tile of every world, (N,) int64, and the
+        period in seconds.
         """
         self._names = [f"Episode_Reward/{name}" for name in rewards]
         self._names += [f"Episode_Termination/{name}" for name in terminations]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ...backends.base import PhysicsOptions, PhysicsState
+from ...backends.base import PhysicsOptions, PhysicsState, ResetState
 from ...robots.base import Robot
 from ...robots.body_plan import joint_ranges
 from ...robots.rotation import from_yaw
@@ -23,33 +23,25 @@ from .terrain_configuration import TerrainConfiguration
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeStart:
-    """Draw the start of the masked worlds' next episode."""
+    """Start of the masked worlds' next episode."""
 
     worlds: torch.Tensor
     """(N,) bool."""
-    base_position: torch.Tensor
-    """World frame [m], (N, 3)."""
-    base_quaternion: torch.Tensor
-    """wxyz, (N, 4)."""
+    state: ResetState
+    """Poses and velocities."""
     heading_xy: torch.Tensor
     """Unit vector of the base's x axis in the world's xy plane, (N, 2)."""
-    base_linear_velocity: torch.Tensor
-    """World frame [m/s], (N, 3)."""
-    base_angular_velocity: torch.Tensor
-    """Body frame [rad/s], (N, 3)."""
-    joint_position: torch.Tensor
-    """[rad], (N, J)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Push:
-    """New velocities of pushed bases."""
+    """New velocities of pushed bases, the arguments of ``PhysicsBackend.push``."""
 
     worlds: torch.Tensor
     """(N,) bool."""
-    linear_velocity: torch.Tensor
+    linear_velocity_w: torch.Tensor
     """World frame, NaN where it stays [m/s], (N, 3)."""
-    angular_velocity: torch.Tensor
+    angular_velocity_b: torch.Tensor
     """Body frame [rad/s], (N, 3)."""
 
 
@@ -87,15 +79,14 @@ class EpisodeStarts:
         ground = self._rasters.height(memory.terrain_index, footprint).amax(dim=1)
         joints = self._default_pose * uniform.between("joints", *self._reset.joint_scale)
         twist = uniform.signed("twist") * self._reset.velocity
-        return EpisodeStart(
-            worlds=worlds,
+        state = ResetState(
             base_position=torch.cat((xy, ground[:, None] + self._clearance), dim=1),
             base_quaternion=from_yaw(yaw),
-            heading_xy=direction,
             base_linear_velocity=twist[:, :3],
             base_angular_velocity=twist[:, 3:],
             joint_position=torch.clamp(joints, self._lower, self._upper),
         )
+        return EpisodeStart(worlds=worlds, state=state, heading_xy=direction)
 
 
 class Pushes:
@@ -121,7 +112,7 @@ class Pushes:
         if self._add:
             linear = linear + state.base_linear_velocity_w[:, :2]
             angular = angular + state.base_angular_velocity_b
-        return Push(worlds=due, linear_velocity=torch.cat((linear, self._stays), dim=1), angular_velocity=angular)
+        return Push(worlds=due, linear_velocity_w=torch.cat((linear, self._stays), dim=1), angular_velocity_b=angular)
 
 
 class Latency:

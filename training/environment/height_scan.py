@@ -20,13 +20,7 @@ class HeightRasters:
     def __init__(
         self, terrains: Sequence[Terrain], *, half_size: float, cell: float, device: torch.device | str
     ) -> None:
-        """Sample the terrains.
-
-        Args:
-            terrains: the palette; terrain index 0 is the first.
-            half_size: extent of the rasters from the origin in every direction [m].
-            cell: distance between nodes [m].
-        """
+        """Sample the terrains of a palette to ``half_size`` from the origin in every direction [m], at nodes ``cell`` apart [m]."""
         steps = round(half_size / cell)
         self.cell = cell
         self.half_size = steps * cell
@@ -39,14 +33,8 @@ class HeightRasters:
         self._heights = torch.from_numpy(heights).to(device).reshape(-1)
 
     def height(self, terrain_index: torch.Tensor, points_xy: torch.Tensor) -> torch.Tensor:
-        """Return the ground height below points.
-
-        Args:
-            terrain_index: terrain of each world, (N,) int64.
-            points_xy: world frame [m], (N, P, 2).
-
-        Returns:
-            [m], (N, P). Points that are not finite give the height of some node, so that a diverged world does no harm.
+        """Return the ground height [m], (N, P), below points of the world frame [m], (N, P, 2), on each world's terrain, (N,) int64. Points
+        that are not finite give the height of some node, so that a diverged world does no harm.
         """
         nodes = (points_xy * (1.0 / self.cell) + (self.half_size / self.cell + 0.5)).nan_to_num(0.0, 0.0, 0.0)
         nodes = nodes.clamp(0.0, float(self.nodes - 1)).long()
@@ -84,15 +72,8 @@ def _heading(quaternion: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
 
 
 def place_pattern(pattern: torch.Tensor, position_xy: torch.Tensor, heading_xy: torch.Tensor) -> torch.Tensor:
-    """Return a pattern of points turned to a heading and moved to a position.
-
-    Args:
-        pattern: points about the base, (P, 2) [m].
-        position_xy: base position, world frame [m], (N, 2).
-        heading_xy: unit vectors, (N, 2).
-
-    Returns:
-        World frame [m], (N, P, 2).
+    """Return points about the base, (P, 2) [m], turned to headings, unit vectors (N, 2), and moved to positions in the world frame [m], (N,
+    2): (N, P, 2).
     """
     left = torch.stack((-heading_xy[:, 1], heading_xy[:, 0]), dim=-1)
     offset = pattern[None, :, :1] * heading_xy[:, None, :] + pattern[None, :, 1:] * left[:, None, :]

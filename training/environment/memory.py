@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import torch
@@ -32,8 +33,9 @@ def _block(
     numbers: Callable[..., torch.Tensor], *shape: int, names: Sequence[str], widths: Sequence[int | None]
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Return a tensor, and views of its neighbouring columns by name; a width of None is a column without an axis of its own."""
-    whole = numbers(*shape, sum(1 if width is None else width for width in widths))
-    parts = whole.split([1 if width is None else width for width in widths], dim=-1)
+    columns = [1 if width is None else width for width in widths]
+    whole = numbers(*shape, sum(columns))
+    parts = whole.split(columns, dim=-1)
     views = [part.squeeze(-1) if width is None else part for part, width in zip(parts, widths, strict=True)]
     return whole, dict(zip(names, views, strict=True))
 
@@ -134,16 +136,9 @@ class EnvironmentMemory:
         device: torch.device | str,
     ) -> EnvironmentMemory:
         """Return zeros of the right shapes."""
-
-        def numbers(*shape: int) -> torch.Tensor:
-            return torch.zeros(shape, device=device)
-
-        def counts(*shape: int) -> torch.Tensor:
-            return torch.zeros(shape, dtype=torch.int64, device=device)
-
-        def flags() -> torch.Tensor:
-            return torch.zeros(num_envs, dtype=torch.bool, device=device)
-
+        numbers = partial(torch.zeros, device=device)
+        counts = partial(numbers, dtype=torch.int64)
+        flags = partial(numbers, num_envs, dtype=torch.bool)
         widths = (None, 2, None, 2, None, joints, joints, joints, joints, joints, feet, terms, None)
         episode, columns = _block(numbers, num_envs, names=EPISODE, widths=widths)
         sums, totals = _block(numbers, names=SUMS, widths=(terms, None, ends, metrics, None))
@@ -152,7 +147,7 @@ class EnvironmentMemory:
             sums=sums,
             **columns,
             **totals,
-            step=counts(),
+            step=counts(()),
             episode_length=counts(num_envs),
             level=counts(num_envs),
             terrain_index=counts(num_envs),
@@ -166,7 +161,7 @@ class EnvironmentMemory:
             history=numbers(num_envs, history, frame),
             push_phase=counts(num_envs),
             last_log=numbers(terms + ends + metrics),
-            diverged_total=counts(),
+            diverged_total=counts(()),
         )
 
     def turn_commanded_heading(self, period: float) -> None:
@@ -203,11 +198,7 @@ def copied(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 
 def restore(saved: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> None:
-    """Copy saved tensors into present ones.
-
-    Raises:
-        ValueError: a tensor is missing or has another shape.
-    """
+    """Copy saved tensors into present ones. Raises ValueError: a tensor is missing or has another shape."""
     for name, value in fitting(saved, present).items():
         present[name].copy_(value)
 

@@ -29,28 +29,19 @@ HEIGHT_SCALE = 2.5
 
 def noise_amplitude(contract: PolicyContract, noise: NoiseConfiguration, device: torch.device | str) -> torch.Tensor:
     """Half-width of the noise on each entry of a frame, in scaled units, (frame width,)."""
-    terms = contract.observation
-    scales = [
-        torch.tensor(term.scale).abs().expand(width) for term, width in zip(terms, contract.term_widths, strict=True)
+    amplitudes = [
+        torch.tensor(term.scale).abs().expand(width) * observation(term.name).half_width(noise)
+        for term, width in zip(contract.observation, contract.term_widths, strict=True)
     ]
-    half_widths = [observation(term.name).half_width(noise) for term in terms]
-    return torch.cat([scale * half_width for scale, half_width in zip(scales, half_widths, strict=True)]).to(device)
+    return torch.cat(amplitudes).to(device)
 
 
 def push_history(history: torch.Tensor, frame: torch.Tensor, forget: torch.Tensor, *, start: str) -> torch.Tensor:
-    """History with one more frame at its end and the oldest gone.
-
-    Args:
-        history: (N, H, width), oldest first.
-        frame: (N, width).
-        forget: worlds whose episode has just begun, (N,) bool.
-        start: what stands before their new frame: ``zeros``, or ``repeat`` for copies of it.
+    """Return a history (N, H, width), oldest first, with one more frame (N, width) at its end and the oldest gone. In the worlds of
+    ``forget``, (N,) bool, an episode has just begun, copies of the frame stand before it where ``start`` is ``repeat``, else zeros.
     """
-    newest, begins = frame[:, None], forget[:, None, None]
-    if start == "repeat":
-        kept = torch.where(begins, newest, history[:, 1:])
-    else:
-        kept = history[:, 1:].masked_fill(begins, 0.0)
+    newest = frame[:, None]
+    kept = torch.where(forget[:, None, None], newest if start == "repeat" else 0.0, history[:, 1:])
     return torch.cat((kept, newest), dim=1)
 
 
@@ -140,11 +131,7 @@ class Observer:
         rasters: HeightRasters,
         torque_limit: torch.Tensor,
     ) -> None:
-        """Choose the terms.
-
-        Raises:
-            ConfigurationError: a term of one's own is not there.
-        """
+        """Choose the terms. Raises ConfigurationError: a term of one's own is not there."""
         own = resolve_own(
             configuration.own,
             "environment.observations.own",

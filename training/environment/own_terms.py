@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -17,13 +17,12 @@ from ...files.parsing import one_line, shown
 from ...files.plugins import imported, raised
 from ...policy.observation_table import STANDARD, Observation, ObservationError, observation, register
 from ..configuration import ConfigurationError, to_plain
-from .configuration import ObservationConfiguration
+from .configuration import ObservationConfiguration, OwnTerm
 
 Kind = TypeVar("Kind")
 _PACKAGE = __name__.partition(".")[0]
 _MOVED = {
-    "training.commands": "training.environment.commands",
-    "training.curriculum": "training.environment.curriculum",
+    f"{_PACKAGE}.training.{name}": f"{_PACKAGE}.training.environment.{name}" for name in ("commands", "curriculum")
 }
 """Modules of this package that checkpoints of version 0.1 name by their former place."""
 
@@ -31,15 +30,7 @@ _MOVED = {
 def _present(path: str) -> str:
     """Return ``module:name`` with the module's present place in this package."""
     module, colon, name = path.partition(":")
-    inner = module.removeprefix(f"{_PACKAGE}.")
-    return f"{_PACKAGE}.{_MOVED[inner]}{colon}{name}" if inner != module and inner in _MOVED else path
-
-
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-    @property
-    def function(self) -> str: ...
+    return f"{_MOVED.get(module, module)}{colon}{name}"
 
 
 def resolve(path: str, setting: str) -> Callable[..., Any]:
@@ -79,14 +70,8 @@ def find_class(path: str, setting: str, base: type[Kind]) -> type[Kind]:
 
 
 def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> Callable[..., Kind]:
-    """Return the class at ``module:name``.
-
-    Args:
-        base: class that it must be derived from.
-        methods: names of its instances' called methods.
-
-    Raises:
-        ConfigurationError: as ``resolve``, or it is no such class.
+    """Return the class at ``module:name``, derived from ``base``; calling ``methods`` of a user's turns their exceptions into one sentence.
+    Raises ConfigurationError as ``find_class``.
     """
     found, where = find_class(path, setting, base), f"{setting} is {shown(_present(path))}"
     if _own(path):
@@ -102,22 +87,15 @@ def resolve_class(path: str, setting: str, base: type[Kind], *methods: str) -> C
 
 
 def resolve_own(
-    terms: Iterable[_Named],
+    terms: Iterable[OwnTerm],
     setting: str,
     taken: Iterable[str] = (),
     *,
     gives: Callable[[Any, Any], bool] | None = None,
     rule: str = "",
 ) -> dict[str, Callable[..., Any]]:
-    """Return the functions of all terms by name.
-
-    Args:
-        taken: names that they cannot have.
-        gives: checks a function's result, from its first argument and the result; None for no check.
-        rule: the check in words.
-
-    Raises:
-        ConfigurationError: a name is used twice, or a function is not there.
+    """Return the functions of all terms by name. ``gives`` checks a result, from a function's first argument and the result, and ``rule``
+    is the check in words. Raises ConfigurationError: a name is used twice or in ``taken``, or a function is not there.
     """
     functions: dict[str, Callable[..., Any]] = {}
     for term in terms:
@@ -162,11 +140,10 @@ def _checked(
 
     def checked(first: Any, *others: Any) -> Any:
         found = function(first, *others)
-        if not isinstance(found, torch.Tensor) or not gives(first, found):
-            shape = (
-                f"a tensor of {tuple(found.shape)}, {found.dtype}" if isinstance(found, torch.Tensor) else shown(found)
-            )
-            raise ConfigurationError(f"{where}, which gave {shape}; {rule}")
+        if not isinstance(found, torch.Tensor):
+            raise ConfigurationError(f"{where}, which gave {shown(found)}; {rule}")
+        if not gives(first, found):
+            raise ConfigurationError(f"{where}, which gave a tensor of {tuple(found.shape)}, {found.dtype}; {rule}")
         return found
 
     return checked
@@ -175,11 +152,8 @@ def _checked(
 def guarded(
     call: Callable[..., Any], where: str, passed_on: tuple[type[BaseException], ...] = ()
 ) -> Callable[..., Any]:
-    """Return a user's function with its exceptions, and its attempts to end the program, turned into one sentence.
-
-    Args:
-        where: the beginning of the sentence.
-        passed_on: exceptions that stay as they are, as ``ConfigurationError`` does.
+    """Return a user's function with its exceptions, but not those of ``passed_on``, and its attempts to end the program turned into one
+    sentence that begins with ``where``.
     """
     kept: tuple[type[BaseException], ...] = (ConfigurationError, *passed_on)
 
@@ -195,11 +169,8 @@ def guarded(
 
 
 def foreign_functions(settings: Any, known: Any) -> list[str]:
-    """Return every ``module:function`` that settings would import and that is neither the package's own nor named in ``known``.
-
-    Args:
-        settings: frozen dataclasses, of any depth, or plain data.
-        known: settings that are trusted.
+    """Return every ``module:function`` that settings, dataclasses or plain data, would import and that is neither the package's own nor
+    named in ``known`` settings.
     """
     trusted = set(_names(to_plain(known)))
     return sorted({name for name in _names(to_plain(settings)) if name not in trusted and not _own(name)})

@@ -7,6 +7,7 @@ inputs, random numbers do not depend on what happened in other worlds, and one g
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import accumulate, pairwise, starmap
 
 import torch
 
@@ -15,12 +16,9 @@ class UniformColumns:
     """Named blocks of columns of one (N, C) tensor of uniform numbers in [0, 1)."""
 
     def __init__(self, widths: Mapping[str, int], num_envs: int, generator: torch.Generator) -> None:
-        self._slices: dict[str, slice] = {}
-        total = 0
-        for name, width in widths.items():
-            self._slices[name] = slice(total, total + width)
-            total += width
-        self.values = torch.zeros(num_envs, total, device=generator.device)
+        ends = list(accumulate(widths.values(), initial=0))
+        self._slices = dict(zip(widths, starmap(slice, pairwise(ends)), strict=True))
+        self.values = torch.zeros(num_envs, ends[-1], device=generator.device)
         self._signed = torch.zeros_like(self.values)
         self._generator = generator
 

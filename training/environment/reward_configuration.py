@@ -20,13 +20,19 @@ _BASE_HEIGHT = Ramp(start=-1.0, end=-10.0, begin=0.0, until=0.2)
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnReward:
-    """Reward term of one's own."""
+class OwnTerm:
+    """A function of one's own."""
 
     name: str
     """Name in the log and in settings."""
     function: str
-    """``module:function`` of ``StepInputs`` to one number for each world, (N,)."""
+    """The function, as ``module:function``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnReward(OwnTerm):
+    """Reward term of one's own: a function of ``StepInputs`` to one number for each world, (N,)."""
+
     weight: Ramp | float
     """Weight per second; penalties are negative."""
 

@@ -198,11 +198,7 @@ class RewardFunction:
     """Weighted sum of the terms with a weight other than zero."""
 
     def __init__(self, configuration: RewardWeights, control_period: float, device: torch.device | str) -> None:
-        """Choose the terms and put their weights on the device.
-
-        Raises:
-            ConfigurationError: a term of one's own is not there.
-        """
+        """Choose the terms and put their weights on the device. Raises ConfigurationError: a term of one's own is not there."""
         own = resolve_own(
             configuration.own,
             "environment.rewards.own",

@@ -18,17 +18,13 @@ class RampTable:
         Raises:
             ConfigurationError: a ramp ends before it begins.
         """
-        rows = []
-        for ramp in ramps:
-            if isinstance(ramp, Ramp):
-                if ramp.until < ramp.begin:
-                    raise ConfigurationError(
-                        f"a ramp begins at {ramp.begin:g} and ends at {ramp.until:g} of the run; "
-                        "'until' must not be before 'begin'"
-                    )
-                rows.append((ramp.start, ramp.end - ramp.start, ramp.begin, 1.0 / max(ramp.until - ramp.begin, 1e-9)))
-            else:
-                rows.append((float(ramp), 0.0, 0.0, 0.0))
+        moving = [ramp if isinstance(ramp, Ramp) else Ramp(start=ramp, end=ramp) for ramp in ramps]
+        for ramp in moving:
+            if ramp.until < ramp.begin:
+                raise ConfigurationError(
+                    f"a ramp begins at {ramp.begin:g} and ends at {ramp.until:g} of the run; 'until' must not be before 'begin'"
+                )
+        rows = [(r.start, r.end - r.start, r.begin, 1.0 / max(r.until - r.begin, 1e-9)) for r in moving]
         start, change, begin, rate = torch.tensor(rows, dtype=torch.float32, device=device).reshape(-1, 4).unbind(1)
         self._start, self._change, self._begin, self._rate = (t.contiguous() for t in (start, change, begin, rate))
 

@@ -98,15 +98,9 @@ class EnvironmentStep:
         )
         self.rewards = RewardFunction(configuration.rewards, period, device)
         self.terminations = Terminations(configuration.termination)
-        make_commands = resolve_class(
-            configuration.commands.generator,
-            "environment.commands.generator",
-            CommandGenerator,
-            "draw",
-            "held_yaw_rate",
-        )
-        self.commands = make_commands(
-            configuration.commands,
+        drawn, where = configuration.commands, "environment.commands.generator"
+        self.commands = resolve_class(drawn.generator, where, CommandGenerator, "draw", "held_yaw_rate")(
+            drawn,
             terrain_limits=[tile.command_limits for tile in palette.tiles],
             terrain_ends=[tile.ends for tile in palette.tiles],
             control_period=period,
@@ -146,9 +140,8 @@ class EnvironmentStep:
         )
         self.uniform = UniformColumns(
             {
-                "noise": contract.frame_width,
-                **{"delay": 1, "place": 2, "spread": 1, "yaw": 1, "joints": joints, "twist": 6, "push": 5},
-                **{"level": 1, "variant": 1},
+                **{"noise": contract.frame_width, "delay": 1, "place": 2, "spread": 1, "yaw": 1, "joints": joints},
+                **{"twist": 6, "push": 5, "level": 1, "variant": 1},
                 **dict.fromkeys(MOTOR_COLUMNS, joints),
                 **COMMAND_COLUMNS,
             },

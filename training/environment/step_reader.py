@@ -33,15 +33,9 @@ class StepReader:
         scan: torch.Tensor,
         rasters: HeightRasters,
     ) -> None:
-        """Prepare constants.
-
-        Args:
-            kind: kind of tile of every world, (N,) int64.
-            scan: points of the height scan about the base [m], (P, 2).
-
-        Raises:
-            ConfigurationError: no point of the scan is below the trunk, or joint speeds of motors with an unknown no-load speed are
-                judged.
+        """Prepare constants; ``kind`` is the kind of tile of every world, (N,) int64, ``scan`` the points of the height scan about the base
+        [m], (P, 2). Raises ConfigurationError: no point of the scan is below the trunk, or joint speeds of motors with an unknown no-load
+        speed are judged.
         """
         self._settings, self._rasters = configuration.rewards, rasters
         self._joint_velocity_limit = configuration.termination.joint_velocity
@@ -79,9 +73,8 @@ class StepReader:
         self._sigma_growth = sigma - r.tracking_sigma
         levels = torch.arange(1, palette.num_levels + 1, device=device)
         self._difficulty = (torch.exp(levels * 0.1) - 1.0).clamp(max=1.0)
-        low = torch.tensor((r.sigma_linear_range[0], r.sigma_linear_range[0], r.sigma_yaw_range[0]), device=device)
-        high = torch.tensor((r.sigma_linear_range[1], r.sigma_linear_range[1], r.sigma_yaw_range[1]), device=device)
-        self._sigma_low, self._sigma_rate = low, 1.0 / (high - low)
+        rising = torch.tensor((r.sigma_linear_range, r.sigma_linear_range, r.sigma_yaw_range), device=device)
+        self._sigma_low, self._sigma_rate = rising[:, 0], 1.0 / (rising[:, 1] - rising[:, 0])
         leave = configuration.terrain.leave_distance
         distance = [leave if leave is not None and tile.ends else math.inf for tile in tiles]
         self._leave = torch.tensor(distance, device=device)[kind]
@@ -111,23 +104,15 @@ class StepReader:
 
     def _commanded_heading(self, memory: EnvironmentMemory, heading_xy: torch.Tensor) -> torch.Tensor:
         """Return ``StepInputs.commanded_heading_xy``, where ``heading_xy`` are the robots' own."""
-        along = self._settings.progress_along
-        if along == "base":
-            return heading_xy
-        if along == "command":
-            return memory.commanded_heading
-        return torch.where(memory.holds_heading[:, None], memory.commanded_heading, heading_xy)
+        if self._settings.progress_along == "straight":
+            return torch.where(memory.holds_heading[:, None], memory.commanded_heading, heading_xy)
+        return heading_xy if self._settings.progress_along == "base" else memory.commanded_heading
 
     def __call__(
         self, state: PhysicsState, memory: EnvironmentMemory, action: torch.Tensor, progress: torch.Tensor
     ) -> StepInputs:
-        """Return the inputs of rewards and terminations after a step.
-
-        Args:
-            state: physics after the step.
-            memory: state before it, and the counters of the step.
-            action: raw action of the step, (N, J).
-            progress: fraction of the run, scalar.
+        """Return the inputs of rewards and terminations after a step, from the physics after it, the memory of before it, with the counters
+        of the step, the raw action (N, J), and the fraction of the run, a scalar.
         """
         settings, base = self._settings, state.base_position_w
         velocity_b = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)

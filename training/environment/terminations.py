@@ -21,16 +21,6 @@ STUCK_SHORTFALL = 0.9
 Rule = Callable[[StepInputs, TerminationConfiguration], torch.Tensor]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Termination:
-    """A rule, and the kind of its end."""
-
-    rule: Rule
-    """Episodes that are over, (N,) bool."""
-    time_out: bool = False
-    """True if the end is no failure."""
-
-
 def time_out(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
     """Return True where the longest episode is over."""
     return inputs.episode_length >= inputs.max_episode_length
@@ -68,15 +58,9 @@ def diverged(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Te
     return inputs.diverged
 
 
-TERMINATIONS: dict[str, Termination] = {
-    "time_out": Termination(rule=time_out, time_out=True),
-    "left_tile": Termination(rule=left_tile, time_out=True),
-    "trunk_contact": Termination(rule=trunk_contact),
-    "tilt": Termination(rule=tilt),
-    "stuck": Termination(rule=stuck),
-    "diverged": Termination(rule=diverged),
-}
-"""All rules by name. A rule is left out where its setting, of the same name, is None; ``own`` adds more."""
+_TIME_OUTS = (time_out, left_tile)
+TERMINATIONS: dict[str, Rule] = {f.__name__: f for f in (*_TIME_OUTS, trunk_contact, tilt, stuck, diverged)}
+"""All rules by name: time-outs, then failures. A rule is left out where its setting, of the same name, is None; ``own`` adds more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,13 +79,9 @@ class Terminations:
     """The rules in use."""
 
     def __init__(self, configuration: TerminationConfiguration) -> None:
-        """Choose the rules.
-
-        Raises:
-            ConfigurationError: a rule of one's own is not there.
-        """
+        """Choose the rules. Raises ConfigurationError: a rule of one's own is not there."""
         self._settings = configuration
-        used = {name: t for name, t in TERMINATIONS.items() if getattr(configuration, name, True) is not None}
+        used = {name: rule for name, rule in TERMINATIONS.items() if getattr(configuration, name, True) is not None}
         own = resolve_own(
             configuration.own,
             "environment.termination.own",
@@ -109,11 +89,12 @@ class Terminations:
             gives=lambda inputs, found: found.shape == inputs.command.shape[:1] and found.dtype is torch.bool,
             rule="it must be true or false for each world, (N,) bool",
         )
-        used |= {t.name: Termination(rule=own[t.name], time_out=t.time_out) for t in configuration.own}
+        time_outs = {*(f.__name__ for f in _TIME_OUTS), *(term.name for term in configuration.own if term.time_out)}
         # Time-outs first, so that each sort is neighbouring columns.
-        self.names: tuple[str, ...] = tuple(sorted(used, key=lambda name: not used[name].time_out))
-        self._rules = [used[name].rule for name in self.names]
-        self._time_outs = sum(t.time_out for t in used.values())
+        rules = dict(sorted((used | own).items(), key=lambda rule: rule[0] not in time_outs))
+        self.names: tuple[str, ...] = tuple(rules)
+        self._rules = list(rules.values())
+        self._time_outs = len(time_outs)
 
     def __call__(self, inputs: StepInputs) -> Ends:
         """Return the ends of every world's episode, and set ``inputs.failed``."""

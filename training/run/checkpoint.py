@@ -21,20 +21,11 @@ from pydantic import Field
 
 from ...files.parsing import Count, Text, build, edited, one_line, shown
 from ...files.writing import replacing
+from ...policy import native
 from ...policy.base import PolicyError
 from ...policy.contract import PolicyContract
 from ...policy.foreign.fence.archive import read_limited
 from ...policy.loading import file_kind
-from ...policy.native import (
-    FORMAT,
-    ForeignFile,
-    StoredNetwork,
-    checksum,
-    is_policy,
-    load_entries,
-    policy_entries,
-    read_policy,
-)
 from ..algorithms.bootstrap import iterations_left
 
 TRAINING_VERSION = 1
@@ -44,14 +35,16 @@ class CheckpointError(RuntimeError):
     """A checkpoint cannot be written or does not fit the run; the message says which file, why, and what to do."""
 
 
-def checkpoint_entries(contract: PolicyContract, network: StoredNetwork, extra: Mapping[str, Any]) -> dict[str, Any]:
+def checkpoint_entries(
+    contract: PolicyContract, network: native.StoredNetwork, extra: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return the dictionary of a checkpoint: the entries of a policy file, and ``extra``.
 
     Raises:
         CheckpointError: ``extra`` holds something other than tensors and plain data, or takes a name of the policy
         format.
     """
-    entries = policy_entries(contract, network)
+    entries = native.policy_entries(contract, network)
     if taken := entries.keys() & extra.keys():
         raise CheckpointError(
             f"A checkpoint entry cannot be named {', '.join(sorted(taken))}: the policy format uses these names."
@@ -84,19 +77,15 @@ def write_checkpoint(path: Path, entries: Mapping[str, Any]) -> None:
     Raises:
         CheckpointError: the file cannot be written, for example because the disk is full.
     """
-    policy = entries.get("format") == FORMAT
+    policy = entries.get("format") == native.FORMAT
     buffer = io.BytesIO()
-    torch.save({**entries, "checksum": checksum(entries)} if policy else dict(entries), buffer)
+    torch.save({**entries, "checksum": native.checksum(entries)} if policy else dict(entries), buffer)
     with _whole(path) as partial:
         partial.write_bytes(buffer.getbuffer())
 
 
 def copy_checkpoint(source: Path, target: Path) -> None:
-    """Make ``target`` a copy of ``source``, whole or not at all.
-
-    Raises:
-        CheckpointError: it cannot be read or written.
-    """
+    """Make ``target`` a copy of ``source``, whole or not at all. Raises CheckpointError: it cannot be read or written."""
     with _whole(target) as partial:
         shutil.copyfile(source, partial)
 
@@ -128,7 +117,7 @@ def read_checkpoint(path: str | Path, *, training_state: bool = True, purpose: s
     cannot = f"Cannot {purpose} '{one_line(path)}': it"
     entries = _load(Path(path), purpose)
     training = entries.get("training")
-    policy = is_policy(entries)
+    policy = native.is_policy(entries)
     if policy:
         _check_policy(entries, str(path), purpose)
     if not training_state and training is None and policy:
@@ -198,7 +187,7 @@ def _load(file: Path, purpose: str) -> dict[str, Any]:
     try:
         data = read_limited(file)
         kind = file_kind(data, str(file))
-        entries = dict(load_entries(data, source=str(file))) if kind == "torch" else None
+        entries = dict(native.load_entries(data, source=str(file))) if kind == "torch" else None
     except PolicyError as error:
         raise CheckpointError(f"Cannot {purpose.partition(' ')[0]}: {error}.") from error
     if entries is None:
@@ -212,10 +201,10 @@ def _load(file: Path, purpose: str) -> dict[str, Any]:
 def _check_policy(entries: Mapping[str, Any], source: str, purpose: str) -> None:
     """Refuse a checkpoint with a damaged policy, or with a program: training goes on with weights."""
     try:
-        _, network = read_policy(entries, source=source)
+        _, network = native.read_policy(entries, source=source)
     except PolicyError as error:
         raise CheckpointError(f"Cannot {purpose.partition(' ')[0]}: {error}.") from error
-    if isinstance(network, ForeignFile):
+    if isinstance(network, native.ForeignFile):
         raise CheckpointError(
             f"Cannot {purpose} '{one_line(source)}': it carries a program ({network.kind}), not weights, which is all that training "
             "takes; --trust changes nothing in that."
@@ -262,7 +251,7 @@ def write_apart(source: str | Path, destination: Path) -> None:
         name: entries[name] for name in ("critic_state_dict", "iter", "bootstrap", "training") if name in entries
     }
     write_checkpoint(destination, whole)
-    write_checkpoint(training_part(destination), {"policy": checksum(entries), "actor_state_dict": more, **rest})
+    write_checkpoint(training_part(destination), {"policy": native.checksum(entries), "actor_state_dict": more, **rest})
 
 
 def _with_training_part(entries: dict[str, Any], path: Path, cannot: str) -> dict[str, Any]:
@@ -275,7 +264,7 @@ def _with_training_part(entries: dict[str, Any], path: Path, cannot: str) -> dic
     if part == path or not part.is_file():
         return entries
     beside = _load(part, "start from")
-    if beside.get("policy") != checksum(entries):
+    if beside.get("policy") != native.checksum(entries):
         raise CheckpointError(f"{cannot} is not the policy that '{one_line(part)}' belongs to; move that file away.")
     with edited(f"Cannot start from '{path}': '{one_line(part)}' beside it", CheckpointError, RuntimeError):
         student = {f"student.{name}": value for name, value in entries["state_dict"].items()}
@@ -283,14 +272,9 @@ def _with_training_part(entries: dict[str, Any], path: Path, cannot: str) -> dic
 
 
 def trim_checkpoint(source: str | Path, destination: Path, *, raw: bool = False) -> None:
-    """Write a checkpoint's networks without the state for resuming: a policy file from which training can begin anew (``--init-from``),
-    with its teacher and its critic.
-
-    Args:
-        raw: the weights after the last update instead of their average.
-
-    Raises:
-        CheckpointError: ``source`` is no training checkpoint, or the destination cannot be written.
+    """Write a checkpoint's averaged networks, or ``raw`` ones after the last update, without the state for resuming: a policy file from
+    which training can begin anew (``--init-from``), with its teacher and its critic. Raises CheckpointError: ``source`` is no training
+    checkpoint, or the destination cannot be written.
     """
     entries = read_checkpoint(source, purpose="use")
     with edited(f"Cannot use '{source}': it", CheckpointError, RuntimeError):

@@ -35,11 +35,8 @@ class Filmer:
     def take(
         self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False
     ) -> tuple[list[tuple[Path, int]], str]:
-        """Return videos that were finished since the last call, with their iterations; and a sentence for people, if there is one.
-
-        Args:
-            seconds: longest wait for those that are pending [s].
-            stop: says when to wait no longer.
+        """Return videos that were finished since the last call, with their iterations; and a sentence for people, if there is one. Those
+        that are pending are waited for, at most ``seconds`` [s], until ``stop`` says so.
         """
         films, sentence = [], ""
         for finished in self._side.drain(seconds, stop):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import torch
 
+from ...files.provenance import provenance
 from ...files.writing import LOCK, lock_folder
 from ...policy.finding import shipped_policies
 from ..algorithms.symmetry import build_mirror
@@ -22,7 +25,7 @@ from .checkpoint import CheckpointError
 from .filming import Filmer
 from .plan import TrainPlan
 from .resuming import begin_with, resume_run
-from .run_directory import describe_run, new_run_directory, read_run_json, update_run_json, write_parameters
+from .run_directory import new_run_directory, read_run_json, update_run_json, write_parameters
 from .runner import TrainingRunner
 from .scoring import Scorer
 from .seeding import seed_everything
@@ -172,30 +175,22 @@ def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment) -> None:
     """Write the run's parameters and ``run.json``; a resume is noted there."""
     task = plan.task
     write_parameters(run, environment=task.environment, agent=task.training)
-    description = describe_run(
-        task=task.name,
-        backend=plan.backend,
-        num_envs=task.environment.num_envs,
-        seed=task.training.run.seed,
-        device=plan.device,
-        contract=env.contract,
-    )
-    earlier = read_run_json(run)
-    if earlier:
-        note = {
-            "started": description["started"],
-            "checkpoint": plan.checkpoint.name if plan.checkpoint else "",
-            "command": description["command"],
-        }
-        of_its_begin = ("started", "date", "command")
-        update_run_json(
-            run,
-            {k: v for k, v in description.items() if k not in of_its_begin}
-            | {"settings": plan.settings, "resumed": [*earlier.get("resumed", []), note]},
-        )
+    description = {
+        "task": task.name,
+        "backend": plan.backend,
+        "num_envs": task.environment.num_envs,
+        "seed": task.training.run.seed,
+        "started": f"{datetime.now().astimezone():%Y-%m-%dT%H:%M:%S%z}",
+        "contract_hash": env.contract.hash,
+        **provenance(command=sys.argv, device=plan.device),
+        "settings": plan.settings,
+    }
+    if earlier := read_run_json(run):
+        checkpoint = plan.checkpoint.name if plan.checkpoint else ""
+        note = {"started": description["started"], "checkpoint": checkpoint, "command": description["command"]}
+        description = {k: v for k, v in description.items() if k not in ("started", "date", "command")}
+        update_run_json(run, description | {"resumed": [*earlier.get("resumed", []), note]})
         return
     shipped = plan.request.init_from in shipped_policies()  # known by its name wherever it is installed
     begun_with = plan.checkpoint or (plan.request.init_from if shipped else plan.weights)
-    update_run_json(
-        run, description | {"settings": plan.settings, "begun_with": str(begun_with) if begun_with else None}
-    )
+    update_run_json(run, description | {"begun_with": str(begun_with) if begun_with else None})

@@ -26,11 +26,7 @@ _SERVICES: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 
 def check_logger(name: str) -> None:
-    """Refuse a logger that cannot work here.
-
-    Raises:
-        ConfigurationError: its package is not installed, or it has no account to use.
-    """
+    """Refuse a logger that cannot work here. Raises ConfigurationError: its package is not installed, or it has no account to use."""
     if name not in _SERVICES:
         return
     spec = importlib.util.find_spec(name)
@@ -83,14 +79,7 @@ class RunLogger:
         device: str,
         has_teacher: bool = True,
     ) -> None:
-        """Prepare; without a writer nothing is written.
-
-        Args:
-            configuration: steps of an iteration, and every which environment is a student's.
-            num_envs: environments of this process.
-            device: of the environments' rewards.
-            has_teacher: whether a teacher acts in the other environments.
-        """
+        """Prepare for ``num_envs`` environments of this process; without a writer nothing is written."""
         steps = configuration.run.steps_per_iteration
         self.writer: Any = None
         self.total_steps = 0
@@ -238,13 +227,8 @@ class RunLogger:
         }
 
     def load_state_dict(self, state: Mapping[str, Any], *, running: bool) -> None:
-        """Take over a ``state_dict``.
-
-        Args:
-            running: whether the environments' episodes run on; theirs are then taken over too.
-
-        Raises:
-            LookupError, TypeError, ValueError, AttributeError: it is no such state.
+        """Take over a ``state_dict``, with that of the environments' episodes where they are ``running`` on. Raises LookupError, TypeError,
+        ValueError, AttributeError: it is no such state.
         """
         self.total_steps = int(state["total_steps"])
         self.total_time = float(state["total_time"])

@@ -1,7 +1,7 @@
 """Check a request for a training before anything is built or written.
 
-A run has one of three beginnings, each a pure function from the request to a ``TrainPlan``: ``new_run``, ``run_with_weights``
-(``--init-from``) and ``resumed_run`` (``--resume``).
+A run begins with untrained networks, or in one of two other ways, each a pure function from the request to a ``TrainPlan``:
+``run_with_weights`` (``--init-from``) and ``resumed_run`` (``--resume``).
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ class TrainPlan:
     task: Task
     backend: str
     device: str
-    checkpoint: Path | None
-    """Checkpoint that the run continues; None for a new run."""
-    run: Path | None
-    """Run directory that the run continues; None to make a new one."""
-    weights: Path | None
-    """File with the first networks of a new run; None for untrained ones."""
     needs_trust: bool
     """True if a later resume imports functions that the task does not name: it needs ``trust`` or their names again."""
     settings: Mapping[str, Any]
     """Backend and resolved configuration, kept in every checkpoint: a later resume builds the same run from them."""
+    checkpoint: Path | None = None
+    """Checkpoint that the run continues; None for a new run."""
+    run: Path | None = None
+    """Run directory that the run continues; None to make a new one."""
+    weights: Path | None = None
+    """File with the first networks of a new run; None for untrained ones."""
     notice: str = ""
     """Sentence to print before the run begins, empty for none."""
 
@@ -77,12 +77,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         return resumed_run(request, request.resume)
     if request.init_from is not None:
         return run_with_weights(request, request.init_from)
-    return new_run(request)
-
-
-def new_run(request: TrainRequest) -> TrainPlan:
-    """Plan a run with untrained networks."""
-    return _checked_plan(request, _named_task(request), backend=request.backend or DEFAULT_BACKEND)
+    return _checked_plan(request, _named_task(request), request.backend or DEFAULT_BACKEND)
 
 
 def run_with_weights(request: TrainRequest, choice: str) -> TrainPlan:
@@ -91,14 +86,18 @@ def run_with_weights(request: TrainRequest, choice: str) -> TrainPlan:
     weights = _first_weights(request, choice, named).absolute()
     entries = read_checkpoint(weights, training_state=False, purpose="start from")
     check_network(weights, entries, named, "start")
-    task = _named_task(request, _settings_to_go_on(named, entries))
+    # Schedules go on where the earlier training stopped, robots that can walk start on all levels, steps are smaller, and a policy
+    # without its exploration noise gets little. Settings of the request come after these.
+    highest = f"environment.terrain.highest_start_level={named.environment.terrain.levels - 1}"
+    task = _named_task(request, (f"environment.schedule.begin={reached(entries):g}", highest, *_SMALL_STEPS))
     notice = ""
     if "training" not in entries:
         notice = (
             f"'{choice}' holds no teacher and no critic: the first {named.training.run.bootstrap_iterations} iterations find "
             "them for it (training.run.bootstrap_iterations)"
         )
-    return _checked_plan(request, task, backend=request.backend or DEFAULT_BACKEND, weights=weights, notice=notice)
+    plan = _checked_plan(request, task, request.backend or DEFAULT_BACKEND)
+    return replace(plan, weights=weights, notice=notice)
 
 
 def resumed_run(request: TrainRequest, choice: str) -> TrainPlan:
@@ -122,21 +121,11 @@ def resumed_run(request: TrainRequest, choice: str) -> TrainPlan:
         raise ConfigurationError(
             f"the run has done {iteration} of {wanted} iterations; to go on, give a larger --iterations"
         )
-    notice = "; ".join(filter(None, (branched, moved)))
-    backend = request.backend or backend
-    return _checked_plan(request, task, backend=backend, checkpoint=checkpoint, run=run, notice=notice)
+    plan = _checked_plan(request, task, request.backend or backend)
+    return replace(plan, checkpoint=checkpoint, run=run, notice="; ".join(filter(None, (branched, moved))))
 
 
-def _checked_plan(
-    request: TrainRequest,
-    task: Task,
-    *,
-    backend: str,
-    checkpoint: Path | None = None,
-    run: Path | None = None,
-    weights: Path | None = None,
-    notice: str = "",
-) -> TrainPlan:
+def _checked_plan(request: TrainRequest, task: Task, backend: str) -> TrainPlan:
     """Check the parts that all three beginnings share."""
     _check_rollout(task)
     check_logger(task.training.run.logger)
@@ -151,12 +140,8 @@ def _checked_plan(
         task=replace(task, training=replace(task.training, run=_of_this_command(request, task.training.run))),
         backend=backend,
         device=device,
-        checkpoint=checkpoint,
-        run=run,
-        weights=weights,
         needs_trust=bool(foreign),
         settings=settings,
-        notice=notice,
     )
 
 
@@ -190,9 +175,6 @@ def _check_rollout(task: Task) -> None:
         )
 
 
-# A run that begins with weights
-
-
 def _first_weights(request: TrainRequest, choice: str, task: Task) -> Path:
     """Return the file with the first networks: a policy that ships with the project, or a choice as of ``--resume``."""
     shipped = shipped_policies()
@@ -200,22 +182,6 @@ def _first_weights(request: TrainRequest, choice: str, task: Task) -> Path:
         return find_policy(choice)
     experiment = task.training.run.experiment
     return find_checkpoint(choice, experiment=experiment, root=request.log_root, others=tuple(shipped))
-
-
-def _settings_to_go_on(task: Task, entries: Mapping[str, Any]) -> list[str]:
-    """Return settings for trained networks; those of the request come after them.
-
-    Schedules go on where the earlier training stopped, robots that can walk start on all levels, steps are smaller, and a policy without
-    its exploration noise gets little.
-    """
-    return [
-        f"environment.schedule.begin={reached(entries):g}",
-        f"environment.terrain.highest_start_level={task.environment.terrain.levels - 1}",
-        *_SMALL_STEPS,
-    ]
-
-
-# A resumed run
 
 
 def _own_directory(checkpoint: Path, task: str) -> Path | None:
@@ -235,10 +201,7 @@ def _last_of_its_run(run: Path | None, iteration: int) -> tuple[Path | None, str
     reached = 0 if last is None else int(last.stem.rpartition("_")[2])
     if reached <= iteration:
         return run, ""
-    return (
-        None,
-        f"'{run}' has gone on to iteration {reached}: what comes of {iteration} has a run directory of its own",
-    )
+    return None, f"'{run}' has gone on to iteration {reached}: what comes of {iteration} has a run directory of its own"
 
 
 def _stored_task(entries: Mapping[str, Any], checkpoint: Path, name: str) -> tuple[Task, str, int]:

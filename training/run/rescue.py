@@ -1,8 +1,4 @@
-"""Keep the last good state of a run of several processes in the host's memory, and write it when one of them is lost.
-
-A GPU that waits for a message from a lost process answers no more, so its memory is copied out after every iteration; the copy runs while
-the next rollout begins.
-"""
+"""Write the last good state of a run of several processes when one of them is lost."""
 
 from __future__ import annotations
 
@@ -27,8 +23,7 @@ class Rescue:
 
     def __init__(self, run: RunState) -> None:
         """Keep nothing yet."""
-        self._run = run
-        self.keepsake = Keepsake()
+        self._run, self.keepsake = run, Keepsake()
 
     def keep(self) -> None:
         """Copy the run's networks, optimizers and averages after an iteration, if another process may be lost."""
@@ -38,14 +33,8 @@ class Rescue:
 
     def write(self, error: ProcessLostError, begin: float) -> ProcessLostError:
         """Write the checkpoint; the first process that is left does it, and returns the error that says so, unless the lost process
-        diverged and has reported that.
-
-        Args:
-            error: of the lost process.
-            begin: value of ``time.monotonic()`` when this call of ``learn`` began.
-
-        Raises:
-            SystemExit: another process has written the checkpoint or reported the reason.
+        diverged and has reported that. ``begin`` is ``time.monotonic()`` of when this call of ``learn`` began. Raises SystemExit: another
+        process has written the checkpoint or reported the reason.
         """
         run = self._run
         time.sleep(float(run.processes.rank))
@@ -76,15 +65,12 @@ class Rescue:
         run = self._run
         # The device's own stream may wait for the lost process forever; the environment is not touched by that.
         on_gpu = torch.device(run.device).type == "cuda"
-        aside = torch.cuda.stream(torch.cuda.Stream(run.device)) if on_gpu else nullcontext()
-        with aside:
+        with torch.cuda.stream(torch.cuda.Stream(run.device)) if on_gpu else nullcontext():
             local = {"num_envs": run.env.num_envs, "log": run.logger.state_dict(), "world_size": 0}
             if hasattr(run.env, "progress_dict"):
                 local["environment"] = run.env.progress_dict()
             write_learned(run, path, learned, local)
 
     def _record_loss(self, checkpoint: Path | None) -> None:
-        outcome = TrainingOutcome(
-            reason="lost a process", iteration=self._run.iteration, checkpoint=checkpoint, exit_code=2
-        )
-        self._run.record(outcome)
+        reason, iteration = "lost a process", self._run.iteration
+        self._run.record(TrainingOutcome(reason=reason, iteration=iteration, checkpoint=checkpoint, exit_code=2))

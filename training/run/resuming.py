@@ -19,19 +19,8 @@ from ..algorithms.bootstrap import iterations_left
 from ..algorithms.methods import find_method
 from ..networks import Widths, command_entries
 from ..tasks import Task
-from .checkpoint import (
-    TRAINING_VERSION,
-    CheckpointError,
-    RunNumbers,
-    checkpoint_entries,
-    learned_networks,
-    rank_file,
-    read_checkpoint,
-    read_rank,
-    run_numbers,
-    student_state,
-    write_checkpoint,
-)
+from . import checkpoint
+from .checkpoint import CheckpointError, RunNumbers
 from .keepsake import host_copy
 from .run_directory import read_run_json
 from .seeding import random_state, restore_random_state
@@ -51,7 +40,7 @@ def intact_checkpoint(run: Path | None) -> str:
 def stored_network(run: RunState, average: Mapping[str, Any] | None = None) -> StoredNetwork:
     """Return the student as it is deployed: with averaged weights."""
     actor = run.alg.actor
-    weights = student_state((average or run.average.state_dict())["actor_state_dict"])
+    weights = checkpoint.student_state((average or run.average.state_dict())["actor_state_dict"])
     return StoredNetwork(architecture=actor.architecture, arguments=actor.arguments, state_dict=weights)
 
 
@@ -72,7 +61,7 @@ def save_run(run: RunState, path: Path) -> None:
     if run.processes.several:
         local["written"] = f"{run.learning} {run.iteration}"
     if run.processes.rank != 0:
-        write_checkpoint(rank_file(path, run.processes.rank), local)
+        checkpoint.write_checkpoint(checkpoint.rank_file(path, run.processes.rank), local)
         return
     learned = host_copy(run.learned(), run.device)
     write_learned(run, path, learned, local | {"world_size": run.processes.count})
@@ -93,7 +82,7 @@ def write_learned(run: RunState, path: Path, learned: Mapping[str, Any], local: 
             )
     training = {
         **local,
-        "version": TRAINING_VERSION,
+        "version": checkpoint.TRAINING_VERSION,
         "task": run.task,
         "settings": run.settings,
         "progress": float(getattr(run.env, "progress", 1.0)),
@@ -108,7 +97,9 @@ def write_learned(run: RunState, path: Path, learned: Mapping[str, Any], local: 
     }
     contract = replace(run.contract, provenance=provenance)
     extra = {**learned, "iter": run.iteration, "infos": None, "training": training}
-    write_checkpoint(path, checkpoint_entries(contract, stored_network(run, learned["average"]), extra))
+    checkpoint.write_checkpoint(
+        path, checkpoint.checkpoint_entries(contract, stored_network(run, learned["average"]), extra)
+    )
 
 
 def resume_run(run: RunState, path: Path) -> None:
@@ -121,8 +112,8 @@ def resume_run(run: RunState, path: Path) -> None:
     Raises:
         CheckpointError: damaged, of another task, contract, network or number of environments.
     """
-    entries = read_checkpoint(path)
-    numbers = run_numbers(entries, path)
+    entries = checkpoint.read_checkpoint(path)
+    numbers = checkpoint.run_numbers(entries, path)
     _check_fits(run, path, entries, numbers)
     with edited(f"Cannot resume from '{path}': its training state", CheckpointError, RuntimeError):
         whole = _take_over(run, path, entries, numbers)
@@ -154,7 +145,7 @@ def _take_over(run: RunState, path: Path, entries: Mapping[str, Any], numbers: R
     local: Mapping[str, Any] | None = None
     if numbers.world_size == run.processes.count:
         rank = run.processes.rank
-        local = read_rank(path, rank, training.get("written")) if rank else training
+        local = checkpoint.read_rank(path, rank, training.get("written")) if rank else training
     if local is not None:
         run.fresh = not (_load_environment(run, path, local["environment"]) and _runs_on(run, local))
         restore_random_state(_table(local["random"]), run.device)
@@ -185,7 +176,7 @@ def begin_with(run: RunState, path: Path) -> None:
     Raises:
         CheckpointError: damaged, of other joints or another observation, or of other networks.
     """
-    entries = read_checkpoint(path, training_state=False, purpose="start from")
+    entries = checkpoint.read_checkpoint(path, training_state=False, purpose="start from")
     with edited(f"Cannot start from '{path}': it", CheckpointError, RuntimeError):
         _begin(run, path, entries)
 
@@ -206,7 +197,7 @@ def _begin(run: RunState, path: Path, entries: Mapping[str, Any]) -> None:
         if bare:
             run.alg.actor.student.load_state_dict(entries["state_dict"])
         else:
-            run.alg.load(learned_networks(entries), optimizers=False)
+            run.alg.load(checkpoint.learned_networks(entries), optimizers=False)
         run.alg.follow_student(left)
     except (RuntimeError, KeyError, ValueError) as error:
         raise _misfit("start", path, error) from error
@@ -277,11 +268,7 @@ def _check_fits(run: RunState, path: Path, entries: Mapping[str, Any], numbers: 
 
 
 def check_environments(path: Path, theirs: int, mine: int) -> None:
-    """Refuse to resume a checkpoint of another number of environments in each process.
-
-    Raises:
-        CheckpointError: it is.
-    """
+    """Refuse to resume a checkpoint of another number of environments in each process. Raises CheckpointError: it is."""
     if theirs != mine:
         raise CheckpointError(
             f"Cannot resume from '{path}': it has {theirs} environments in each process, this run {mine}; leave --num-envs and "

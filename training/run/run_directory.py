@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,9 +18,7 @@ import yaml
 from pydantic import Field
 
 from ...files.parsing import NotNegative, Text, one_line, read_results, take
-from ...files.provenance import provenance
 from ...files.writing import json_text, make_folder, write_atomically
-from ...policy.contract import PolicyContract
 from ...policy.finding import LOG_ROOT, latest_checkpoint
 from ..configuration import to_plain
 from .checkpoint import CheckpointError
@@ -101,20 +98,6 @@ def write_parameters(run: Path, *, environment: Any, agent: Any) -> None:
         write_atomically(folder / f"{name}.yaml", text, CheckpointError)
 
 
-def describe_run(
-    *, task: str, backend: str, num_envs: int, seed: int, device: str, contract: PolicyContract
-) -> dict[str, Any]:
-    """Return the entries of ``run.json`` on the place and the parts of a run."""
-    return {
-        "task": task,
-        "backend": backend,
-        "num_envs": num_envs,
-        "seed": seed,
-        "started": f"{datetime.now().astimezone():%Y-%m-%dT%H:%M:%S%z}",
-        "contract_hash": contract.hash,
-    } | provenance(command=sys.argv, device=device)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Noted:
     """Entries that readers of a ``run.json`` rely on."""
@@ -130,11 +113,7 @@ class _Noted:
 
 
 def read_run_json(run: Path) -> dict[str, Any]:
-    """Return the entries of a run directory's ``run.json``, none if there is no such file.
-
-    Raises:
-        CheckpointError: it is damaged.
-    """
+    """Return the entries of a run directory's ``run.json``, none if there is no such file. Raises CheckpointError: it is damaged."""
     path = run / "run.json"
     if not path.exists():
         return {}
@@ -160,10 +139,6 @@ def refuse_links(run: Path) -> None:
 
 
 def update_run_json(run: Path, changes: Mapping[str, Any]) -> None:
-    """Merge entries into ``run.json``, creating it if needed.
-
-    Raises:
-        CheckpointError: it is damaged or cannot be written.
-    """
+    """Merge entries into ``run.json``, creating it if needed. Raises CheckpointError: it is damaged or cannot be written."""
     data = read_run_json(run) | to_plain(changes)
     write_atomically(run / "run.json", json_text(data), CheckpointError)

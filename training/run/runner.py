@@ -203,11 +203,8 @@ class TrainingRunner(RunState):
         """Return the reason to stop now, an empty text to go on; it is the same in every process, or they would wait for each other
         forever.
         """
-        code = 0
-        if max_seconds is not None and time.monotonic() - begin >= max_seconds:
-            code = 1
-        if signals.received is not None:
-            code = 2
+        late = max_seconds is not None and time.monotonic() - begin >= max_seconds
+        code = 2 if signals.received is not None else int(late)
         return ("", "time", "signal")[self.processes.largest(code)]
 
     def _save_and_show(self, written: Path | None, *, last: bool) -> Path | None:

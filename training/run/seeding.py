@@ -26,15 +26,10 @@ def random_state(device: torch.device | str) -> dict[str, Any]:
     """Return the states of the global generators of Python, NumPy and PyTorch (CPU and ``device``), as tensors and plain data."""
     version, words, gauss = random.getstate()
     name, keys, position, has_gauss, cached = np.random.get_state()  # type: ignore[misc]
+    words_of_numpy = np.asarray(keys).astype(np.int64)
     state: dict[str, Any] = {
         "python": [version, list(words), gauss],
-        "numpy": [
-            str(name),
-            torch.from_numpy(np.asarray(keys).astype(np.int64)),
-            int(position),
-            int(has_gauss),
-            float(cached),
-        ],
+        "numpy": [str(name), torch.from_numpy(words_of_numpy), int(position), int(has_gauss), float(cached)],
         "torch": torch.get_rng_state(),
     }
     if torch.device(device).type == "cuda":

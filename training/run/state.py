@@ -7,7 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import torch
 from rsl_rl.env import VecEnv
 
 from ...policy.contract import PolicyContract
@@ -60,12 +59,8 @@ class RunState:
         Raises:
             ConfigurationError: environment and settings do not fit together.
         """
-        self.env = env
-        self.configuration = configuration
-        self.contract = contract
-        self.task = task
-        self.log_dir = log_dir
-        self.device = device
+        self.env, self.configuration, self.contract, self.task = env, configuration, contract, task
+        self.log_dir, self.device = log_dir, device
         self.processes = processes or Processes()
         self.settings = dict(settings or {})
         self.message = message or (lambda _: None)
@@ -79,10 +74,7 @@ class RunState:
             device=device,
             processes=self.processes,
         )
-        networks: dict[str, torch.nn.Module] = {
-            "actor_state_dict": self.alg.actor,
-            "critic_state_dict": self.alg.critic,
-        }
+        networks: dict[str, Any] = {"actor_state_dict": self.alg.actor, "critic_state_dict": self.alg.critic}
         self.average = WeightAverage(networks, age=configuration.run.average_age)
         self.logger = RunLogger(
             configuration,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 STOP_SIGNALS = tuple(known for known in signal.Signals if known.name in ("SIGTERM", "SIGINT", "SIGHUP"))
@@ -50,16 +50,10 @@ class StopSignals:
     """
 
     def __init__(self, message: Callable[[str], None], *, interrupts: bool = True) -> None:
-        """Prepare.
-
-        Args:
-            message: called with a sentence; where it cannot be printed, it is lost.
-            interrupts: whether a second SIGINT raises KeyboardInterrupt; otherwise it sets ``insisted``.
-        """
+        """Prepare; a ``message`` that cannot be printed is lost. A second SIGINT raises KeyboardInterrupt, or else sets ``insisted``."""
         self.received: int | None = None
         self.insisted = False
-        self._message = message
-        self._interrupts = interrupts
+        self._message, self._interrupts = message, interrupts
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
@@ -70,9 +64,7 @@ class StopSignals:
                     self._previous[number] = signal.signal(number, self._handle)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,8 +86,8 @@ def work_through(
         if keep.samefile(folder):
             raise SweepError(f"--keep is '{keep}', the sweep's own folder; give another one")
         keep = keep.absolute()
-    lock = lock_folder(folder, SweepError)
-    try:
+    with ExitStack() as closing:
+        closing.callback(lock_folder(folder, SweepError).release)
         runs, refused = plan_runs(sweep, folder, to_train=not report)
         if not runs and len(set(refused.values())) == 1:
             raise SweepError(next(iter(refused.values())))
@@ -108,8 +108,6 @@ def work_through(
             outcome = jobs.work([] if report else runs)
         found = fold_sweep(sweep, runs, refused, outcome.failures, folder)
         kept = None if keep is None else _keep(sweep, runs, keep, _failures(runs, found))
-    finally:
-        lock.release()
     return SweepCall(runs=runs, refused=refused, outcome=outcome, found=found, kept=kept)
 
 

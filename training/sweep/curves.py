@@ -61,20 +61,18 @@ def learning_curves(run: Path) -> dict[str, Curve]:
 
 
 def curves_csv(curves: Mapping[tuple[str, int], Mapping[str, Curve]]) -> str:
-    """A row for each point: entry, seed, figure, environment steps and value."""
-    rows: list[Sequence[object]] = [("entry", "seed", "figure", "environment_steps_millions", "value")]
-    for (entry, seed), figures in curves.items():
-        for figure, points in figures.items():
-            rows += [(entry, seed, figure, f"{x:.6g}", f"{y:.6g}") for x, y in zip(*points, strict=True)]
-    return csv_text(rows)
+    """Return a row for each point: entry, seed, figure, environment steps and value."""
+    rows = [(*run, *row) for run, figures in curves.items() for row in _rows(figures)]
+    return csv_text([("entry", "seed", *_KEPT_HEAD), *rows])
 
 
 def kept_curves_csv(curves: Mapping[str, Curve]) -> str:
-    """A row for each point of one run's curves: figure, environment steps and value."""
-    rows: list[Sequence[object]] = [_KEPT_HEAD]
-    for figure, points in curves.items():
-        rows += [(figure, f"{x:.6g}", f"{y:.6g}") for x, y in zip(*points, strict=True)]
-    return csv_text(rows)
+    """Return a row for each point of one run's curves: figure, environment steps and value."""
+    return csv_text([_KEPT_HEAD, *_rows(curves)])
+
+
+def _rows(curves: Mapping[str, Curve]) -> list[tuple[str, str, str]]:
+    return [(name, f"{x:.6g}", f"{y:.6g}") for name, points in curves.items() for x, y in zip(*points, strict=True)]
 
 
 def _read_curves(path: Path) -> dict[str, Curve]:

@@ -86,11 +86,7 @@ class Sweep:
 
 
 def load_sweep(path: Path) -> Sweep:
-    """Read a sweep's file.
-
-    Raises:
-        SweepError: no such file, no valid TOML, a field that does not fit, or no such suite.
-    """
+    """Read a sweep's file. Raises SweepError: no such file, no valid TOML, a field that does not fit, or no such suite."""
     source = f"sweep file '{one_line(path)}'"
     sweep = build(Sweep, parse_toml(read_text(path, "sweep file", SweepError), source, SweepError), source, SweepError)
     scores = {} if sweep.training_suite == NO_SUITE else {"training_suite": sweep.training_suite}

@@ -117,9 +117,7 @@ def _entry(name: str, rows: Sequence[Mapping[str, Any]], refused: str | None) ->
         "mean": statistics.fmean(scores) if scores else None,
         "deviation": statistics.stdev(scores) if len(scores) > 1 else None,
         "range": [scores[0], scores[-1]] if len(scores) > 1 else None,
-        "best": {k: best[k] for k in ("seed", "score", "score_interval", "level", "groups", "results")}
-        if best
-        else None,
+        "best": best and {k: best[k] for k in ("seed", "score", "score_interval", "level", "groups", "results")},
     }
 
 

@@ -35,13 +35,8 @@ def check_keep(runs: Sequence[SweepRun], folder: Path) -> None:
 
 
 def keep_runs(sweep: Sweep, runs: Sequence[SweepRun], folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Keep trained runs in another folder, beside its present ones.
-
-    Args:
-        folder: another one, of a sweep of the same trainings.
-
-    Returns:
-        Labels of the runs that were kept now, without earlier ones; and reasons why runs could not be kept, by label.
+    """Keep trained runs in another folder, of a sweep of the same trainings. Return labels of the runs that were kept now, without earlier
+    ones; and reasons why runs could not be kept, by label.
     """
     kept, failures = [], {}
     for run in runs:

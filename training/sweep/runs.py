@@ -100,11 +100,7 @@ class SweepRun:
 
     @property
     def trained(self) -> bool:
-        """True if all of its iterations are done.
-
-        Raises:
-            CheckpointError: its description is damaged.
-        """
+        """True if all of its iterations are done. Raises CheckpointError: its description is damaged."""
         noted = self.description()
         finished = self.directory != self._kept or noted.get("outcome") == "finished"
         return finished and noted.get("iteration", 0) >= self.iterations
@@ -294,11 +290,7 @@ def _read_policy(path: Path) -> FilePolicy:
 
 
 def read_card(folder: Path) -> Result:
-    """Return the result in a folder.
-
-    Raises:
-        ComparisonError: there are none, or they are damaged.
-    """
+    """Return the result in a folder. Raises ComparisonError: there are none, or they are damaged."""
     try:
         card = load_result(folder)
         for name in SCORES:

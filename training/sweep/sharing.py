@@ -8,7 +8,7 @@ import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _PROGRAM = "nvidia-cuda-mps-control"
@@ -23,12 +23,9 @@ _PATIENCE = 20.0
 def shared_gpus(say: Callable[[str], None]) -> Iterator[Mapping[str, str]]:
     """Start MPS for the processes that get the yielded variables in their environment, and end it afterwards.
 
-    One that runs already is used as it is. Where there is none, a sentence says so, and the trainings run without it.
-
-    Args:
-        say: called with a sentence.
+    One that runs already is used as it is. Where there is none, ``say`` gets a sentence, and the trainings run without it.
     """
-    if _is_there(Path(os.environ.get("CUDA_MPS_PIPE_DIRECTORY", _DEFAULT_PIPES))):
+    if Path(os.environ.get("CUDA_MPS_PIPE_DIRECTORY", _DEFAULT_PIPES), "control").exists():
         yield {}
         return
     program = shutil.which(_PROGRAM, path=os.pathsep.join([os.environ.get("PATH", ""), *_FOLDERS]))
@@ -42,21 +39,17 @@ def shared_gpus(say: Callable[[str], None]) -> Iterator[Mapping[str, str]]:
             Path(path).mkdir()
         # All GPUs, by their own numbers: a training's CUDA_VISIBLE_DEVICES chooses among those that the daemon sees.
         environment = {k: v for k, v in os.environ.items() if k != "CUDA_VISIBLE_DEVICES"} | variables
-        failure = _call([program, "-d"], environment)
-        if failure:
+        if failure := _call([program, "-d"], environment):
             say(f"NVIDIA's MPS could not be started ({failure}): trainings on the same GPU take turns, which is slower")
             yield {}
             return
         try:
             yield variables
         finally:
-            if _call([program], environment, "quit\n"):
-                _kill(Path(variables["CUDA_MPS_PIPE_DIRECTORY"]) / f"{_PROGRAM}.pid")
-
-
-def _is_there(pipes: Path) -> bool:
-    """Return True if a daemon listens in this folder."""
-    return (pipes / "control").exists()
+            if _call([program], environment, "quit\n"):  # it does not end by itself
+                with suppress(OSError, ValueError):
+                    note = Path(variables["CUDA_MPS_PIPE_DIRECTORY"], f"{_PROGRAM}.pid")
+                    os.kill(int(note.read_text()), signal.SIGKILL)
 
 
 def _call(command: list[str], environment: Mapping[str, str], text: str = "") -> str:
@@ -71,11 +64,3 @@ def _call(command: list[str], environment: Mapping[str, str], text: str = "") ->
         return error.strerror or "it cannot be run"
     lines = (done.stderr or done.stdout).strip().splitlines()
     return (lines[-1] if lines else f"exit code {done.returncode}") if done.returncode else ""
-
-
-def _kill(note: Path) -> None:
-    """End a daemon that does not end by itself."""
-    try:
-        os.kill(int(note.read_text()), signal.SIGKILL)
-    except (OSError, ValueError):
-        return

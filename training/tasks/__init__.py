@@ -91,12 +91,8 @@ _ALL_TERRAINS_LEARNING = AlgorithmConfiguration(
     # Large steps learn fast; small ones, which a trained policy loses least by, end the run.
     desired_kl=Ramp(start=0.01, end=0.003, begin=0.4, until=0.8),
 )
-
-
 _ALL_TERRAINS_ITERATIONS = 5000
 """Two billion steps of 16,384 worlds, in all."""
-
-
 _PLAIN = NetworkConfiguration(student_encoder="mlp")
 _MOE_NG = NetworkConfiguration(student_encoder="moe_ng")
 _AC_MOE = replace(_PLAIN, expert_width=128, actor_hidden=(512, 256), critic_hidden=(512, 256))
@@ -133,7 +129,6 @@ def _on_all_terrains(name: str, method: str, network: NetworkConfiguration, titl
 _LEVEL_GROUND = TerrainConfiguration(
     tiles=(FLAT_TILE,), levels=1, curriculum=False, leave_distance=None, spread_probability=0.0
 )
-_FLAT_ITERATIONS = 380
 
 
 def _flat() -> Task:
@@ -162,15 +157,11 @@ def _flat() -> Task:
         algorithm=replace(
             _MIRRORED, compile_mode="none", entropy_coefficient=Ramp(start=0.01, end=0.003, begin=0.4, until=0.8)
         ),
-        network=NetworkConfiguration(student_encoder="mlp"),
-        run=RunConfiguration(experiment="go2_flat", iterations=_FLAT_ITERATIONS, save_interval=100, gauge_interval=0),
+        network=_PLAIN,
+        run=RunConfiguration(experiment="go2_flat", iterations=380, save_interval=100, gauge_interval=0),
     )
-    return Task(
-        name="go2-flat", title="Unitree Go2 on level ground (quick)", environment=environment, training=training
-    )
-
-
-_SPRINT_ITERATIONS = 2000
+    title = "Unitree Go2 on level ground (quick)"
+    return Task(name="go2-flat", title=title, environment=environment, training=training)
 
 
 def _sprint() -> Task:
@@ -209,16 +200,10 @@ def _sprint() -> Task:
     )
     training = TrainingConfiguration(
         algorithm=replace(_MIRRORED, entropy_coefficient=Ramp(start=0.01, end=0.003, begin=0.5, until=0.8)),
-        run=RunConfiguration(
-            experiment="go2_sprint", iterations=_SPRINT_ITERATIONS, save_interval=200, gauge_interval=0
-        ),
+        run=RunConfiguration(experiment="go2_sprint", iterations=2000, save_interval=200, gauge_interval=0),
     )
-    return Task(
-        name="go2-sprint",
-        title="Unitree Go2 at 4 m/s on level ground (the paper's fast task)",
-        environment=environment,
-        training=training,
-    )
+    title = "Unitree Go2 at 4 m/s on level ground (the paper's fast task)"
+    return Task(name="go2-sprint", title=title, environment=environment, training=training)
 
 
 TASKS: Mapping[str, Task] = MappingProxyType(
@@ -249,15 +234,11 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
         TaskError: unknown task, or a key or value that does not fit.
         RobotError: the robot cannot be found, or is wrong.
     """
-    if ":" in name:
-        known = _own_task(name)
-    elif name in TASKS:
-        known = TASKS[name]
-    else:
+    if ":" not in name and name not in TASKS:
         near = get_close_matches(name, TASKS, n=3, cutoff=0.3)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise TaskError(f"unknown task '{one_line(name, 80)}'; {hint}the tasks are: {', '.join(TASKS)}")
-    chosen = list(overrides)
+    known, chosen = TASKS[name] if name in TASKS else _own_task(name), list(overrides)
     named = [o for o in chosen if o.split("=", 1)[0].strip() == "environment.robot"]
     if named and robot is not None:
         raise TaskError(f"the robot is given twice, as '{robot}' and with environment.robot=; leave one out")

@@ -38,11 +38,7 @@ class Ratios:
 
 
 def ratios(robot: Robot, reference: Robot) -> Ratios:
-    """Compare two robots.
-
-    Raises:
-        RobotError: a foot does not hang on the base by joints of ``joint_names``.
-    """
+    """Compare two robots. Raises RobotError: a foot does not hang on the base by joints of ``joint_names``."""
     mine, its = body_plan(robot), body_plan(reference)
     forward, lateral, yaw = (
         a / b if b > 0.0 else 1.0 for a, b in zip(robot.command_limits, reference.command_limits, strict=True)
@@ -155,10 +151,5 @@ def _limits(limits: Triple, factor: Triple, robot: Robot) -> Triple:
 
 
 def _stage(stage: CommandStage, speed: Triple) -> CommandStage:
-    forward, lateral, yaw = speed
-    return replace(
-        stage,
-        forward=_scaled(stage.forward, forward),
-        lateral=_scaled(stage.lateral, lateral),
-        yaw=_scaled(stage.yaw, yaw),
-    )
+    forward, lateral, yaw = map(_scaled, (stage.forward, stage.lateral, stage.yaw), speed)
+    return replace(stage, forward=forward, lateral=lateral, yaw=yaw)
