@@ -229,6 +229,10 @@ class Randomization:
 
     friction: torch.Tensor | None = None
     """Sliding friction coefficient that acts in every contact of the world, (W,)."""
+    foot_torsion: torch.Tensor | None = None
+    """Factor on the feet's torsional and rolling friction, (W,); feet of contact dimension 3 have neither."""
+    foot_softness: torch.Tensor | None = None
+    """Factor on the time constant of the feet's contacts, (W,)."""
     base_mass_offset: torch.Tensor | None = None
     """Mass added to the base body's nominal mass [kg], (W,); inertia and centre of mass stay (a point load at the centre of mass).
     The sum is at least ``SMALLEST_BASE_MASS``."""
@@ -267,7 +271,7 @@ class Capability:
 # Everything that a backend declares, in the documentation's order: terrain, randomization, actions, model, reports.
 CAPABILITY_NAMES: tuple[str, ...] = (
     "plane", "boxes", "height_field", "per_world_terrain",
-    "friction", "base_mass", "link_mass", "base_com", "gains", "motor_strength", "motor_speed", "motor_offset",
+    "friction", "foot_contact", "base_mass", "link_mass", "base_com", "gains", "motor_strength", "motor_speed", "motor_offset",
     "latency", "push", "external_force",
     "torque_limits", "torque_speed_limit", "joint_friction", "elliptic_cone", "foot_condim_6", "self_collision",
     "contact_forces", "penetration", "deterministic", "gpu",

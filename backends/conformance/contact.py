@@ -270,6 +270,31 @@ def torsion(bench: Bench) -> str:
     return f"torsional friction takes {slowed.min():.3f} to {slowed.max():.3f} of 3 rad/s, to {error:.1e} rad/s"
 
 
+@check("contact/foot_change", "foot_contact", "foot_condim_6", "plane")
+def foot_change(bench: Bench) -> str:
+    """Spinning on one foot, each world slows down and sinks in by its own torsional friction and softness, as the reference does."""
+    parameters, seconds, height = bench.stiff(), 0.1, []
+    changes = [{"foot_torsion": 0.25 * row, "foot_softness": 1.0 + 0.5 * row} for row in range(WORLDS)]
+    start = spun(Reference(bench.robot, parameters), foot=0, rate=3.0)
+    rate, physics = [], bench.physics(foot_condim=4)
+    for change in changes:
+        reference = Reference(bench.robot, parameters, timestep=physics.timestep, ground=physics)
+        reference.change(**change)
+        reference.place(**start)
+        reference.step(bench.robot.default_joint_position, substeps=round(seconds / physics.timestep))
+        rate.append(rotated(reference.base_quaternion, reference.base_angular_velocity)[2])
+        height.append(reference.base_position[2])
+    with bench.worlds(parameters, foot_condim=4) as worlds:
+        worlds.randomize(**{name: np.array([change[name] for change in changes]) for name in changes[0]})
+        worlds.reset(**{name: [value] * WORLDS for name, value in start.items()}, held_target=worlds.default_pose)
+        worlds.run(seconds)
+        found = worlds.read()
+    slowed, sunk = np.ptp(rate), np.ptp(height)
+    error = expect_close(f"yaw rate after {seconds} s on a foot [rad/s]", yaw_rate(found), rate, 0.02 * slowed + 0.001)
+    expect_close("height of the base on a foot [m]", found.base_position_w[:, 2], height, 0.02 * sunk + 1e-5)
+    return f"rates differ by {slowed:.3f} rad/s and heights by {1e3 * sunk:.1f} mm between worlds, to {error:.1e} rad/s"
+
+
 def spun(reference: Reference, *, foot: int, rate: float) -> dict[str, np.ndarray]:
     """Return a reset of the robot in its default pose, its centre of mass above one foot on the ground, spinning at ``rate`` [rad/s]."""
     reference.place((0.0, 0.0, 0.0))

@@ -63,9 +63,17 @@ class Reference:
         return float(self.model.body_mass.sum())
 
     def change(
-        self, *, base_mass: float = 0.0, base_com: ArrayLike = (0.0, 0.0, 0.0), link_scale: ArrayLike = 1.0
+        self,
+        *,
+        base_mass: float = 0.0,
+        base_com: ArrayLike = (0.0, 0.0, 0.0),
+        link_scale: ArrayLike = 1.0,
+        foot_torsion: float = 1.0,
+        foot_softness: float = 1.0,
     ) -> None:
         """Change the model as ``Randomization`` says; ``link_scale`` is (B,), its entry for the base is ignored."""
+        self.model.geom_friction[self.feet, 1:] *= foot_torsion
+        self.model.geom_solref[self.feet, 0] *= foot_softness
         scale = np.broadcast_to(np.asarray(link_scale, dtype=np.float64), self.bodies.shape)
         for body, factor in zip(self.bodies, scale, strict=True):
             if body != self.base:

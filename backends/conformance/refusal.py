@@ -49,6 +49,7 @@ REQUESTS: dict[str, Callable[[Bench], None]] = {
     "height_field": lambda bench: _build(bench, terrains=(_FIELD,)),
     "per_world_terrain": lambda bench: _build(bench, terrains=(FLAT, _BOX), terrain_index=(0, 1, 0, 1)),
     "friction": _randomize("friction", 0.7),
+    "foot_contact": _randomize("foot_torsion", 0.5),
     "base_mass": _randomize("base_mass_offset", 1.0),
     "link_mass": _randomize("link_mass_scale", 1.1, lambda bench: (len(bench.robot.collision_bodies),)),
     "base_com": _randomize("base_com_offset", 0.01, lambda bench: (3,)),

@@ -119,6 +119,7 @@ class MujocoBackend(PhysicsBackend):
         self._joint_q = np.array([model.joint(j).qposadr[0] for j in robot.joint_names])
         self._joint_v = np.array([model.joint(j).dofadr[0] for j in robot.joint_names])
         self._bodies = np.array([model.body(b).id for b in robot.collision_bodies])
+        self._feet = np.array([model.geom(name).id for name in robot.foot_geoms])
 
     # ---- reading ------------------------------------------------------------------------------------------------
 
@@ -352,6 +353,10 @@ class MujocoBackend(PhysicsBackend):
         model, nominal = self._models[row], self._palette[self._terrain[row]]
         if "friction" in values:
             model.geom_friction[:, 0] = values["friction"]
+        if "foot_torsion" in values:
+            model.geom_friction[self._feet, 1:] = nominal.geom_friction[self._feet, 1:] * values["foot_torsion"]
+        if "foot_softness" in values:
+            model.geom_solref[self._feet, 0] = nominal.geom_solref[self._feet, 0] * values["foot_softness"]
         model.body_mass[:] = nominal.body_mass
         model.body_inertia[:] = nominal.body_inertia
         if "link_mass_scale" in values:

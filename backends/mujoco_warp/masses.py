@@ -15,7 +15,7 @@ from ..warp.motors import MotorTensors
 from .model import SharedModel
 
 BATCHED_FIELDS = (
-    "geom_friction", "geom_size", "geom_aabb", "geom_rbound", "geom_dataid",
+    "geom_friction", "geom_solref", "geom_size", "geom_aabb", "geom_rbound", "geom_dataid",
     "body_mass", "body_inertia", "body_ipos", "body_subtreemass", "body_invweight0", "dof_invweight0",
 )  # fmt: skip
 """Model fields with an entry for every world."""
@@ -26,7 +26,11 @@ class WorldMasses:
 
     def __init__(self, shared: SharedModel, model: mujoco_warp.Model, device: torch.device) -> None:
         self._base = shared.base
-        self._friction = wp.to_torch(model.geom_friction)
+        self._friction, self._reference = wp.to_torch(model.geom_friction), wp.to_torch(model.geom_solref)
+        feet = np.flatnonzero(shared.roles["foot"] >= 0)
+        self._feet = torch.tensor(feet, dtype=torch.int64, device=device)
+        self._nominal_moments = self._friction[0, self._feet, 1:].clone()
+        self._nominal_time = self._reference[0, self._feet, 0].clone()
         self._mass, self._inertia = wp.to_torch(model.body_mass), wp.to_torch(model.body_inertia)
         self._com = wp.to_torch(model.body_ipos)
         self._nominal_mass, self._nominal_inertia = self._mass.clone(), self._inertia.clone()
@@ -51,6 +55,14 @@ class WorldMasses:
         if "friction" in rows:
             # in every geom, so that no other coefficient acts by its size or priority
             write(self._friction[:, :, 0], rows["friction"][:, None].expand(-1, self._friction.shape[1]))
+        if "foot_torsion" in rows:
+            moments = self._nominal_moments * rows["foot_torsion"][:, None, None]
+            self._friction[:, self._feet, 1:] = torch.where(
+                mask[:, None, None], moments, self._friction[:, self._feet, 1:]
+            )
+        if "foot_softness" in rows:
+            time = self._nominal_time * rows["foot_softness"][:, None]
+            self._reference[:, self._feet, 0] = torch.where(mask[:, None], time, self._reference[:, self._feet, 0])
         base, bodies = self._base, self._other_bodies
         if "link_mass_scale" in rows:
             scale, column = rows["link_mass_scale"][:, self._others], mask[:, None]

@@ -234,6 +234,9 @@ class NewtonBackend(WarpBackend):
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``. Fields may also have a row for every world; then the masked rows count."""
+        if randomization.foot_torsion is not None or randomization.foot_softness is not None:
+            own = f"backend '{self.name}' has the same feet in all worlds"
+            raise BackendError(f"{own}; leave foot_torsion and foot_softness out, or use 'mujoco-warp'")
         masses, rows = self._masses, self._changes(randomization, worlds)
         self._write_motors(rows)
         if "friction" in rows:

@@ -38,6 +38,11 @@ def _declare(**others: Capability) -> dict[str, Capability]:
     return {name: others.get(name, _EXACT) for name in CAPABILITY_NAMES}
 
 
+_SAME_FEET = Capability(
+    support=Support.NONE, note="the feet's contacts are the same in all worlds, but for sliding friction"
+)
+
+
 class SolverAdapter(ABC):
     """One Newton solver with its contacts."""
 
@@ -119,9 +124,10 @@ class MujocoAdapter(SolverAdapter):
 
     name = "mujoco"
     capabilities = _declare(
+        foot_contact=_SAME_FEET,
         deterministic=_roughly(
             "to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces"
-        )
+        ),
     )
     gap = 0.0
     skin = True
@@ -294,6 +300,7 @@ class SteelAdapter(SolverAdapter):
 
     name = "steel"
     capabilities = _declare(
+        foot_contact=_SAME_FEET,
         joint_friction=_roughly("an explicit torque that changes sign over a small speed: a joint at rest creeps"),
         elliptic_cone=_roughly("friction is the exact cone of a hard contact; impratio has no meaning here"),
         foot_condim_6=Capability(

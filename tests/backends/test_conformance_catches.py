@@ -151,6 +151,17 @@ class FrictionOfTheFirstWorld(RandomizationFault):
         return randomization if friction is None else replace(randomization, friction=friction[:1].expand_as(friction))
 
 
+class FeetOfTheFirstWorld(RandomizationFault):
+    def spoil(self, randomization):
+        torsion = randomization.foot_torsion
+        return randomization if torsion is None else replace(randomization, foot_torsion=torsion[:1].expand_as(torsion))
+
+
+class SoftnessIgnored(RandomizationFault):
+    def spoil(self, randomization):
+        return replace(randomization, foot_softness=None)
+
+
 class CenterOfMassMirrored(RandomizationFault):
     def spoil(self, randomization):
         shift = randomization.base_com_offset
@@ -289,6 +300,8 @@ FAULTS = [
     (LegsPass, "contact/legs"),
     (CondimIgnored, "contact/torsion"),
     (CondimNeverAboveThree, "contact/torsion"),
+    (FeetOfTheFirstWorld, "contact/foot_change"),
+    (SoftnessIgnored, "contact/foot_change"),
     (DivergenceHidden, "health/divergence"),
     (LateTargets, "motors/latency"),
     (SpeedIgnored, "motors/speed_limit"),

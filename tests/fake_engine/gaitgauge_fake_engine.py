@@ -166,6 +166,8 @@ class FakeBackend(PhysicsBackend):
         self.force_w = full(0.0, 3)
         self.randomized = Randomization(
             friction=full(math.nan),
+            foot_torsion=full(1.0),
+            foot_softness=full(1.0),
             base_mass_offset=full(0.0),
             link_mass_scale=full(1.0, len(bodies)),
             base_com_offset=full(0.0, 3),

@@ -244,12 +244,19 @@ def test_pushes_add_or_replace():
 
 def test_randomization_ranges():
     ranges = RandomizationConfiguration(
-        friction=(0.3, 0.9), stiffness=(0.8, 1.1), motor_offset=(-0.02, 0.05), motor_speed=(1.0, 2.5)
+        friction=(0.3, 0.9),
+        foot_torsion=(0.0, 1.5),
+        foot_softness=(0.5, 2.0),
+        stiffness=(0.8, 1.1),
+        motor_offset=(-0.02, 0.05),
+        motor_speed=(1.0, 2.5),
     )
     environment = make(2000, randomization=ranges)
     drawn = environment.backend.randomized
     for values, (low, high) in (
         (drawn.friction, (0.3, 0.9)),
+        (drawn.foot_torsion, (0.0, 1.5)),
+        (drawn.foot_softness, (0.5, 2.0)),
         (drawn.base_mass_offset, (-1.0, 1.0)),
         (drawn.link_mass_scale, (0.9, 1.1)),
         (drawn.base_com_offset, (-0.03, 0.03)),
@@ -275,6 +282,7 @@ def test_motors_that_nobody_varies_are_not_written(monkeypatch):
 
     monkeypatch.setattr(FakeBackend, "randomize", randomize)
     make(randomization=RandomizationConfiguration(motor_strength=(0.9, 0.9), motor_offset=(0.0, 0.0)))
+    assert not written & {"foot_torsion", "foot_softness"}
     assert written & set(MotorParameters.NEUTRAL) == {"stiffness_scale", "damping_scale", "motor_strength"}
 
 

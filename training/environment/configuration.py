@@ -208,6 +208,10 @@ class RandomizationConfiguration:
 
     friction: tuple[_Friction, _Friction] = (0.2, 1.25)
     """Effective sliding friction, once per world. Published: 0.5 to 1.5; the gauge judges 0.2 to 1.0."""
+    foot_torsion: tuple[NotNegative, NotNegative] = (1.0, 1.0)
+    """Factor on the feet's torsional and rolling friction, once per world; acts with physics.foot_condim 4 or 6."""
+    foot_softness: tuple[Positive, Positive] = (1.0, 1.0)
+    """Factor on the time constant of the feet's contacts, once per world."""
     base_mass: tuple[_Kilograms, _Kilograms] = (-1.0, 1.0)
     """Added to the base's mass [kg], once per world."""
     link_mass: tuple[_Factor, _Factor] = (0.9, 1.1)

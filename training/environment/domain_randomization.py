@@ -17,19 +17,22 @@ def draw_bodies(
     ranges: RandomizationConfiguration, num_envs: int, num_bodies: int, generator: torch.Generator
 ) -> dict[str, torch.Tensor]:
     """Draw once per world, on the generator's device, by the names of ``Randomization``: effective sliding friction (N,), mass added to
-    the base [kg] (N,), factors on the other bodies' masses (N, bodies), and the shift of the base's centre of mass [m] (N, 3).
+    the base [kg] (N,), factors on the other bodies' masses (N, bodies), the shift of the base's centre of mass [m] (N, 3), and, where
+    they vary, factors on the feet's torsion and softness (N,).
     """
 
     def between(bounds: Range, *shape: int) -> torch.Tensor:
         values = torch.empty(num_envs, *shape, device=generator.device)
         return values.uniform_(bounds[0], bounds[1], generator=generator)
 
-    return {
+    drawn = {
         "friction": between(ranges.friction),
         "base_mass_offset": between(ranges.base_mass),
         "link_mass_scale": between(ranges.link_mass, num_bodies),
         "base_com_offset": between(ranges.base_com, 3),
     }
+    feet = {"foot_torsion": ranges.foot_torsion, "foot_softness": ranges.foot_softness}
+    return drawn | {name: between(bounds) for name, bounds in feet.items() if bounds != (1.0, 1.0)}
 
 
 class MotorParameters:
