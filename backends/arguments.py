@@ -79,7 +79,9 @@ def check_randomization(scene: Scene, randomization: Randomization, worlds: torc
     """
     check_worlds(scene, worlds)
     joints, bodies = scene.robot.num_joints, len(scene.robot.collision_bodies)
-    columns = dict.fromkeys(("friction", "foot_torsion", "foot_softness", "base_mass_offset"), ())
+    columns: dict[str, tuple[int, ...]] = dict.fromkeys(
+        ("friction", "foot_torsion", "foot_softness", "base_mass_offset"), ()
+    )
     columns |= {"link_mass_scale": (bodies,), "base_com_offset": (3,)}
     for item in fields(Randomization):
         value = getattr(randomization, item.name)

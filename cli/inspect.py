@@ -102,11 +102,7 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def list_things(what: str) -> None:
-    """Print a table of the names of a kind, a key of ``LISTS``.
-
-    Raises:
-        UserError: nothing of that name can be listed.
-    """
+    """Print a table of the names of a kind, a key of ``LISTS``. Raises UserError: nothing of that name can be listed."""
     make = LISTS.get(what)
     if make is None:
         raise UserError(f"cannot list '{what}'{did_you_mean(what, LISTS) or ';'} choose one of: {', '.join(LISTS)}")

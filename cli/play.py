@@ -84,11 +84,7 @@ def _events(sessions: Sequence[PlaySession]) -> str:
 
 
 def _check(asked: PlayRequest) -> str:
-    """Return the viewer that is asked for, or the best that this machine has.
-
-    Raises:
-        UserError: options that make no sense.
-    """
+    """Return the viewer that is asked for, or the best that this machine has. Raises UserError: options that make no sense."""
     from ..gauge.pipelines import check_friction
 
     films = {"--out": (asked.out, VIDEO_ENDINGS), "--gif": (asked.gif, CLIP_ENDINGS)}

@@ -14,44 +14,34 @@ from ..gauge.play.cluster import check_address
 from ..training.sweep.call import Kept, work_through
 from ..training.sweep.file import load_sweep
 from .console import Terminal, make_table, print_json, shell_command
+from .requests import SweepRequest
 from .train import parse_duration
 
 
-def run_sweep(
-    file: Path,
-    *,
-    out: Path | None,
-    threads: int | None,
-    per_gpu: int,
-    cluster: str | None,
-    time: str | None,
-    report: bool,
-    keep: Path | None,
-    json_output: bool,
-) -> None:
+def run_sweep(asked: SweepRequest) -> None:
     """Run what is left of a sweep, print its table, and keep what is trained.
 
     The exit code is 1 where an entry could not be done or kept, or was stopped from outside and no time limit was set; 128 + signal
     where the sweep was stopped.
     """
     began = clock.monotonic()
-    sweep = load_sweep(file)
-    folder = (out or Path("results") / f"sweep-{sweep.name}").absolute()
-    deadline = None if time is None else began + parse_duration(time)
+    sweep, threads = load_sweep(asked.file), asked.threads
+    folder = (asked.out or Path("results") / f"sweep-{sweep.name}").absolute()
+    deadline = None if asked.time is None else began + parse_duration(asked.time)
     errors = Terminal(stderr=True)
     gauging = None
-    if cluster is not None:
-        check_address(cluster)
-        gauging = ["--cluster", cluster, *([] if threads is None else ["--threads", str(threads)])]
+    if asked.cluster is not None:
+        check_address(asked.cluster)
+        gauging = ["--cluster", asked.cluster, *([] if threads is None else ["--threads", str(threads)])]
     done = work_through(
         sweep,
         folder,
         threads=threads or max((os.cpu_count() or 2) // 2, 1),
-        per_gpu=per_gpu,
+        per_gpu=asked.per_gpu,
         gauging=gauging,
         deadline=deadline,
-        report=report,
-        keep=keep,
+        report=asked.report,
+        keep=asked.keep,
         say=errors.say,
     )
     if done is None:
@@ -60,13 +50,13 @@ def run_sweep(
     for label, sentence in done.failures.items():
         if label not in outcome.failures:  # those were told when they happened
             errors.say(f"{label} failed: {sentence}")
-    if json_output:
+    if asked.json_output:
         print_json(done.found)
     else:
         print_sweep(Terminal(), done.found, folder)
     if done.kept is not None:
-        assert keep is not None
-        print_kept(errors, done.kept, f"{len(done.runs)} are in {keep.absolute()}")
+        assert asked.keep is not None
+        print_kept(errors, done.kept, f"{len(done.runs)} are in {asked.keep.absolute()}")
     if outcome.unfinished:
         errors.say(f"{len(outcome.unfinished)} of {len(done.runs)} runs are not done; go on with:\n  {shell_command()}")
     if outcome.stopped is not None:

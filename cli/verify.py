@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -14,77 +16,57 @@ from ..studies.compare.comparison import load_result
 from ..studies.naming import distinct_names, folder_name
 from .console import Terminal, print_json
 from .evaluate import shower
+from .requests import VerifyRequest
 from .studies import resumable
 
 
-def run_verification(
-    card: Path,
-    *,
-    policy: str | None,
-    suite: str | None,
-    device: str | None,
-    threads: int | None,
-    quick: bool,
-    fresh: int | None,
-    out: Path | None,
-    json_output: bool,
-    trust: bool,
-) -> None:
+def run_verification(asked: VerifyRequest) -> None:
     """Replay, show progress, print whether the card holds; exit code 1 where it does not."""
-    content = load_result(card)
-    place = card.resolve()
-    prepared = prepare_replay(
-        content,
-        policy=policy,
-        beside=place if place.is_dir() else place.parent,
-        suite=suite,
-        device=choose_device(content.backend, device),
-        threads=threads,
-        quick=quick,
-        fresh=fresh,
-        trust=trust,
-    )
+    content, place, fresh = load_result(asked.card), asked.card.resolve(), asked.fresh
+    kept = {name: getattr(asked, name) for name in ("policy", "suite", "threads", "quick", "fresh", "trust")}
+    beside, device = place if place.is_dir() else place.parent, choose_device(content.backend, asked.device)
+    prepared = prepare_replay(content, beside=beside, device=device, **kept)
     (name,) = distinct_names([str(place.parent if place.name == "results.json" else place)])
-    stem = folder_name(name)
-    folder = (
-        out or Path("results") / f"verify-{stem}{'-quick' if quick else ''}{'' if fresh is None else f'-fresh-{fresh}'}"
-    )
+    kind = "-quick" * asked.quick + ("" if fresh is None else f"-fresh-{fresh}")
+    folder = asked.out or Path("results") / f"verify-{folder_name(name)}{kind}"
     with resumable(Terminal(stderr=True), "gauging", folder) as display:
         command = ["gaitgauge", *sys.argv[1:]]
         found = verify(content, prepared, folder, fresh=fresh, command=command, watch=shower(display))
-    if json_output:
+    if asked.json_output:
         print_json(found)
     else:
-        console = Terminal()
-        for item in found["levels"]:
-            where = f"{item['terrain']}, friction {item['friction']:g}, payload {item['payload']:g} kg"
-            console.say(f"{where}: level {item['card']} on the card, {item['here']} here")
-        played, whole = found["environments"]
-        seeds = "" if fresh is None else ", with other seeds"
-        sample = ", one of each terrain" if quick else ""
-        console.say(f"played {played} of the card's {whole} environments{sample}{seeds}")
-        if found["score"] is not None:
-            band = "no interval" if found["band"] is None else "a replay within {:.4f} to {:.4f}".format(*found["band"])
-            console.say(f"score on the card {found['score']:.4f} ({band}), here {found['replayed']:.4f}")
-        for item in found["settings"]:
-            console.say(f"{item['name']}: {shown(item['card'])} on the card, {shown(item['here'])} here")
-        if found["unlike"]:
-            console.say(f"card and replay were made with other versions: {'; '.join(found['unlike'])}")
-        if found["settings"]:
-            console.say("the card does NOT hold: it was made with another solver or other motors")
-        elif found["figures"]:
-            console.say(f"the card does NOT hold: every outcome is the same, but not its {', '.join(found['figures'])}")
-        elif found["equal"]:
-            console.say("the card holds: every outcome is the same to the last digit")
-        elif found["holds"] and found["band"] is not None and found["replayed"] > found["band"][1]:
-            console.say("the card holds: with other seeds the score is higher still")
-        elif found["holds"]:
-            console.say("the card holds: the score lies within its band, single outcomes differ")
-        elif fresh is not None:
-            console.say(
-                "the card does NOT hold with other seeds: its score owes something to those that everybody knows"
-            )
-        else:
-            console.say("the card does NOT hold on this machine")
+        _print_verification(Terminal(), found, asked)
     if not found["holds"]:
         raise typer.Exit(1)
+
+
+def _print_verification(console: Terminal, found: Mapping[str, Any], asked: VerifyRequest) -> None:
+    """Print what was played, what differs, and whether the card holds."""
+    for item in found["levels"]:
+        where = f"{item['terrain']}, friction {item['friction']:g}, payload {item['payload']:g} kg"
+        console.say(f"{where}: level {item['card']} on the card, {item['here']} here")
+    played, whole = found["environments"]
+    kind = ", one of each terrain" * asked.quick + ("" if asked.fresh is None else ", with other seeds")
+    console.say(f"played {played} of the card's {whole} environments{kind}")
+    if found["score"] is not None:
+        band = "no interval" if found["band"] is None else "a replay within {:.4f} to {:.4f}".format(*found["band"])
+        console.say(f"score on the card {found['score']:.4f} ({band}), here {found['replayed']:.4f}")
+    for item in found["settings"]:
+        console.say(f"{item['name']}: {shown(item['card'])} on the card, {shown(item['here'])} here")
+    if found["unlike"]:
+        console.say(f"card and replay were made with other versions: {'; '.join(found['unlike'])}")
+    higher = found["band"] is not None and found["replayed"] > found["band"][1]
+    if found["settings"]:
+        verdict = "does NOT hold: it was made with another solver or other motors"
+    elif found["figures"]:
+        verdict = f"does NOT hold: every outcome is the same, but not its {', '.join(found['figures'])}"
+    elif found["equal"]:
+        verdict = "holds: every outcome is the same to the last digit"
+    elif found["holds"]:
+        same = "the score lies within its band, single outcomes differ"
+        verdict = f"holds: {'with other seeds the score is higher still' if higher else same}"
+    elif asked.fresh is not None:
+        verdict = "does NOT hold with other seeds: its score owes something to those that everybody knows"
+    else:
+        verdict = "does NOT hold on this machine"
+    console.say(f"the card {verdict}")

@@ -27,11 +27,7 @@ _CODECS: dict[str, tuple[str, str, list[str]]] = {
 
 
 def check_film_path(path: Path, option: str, endings: tuple[str, ...]) -> None:
-    """Refuse the name of a film that cannot be written.
-
-    Raises:
-        UserError: the folder does not exist, or the name has another ending.
-    """
+    """Refuse the name of a film that cannot be written. Raises UserError: the folder does not exist, or the name has another ending."""
     if path.suffix.lower() not in endings:
         other = _OPTION_OF.get(path.suffix.lower())
         hint = f", or write {other} {path}" if other else ""

@@ -22,12 +22,7 @@ class WorldMaker:
     """Make worlds as one ``gaitgauge play`` asks for them. Policies are loaded once."""
 
     def __init__(self, request: PlayRequest) -> None:
-        """Find device and suite.
-
-        Raises:
-            BackendError: no such engine or device.
-            SuiteError: no such suite.
-        """
+        """Find device and suite. Raises BackendError: no such engine or device; SuiteError: no such suite."""
         self._request = request
         self._settings: dict[str, Any] = {
             "backend": request.backend,
@@ -38,11 +33,7 @@ class WorldMaker:
         self._policies: dict[str, tuple[Policy, Robot]] = {}
 
     def make(self, choice: str, terrain: str, level: int | None, friction: float, label: str) -> PlaySession:
-        """Return a robot with a policy on a terrain.
-
-        Raises:
-            PolicyError, ContractError, TerrainError, BackendError, UserError: one sentence on what is wrong.
-        """
+        """Return a robot with a policy on a terrain. Raises PolicyError, ContractError, TerrainError, BackendError, UserError."""
         ground = make_terrain(terrain, level)
         if choice not in self._policies:
             self._policies[choice] = open_policy(choice, self._request.robot, trust=self._request.trust)

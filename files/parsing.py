@@ -232,22 +232,7 @@ def _path(steps: Iterable[str | int]) -> str:
 # ---- dataclasses ----------------------------------------------------------------------------------------------------
 
 
-def build(kind: type[Kind], data: object, source: str, error: type[Exception], *, false_is_none: bool = False) -> Kind:
-    """Build a (nested) frozen dataclass from plain data.
-
-    Args:
-        kind: the dataclass; its annotations are the rules.
-        data: result of a parser above; lists stand for tuples.
-        source: origin of the data, the beginning of every sentence.
-        false_is_none: ``false`` stands for None where a field may be None, and sentences say so: TOML has no null.
-
-    Raises:
-        error: an unknown or missing field, a value of another type or out of range, or a refusal of ``__post_init__``.
-    """
-    return _built(kind, data, source, error, false_is_none=false_is_none)
-
-
-def _built(
+def build(
     kind: type[Kind],
     data: object,
     source: str,
@@ -256,6 +241,18 @@ def _built(
     false_is_none: bool = False,
     extra: Literal["forbid", "ignore"] = "forbid",
 ) -> Kind:
+    """Build a (nested) frozen dataclass from plain data.
+
+    Args:
+        kind: the dataclass; its annotations are the rules.
+        data: result of a parser above; lists stand for tuples.
+        source: origin of the data, the beginning of every sentence.
+        false_is_none: ``false`` stands for None where a field may be None, and sentences say so: TOML has no null.
+        extra: refuse or ignore entries that no field names.
+
+    Raises:
+        error: an unknown or missing field, a value of another type or out of range, or a refusal of ``__post_init__``.
+    """
     data = plain(data, source, error)
     text = json.dumps([_none_for_false(kind, data) if false_is_none else data])
     try:
@@ -266,15 +263,11 @@ def _built(
 
 
 def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
-    """Return a dataclass from the entries of a table that bear its fields' names, and so for the tables in it.
-
-    Raises:
-        error: as ``build``.
-    """
+    """Build a dataclass from a table's entries that bear its fields' names, and so for the tables in it; raise ``error`` as ``build``."""
     if not isinstance(data, Mapping):
         raise error(f"{source} is {shown(data)}; it must be a table")
     own = {f.name: data[f.name] for f in fields(kind) if f.name in data}  # type: ignore[arg-type]
-    return _built(kind, own, source, error, extra="ignore")
+    return build(kind, own, source, error, extra="ignore")
 
 
 def check_fields(instance: Any, source: str, error: type[Exception]) -> None:

@@ -71,6 +71,13 @@ def same_file(path: str | Path, other: str | Path) -> bool:
     return False
 
 
+def write_files(folder: Path, texts: Mapping[str, str], error: type[Exception]) -> None:
+    """Write texts by file name into a folder that is created, each whole or not at all; raise ``error`` where that fails."""
+    make_folder(folder, error)
+    for name, text in texts.items():
+        write_atomically(folder / name, text, error)
+
+
 def make_folder(folder: Path, error: type[Exception], *, option: str = "--out") -> None:
     """Create a folder and its parents where missing; raise ``error``, which names the ``option`` for the place, on failure."""
     try:
@@ -116,9 +123,7 @@ def _writable(value: Any) -> Any:
         return str(value)
     if isinstance(value, Mapping):
         return {_writable(str(k)): _writable(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_writable(v) for v in value]
-    return value
+    return [_writable(v) for v in value] if isinstance(value, list | tuple) else value
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from ..policy.contract import PRIVILEGED_TERMS
@@ -17,20 +17,16 @@ _AXES = {"terrains": "terrain", "frictions": "friction", "payloads": "payload", 
 def coverage(
     suite: Suite, environments: Sequence[Environment], seeds: Sequence[int], *, pipeline: str = "stress"
 ) -> Coverage:
-    """Return the part of a suite that was played.
-
-    Args:
-        pipeline: ``level`` plays no quality episodes, so its seeds do not matter.
-    """
+    """Return the part of a suite that was played; ``pipeline``: ``level`` plays no quality episodes, so its seeds do not matter."""
     matrix = suite.matrix
     levels_alone = pipeline == "level"
     whole = make_environments(suite, terrains=matrix.terrains, frictions=None, payloads=None, level=None)
     wanted = {e.key for e in whole}
     played: dict[str, list[Any]] = {
-        "terrains": _distinct(e.terrain for e in environments),
-        "frictions": sorted(_distinct(e.friction for e in environments)),
-        "payloads": sorted(_distinct(e.payload for e in environments)),
-        "seeds": [] if levels_alone else sorted(_distinct(seeds)),
+        "terrains": list(dict.fromkeys(e.terrain for e in environments)),
+        "frictions": sorted({e.friction for e in environments}),
+        "payloads": sorted({e.payload for e in environments}),
+        "seeds": [] if levels_alone else sorted(set(seeds)),
     }
     axes: dict[str, Any] = {
         axis: AxisCoverage(
@@ -42,7 +38,8 @@ def coverage(
     }
     found = {e.key for e in environments}
     levels = sorted({e.level for e in environments if e.level})
-    foreign = [_foreign(_AXES[axis], entry.foreign) for axis, entry in axes.items() if entry.foreign]
+    units = {"payloads": " kg"}
+    foreign = [f"{_AXES[at]} {_listed(e.foreign)}{units.get(at, '')}" for at, e in axes.items() if e.foreign]
     if levels:
         foreign.append(f"level {_listed(levels)} given, not searched for")
     if not foreign and found - wanted:
@@ -88,23 +85,12 @@ def score_label(result: Result) -> str:
 
 
 def notes(result: Result) -> list[str]:
-    """Return sentences that a reader of the score must know: gains that are not the policy's or the robot's usual ones, privileged
-    observations.
-    """
+    """Return sentences that a reader of the score must know: on privileged observations, and on gains that are not the usual ones."""
     found = []
     if result.policy.kind_of_observations == "privileged":
         terms = ", ".join(t for t in result.policy.observations or () if t in PRIVILEGED_TERMS)
         found.append(f"privileged observations: no sensor of a robot measures {terms}")
     return found + ([result.motors.note] if result.motors.note else [])
-
-
-def _distinct(values: Iterable[Any]) -> list[Any]:
-    return list(dict.fromkeys(values))
-
-
-def _foreign(word: str, values: Sequence[Any]) -> str:
-    unit = " kg" if word == "payload" else ""
-    return f"{word} {_listed(values)}{unit}"
 
 
 def _listed(values: Sequence[Any]) -> str:

@@ -102,11 +102,7 @@ class Record:
 
     @classmethod
     def load(cls, path: Path) -> Record:
-        """Read a record.
-
-        Raises:
-            RecordError: the file is damaged.
-        """
+        """Read a record; raise ``RecordError`` where the file is damaged."""
         try:
             if not path.is_file():  # a pipe never ends, nor does a link to /dev/zero
                 raise RecordError("it is no file")
@@ -124,31 +120,20 @@ class Record:
             episode = build(Episode, {n: head[n] for n in names}, "its head", RecordError)
             if episode.key != path.stem:
                 raise RecordError(f"it holds episode {one_line(episode.key)}")
-            rest = build(
-                _Outcome,
-                {**{n: head[n] for n in _HEAD if n != "fallen"}, "fallen": head.get("fallen")},
-                "its head",
-                RecordError,
-            )
+            outcome = {"fallen": head.get("fallen")} | {n: head[n] for n in _HEAD if n != "fallen"}
+            rest = build(_Outcome, outcome, "its head", RecordError)
             record = cls(episode=episode, **vars(rest), **arrays)
             record.check_samples()
             return record
         except _READ_ERRORS as error:
-            reason = (
-                f"it lacks {one_line(error)}"
-                if isinstance(error, KeyError)
-                else one_line(error) or type(error).__name__
-            )
+            said = one_line(error)
+            reason = f"it lacks {said}" if isinstance(error, KeyError) else said or type(error).__name__
             raise RecordError(
                 f"episode file {one_line(path)} is damaged ({reason}); delete it and run again with --resume"
             ) from error
 
     def check_samples(self) -> None:
-        """Compare the samples' shapes, types and indices with the rest.
-
-        Raises:
-            RecordError: they do not fit.
-        """
+        """Compare the samples' shapes, types and indices with the rest; raise ``RecordError`` where they do not fit."""
         count = len(self.samples)
         expected: dict[str, tuple[NDArray[Any], Any, tuple[int, ...]]] = {
             "samples": (self.samples, np.float32, (count, len(self.columns) if count else self.samples.shape[-1])),

@@ -125,7 +125,10 @@ def prepare(request: Request) -> Prepared:
     for name, environment in {e.terrain: e for e in environments}.items():
         highest = suite.scoring.levels if environment.level is None else environment.level
         check_terrain(suite, make_terrain(name, int(highest)), searched=environment.searched)
-    robot, policy = _robot_and_policy(request)
+    # foreign files take their contract from the robot that is asked for
+    asked = None if request.robot is None else load_robot(request.robot)
+    policy = load_policy(request.policy, asked, trust=request.trust)
+    robot = robot_for(policy.contract, request.robot)
     check_fit(suite, robot, policy.contract)
     return Prepared(
         request=request,
@@ -136,13 +139,6 @@ def prepare(request: Request) -> Prepared:
         environments=tuple(environments),
         seeds=tuple(dict.fromkeys(seeds)),
     )
-
-
-def _robot_and_policy(request: Request) -> tuple[Robot, FilePolicy]:
-    """Return robot and policy: foreign files take their contract from the robot that is asked for."""
-    asked = None if request.robot is None else load_robot(request.robot)
-    policy = load_policy(request.policy, asked, trust=request.trust)
-    return robot_for(policy.contract, request.robot), policy
 
 
 def _terrains(request: Request, suite: Suite) -> list[str]:
@@ -242,7 +238,9 @@ def evaluate(
         counted = [record for outcome in outcomes for record in (*outcome.trials, *outcome.records)]
         scores = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
         contract = prepared.policy.contract
-        motors = joint_parameters(suite, prepared.robot, contract)
+        digests = {"policy": prepared.policy.digest, "robot": robot_digest(prepared.robot)}
+        digests |= {"suite": suite.digest, "source": source_digest()}
+        motors, note = joint_parameters(suite, prepared.robot, contract), gains_note(suite, prepared.robot, contract)
         result = Result(
             **vars(scores),
             policy=PolicyName(
@@ -257,22 +255,12 @@ def evaluate(
             pipeline=request.pipeline,
             backend=request.backend,
             robot=prepared.robot.name,
-            motors=Motors(
-                stiffness=motors.stiffness, damping=motors.damping, note=gains_note(suite, prepared.robot, contract)
-            ),
+            motors=Motors(stiffness=motors.stiffness, damping=motors.damping, note=note),
             health=health([record for outcome in outcomes for record in outcome.records]),
             solver=dict(find_backend(request.backend, prepared.device).solver_settings(suite.physics)),
             provenance=Provenance(
                 **provenance(
-                    command=command,
-                    device=prepared.device,
-                    threads=request.threads or count,
-                    digests={
-                        "policy": prepared.policy.digest,
-                        "robot": robot_digest(prepared.robot),
-                        "suite": suite.digest,
-                        "source": source_digest(),
-                    },
+                    command=command, device=prepared.device, threads=request.threads or count, digests=digests
                 ),
                 seconds=round(time.perf_counter() - began, 2),
                 physics_steps=effort.physics_steps,
@@ -307,15 +295,12 @@ def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None)
         count = local_workers(request.backend, prepared.device, threads=threads, most=most)
     if on_gpu:
         speculation = GPU_SPECULATION
-        worlds = min(
-            max(sum(count_segments(e, suite) for e in (*required, *speculation.choose(plans, required))), 1),
-            _GPU_WORLDS,
-        )
+        segments = sum(count_segments(e, suite) for e in (*required, *speculation.choose(plans, required)))
+        worlds = min(max(segments, 1), _GPU_WORLDS)
     else:
         walk = sum(count_sub_commands(suite, g.name) for g in suite.goals if g.name != TARGET)
-        worlds = min(
-            len(prepared.environments) * max(len(prepared.seeds) * walk, len(suite.matrix.search_seeds)), _WORLDS
-        )
+        each = max(len(prepared.seeds) * walk, len(suite.matrix.search_seeds))
+        worlds = min(len(prepared.environments) * each, _WORLDS)
         # a single worker has no core to spare
         speculation = Speculation(at_work=_EARLY * count if count > 1 else 0)
     job = Job(

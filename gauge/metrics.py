@@ -357,11 +357,7 @@ def metric_names() -> list[str]:
 
 
 def find_metric(name: str) -> Metric:
-    """Return a metric by its name.
-
-    Raises:
-        MetricError: no such metric, or a plug-in that cannot be loaded or gives no proper ``Metric``.
-    """
+    """Return a metric by its name; raise ``MetricError`` where there is none, or its plug-in fails or gives no ``Metric``."""
     if name in METRICS:
         return METRICS[name]
     plugin = plugins(GROUP).get(name)
@@ -401,11 +397,7 @@ class MetricEvaluator:
     """All metrics of a suite for N instants at once."""
 
     def __init__(self, rules: Metrics, robot: Robot, weight: float, device: torch.device, dtype: torch.dtype) -> None:
-        """Find the metrics; ``weight`` is that of the robot [N].
-
-        Raises:
-            MetricError: a metric cannot be loaded, or not be measured on the robot.
-        """
+        """Find the metrics of a robot of ``weight`` [N]; raise ``MetricError`` where one cannot be loaded or measured on the robot."""
         self.names = tuple(rules.weights)
         self.constants = MetricConstants(rules=rules, robot=robot, weight=weight, device=device, dtype=dtype)
         self._metrics = {name: find_metric(name) for name in self.names}
@@ -418,11 +410,7 @@ class MetricEvaluator:
                 metric.prepare(self.constants)
 
     def evaluate(self, instants: Instants) -> torch.Tensor:
-        """Return the metrics of N instants, (N, M), NaN where a metric is not defined.
-
-        Raises:
-            MetricError: a plug-in fails, or gives values of another shape.
-        """
+        """Return metrics of N instants, (N, M), NaN where undefined; raise ``MetricError`` where a plug-in fails or misshapes them."""
         columns = []
         for name, metric in self._metrics.items():
             value, like = metric.function(instants), instants.friction

@@ -12,11 +12,7 @@ from .suite import Suite
 
 
 def suite_parameters(suite: Suite, robot: Robot) -> JointParameters:
-    """The robot's joint and motor constants that a suite names.
-
-    Raises:
-        RobotError: the robot lacks them.
-    """
+    """Return the joint and motor constants that a suite names; raise ``RobotError`` where the robot lacks them."""
     found = robot.parameters.get(suite.parameters)
     if found is None:
         raise RobotError(

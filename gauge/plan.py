@@ -56,10 +56,7 @@ class Plan:
 
 
 def plan(environment: Environment, records: Records, rules: PlanRules) -> Plan:
-    """Plan an environment: the level as the suite finds it unless it is given, then the quality episodes.
-
-    ``records`` may hold those of other environments, too.
-    """
+    """Plan an environment: its level unless it is given, then its quality. ``records`` may hold those of other environments, too."""
     if environment.level is None and rules.suite.scoring.level == "curve":
         return _plan_curve(environment, records, rules)
     counted: list[Episode] = []

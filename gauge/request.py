@@ -41,16 +41,13 @@ class EvaluationOptions:
         None
     )
     frictions: Annotated[
-        tuple[float, ...],
-        Choice("Friction coefficient; repeatable. Default: the suite's.", PLAYED, flags=("--friction",)),
+        tuple[float, ...], Choice("Friction coefficient; repeatable. Default: the suite's.", PLAYED)
     ] = ()
     payloads: Annotated[
-        tuple[float, ...],
-        Choice("Mass on the base [kg]; repeatable. Default: the suite's.", PLAYED, flags=("--payload",)),
+        tuple[float, ...], Choice("Mass on the base [kg]; repeatable. Default: the suite's.", PLAYED)
     ] = ()
     seeds: Annotated[
-        tuple[int, ...],
-        Choice("Seed of the quality episodes; repeatable. Default: the suite's.", PLAYED, flags=("--seed",)),
+        tuple[int, ...], Choice("Seed of the quality episodes; repeatable. Default: the suite's.", PLAYED)
     ] = ()
     threads: ThreadCount = None
     trust: Trust = False

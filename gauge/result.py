@@ -432,11 +432,7 @@ class Result(Scores):
         return found
 
     def check_replicates(self, source: str, error: type[Exception]) -> None:
-        """Check that the level searches can be drawn again.
-
-        Raises:
-            error: all replicates together are too many.
-        """
+        """Check that the level searches can be drawn again; raise ``error`` where all replicates together are too many."""
         if len(self.environments) * self.chance.resamples > MOST_REPLICATES:
             raise error(
                 f"{source}: {len(self.environments)} environments with {self.chance.resamples:,} replicates are more than is "

@@ -25,11 +25,7 @@ Figure = tuple[str, float | None, float | None]
 
 
 def check_figures(result: Result, source: str, error: type[Exception]) -> None:
-    """Check that seeds, trials, scores, levels, groups, metrics and falls are those of the runs.
-
-    Raises:
-        error: one sentence with the first figure that is not.
-    """
+    """Check that seeds, trials, scores, levels, groups, metrics and falls are the runs'; raise ``error`` on the first that is not."""
     rows = result.environments
     _check_environments(rows, result.chance, source, error)
     if result.score is not None and None in (scores := [row.score for row in rows]):
@@ -46,11 +42,7 @@ def check_figures(result: Result, source: str, error: type[Exception]) -> None:
 
 
 def check_interval(result: Result, source: str, error: type[Exception]) -> None:
-    """Check that the interval of the score is that of the trials and runs.
-
-    Raises:
-        error: it is another, or there should be none.
-    """
+    """Check that the interval of the score is that of the trials and runs; raise ``error`` where it is not."""
     rows, stated = result.environments, result.score_interval
     if result.score is None or not rows:
         return

@@ -88,9 +88,8 @@ def fold(
         group = [e for e in environments if e.terrain == terrain]
         mine = np.array([e.terrain == terrain for e in environments])
         weights, level = mine / len(group), None if terrain == FLAT else _mean_level(group)
-        found = TerrainScore(
-            level=level, level_interval=level_interval(level, weights) if any(e.searched for e in group) else None
-        )
+        between = level_interval(level, weights) if any(e.searched for e in group) else None
+        found = TerrainScore(level=level, level_interval=between)
         if evaluated:
             statistics = np.mean([v["score"] for v, own in zip(values, mine, strict=True) if own], axis=0)
             scores.append(statistics[2])
@@ -123,17 +122,13 @@ def fold(
         score_interval=interval(score, weights),
         groups={g: _number(v) for g, v in groups.items()},
         metrics={m: MetricScore(**_named(v), interval=interval(float(v[2]), even, (m,))) for m, v in weighted.items()},
-        environments=tuple(
-            replace(row, interval=interval(row.score or 0.0, alone)) for row, alone in zip(rows, each, strict=True)
-        ),
+        environments=tuple(replace(r, interval=interval(r.score or 0.0, e)) for r, e in zip(rows, each, strict=True)),
         groups_interval={g: interval(groups[g], even, names) for g, names in scoring.groups.items()},
     )
 
 
 def environment_weights(terrains: Sequence[str]) -> Array:
-    """Return the weight of each environment in the benchmark's score, (E,): terrains count the same, and so do the environments
-    of one.
-    """
+    """Return the weight of each environment in the score, (E,): terrains count the same, and so do the environments of one."""
     counts = Counter(terrains)
     return np.array([1.0 / (len(counts) * counts[t]) for t in terrains])
 
@@ -268,11 +263,8 @@ def rows_csv(records: Sequence[Record]) -> str:
         for goal, part in of_columns[0] if of_columns else ():
             name = record.episode.goals[goal]
             mine = (record.goal_index == goal) & (record.part_index == part)
-            row = asdict(record.episode) | {
-                "goals": name,
-                "command": command_name(name, part),
-                "samples": int(mine.sum()),
-            }
+            row = {**asdict(record.episode), "goals": name, "command": command_name(name, part)}
+            row["samples"] = int(mine.sum())
             row["self_contact"] = None if record.touching is None else _number(record.touching[mine].mean())
             if record.fallen is not None:
                 row["falls"] = record.fallen.count((goal, part))

@@ -41,11 +41,10 @@ def run_statistics(record: Record, column: int) -> Array:
 def command_statistics(record: Record, column: int) -> dict[tuple[int, int], Array]:
     """``tail_means`` of one column over the samples of each sub-command that was played, (3,), by goal and sub-command index."""
     parts = np.stack((record.goal_index, record.part_index), axis=1)
-    found = {}
-    for goal, part in np.unique(parts, axis=0).tolist():
-        mine = (record.goal_index == goal) & (record.part_index == part)
-        found[goal, part] = tail_means(record.samples[mine, column].astype(np.float64))
-    return found
+    return {
+        (goal, part): tail_means(record.samples[(parts == (goal, part)).all(1), column].astype(np.float64))
+        for goal, part in np.unique(parts, axis=0).tolist()
+    }
 
 
 class LevelWeights(Protocol):

@@ -65,11 +65,7 @@ class RunFolder:
         record.save(self._episodes)
 
     def discard_all_but(self, counted: Collection[Episode]) -> None:
-        """Remove the records of speculative episodes that results do not count.
-
-        Raises:
-            StoreError: one cannot be removed.
-        """
+        """Remove the records of speculative episodes that results do not count; raise ``StoreError`` where one cannot be removed."""
         names = {episode.key for episode in counted}
         for path in self._episodes.glob("*.npz"):
             if path.stem not in names:

@@ -350,11 +350,7 @@ def _goal_rules(suite: Suite) -> dict[str, bool]:
 
 
 def _check(suite: Suite, source: str) -> None:
-    """Refuse values that are allowed one by one and not together.
-
-    Raises:
-        SuiteError: one sentence.
-    """
+    """Raise ``SuiteError``, one sentence, for values that are allowed one by one and not together."""
     physics, events, metrics, settling = suite.physics, suite.events, suite.metrics, suite.settling
     goals = [g.name for g in suite.goals]
     matrix, scoring = suite.matrix, suite.scoring

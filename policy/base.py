@@ -110,22 +110,14 @@ def act_alike(alone: PolicySession, together: PolicySession, width: int) -> bool
 
 
 def check_observation(observation: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> None:
-    """Check that a session was handed ``rows`` observations of the contract's width.
-
-    Raises:
-        PolicyError: another shape; ``source`` is the policy's name in the message.
-    """
+    """Raise ``PolicyError``, with the policy's name ``source``, for observations that are not ``rows`` of the contract's width."""
     expected = (rows, contract.observation_width)
     if observation.shape != expected:
         raise PolicyError(f"'{source}' takes observations of shape {expected}, not {tuple(observation.shape)}")
 
 
 def checked_action(action: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> torch.Tensor:
-    """Return a network's output as a fresh float32 tensor (rows, J). A batch of one may lack its batch axis.
-
-    Raises:
-        PolicyError: the output has another shape.
-    """
+    """Return an output as a fresh float32 tensor (rows, J), one row also without its axis; raise ``PolicyError`` for another shape."""
     expected = (rows, contract.num_joints)
     if rows == 1 and tuple(action.shape) == expected[1:]:
         action = action.unsqueeze(0)

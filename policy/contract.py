@@ -43,9 +43,7 @@ _Period = Annotated[float, Field(strict=True, ge=0.0005, le=1.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationTerm:
-    """One block of the observation vector. ``joint_position`` is relative to the default pose; ``last_action`` is the
-    raw output.
-    """
+    """One block of the observation vector; ``joint_position`` is relative to the default pose, ``last_action`` the raw output."""
 
     name: Text
     """Name of an observation of ``observation_table``."""
@@ -64,9 +62,7 @@ class ObservationTerm:
 
 @dataclass(frozen=True, kw_only=True)
 class History:
-    """Past observations that the network expects in its input. A network that keeps its own history has length 1
-    here; ``start`` holds for its history too.
-    """
+    """Past observations in a network's input; length 1 where the network keeps its own, for which ``start`` holds too."""
 
     length: Annotated[int, Field(strict=True, ge=1, le=1000)] = 1
     """Number of frames, the current one included."""
@@ -167,20 +163,12 @@ class PolicyContract:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PolicyContract:
-        """Read what ``to_dict`` wrote, as it comes back from JSON.
-
-        Raises:
-            ContractError: a field is unknown, missing or malformed.
-        """
+        """Read what ``to_dict`` wrote; raise ``ContractError`` where a field is unknown, missing or malformed."""
         return build(cls, data, "contract", ContractError)
 
     @classmethod
     def from_json(cls, text: str) -> PolicyContract:
-        """Read a contract from JSON text.
-
-        Raises:
-            ContractError: not JSON, or not a contract.
-        """
+        """Read a contract from JSON text; raise ``ContractError`` where it is no JSON or no contract."""
         if len(text) > LARGEST:
             raise ContractError(f"the contract is not read: it is larger than {LARGEST / 1e6:g} MB")
         return cls.from_dict(parse_json(text, "the contract", ContractError))
@@ -225,11 +213,7 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
 
 
 def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyContract:
-    """Return the contract with its joints in another order; every value per joint goes with its joint.
-
-    Args:
-        joint_names: the contract's joints, each once.
-    """
+    """Return the contract with all its joints in the order of ``joint_names``; every value per joint goes with its joint."""
     index = [contract.joint_names.index(name) for name in joint_names]
 
     def moved(values: Any) -> Any:
@@ -251,11 +235,7 @@ def other_width(contract: PolicyContract, width: int) -> str:
 
 
 def difference(a: PolicyContract, b: PolicyContract) -> str:
-    """Return the differences between two contracts, one line per field (``field: value in a -> value in b``); empty if they are
-    equal.
-
-    The provenance does not count.
-    """
+    """Return two contracts' differences but for provenance, lines ``field: value in a -> value in b``; empty where they are equal."""
     left, right = _flat(a), _flat(b)
     lines = [
         f"{n}: {left.get(n, 'absent')} -> {right.get(n, 'absent')}" for n in left | right if left.get(n) != right.get(n)

@@ -34,11 +34,7 @@ DEFAULT_ROBOT = "go2"
 
 
 def load_policy(
-    path_or_name: str | Path,
-    robot: Robot | None = None,
-    *,
-    trust: bool = False,
-    contract_file: Path | None = None,
+    path_or_name: str | Path, robot: Robot | None = None, *, trust: bool = False, contract_file: Path | None = None
 ) -> FilePolicy:
     """Load a policy and try it on zeros.
 
@@ -148,9 +144,7 @@ def _foreign(
 def _foreign_contract(
     child: Child, kind: str, metadata: Mapping[str, str], path: Path, source: str, robot: Robot
 ) -> PolicyContract:
-    """Return the contract beside the file or in it, an ONNX file's deploy.yaml or mjlab metadata, or else the
-    standard one with as many frames as the input is wide.
-    """
+    """Return the contract beside a file or in it, of its deploy.yaml or mjlab metadata, or else the standard one of the input's width."""
     contract = sidecar_contract(path)
     if contract is None and "contract" in metadata:
         contract = _stored_contract(metadata["contract"], source)

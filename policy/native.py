@@ -208,20 +208,15 @@ def _intact(entries: Mapping[str, Any]) -> bool:
 
 
 def load_entries(data: bytes, *, source: str) -> Mapping[str, Any]:
-    """Read a ``torch.save`` archive of plain data and tensors, without the ability to run code.
-
-    Raises:
-        PolicyError: damaged, or with anything else inside.
-    """
+    """Read a ``torch.save`` archive of data and tensors without running code; raise ``PolicyError`` for damage or anything else."""
     records = read_archive(data, source=source)
     if "data.pkl" not in records:
         raise PolicyError(f"'{source}' is a zip archive, but neither TorchScript nor a torch.save file")
     reading = read_pickle(records["data.pkl"], source=source)
     called = {call.function.name for call in reading.calls}
     # torch itself would allow some more: calls that make what no policy has, of any size
-    if strange := [
-        n for n in reading.names if n not in _PLAIN_CALLS and (n in called or not _PLAIN_NAMES.fullmatch(n))
-    ]:
+    others = [n for n in reading.names if n not in _PLAIN_CALLS]
+    if strange := [n for n in others if n in called or not _PLAIN_NAMES.fullmatch(n)]:
         raise PolicyError(
             f"'{source}' holds more than tensors and plain data ('{strange[0].replace(' ', '.')}'), and was not loaded"
         )
@@ -322,14 +317,8 @@ class NativePolicy(FilePolicy):
     """Play a policy with a network of ``architectures.py``."""
 
     def __init__(self, contract: PolicyContract, stored: StoredNetwork, *, path: str) -> None:
-        """Build the network.
-
-        Raises:
-            PolicyError: the network does not fit the contract.
-        """
-        self.contract = contract
-        self.path = path
-        self.stored = stored
+        """Build the network; raise ``PolicyError`` where it does not fit the contract."""
+        self.contract, self.path, self.stored = contract, path, stored
         self.network = build_network(stored, contract, source=path)
         self._recorded: dict[int, FrozenNetwork] = {}
 
@@ -367,10 +356,8 @@ def frozen(network: Any, num_episodes: int) -> Any:
     with torch.inference_mode(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what a recording would not follow; the comparison below sees it
         generator = torch.Generator().manual_seed(0)
-        inputs = [
-            torch.randn(rows, network.history_length, network.frame_width, generator=generator)
-            for rows in (num_episodes, 8, num_episodes + 1)
-        ]
+        shape, counts = (network.history_length, network.frame_width), (num_episodes, 8, num_episodes + 1)
+        inputs = [torch.randn(rows, *shape, generator=generator) for rows in counts]
         try:
             recorded = torch.jit.freeze(torch.jit.trace(network, inputs[0], check_trace=False))
             # twice: the second call is the one that its executor has optimized
@@ -387,17 +374,14 @@ class NativeSession(PolicySession):
         self, network: Any, num_episodes: int, contract: PolicyContract, device: torch.device, source: str
     ) -> None:
         """Take over a network of ``ARCHITECTURES`` on ``device``; ``source`` is its name for messages."""
-        self._network = network
-        self._num_episodes = num_episodes
-        self._contract = contract
-        self._source = source
-        frames, width = self._network.history_length, self._network.frame_width
+        self._network, self._num_episodes, self._contract, self._source = network, num_episodes, contract, source
+        frames, width = network.history_length, network.frame_width
         # A frame that has not been seen is NaN where the first one takes its place.
         self._unseen = math.nan if contract.history.start == "repeat" else 0.0
         self._history = torch.full((num_episodes, frames, width), self._unseen, device=device)
         self._initial: torch.Tensor | None = None
         if hasattr(network, "initial_state"):
-            self._initial = self._network.initial_state(num_episodes).to(device)
+            self._initial = network.initial_state(num_episodes).to(device)
             self._state = self._initial.clone()
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:

@@ -34,9 +34,7 @@ class ObservationBuilder:
             ContractError: the policy is not for this robot.
         """
         index = check_robot(contract, robot)
-        self.contract = contract
-        self.num_episodes = num_episodes
-        self.device = torch.device(device)
+        self.contract, self.num_episodes, self.device = contract, num_episodes, torch.device(device)
         self._observations = [observation(term.name) for term in contract.observation]
         # a noise stream also draws for what this policy does not observe
         self._noisy = {each.name for each in OBSERVATIONS.values() if each.noise is not None}
@@ -102,9 +100,7 @@ class ObservationBuilder:
         frame = torch.cat(blocks, dim=-1).to(torch.float32) * self._scale
         if self._limit is not None:
             frame = torch.clamp(frame, -self._limit, self._limit)
-        if self.contract.history.length == 1:
-            return frame
-        return self._with_history(frame)
+        return frame if self.contract.history.length == 1 else self._with_history(frame)
 
     def _value(
         self,
@@ -136,10 +132,7 @@ class ObservationBuilder:
         return frames.reshape(self.num_episodes, -1)
 
     def targets(self, action: torch.Tensor) -> torch.Tensor:
-        """Return joint targets [rad] of raw actions, both (N, J): actions in the policy's joint order, targets in the robot's.
-
-        NaN stays NaN.
-        """
+        """Return joint targets [rad], in the robot's order, of raw actions in the policy's order, both (N, J). NaN stays NaN."""
         if self.contract.action_clip is not None:
             action = torch.clamp(action, -self.contract.action_clip, self.contract.action_clip)
         target = self._default + self._action_scale * action

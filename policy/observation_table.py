@@ -62,11 +62,7 @@ class Observation:
     """The contract's default pose is subtracted after the noise [rad]."""
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ObservationError: a field is malformed.
-        """
+        """Check the fields; raise ``ObservationError`` where one is malformed."""
         where = f"observation {shown(self.name)}"
         if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ObservationError(f"{where} has no usable name; use letters, digits and underscores")
@@ -87,9 +83,7 @@ class Observation:
 
     def half_width(self, noise: Any) -> float:
         """Return the half width of the noise that a suite's or a training's ``noise`` settings give it, in its own unit."""
-        if isinstance(self.noise, str):
-            return float(getattr(noise, self.noise, 0.0))
-        return float(self.noise or 0.0)
+        return float(getattr(noise, self.noise, 0.0) if isinstance(self.noise, str) else self.noise or 0.0)
 
 
 def _base_linear_velocity(state: PhysicsState, command: torch.Tensor, last_action: torch.Tensor) -> torch.Tensor:
@@ -187,11 +181,7 @@ _OWN_NAMES = frozenset(OBSERVATIONS)
 
 
 def observation(name: str) -> Observation:
-    """Return the observation of a name; a plug-in is loaded.
-
-    Raises:
-        ObservationError: there is no such observation, or its plug-in is broken.
-    """
+    """Return the observation of a name, plug-ins included; raise ``ObservationError`` where there is none or it is broken."""
     if name in OBSERVATIONS:
         return OBSERVATIONS[name]
     installed = plugins(GROUP)
@@ -239,11 +229,7 @@ def _checked(made: Observation) -> Callable[[PhysicsState, torch.Tensor, torch.T
 
 
 def foreign_observation(foreign_name: str) -> Observation:
-    """Return the observation that files of other projects call by this name; plug-ins come after the project's own.
-
-    Raises:
-        ObservationError: there is none, or a plug-in is broken.
-    """
+    """Return the first observation, the project's own first, with this foreign name; raise ``ObservationError`` where none has it."""
     known: dict[str, Observation] = {}
     for name in dict.fromkeys((*OBSERVATIONS, *plugins(GROUP))):
         found = observation(name)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 from ..files.choices import PLACE, Choice, FirstSeed, PolicyNames, RobotName, ThreadCount, Trust
 
+_ENGINE = Choice("Physics engine, see 'gaitgauge list backends'.", PLACE, "backends", flags=("--backend", "--engine"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class PoliciesRequest:
@@ -14,12 +16,7 @@ class PoliciesRequest:
 
     policies: PolicyNames
     seed: FirstSeed = 0
-    backend: Annotated[
-        str,
-        Choice(
-            "Physics engine, see 'gaitgauge list backends'.", PLACE, flags=("--backend", "--engine"), values="backends"
-        ),
-    ] = "mujoco"
+    backend: Annotated[str, _ENGINE] = "mujoco"
     robot: RobotName = None
     threads: ThreadCount = None
     trust: Trust = False

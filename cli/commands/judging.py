@@ -76,7 +76,7 @@ def verify(request: VerifyRequest) -> None:
     """
     from ..verify import run_verification
 
-    run_verification(**vars(request))
+    run_verification(request)
 
 
 @command(app)

@@ -55,4 +55,4 @@ def sweep(request: SweepRequest) -> None:
     """
     from ..sweep import run_sweep
 
-    run_sweep(**vars(request))
+    run_sweep(request)

@@ -91,14 +91,11 @@ class Chance:
             other: of the value that is subtracted; its level searches are independent of these.
             paired: both have the same seeds in the same order, whose differences are the sample.
         """
+        seeds = (*self.seeds, *other.seeds)
         if paired:
             seeds = tuple(a - b for a, b in zip(self.seeds, other.seeds, strict=True))
-        else:
-            seeds = (*self.seeds, *other.seeds)
-        variances, freedoms = zip(
-            (self.levels.var(), self.level_freedom), (other.levels.var(), other.level_freedom), strict=True
-        )
-        freedom = welch(np.array(variances), np.array(freedoms))
+        variances = np.array([self.levels.var(), other.levels.var()])
+        freedom = welch(variances, np.array([self.level_freedom, other.level_freedom]))
         return Chance(levels=self.levels - other.levels, level_freedom=freedom, seeds=seeds)
 
 

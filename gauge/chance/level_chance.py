@@ -47,18 +47,16 @@ def success_curves(searches: Sequence[Trials], terrains: Sequence[str], levels: 
     for at, trials in enumerate(searches):
         for level, outcomes in trials.items():
             reached = sum(outcomes.values())
-            likelihoods[at] += (
-                reached * log_pass[:, :, level - 1] + (len(outcomes) - reached) * log_fail[:, :, level - 1]
-            )
+            failed = len(outcomes) - reached
+            likelihoods[at] += reached * log_pass[:, :, level - 1] + failed * log_fail[:, :, level - 1]
     centres = _shares(likelihoods, axis=1)
     names = list(dict.fromkeys(terrains))
     groups = [np.array([t == name for t in terrains]) for name in names]
     of_width = np.array([np.logaddexp.reduce(likelihoods[mine], axis=1).sum(0) for mine in groups])
     log_widths = np.log(_WIDTHS / _USUAL_WIDTH)
     around = np.log(_shares(-0.5 * ((log_widths - log_widths[:, None]) / _TERRAIN_SPREAD) ** 2, axis=1))
-    told = np.logaddexp.reduce(
-        around + of_width[:, None], axis=2
-    )  # (terrains, usual width): by each terrain of the usual one
+    # (terrains, usual width): by each terrain of the usual one
+    told = np.logaddexp.reduce(around + of_width[:, None], axis=2)
     beforehand = -0.5 * (log_widths / _WIDTH_SPREAD) ** 2
     curves = np.zeros((len(searches), levels))
     for terrain, mine in enumerate(groups):
@@ -77,9 +75,7 @@ def _shares(logarithms: Array, axis: int) -> Array:
 
 
 def bisect(passed: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Level that the search finds for each table of outcomes, (…, levels) to (…,): the way of ``plan``, through all tables at once;
-    0 where none is passed on the way.
-    """
+    """Return the level that ``plan``'s search finds for each table of outcomes, (…, levels) to (…,); 0 where none is passed."""
     low = np.zeros(passed.shape[:-1], dtype=np.int64)
     high = np.full_like(low, passed.shape[-1])
     while (open_ := low < high).any():
@@ -106,9 +102,8 @@ def shared_luck(searches: Sequence[Trials], curves: Array) -> float:
         of_seed: dict[int, list[tuple[float, float]]] = {}
         for level, outcomes in trials.items():
             for seed, reached in outcomes.items():
-                of_seed.setdefault(seed, []).append(
-                    (reached - curve[level - 1], curve[level - 1] * (1.0 - curve[level - 1]))
-                )
+                chance = curve[level - 1]
+                of_seed.setdefault(seed, []).append((reached - chance, chance * (1.0 - chance)))
         for seed, played in of_seed.items():
             residuals, variances = np.array(played).T
             sums.setdefault(seed, []).append((residuals.sum(), np.sqrt(variances).sum(), variances.sum()))
@@ -121,10 +116,7 @@ def shared_luck(searches: Sequence[Trials], curves: Array) -> float:
 
 
 def bisected_levels(reached: NDArray[np.bool_], pass_rate: float) -> NDArray[np.int64]:
-    """Level that a bisection over level tests finds, (…,), from whether each seed reaches the target, (…, levels, seeds).
-
-    ``pass_rate`` is the share of the seeds that must.
-    """
+    """Return the level that a bisection finds, (…,), where ``pass_rate`` of the seeds must have ``reached`` it, (…, levels, seeds)."""
     return bisect(reached.sum(-1) >= math.ceil(pass_rate * reached.shape[-1] - 1e-9))
 
 

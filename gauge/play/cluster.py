@@ -21,18 +21,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...files.parsing import one_line, shown
+from ...policy.native import first_line
 from ...robots.identity import packed
 from .cluster_node import Arrived, Message, fingerprint
-from .workers import (
-    Drop,
-    Failed,
-    Finished,
-    Job,
-    Lost,
-    Play,
-    Progress,
-    Stop,
-)
+from .workers import Drop, Failed, Finished, Job, Lost, Play, Progress, Stop
 
 _ADDRESS = re.compile(r"auto|(ray://)?(?P<host>[\w.-]{1,253}|\[[\da-fA-F:]{1,45}\]):(?P<port>\d{1,5})", re.ASCII)
 _CONNECTING = 5.0
@@ -59,11 +51,7 @@ class ClusterError(RuntimeError):
 
 
 def check_address(address: str) -> None:
-    """Refuse a text that is no address of a Ray cluster, and a machine without Ray.
-
-    Raises:
-        ClusterError: one sentence.
-    """
+    """Raise ``ClusterError`` for a text that is no address of a Ray cluster, and on a machine without Ray."""
     _ray()
     if _ADDRESS.fullmatch(address) is None:
         raise ClusterError(
@@ -76,11 +64,7 @@ class Cluster:
     """A connection to a running Ray cluster."""
 
     def __init__(self, address: str) -> None:
-        """Connect.
-
-        Raises:
-            ClusterError: Ray is not installed, nothing answers at the address, or no CPU is free.
-        """
+        """Connect; raise ``ClusterError`` where Ray is not installed, nothing answers at the address, or no CPU is free."""
         check_address(address)
         self._ray = _ray()
         try:
@@ -90,8 +74,8 @@ class Cluster:
             self._head = address if "://" in address else self._ray.get_runtime_context().gcs_address
         except Exception as error:  # Ray raises errors of many classes, some of them its own
             raise ClusterError(
-                f"no Ray cluster can be used at {address} ({_first_sentence(error)}); start one with 'ray start --head', run "
-                "this on one of its nodes or give its ray:// address (--cluster)"
+                f"no Ray cluster can be used at {address} ({one_line(first_line(error), 160)}); start one with 'ray "
+                "start --head', run this on one of its nodes or give its ray:// address (--cluster)"
             ) from error
         self.cpus = self._free_cpus()
         """CPUs that were free, at least 1."""
@@ -193,11 +177,6 @@ class ClusterWorkers:
 
     # ---- workers come and go --------------------------------------------------------------------------------------
 
-    def _start(self, seat: _Seat) -> None:
-        """Have Ray start a worker wherever a CPU is free, as soon as one is."""
-        seat.actor = self._make.remote(fingerprint(), self._shipment)
-        self._call(seat)
-
     def _call(self, seat: _Seat) -> None:
         """Bring a worker its messages and let it play on."""
         messages, seat.outbox = seat.outbox, []
@@ -210,7 +189,8 @@ class ClusterWorkers:
             self._next_look = time.monotonic() + _LISTENING
         for seat in self._seats:
             if seat.actor is None and time.monotonic() >= seat.begin:
-                self._start(seat)
+                seat.actor = self._make.remote(fingerprint(), self._shipment)  # Ray starts it as soon as a CPU is free
+                self._call(seat)
         ray, calls = self._ray, {seat.call: n for n, seat in enumerate(self._seats) if seat.call is not None}
         if not calls:
             idle = [seat for seat in self._seats if seat.there]
@@ -263,7 +243,7 @@ class ClusterWorkers:
 
     def _replace(self, number: int, error: Exception) -> None:
         """Replace a lost worker."""
-        seat, reason = self._seats[number], _first_sentence(error)
+        seat, reason = self._seats[number], one_line(first_line(error), 160)
         self._ray.kill(seat.actor)  # it may only have been out of reach
         if seat.there:
             self._heard.append((number, Lost()))
@@ -295,9 +275,9 @@ class ClusterWorkers:
                     "there again, or without --cluster"
                 ) from error
             return
-        if self._anyone:
-            return
-        if not any(node["Alive"] and node["Resources"].get("CPU", 0.0) >= 1.0 for node in self._ray.nodes()):
+        if not self._anyone and not any(
+            node["Alive"] and node["Resources"].get("CPU", 0.0) >= 1.0 for node in self._ray.nodes()
+        ):
             raise ClusterError(
                 f"no node of the Ray cluster is left; {_KEPT} once it has nodes again, or without --cluster"
             )
@@ -364,9 +344,3 @@ def _knock(address: str, *, greet: bool = False) -> None:
                 raise OSError("something else than Ray answers there")
     except OverflowError as error:
         raise OSError(str(error)) from error
-
-
-def _first_sentence(error: BaseException) -> str:
-    """Return the beginning of an error's message."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return one_line(lines[0].partition(". ")[0].rstrip("."), 160) if lines else type(error).__name__

@@ -39,12 +39,7 @@ class NodeWorker:
     """A worker in an actor's process."""
 
     def __init__(self, node: str, wanted: dict[str, str], shipment: bytes) -> None:
-        """Keep what is needed to begin.
-
-        Args:
-            node: the node's name, for messages.
-            wanted: ``fingerprint`` of the machine that asks.
-        """
+        """Keep what is needed to begin; ``node``: its name for messages, ``wanted``: ``fingerprint`` of the machine that asks."""
         self._node, self._wanted, self._shipment = node, wanted, shipment
         self._worker: Worker | None = None
 
@@ -77,9 +72,8 @@ class NodeWorker:
     def _begin(self) -> Worker:
         torch.set_num_threads(1)
         job, robot = pickle.loads(self._shipment)
-        with tempfile.TemporaryDirectory(
-            prefix="gaitgauge-robot-"
-        ) as folder:  # its engine has read all when it is made
+        # the engine has read all files once the worker is made
+        with tempfile.TemporaryDirectory(prefix="gaitgauge-robot-") as folder:
             worker = Worker(replace(job, robot=unpacked(robot, Path(folder), largest=LARGEST_MODEL)))
         gc.freeze()
         return worker

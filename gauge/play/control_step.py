@@ -61,14 +61,7 @@ class ControlStep(ABC):
     """Take control steps of all worlds of a rollout: observe, act, step, judge. The tensors of a step go from function to function."""
 
     def __init__(self, suite: Suite, policy: Policy, backend: PhysicsBackend, *, one_by_one: bool) -> None:
-        """Prepare empty worlds.
-
-        Args:
-            one_by_one: see ``SampleTable``.
-
-        Raises:
-            BackendError: the engine cannot push robots, and the suite does.
-        """
+        """Prepare empty worlds, ``one_by_one`` as for ``SampleTable``; ``BackendError``: the suite pushes robots, the engine cannot."""
         if suite.push is not None and unsupported(["external_force"], backend.capabilities()):
             raise BackendError(
                 f"suite '{suite.name}' pushes robots, and engine '{backend.name}' knows no external force; choose another engine "

@@ -94,10 +94,8 @@ class ReferenceStream(NoiseStream):
             draw, delay, steps = generator.random, generator.randint, range(len(self._half))
             drawn = [([draw() for _ in steps], delay(0, latency)) for _ in range(count)]
             unit = np.array([numbers for numbers, _ in drawn]).reshape(count, -1)[:, self._observed]
-            uniform[row], delays[row] = (
-                low + (-low - low) * unit,
-                [number for _, number in drawn],
-            )  # as random.uniform does
+            uniform[row] = low + (-low - low) * unit  # as random.uniform does
+            delays[row] = [number for _, number in drawn]
         return torch.tensor(uniform, device=self._device), torch.tensor(delays, device=self._device)
 
     def draw(self, step: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
@@ -182,8 +180,7 @@ class NoiseReader:
     """Reads K streams step by step, many steps at a time."""
 
     def __init__(self, stream: NoiseStream, worlds: int, device: torch.device) -> None:
-        self._stream = stream
-        self._device = device
+        self._stream, self._device = stream, device
         self._offset = torch.zeros(worlds, dtype=torch.int64, device=device)
         self._ahead = torch.arange(BLOCK_STEPS, device=device)[:, None]
         self._block: list[tuple[dict[str, torch.Tensor], torch.Tensor]] = []

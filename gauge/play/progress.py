@@ -45,11 +45,7 @@ class ProgressMeter:
     """Estimates what is left from plans and from the episodes at work."""
 
     def __init__(self, suite: Suite, began: float) -> None:
-        """Begin.
-
-        Args:
-            began: value of ``time.perf_counter()`` when the evaluation began.
-        """
+        """Begin; ``began``: value of ``time.perf_counter()`` when the evaluation began."""
         # a target is reached, or missed, in part of the time that it may take
         crossing = 0.4 * max(suite.commands.target_time.values(), default=25.0)
         settling = suite.settling.shortest

@@ -31,10 +31,5 @@ def _draw(what: str, segment: Segment) -> random.Random:
 
 
 def sideways(quaternion: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-    """Return a force to the left of the heading in world axes, horizontal [N], (N, 3).
-
-    Args:
-        quaternion: base orientation wxyz, (N, 4).
-        force: [N], (N,).
-    """
+    """Return a horizontal force in world axes, (N, 3), from ``force`` to the left of the heading, (N,) [N]; wxyz ``quaternion`` (N, 4)."""
     return from_heading(quaternion, torch.zeros_like(force), force)

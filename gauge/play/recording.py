@@ -60,9 +60,7 @@ class StepRecording:
                     raise
                 reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         logging.getLogger(__name__).warning(
-            "control steps are not recorded as CUDA graphs, which makes them slower: '%s' cannot be: %s",
-            name,
-            reason,
+            "control steps are not recorded as CUDA graphs, which makes them slower: '%s' cannot be: %s", name, reason
         )
         self.enabled = False
         self._functions.clear()

@@ -27,15 +27,7 @@ robot touch each other, (T,)."""
 class SampleTable:
     """Samples of K worlds. A world's rows depend on its own segment alone, and so do the metrics worked out from them."""
 
-    def __init__(
-        self,
-        suite: Suite,
-        robot: Robot,
-        weight: float,
-        like: PhysicsState,
-        *,
-        one_by_one: bool,
-    ) -> None:
+    def __init__(self, suite: Suite, robot: Robot, weight: float, like: PhysicsState, *, one_by_one: bool) -> None:
         """Prepare the table; ``reserve`` gives it rows.
 
         Args:
@@ -131,10 +123,9 @@ class SampleTable:
         values = torch.cat([self._evaluate(*batch) for batch in zip(*rows, batches, strict=True)])
         poses = mine.split(self._split, dim=1)[list(self._shapes).index("joint_position")].cpu().numpy()
         ends = np.cumsum(counts)[:-1]
-        pieces = zip(
-            np.split(values.cpu().numpy(), ends), np.split(self._self_contact.touching(poses), ends), strict=True
-        )
-        return [(piece[:, :-1], piece[:, -1] > 0, touching) for piece, touching in pieces]
+        touching = np.split(self._self_contact.touching(poses), ends)
+        pieces = zip(np.split(values.cpu().numpy(), ends), touching, strict=True)
+        return [(piece[:, :-1], piece[:, -1] > 0, touched) for piece, touched in pieces]
 
     def _evaluate(
         self, rows: torch.Tensor, limits: torch.Tensor, friction: torch.Tensor, counts: Sequence[int]

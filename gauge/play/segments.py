@@ -20,9 +20,7 @@ from ..suite import Suite
 
 
 def count_segments(episode: Episode, suite: Suite | None = None) -> int:
-    """Return the number of segments of an episode that can be played side by side at first; without the suite, goals of its own count as
-    one each.
-    """
+    """Return the number of segments that can be played side by side at first; without the suite, its own goals count as one each."""
     if suite is not None:
         return sum(count_sub_commands(suite, goal) for goal in episode.goals)
     return sum(len(SUB_COMMANDS[goal]) if goal in SUB_COMMANDS else 1 for goal in episode.goals)

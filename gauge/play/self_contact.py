@@ -29,9 +29,8 @@ class SelfContact:
         """Return whether any parts overlap in poses, (T, J) [rad]; False for a pose that is not finite; (T,)."""
         finite = np.isfinite(joint_position).all(axis=1)
         poses = zip(joint_position, finite, strict=True)
-        return np.array(
-            [known and bool(self._overlapping(pose) - self._always) for pose, known in poses], dtype=np.bool_
-        )
+        touching = [known and bool(self._overlapping(pose) - self._always) for pose, known in poses]
+        return np.array(touching, dtype=np.bool_)
 
     def _overlapping(self, joint_position: NDArray[np.floating]) -> set[tuple[int, int]]:
         """Return the pairs of geoms that overlap in a pose."""
@@ -41,6 +40,4 @@ class SelfContact:
         if not self._data.ncon:  # nearly always
             return set()
         contacts = self._data.contact
-        return {
-            (int(a), int(b)) for (a, b), distance in zip(contacts.geom, contacts.dist, strict=True) if distance < 0.0
-        }
+        return {(int(a), int(b)) for a, b in contacts.geom[contacts.dist < 0.0]}

@@ -12,11 +12,9 @@ one thread each keep two cores busy where one with two threads does not.
 from __future__ import annotations
 
 import gc
-import multiprocessing
 import os
 import pickle
 import signal
-import sys
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
@@ -30,6 +28,7 @@ import torch
 
 from ...backends.base import PhysicsBackend, Scene
 from ...backends.registry import engine_class
+from ...files.cell import CONTEXT
 from ...policy.base import Policy
 from ...policy.foreign.fenced_policy import FencedPolicy
 from ...policy.loading import restore_policy
@@ -43,11 +42,6 @@ from .rollout import Rollout
 
 PROGRESS_INTERVAL = 0.2
 """Time between a worker's reports on how far it is [s]."""
-# a forked worker has all modules and the policy at once; elsewhere system libraries do not bear being forked
-if sys.platform == "linux":
-    _CONTEXT = multiprocessing.get_context("fork")
-else:
-    _CONTEXT = multiprocessing.get_context("spawn")
 
 
 # ---- messages ---------------------------------------------------------------------------------------------------------
@@ -156,11 +150,7 @@ class Job:
 
     @cached_property
     def scene(self) -> Scene:
-        """Return the worlds, with all terrains in one layout.
-
-        Raises:
-            TerrainError: a terrain cannot be made.
-        """
+        """Return the worlds, with all terrains in one layout; raise ``TerrainError`` where a terrain cannot be made."""
         return Scene(
             robot=self.robot,
             parameters=joint_parameters(self.suite, self.robot, self.policy.contract),
@@ -170,11 +160,7 @@ class Job:
         )
 
     def rollout(self) -> Rollout:
-        """Build the worlds, and return the rollout that plays in them.
-
-        Raises:
-            BackendError: the engine cannot do what the scene asks for.
-        """
+        """Build the worlds and return the rollout in them; raise ``BackendError`` where the engine cannot do what the scene asks for."""
         index = {place: i for i, place in enumerate(self.places)}
         backend = self.build(self.scene, threads=self.threads)
         return Rollout(self.suite, self.policy, backend, lambda e: index[e.terrain, e.level])
@@ -278,13 +264,12 @@ class LocalProcesses:
         self._open: dict[Connection, int] = {}  # workers that have not stopped
         try:
             for number in range(count):
-                ours, theirs = _CONTEXT.Pipe()
+                ours, theirs = CONTEXT.Pipe()  # a forked worker has all modules and the policy at once
                 self._pipes.append(ours)
                 self._open[ours] = number
                 with theirs:
-                    process = _CONTEXT.Process(
-                        target=_run_worker, args=(job, theirs, tuple(self._pipes)), name=f"worker-{number}"
-                    )
+                    arguments = (job, theirs, tuple(self._pipes))
+                    process = CONTEXT.Process(target=_run_worker, args=arguments, name=f"worker-{number}")
                     process.start()
                 self._processes.append(process)
         except BaseException:

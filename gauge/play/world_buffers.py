@@ -163,18 +163,12 @@ class WorldBuffers:
         schedule: Schedule,
         rules: SegmentRules,
     ) -> None:
-        """Let segments begin in worlds; nothing of the worlds' earlier ones is left.
-
-        Args:
-            terrain_index: their terrains, indices into ``terrains``.
-        """
+        """Let segments begin in worlds, on ``terrains`` by their ``terrain_index``; nothing of the worlds' earlier ones is left."""
         device = self.active.device
         at = torch.tensor(worlds, device=device)
         episodes, grounds = [s.episode for s in segments], [terrains[i] for i in terrain_index]
-        poses = [
-            t.spawns["level_eval" if e.stage == "eval" else "level_search"]
-            for t, e in zip(grounds, episodes, strict=True)
-        ]
+        spawns = ["level_eval" if e.stage == "eval" else "level_search" for e in episodes]
+        poses = [ground.spawns[spawn] for ground, spawn in zip(grounds, spawns, strict=True)]
         aims, stand = [s.goal == TARGET for s in segments], robot.stand_height
 
         def write(into: torch.Tensor, values: Sequence[object]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -59,7 +60,7 @@ def strip(marks: Mapping[str, float | None], interval: Sequence[float] | None) -
     band = None
     if interval is not None:
         low, high = (_strip_x(v) for v in interval)
-        band = (low, _round(max(high - low, 1.0)))
+        band = (low, round(max(high - low, 1.0), 2))
     places = {statistic: _strip_x(value) for statistic, value in marks.items() if value is not None}
     return {"ticks": [_strip_x(i / 4) for i in range(5)], "band": band, "marks": places}
 
@@ -82,7 +83,7 @@ def radar(terrains: Mapping[str, TerrainScore], statistics: Mapping[str, str]) -
 
     def at(angle: float, value: float) -> tuple[float, float]:
         radius = _RADAR_RADIUS * value
-        return _round(centre[0] + radius * math.sin(angle)), _round(centre[1] - radius * math.cos(angle))
+        return round(centre[0] + radius * math.sin(angle), 2), round(centre[1] - radius * math.cos(angle), 2)
 
     spokes = []
     for angle, (name, row) in zip(angles, terrains.items(), strict=True):
@@ -91,10 +92,10 @@ def radar(terrains: Mapping[str, TerrainScore], statistics: Mapping[str, str]) -
         side = math.sin(angle)
         anchor = "middle" if abs(side) < 0.2 else "start" if side > 0 else "end"
         lift = -14.0 if math.cos(angle) > 0.9 else 8.0 if math.cos(angle) < -0.9 else 0.0
-        label = {"x": label_x, "y": _round(label_y + lift), "anchor": anchor, "text": terrain_label(name)}
+        label = {"x": label_x, "y": round(label_y + lift, 2), "anchor": anchor, "text": terrain_label(name)}
         spokes.append({"x": x, "y": y, "label": label, "value": row.mean50})
     rings = [
-        {"value": v, "points": [at(a, v) for a in angles], "label": (_round(centre[0] + 4), at(0.0, v)[1])}
+        {"value": v, "points": [at(a, v) for a in angles], "label": (round(centre[0] + 4, 2), at(0.0, v)[1])}
         for v in (0.2, 0.4, 0.6, 0.8, 1.0)
     ]
     shapes = [
@@ -136,12 +137,8 @@ def sweep(rows: Sequence[EnvironmentRow], *, axis: str, quantity: str) -> list[d
     left, right = _PANEL_LEFT, _PANEL_WIDTH - _PANEL_RIGHT
     upper, lower = _PANEL_TOP, _PANEL_HEIGHT - _PANEL_BOTTOM
 
-    def x_of(value: float) -> float:
-        return _linear(value, (values[0], values[-1]), (left + 8.0, right - 8.0))
-
-    def y_of(value: float) -> float:
-        return _linear(value, (0.0, top), (lower, upper))
-
+    x_of = partial(_linear, domain=(values[0], values[-1]), span=(left + 8.0, right - 8.0))
+    y_of = partial(_linear, domain=(0.0, top), span=(lower, upper))
     steps = [top * i / 4 for i in range(5)] if quantity == "score" else [0.0, top / 2, top]
     return [
         {
@@ -187,8 +184,8 @@ def heat(rows: Sequence[EnvironmentRow], *, quantity: str) -> list[dict[str, Any
         bottom = _HEAT_TOP + _CELL * len(payloads)
         cells = [
             {
-                "x": _round(_HEAT_LEFT + _WIDE * frictions.index(r.friction)),
-                "y": _round(bottom - _CELL * (payloads.index(r.payload) + 1)),
+                "x": round(_HEAT_LEFT + _WIDE * frictions.index(r.friction), 2),
+                "y": round(bottom - _CELL * (payloads.index(r.payload) + 1), 2),
                 "share": round(value / top, 3),
                 "text": f"{value:.2f}".removeprefix("0") if quantity == "score" else number(value),
                 "title": f"friction {number(r.friction)}, payload {number(r.payload)} kg: {number(value)}",
@@ -203,11 +200,11 @@ def heat(rows: Sequence[EnvironmentRow], *, quantity: str) -> list[dict[str, Any
                 "cell": (_WIDE, _CELL),
                 "cells": cells,
                 "x_ticks": [
-                    {"x": _round(_HEAT_LEFT + _WIDE * (frictions.index(v) + 0.5)), "label": number(v)}
+                    {"x": round(_HEAT_LEFT + _WIDE * (frictions.index(v) + 0.5), 2), "label": number(v)}
                     for v in _thin(frictions)
                 ],
                 "y_ticks": [
-                    {"y": _round(bottom - _CELL * (i + 0.5)), "label": number(v)} for i, v in enumerate(payloads)
+                    {"y": round(bottom - _CELL * (i + 0.5), 2), "label": number(v)} for i, v in enumerate(payloads)
                 ],
                 "bottom": bottom,
             }
@@ -248,7 +245,7 @@ def searches(rows: Sequence[EnvironmentRow]) -> list[dict[str, Any]]:
                 "left": left,
                 "bottom": bottom,
                 "lines": lines,
-                "x_ticks": [{"x": _round(left + _CELL * (k - 0.5)), "label": str(k)} for k in range(1, top + 1)],
+                "x_ticks": [{"x": round(left + _CELL * (k - 0.5), 2), "label": str(k)} for k in range(1, top + 1)],
                 "axis": "friction μ, payload" if several else "friction μ",
             }
         )
@@ -276,13 +273,8 @@ def curves(series: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]
     high = high if high > low else low + 1.0
     left, right = _CURVE_LEFT, _CURVE_WIDTH - _CURVE_RIGHT
     upper, lower = _PANEL_TOP, _CURVE_HEIGHT - _PANEL_BOTTOM
-
-    def x_of(value: float) -> float:
-        return _linear(value, (0.0, end), (left, right))
-
-    def y_of(value: float) -> float:
-        return _linear(value, (low, high), (lower, upper))
-
+    x_of = partial(_linear, domain=(0.0, end), span=(left, right))
+    y_of = partial(_linear, domain=(low, high), span=(lower, upper))
     return {
         "size": (_CURVE_WIDTH, _CURVE_HEIGHT),
         "frame": (left, right, upper, lower),
@@ -317,9 +309,7 @@ def _by_terrain(rows: Sequence[EnvironmentRow], quantity: str) -> dict[str, list
 
 def _top(rows: Sequence[EnvironmentRow], quantity: str) -> float:
     """Return the upper end of the axis of a quantity."""
-    if quantity == "score":
-        return 1.0
-    return float(max([LEVELS, *(r.level for r in rows if r.level is not None)]))
+    return 1.0 if quantity == "score" else float(max([LEVELS, *(r.level for r in rows if r.level is not None)]))
 
 
 def _thin(values: Sequence[float]) -> Sequence[float]:
@@ -328,8 +318,4 @@ def _thin(values: Sequence[float]) -> Sequence[float]:
 
 
 def _linear(value: float, domain: tuple[float, float], span: tuple[float, float]) -> float:
-    return _round(span[0] + (value - domain[0]) / (domain[1] - domain[0]) * (span[1] - span[0]))
-
-
-def _round(value: float) -> float:
-    return round(value, 2)
+    return round(span[0] + (value - domain[0]) / (domain[1] - domain[0]) * (span[1] - span[0]), 2)

@@ -61,11 +61,7 @@ def _clip(folder: Path) -> bytes | None:
 
 
 def render(result: Result, clip: bytes | None = None) -> str:
-    """Return the page of a result, as HTML text. All of its texts are shown as text and never become markup.
-
-    Args:
-        clip: a WebP film of the robot.
-    """
+    """Return a result's page as HTML, all texts as text and never markup; ``clip``: a WebP film of the robot."""
     template = page_template(
         __file__,
         "report.html.j2",
@@ -147,17 +143,12 @@ def warnings(rows: Sequence[EnvironmentRow], health: Health, remarks: Sequence[s
     failed, restarted = [r for r in rows if r.level == 0], sum(r.restarted or 0 for r in rows)
     searched = _plural(sum(r.search is not None for r in rows), "searched environment")
     share = health.self_contact or 0.0
+    touching = f"parts of the robot touch each other in {_percent(share)} of the samples"
     kinds = [
         (health.diverged, "grave", f"physics diverged in {health.diverged} of {total}", _DIVERGED, "diverged"),
         (health.overflowed, "grave", f"contacts dropped in {health.overflowed} of {total}", _DROPPED, "overflowed"),
         (health.falls, "grave", f"{_plural(health.falls, 'fall')} in {total}", _FELL, "falls"),
-        (
-            share,
-            "note",
-            f"parts of the robot touch each other in {_percent(share)} of the samples",
-            _TOUCHED,
-            "self_contact",
-        ),
+        (share, "note", touching, _TOUCHED, "self_contact"),
         (failed, "note", f"not even level 1 passed in {len(failed)} of {searched}", _FAILED, None),
         *((text, "note", "for the reader of the score", f"{text[0].upper()}{text[1:]}.", "") for text in remarks),
         (restarted, "note", f"restarts in {restarted} of {total}", _SANK, "restarted"),
@@ -193,9 +184,7 @@ def _percent(share: float) -> str:
 
 
 def metric_matrix(rows: Sequence[EnvironmentRow]) -> dict[str, dict[str, float]]:
-    """Return mean@50 of each metric on each terrain, over its environments that were played: at the levels reached, not weighted by
-    them.
-    """
+    """Return mean@50 of each metric on each terrain: the mean over its played environments at the levels reached, not weighted."""
     matrix: dict[str, dict[str, float]] = {}
     for terrain in dict.fromkeys(r.terrain for r in rows if r.quality):
         tables = [{**r.metrics, QUALITY: r.quality} for r in rows if r.terrain == terrain and r.quality]

@@ -47,11 +47,7 @@ class ReferenceTable:
 
 @cache
 def reference_table() -> ReferenceTable:
-    """Return the scores that ship with the project.
-
-    Raises:
-        ReferenceScoreError: the file is malformed.
-    """
+    """Return the scores that ship with the project; raise ``ReferenceScoreError`` where the file is malformed."""
     data = parse_toml(read_text(_FILE, "reference file", ReferenceScoreError), _FILE.name, ReferenceScoreError)
     return build(ReferenceTable, data, _FILE.name, ReferenceScoreError)
 

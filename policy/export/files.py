@@ -11,6 +11,7 @@ import math
 import warnings
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ def export_torchscript(policy: Policy, path: str | Path) -> float:
         traced = torch.jit.trace(core.eval(), history, check_trace=False)
         script = torch.jit.script(SCRIPTS[type(network)](traced, start).eval())
         torch.jit.save(script, buffer, _extra_files={CONTRACT_FILE: contract.to_json()})
-    return _write_checked(policy, Path(path), buffer.getvalue(), lambda written: _largest_difference(policy, written))
+    return _write_checked(policy, Path(path), buffer.getvalue(), partial(_largest_difference, policy))
 
 
 def export_onnx(policy: Policy, path: str | Path) -> float:
@@ -104,12 +105,10 @@ def export_onnx(policy: Policy, path: str | Path) -> float:
     model.ir_version = ONNX_IR_VERSION
     del model.metadata_props[:]
     onnx.helper.set_model_props(model, {"contract": contract.to_json(), **mjlab_metadata(contract)})
-    return _write_checked(
-        policy, Path(path), model.SerializeToString(), lambda written: _largest_difference(policy, written)
-    )
+    return _write_checked(policy, Path(path), model.SerializeToString(), partial(_largest_difference, policy))
 
 
-def export_deploy(policy: Policy, path: str | Path, robot: Robot, *, finite_clips: bool = False) -> None:
+def export_deploy(policy: Policy, path: str | Path, robot: Robot, *, finite_clips: bool = False) -> float:
     """Write the ``deploy.yaml`` with which the robot's C++ runtime runs the ONNX file; it is read back and compared.
 
     The runtime fills the history with the first observation; ``first_steps`` says what that changes.
@@ -130,7 +129,7 @@ def export_deploy(policy: Policy, path: str | Path, robot: Robot, *, finite_clip
             raise ExportError(f"a deploy.yaml cannot express this policy's contract: {lines.splitlines()[0]}")
         return 0.0
 
-    _write_checked(policy, Path(path), text.encode(), check)
+    return _write_checked(policy, Path(path), text.encode(), check)
 
 
 def export_unitree(policy: Policy, folder: str | Path, robot: Robot) -> dict[Path, float]:
@@ -142,9 +141,7 @@ def export_unitree(policy: Policy, folder: str | Path, robot: Robot) -> dict[Pat
     graph, deploy = Path(folder) / "exported" / "policy.onnx", Path(folder) / "params" / "deploy.yaml"
     for folder_of in (graph.parent, deploy.parent):
         make_folder(folder_of, ExportError)
-    difference_of_graph = export_onnx(policy, graph)
-    export_deploy(policy, deploy, robot, finite_clips=True)
-    return {graph: difference_of_graph, deploy: 0.0}
+    return {graph: export_onnx(policy, graph), deploy: export_deploy(policy, deploy, robot, finite_clips=True)}
 
 
 def first_steps(policy: Policy) -> str | None:
@@ -168,13 +165,12 @@ def export_policy(
     """
     target = Path(folder)
     make_folder(target, ExportError)
-    script, graph, deploy = target / "policy.pt", target / "policy.onnx", target / "deploy.yaml"
-    written = {script: export_torchscript(policy, script)} if "torchscript" in parts else {}
-    written |= {graph: export_onnx(policy, graph)} if "onnx" in parts else {}
-    if "deploy" in parts:
-        export_deploy(policy, deploy, robot)
-        written[deploy] = 0.0
-    return written
+    exports: dict[str, tuple[Path, Callable[[Policy, Path], float]]] = {
+        "torchscript": (target / "policy.pt", export_torchscript),
+        "onnx": (target / "policy.onnx", export_onnx),
+        "deploy": (target / "deploy.yaml", partial(export_deploy, robot=robot)),
+    }
+    return {path: export(policy, path) for part, (path, export) in exports.items() if part in parts}
 
 
 def stacked_contract(contract: PolicyContract, frames: int) -> PolicyContract:

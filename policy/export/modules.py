@@ -25,9 +25,7 @@ class Explained(nn.Module):
 
 
 class _WithMemory(nn.Module):
-    """Keeps the history of one robot in a tensor that ``forward`` changes. At the start its frames are zero, or NaN where
-    the first observation is to take their place.
-    """
+    """Keeps one robot's history in a tensor that ``forward`` changes. Frames begin as zeros, or NaN: copies of the first one."""
 
     def __init__(self, traced: nn.Module, start: torch.Tensor) -> None:
         super().__init__()

@@ -34,11 +34,7 @@ LONGEST_HISTORY = 20
 
 
 def sidecar_contract(path: Path) -> PolicyContract | None:
-    """Return the contract in ``<stem>.contract.json`` or ``contract.json`` beside a policy file, None if there is neither.
-
-    Raises:
-        PolicyError: the sidecar is malformed.
-    """
+    """Return the contract in ``<stem>.contract.json`` or ``contract.json`` beside a file, else None; raise ``PolicyError`` if malformed."""
     for sidecar in (path.with_name(f"{path.stem}.contract.json"), path.with_name("contract.json")):
         if sidecar.is_file():
             try:
@@ -71,11 +67,7 @@ def described_contract(path: Path, robot: Robot) -> PolicyContract:
 def contract_for_width(
     width: int, robot: Robot, *, order: HistoryOrder, provenance: Mapping[str, Any], source: str
 ) -> PolicyContract:
-    """Return the standard contract with as many frames as an input of this width holds.
-
-    Raises:
-        PolicyError: the width is not that of 1 to ``LONGEST_HISTORY`` frames.
-    """
+    """Return the standard contract with as many frames, 1 to ``LONGEST_HISTORY``, as an input holds; else raise ``PolicyError``."""
     frame = standard_contract(robot).frame_width
     frames, rest = divmod(width, frame)
     if rest or not 1 <= frames <= LONGEST_HISTORY:
@@ -214,9 +206,7 @@ def _deploy_joints(data: Any, path: Path, robot: Robot) -> tuple[str, ...]:
 
 
 def matching_joint(name: str, robot: Robot) -> str:
-    """Return the robot's joint of this name, with or without the ending ``_joint``; the name itself if the robot has none
-    such.
-    """
+    """Return the robot's joint of this name, with or without the ending ``_joint``; the name itself if the robot has none."""
     bare = name.removesuffix("_joint")
     return next((j for j in robot.joint_names if j.removesuffix("_joint") == bare), name)
 
@@ -291,11 +281,8 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
         low, high = (float(v) for v in pair.split(";"))
         limit = _limit(low, high, name, source)
         clip = tuple(limit * (abs(s) or 1.0) for s in scale)  # a term scaled by zero is zero, clipped or not
-        terms.append(
-            ObservationTerm(
-                name=term, scale=scale, clip=None if limit == math.inf else clip if len(clip) > 1 else clip[0]
-            )
-        )
+        known = None if limit == math.inf else clip if len(clip) > 1 else clip[0]
+        terms.append(ObservationTerm(name=term, scale=scale, clip=known))
     action_scale = [float(v) for v in words("action_scale")]
     return PolicyContract(
         robot=robot.name,

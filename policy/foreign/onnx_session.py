@@ -39,8 +39,7 @@ _RUN_ERRORS: tuple[type[Exception], ...] = (
 
 def _runtime(data: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
     # What goes wrong is reported by exceptions; the log would only repeat it on the user's terminal.
     options.log_severity_level = 4
     # Without its fall-back, which would only try the CPU again and print that it does.
@@ -116,11 +115,7 @@ class GraphProgram:
         return {"batched": self._batch is not None}
 
     def prepare(self, contract: PolicyContract) -> None:
-        """Try the file on zeros and find a batched form of it.
-
-        Raises:
-            PolicyError: the file fails, or its input or output has another width than the contract says.
-        """
+        """Try the file on zeros and find a batched form of it; raise ``PolicyError`` where it fails or has not the contract's widths."""
         self.contract = contract
         if self._width is not None and self._width != contract.observation_width:
             raise PolicyError(f"'{self.source}' takes {self._width} values, {other_width(contract, self._width)}")

@@ -83,13 +83,13 @@ def load_module(data: bytes, *, source: str) -> Any:
 
 def _check_operators(module: Any, *, source: str) -> None:
     """Check all operators once more, as torch has read them: nothing then hangs on how Python reads the code."""
-    graphs, pending = [], []
+    graphs = []  # nodes live as long as their graph does
     for part in module.modules():
         for name in part._c._method_names():
             graph = part._c._get_method(name).graph.copy()
             torch._C._jit_pass_inline(graph)
-            graphs.append(graph)  # its nodes live as long as it does
-            pending.append(graph)
+            graphs.append(graph)
+    pending: list[Any] = list(graphs)
     while pending:
         for node in pending.pop().nodes():
             space, _, name = node.kind().partition("::")
@@ -101,11 +101,7 @@ def _check_operators(module: Any, *, source: str) -> None:
 
 
 def input_width(module: Any, candidates: Sequence[int], *, source: str) -> int:
-    """Return the first of the candidate widths that the module accepts as (1, width).
-
-    Raises:
-        PolicyError: none of them.
-    """
+    """Return the first of the candidate widths that the module accepts as (1, width); raise ``PolicyError`` where it accepts none."""
     reason = "it has no forward()"
     for width in candidates:
         try:
@@ -136,18 +132,9 @@ def first_tensor(output: Any) -> torch.Tensor:
         raise PolicyError(
             f"returns a {type(output).__name__}; a tensor of actions, alone or first in a tuple, is needed"
         )
-    strange = [
-        word
-        for word, holds in (
-            ("quantized", output.is_quantized),
-            ("complex", output.is_complex()),
-            ("sparse", output.layout != torch.strided),
-            ("meta", output.is_meta),
-            ("nested", output.is_nested),
-        )
-        if holds
-    ]
-    if strange:
+    kinds = {"quantized": output.is_quantized, "complex": output.is_complex(), "meta": output.is_meta}
+    kinds |= {"nested": output.is_nested, "sparse": output.layout != torch.strided}
+    if strange := [kind for kind, holds in kinds.items() if holds]:
         raise PolicyError(f"returns a {strange[0]} tensor; a plain tensor of actions is needed")
     return output
 
@@ -156,11 +143,7 @@ class ScriptProgram:
     """A TorchScript module at work for a policy."""
 
     def __init__(self, data: bytes, source: str) -> None:
-        """Load the module; ``data`` has been looked through (``fence.script.check_script``).
-
-        Raises:
-            PolicyError: it cannot be loaded.
-        """
+        """Load the module from ``data`` after ``fence.script.check_script``; raise ``PolicyError`` where it cannot be loaded."""
         self.source = source
         self._module = load_module(data, source=source)
         self.contract: PolicyContract
@@ -257,9 +240,7 @@ class BatchSession(PolicySession):
         self, module: Any, num_episodes: int, contract: PolicyContract, source: str, memories: Sequence[Memory]
     ) -> None:
         self._module = copy.deepcopy(module)
-        self._contract = contract
-        self._num_episodes = num_episodes
-        self._source = source
+        self._num_episodes, self._contract, self._source = num_episodes, contract, source
         parts = dict(self._module.named_modules())
         self._memories: list[tuple[Any, Memory, torch.Tensor]] = []
         for memory in memories:
@@ -291,8 +272,7 @@ class CopiesSession(PolicySession):
     def __init__(self, module: Any, num_episodes: int, contract: PolicyContract, source: str) -> None:
         """Copy the module, which must be freshly reset."""
         self._fresh = copy.deepcopy(module)
-        self._contract = contract
-        self._source = source
+        self._contract, self._source = contract, source
         self._modules = [copy.deepcopy(self._fresh) for _ in range(num_episodes)]
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:

@@ -54,10 +54,8 @@ class MlpNetwork(nn.Module):
         normalize: bool = False,
     ) -> None:
         super().__init__()
-        self.history_length = history_length
-        self.frame_width = frame_width
+        self.history_length, self.frame_width, self.normalize = history_length, frame_width, normalize
         width = frame_width * history_length
-        self.normalize = normalize
         if normalize:
             self.register_buffer("mean", torch.zeros(1, width))
             self.register_buffer("deviation", torch.ones(1, width))
@@ -110,15 +108,18 @@ class ExpertMixture(GatedExperts):
     seen: torch.Tensor
 
     def __init__(
-        self, *, frame_width: int, history_length: int, latent_width: int, expert_blind_to: Sequence[int], **shape: Any
+        self,
+        *,
+        frame_width: int,
+        history_length: int,
+        latent_width: int,
+        expert_blind_to: Sequence[int] = (),
+        **shape: Any,
     ) -> None:
         """Build the layers; ``shape`` is that of experts and gate, as ``GatedExperts`` takes it."""
         seen = [i for i in range(frame_width) if i not in set(expert_blind_to)]
         super().__init__(
-            gate_inputs=frame_width * history_length,
-            inputs=len(seen) * history_length,
-            outputs=latent_width,
-            **shape,
+            gate_inputs=frame_width * history_length, inputs=len(seen) * history_length, outputs=latent_width, **shape
         )
         self.register_buffer("seen", torch.tensor(seen, dtype=torch.int64), persistent=False)
         self.sees_all = len(seen) == frame_width
@@ -145,29 +146,15 @@ class MoeCtsNetwork(EncoderNetwork):
         num_actions: int = 12,
         history_length: int = 5,
         latent_width: int = 32,
-        num_experts: int = 8,
-        expert_width: int = 256,
-        trunk_hidden: Sequence[int] = (512, 256),
-        gate_hidden: Sequence[int] = (512, 256),
         actor_hidden: Sequence[int] = (512, 256, 128),
-        shared_head: bool = False,
-        expert_blind_to: Sequence[int] = (),
         activation: str = "elu",
+        **experts: Any,
     ) -> None:
-        encoder = ExpertMixture(
-            frame_width=frame_width,
-            history_length=history_length,
-            latent_width=latent_width,
-            num_experts=num_experts,
-            expert_width=expert_width,
-            trunk_hidden=trunk_hidden,
-            gate_hidden=gate_hidden,
-            shared_head=shared_head,
-            expert_blind_to=expert_blind_to,
-            activation=activation,
-        )
+        """Build the layers; ``experts`` are further arguments of ``ExpertMixture``."""
+        common: dict[str, Any] = {"frame_width": frame_width, "history_length": history_length}
+        encoder = ExpertMixture(latent_width=latent_width, activation=activation, **common, **experts)
         actor = multilayer_perceptron((latent_width + frame_width, *actor_hidden, num_actions), activation=activation)
-        super().__init__(encoder, actor, history_length=history_length, frame_width=frame_width)
+        super().__init__(encoder, actor, **common)
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the unit latent (N, L) and weights of the experts (N, K) for ``history`` (N, H, F)."""
@@ -186,11 +173,4 @@ ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     "trot": TrotController,
 }
 
-__all__ = [
-    "ARCHITECTURES",
-    "CtsNetwork",
-    "ExpertMixture",
-    "MlpNetwork",
-    "MoeCtsNetwork",
-    "multilayer_perceptron",
-]
+__all__ = ["ARCHITECTURES", "CtsNetwork", "ExpertMixture", "MlpNetwork", "MoeCtsNetwork", "multilayer_perceptron"]

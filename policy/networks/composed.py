@@ -75,13 +75,8 @@ class _ComposedNetwork(EncoderNetwork):
         """Build the layers; ``actor`` holds the arguments of ``make_actor`` beside the common widths."""
         inputs = frame_width * history_length
         encoder = multilayer_perceptron((inputs, *encoder_hidden, latent_width), activation=activation)
-        made = make_actor(
-            inputs=latent_width + frame_width,
-            num_actions=num_actions,
-            num_experts=num_experts,
-            activation=activation,
-            **actor,
-        )
+        actor |= {"num_experts": num_experts, "activation": activation}
+        made = make_actor(inputs=latent_width + frame_width, num_actions=num_actions, **actor)
         super().__init__(encoder, made, history_length=history_length, frame_width=frame_width)
 
     def encode(self, history: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -34,9 +34,8 @@ class _EstimatorNetwork(EncoderNetwork):
     ) -> None:
         inputs, outputs = frame_width * history_length, VELOCITY + self.latents * latent_width
         encoder = multilayer_perceptron((inputs, *encoder_hidden, outputs), activation=activation)
-        actor = multilayer_perceptron(
-            (VELOCITY + latent_width + frame_width, *actor_hidden, num_actions), activation=activation
-        )
+        widths = (VELOCITY + latent_width + frame_width, *actor_hidden, num_actions)
+        actor = multilayer_perceptron(widths, activation=activation)
         super().__init__(encoder, actor, history_length=history_length, frame_width=frame_width)
         self.latent_width = latent_width
 

@@ -80,10 +80,8 @@ class EncoderNetwork(nn.Module):
 
     def __init__(self, encoder: nn.Module, actor: nn.Module, *, history_length: int, frame_width: int) -> None:
         super().__init__()
-        self.history_length = history_length
-        self.frame_width = frame_width
-        self.encoder = encoder
-        self.actor = actor
+        self.history_length, self.frame_width = history_length, frame_width
+        self.encoder, self.actor = encoder, actor
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
         """Return actions (N, J) for ``history`` (N, H, F)."""
@@ -111,16 +109,15 @@ class Experts(nn.Module):
         self,
         *,
         inputs: int,
-        trunk_hidden: Sequence[int],
-        num_experts: int,
-        expert_width: int,
         outputs: int,
+        trunk_hidden: Sequence[int] = (512, 256),
+        num_experts: int = 8,
+        expert_width: int = 256,
         shared_head: bool = False,
         activation: str = "elu",
     ) -> None:
         super().__init__()
-        self.num_experts = num_experts
-        self.expert_width = expert_width
+        self.num_experts, self.expert_width = num_experts, expert_width
         self.trunk = multilayer_perceptron(
             (inputs, *trunk_hidden, num_experts * expert_width), activation=activation, activate_output=True
         )
@@ -138,17 +135,14 @@ class Experts(nn.Module):
 
 
 class GatedExperts(Experts):
-    """Mix experts by a gate, which may see more than the experts do.
-
-    State dict: that of ``Experts``, and ``gate.<layer>.*``.
-    """
+    """Mix experts by a gate, which may see more than they do. State dict: that of ``Experts``, and ``gate.<layer>.*``."""
 
     def __init__(
         self,
         *,
         gate_inputs: int,
-        gate_hidden: Sequence[int],
-        num_experts: int,
+        gate_hidden: Sequence[int] = (512, 256),
+        num_experts: int = 8,
         activation: str,
         **shape: Any,
     ) -> None:

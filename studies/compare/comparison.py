@@ -240,11 +240,7 @@ def load_result(path: Path) -> Result:
 
 
 def check_different(contestants: Sequence[object], labels: Sequence[str]) -> None:
-    """Refuse the same results, or the same file, twice.
-
-    Raises:
-        ComparisonError: one sentence.
-    """
+    """Refuse the same results, or the same file, twice. Raises ComparisonError."""
     for (one, first), (other, second) in combinations(zip(labels, contestants, strict=True), 2):
         if first == second:
             raise ComparisonError(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jinja2
 
 from ...files.parsing import edited, one_line
-from ...files.writing import csv_text, make_folder, write_atomically
+from ...files.writing import csv_text, write_files
 from ...gauge.metrics import metric_label
 from ...gauge.report.charts import terrain_label
 from ...gauge.report.pages import page_template
@@ -35,11 +35,8 @@ def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
             "tex": as_latex(found),
             "html": as_page(found),
         }
-    make_folder(folder, ComparisonError)
-    paths = {kind: folder / f"comparison.{kind}" for kind in contents}
-    for kind, text in contents.items():
-        write_atomically(paths[kind], text, ComparisonError)
-    return paths
+    write_files(folder, {f"comparison.{kind}": text for kind, text in contents.items()}, ComparisonError)
+    return {kind: folder / f"comparison.{kind}" for kind in contents}
 
 
 def as_csv(found: Comparison) -> str:
@@ -57,26 +54,16 @@ def as_latex(found: Comparison) -> str:
     """Return a ``tabular`` for each pair, for the package booktabs; real differences in bold type."""
     tables = []
     for first, second in _pairs(found):
-        lines = [
-            r"\begin{tabular}{llrrrcr}",
-            r"\toprule",
-            rf" & & {_tex(first)} & {_tex(second)} & difference & 95\,\% interval & corrected $p$ \\",
-        ]
+        head = rf" & & {_tex(first)} & {_tex(second)} & difference & 95\,\% interval & corrected $p$ \\"
+        lines = [r"\begin{tabular}{llrrrcr}", r"\toprule", head]
         for group in _by_kind(found, first, second).values():
             lines.append(r"\midrule")
             for at, d in enumerate(group):
                 difference = f"{d.difference:+.4f}"
                 low_high = "--" if d.interval is None else f"[{d.interval[0]:+.4f}, {d.interval[1]:+.4f}]"
-                cells = [
-                    d.kind if at == 0 else "",
-                    _tex(label(d)),
-                    f"{d.values[0]:.4f}",
-                    f"{d.values[1]:.4f}",
-                    rf"\textbf{{{difference}}}" if d.real else difference,
-                    low_high,
-                    _tex(_odds(d.corrected)),
-                ]
-                lines.append(" & ".join(cells) + r" \\")
+                shown = rf"\textbf{{{difference}}}" if d.real else difference
+                cells = ["" if at else d.kind, _tex(label(d)), *(f"{v:.4f}" for v in d.values), shown, low_high]
+                lines.append(" & ".join([*cells, _tex(_odds(d.corrected))]) + r" \\")
         tables.append("\n".join([*lines, r"\bottomrule", r"\end{tabular}"]))
     head = one_line(f"{found.suite}; {' '.join(found.sentences)}", _LONGEST)
     return "\n\n".join([f"% {head}", *tables]) + "\n"
@@ -115,13 +102,12 @@ def _odds(p: float | None) -> str:
 
 def label(found: Difference) -> str:
     """Return the subject of a difference, for readers."""
-    if found.kind == "terrain":
-        return terrain_label(found.name)
-    if found.kind == "metric":
-        return metric_label(found.name)
-    if found.kind == "payload":
-        return f"{found.name} kg"
-    return found.name.replace("_", " ")
+    words: dict[str, Callable[[str], str]] = {
+        "terrain": terrain_label,
+        "metric": metric_label,
+        "payload": "{} kg".format,
+    }
+    return words.get(found.kind, lambda name: name.replace("_", " "))(found.name)
 
 
 def _pairs(found: Comparison) -> Sequence[tuple[str, str]]:

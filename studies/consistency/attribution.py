@@ -77,11 +77,7 @@ FACTORS: tuple[Factor, ...] = (
 
 
 def choose_factors(names: Sequence[str]) -> tuple[Factor, ...]:
-    """Factors by name, all for none.
-
-    Raises:
-        ConsistencyError: an unknown name.
-    """
+    """Factors by name, all for none. Raises ConsistencyError: an unknown name."""
     known = {f.name: f for f in FACTORS}
     for name in names:
         if name not in known:

@@ -117,12 +117,13 @@ def play_variant(
         build=variant.worlds,
         threads=max(threads // count, 1),
     )
+    plans = [partial(plan_list, episodes)]
 
     def on_progress(dispatcher: Dispatcher) -> None:
         watch(len(episodes) - len(dispatcher.plans[0].required))
 
     with closing(start_workers(job, count)) as workers:
-        play([partial(plan_list, episodes)], records, keep, workers, speculation=Speculation(), watch=on_progress)
+        play(plans, records, keep, workers, speculation=Speculation(), watch=on_progress)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,12 +162,9 @@ class Design:
     def table(self, records: Records) -> Table:
         """Mean@50 of the quality episodes; an episode without samples counts zero, as in a score."""
         columns = (*self.suite.metrics.weights, QUALITY)
-        values = np.zeros((len(self.cells), len(self.seeds), len(columns)))
-        for i, cell in enumerate(self.cells):
-            for j, episode in enumerate(e for e in episodes_of(cell, self.suite, self.seeds) if e.stage == "eval"):
-                record = records[episode]
-                values[i, j] = [run_statistics(record, m)[_MEAN50] for m in range(len(columns))]
-        return Table(values=values, columns=columns)
+        rows = [[records[e] for e in episodes_of(c, self.suite, self.seeds) if e.stage == "eval"] for c in self.cells]
+        values = [[[run_statistics(r, m)[_MEAN50] for m in range(len(columns))] for r in row] for row in rows]
+        return Table(values=np.array(values, dtype=np.float64), columns=columns)
 
     def estimate(
         self, values: Array, name: str, rows: Sequence[int] | None = None, *, magnitude: bool = False
@@ -190,7 +188,7 @@ class Design:
         return {key: found.plain(), "verdict": found.verdict(self.margin)}
 
     def mean(self, values: Array, rows: Sequence[int] | None = None) -> float:
-        """The same mean without its interval."""
+        """Return the mean of ``estimate`` alone."""
         chosen = list(range(len(self.cells)) if rows is None else rows)
         return float(environment_weights([self.cells[i].terrain for i in chosen]) @ values[chosen].mean(1))
 
@@ -213,8 +211,7 @@ def compare(
     chaos = _chaos(design, reference, floor) if floor else None
 
     def block(rows: Sequence[int], label: str) -> dict[str, Any]:
-        key = f"{name}/{label}"
-        picked = list(rows)
+        key, picked = f"{name}/{label}", list(rows)
         difference = second.column(QUALITY) - first.column(QUALITY)
         gap = np.abs(difference)
         entry: dict[str, Any] = {
@@ -257,11 +254,8 @@ def gap_only(design: Design, first: Records, second: Records, name: str) -> dict
 def floor_only(design: Design, reference: Records, draws: Sequence[Records], name: str) -> dict[str, Any]:
     """The gap of an engine to itself put off by a hair, the mean over draws: overall and for each terrain."""
     chaos = _chaos(design, reference, draws)
-
-    def block(rows: Sequence[int], label: str) -> dict[str, Any]:
-        return {"gap": design.estimate(chaos, f"{name}/{label}/gap", rows, magnitude=True).plain()}
-
-    return _by_terrain(design, block)
+    estimate = partial(design.estimate, chaos, magnitude=True)
+    return _by_terrain(design, lambda rows, label: {"gap": estimate(f"{name}/{label}/gap", rows).plain()})
 
 
 def _chaos(design: Design, reference: Records, draws: Sequence[Records]) -> Array:
@@ -281,18 +275,14 @@ def _by_terrain(design: Design, block: Callable[[Sequence[int], str], dict[str, 
 
 def _outcomes(design: Design, reference: Records, compared: Records, rows: Sequence[int]) -> dict[str, Any]:
     """Agreement on falls in quality episodes, and on targets reached in crossings."""
-    pairs = [
-        (reference[e], compared[e]) for i in rows for e in episodes_of(design.cells[i], design.suite, design.seeds)
-    ]
-    walks = [(a, b) for a, b in pairs if a.episode.stage == "eval"]
-    crossings = [(a, b) for a, b in pairs if a.episode.stage == "search"]
+    episodes = [e for i in rows for e in episodes_of(design.cells[i], design.suite, design.seeds)]
 
-    def agreement(chosen: Sequence[tuple[Record, Record]], outcome: Callable[[Record], bool]) -> dict[str, Any] | None:
-        seeds = [a.episode.seed for a, _ in chosen]
-        first, second = [outcome(a) for a, _ in chosen], [outcome(b) for _, b in chosen]
-        return outcome_agreement(first, second, seeds, shared=design.shared_draws)
+    def agreement(stage: str, outcome: Callable[[Record], bool]) -> dict[str, Any] | None:
+        chosen = [e for e in episodes if e.stage == stage]
+        first, second = ([outcome(records[e]) for e in chosen] for records in (reference, compared))
+        return outcome_agreement(first, second, [e.seed for e in chosen], shared=design.shared_draws)
 
-    return {"fell": agreement(walks, lambda r: r.falls > 0), "reached": agreement(crossings, lambda r: bool(r.success))}
+    return {"fell": agreement("eval", lambda r: r.falls > 0), "reached": agreement("search", lambda r: bool(r.success))}
 
 
 def _rows(design: Design, reference: Records, compared: Records, first: Table, second: Table) -> list[dict[str, Any]]:

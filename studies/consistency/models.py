@@ -41,19 +41,13 @@ def compare_models(robot: Robot, descriptions: Mapping[str, Description | None],
         precision; ``not_described`` names the silent engines.
     """
     silent = [label for label, found in descriptions.items() if found is None]
+    others = {label: found for label, found in descriptions.items() if found is not None and label != reference}
     fields: dict[str, Any] = {}
-    base = descriptions.get(reference)
-    for key in DESCRIPTION_KEYS if base is not None else ():
-        assert base is not None
-        if key not in base:
-            continue
+    base = descriptions.get(reference) or {}
+    for key in (k for k in DESCRIPTION_KEYS if k in base):
         expected = np.asarray(base[key], dtype=np.float64)
-        row: dict[str, Any] = {"reference": finite(np.abs(expected).mean()), "variants": {}}
-        for label, found in descriptions.items():
-            if label == reference or found is None:
-                continue
-            row["variants"][label] = _difference(key, found.get(key), expected, robot)
-        fields[key] = row
+        rows = {label: _difference(key, found.get(key), expected, robot) for label, found in others.items()}
+        fields[key] = {"reference": finite(np.abs(expected).mean()), "variants": rows}
     return {"reference": reference, "fields": fields, "not_described": silent}
 
 
@@ -63,12 +57,8 @@ def _difference(key: str, values: Sequence[float] | None, expected: np.ndarray, 
         return None
     found = np.asarray(values, dtype=np.float64)
     if found.shape != expected.shape:
-        return {
-            "largest": None,
-            "relative": None,
-            "entry": f"{len(found)} entries instead of {len(expected)}",
-            "agrees": False,
-        }
+        entry = f"{len(found)} entries instead of {len(expected)}"
+        return {"largest": None, "relative": None, "entry": entry, "agrees": False}
     with np.errstate(invalid="ignore"):  # a limit that only one of them has is an infinite difference
         absolute = np.where(found == expected, 0.0, np.abs(found - expected))
         scale = np.maximum(np.maximum(np.abs(found), np.abs(expected)), 1e-12)

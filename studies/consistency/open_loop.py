@@ -8,7 +8,8 @@ gave while it walked in the reference engine.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -101,23 +102,15 @@ class EnergyMeter:
 
     def measure(self, state: PhysicsState) -> Array:
         """Energy of every world [J], (N,)."""
-        parts = (
-            state.base_position_w,
-            state.base_quaternion_w,
-            state.joint_position,
-            state.base_linear_velocity_w,
-            state.base_angular_velocity_b,
-            state.joint_velocity,
-        )
-        position, quaternion, joints, linear, angular, rates = (p.detach().cpu().double().numpy() for p in parts)
-        energy = np.full(len(position), np.nan)
-        for world in range(len(position)):
-            whole = np.concatenate([p[world] for p in (position, quaternion, joints, linear, angular, rates)])
-            if not np.isfinite(whole).all():
+        places = (state.base_position_w, state.base_quaternion_w, state.joint_position)
+        speeds = (state.base_linear_velocity_w, state.base_angular_velocity_b, state.joint_velocity)
+        parts, data = [_numbers(part) for part in (*places, *speeds)], self._data
+        energy = np.full(len(parts[0]), np.nan)
+        for world, values in enumerate(zip(*parts, strict=True)):
+            if not np.isfinite(np.concatenate(values)).all():
                 continue
-            data = self._data
-            data.qpos[0:3], data.qpos[3:7], data.qpos[self._at] = position[world], quaternion[world], joints[world]
-            data.qvel[0:3], data.qvel[3:6], data.qvel[self._dofs] = linear[world], angular[world], rates[world]
+            data.qpos[0:3], data.qpos[3:7], data.qpos[self._at] = values[:3]
+            data.qvel[0:3], data.qvel[3:6], data.qvel[self._dofs] = values[3:]
             self._mujoco.mj_forward(self._model, data)
             energy[world] = data.energy.sum()
         return energy
@@ -133,12 +126,8 @@ def record_targets(
     """
     scene = open_loop_scene(suite, robot, policy.contract)
     steps = round(DURATION / scene.physics.control_period)
-    backend = variant.worlds(scene, threads=threads)
-    try:
-        with torch.inference_mode():
-            walk = _walk(backend, suite, policy, friction, steps)
-    finally:
-        backend.close()
+    with closing(variant.worlds(scene, threads=threads)) as backend, torch.inference_mode():
+        walk = _walk(backend, suite, policy, friction, steps)
     pose = np.asarray(robot.default_joint_position)
     time = np.arange(steps) * scene.physics.control_period
     # linear chirp: the phase is the integral of a frequency that grows evenly
@@ -201,23 +190,17 @@ def replay(
     """
     scene = open_loop_scene(suite, robot, contract)
     meter = EnergyMeter(scene)
-    backend = variant.worlds(scene, threads=threads)
-    rows: dict[str, list[Array]] = {name: [] for name in ("position", "quaternion", "joints", "ground_force", "energy")}
-    try:
-        with torch.inference_mode():
-            _begin(backend, friction)
-            description = backend.describe()
-            for target in targets:
-                backend.step(torch.tensor(target, device=backend.device, dtype=backend.dtype))
-                state = backend.state
-                rows["position"].append(_numbers(state.base_position_w))
-                rows["quaternion"].append(_numbers(state.base_quaternion_w))
-                rows["joints"].append(_numbers(state.joint_position))
-                rows["ground_force"].append(_numbers(state.ground_force_w)[:, 2])
-                rows["energy"].append(meter.measure(state))
-    finally:
-        backend.close()
-    return Trajectory(**{name: np.stack(values) for name, values in rows.items()}), description
+    rows: list[tuple[Array, ...]] = []
+    with closing(variant.worlds(scene, threads=threads)) as backend, torch.inference_mode():
+        _begin(backend, friction)
+        description = backend.describe()
+        for target in targets:
+            backend.step(torch.tensor(target, device=backend.device, dtype=backend.dtype))
+            state = backend.state
+            pose = map(_numbers, (state.base_position_w, state.base_quaternion_w, state.joint_position))
+            rows.append((*pose, _numbers(state.ground_force_w)[:, 2], meter.measure(state)))
+    names = (field.name for field in fields(Trajectory))
+    return Trajectory(**dict(zip(names, map(np.stack, zip(*rows, strict=True)), strict=True))), description
 
 
 def _numbers(tensor: torch.Tensor) -> Array:
@@ -261,13 +244,12 @@ def compare_trajectories(
             "energy": compared.energy[at, i] - reference.energy[at, i],
         }
         thin = np.unique(np.linspace(0, steps - 1, min(_POINTS, steps)).round().astype(int))
-        apart = {f"{mark:g}": _first(time, ~(position <= mark)) for mark in MARKS}
         result[test] = {
             "time": [float(t) for t in time[thin]],
             "curves": {name: [finite(v) for v in curve[thin]] for name, curve in curves.items()},
             "end": {name: finite(curve[-1]) for name, curve in curves.items()},
             "largest": {name: finite(np.abs(curve).max()) for name, curve in curves.items()},
-            "apart": apart,
+            "apart": {f"{mark:g}": _first(time, ~(position <= mark)) for mark in MARKS},
         }
         if test == "stand":
             rest = slice(max(0, steps - round(REST / period)), steps)

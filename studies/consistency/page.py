@@ -78,26 +78,14 @@ def page_data(results: Mapping[str, Any]) -> dict[str, Any]:
         f"{suite['name']} {suite['version']}",
         f"robot {results['robot']}",
         f"reference {results['reference']}",
-        "friction " + ", ".join(number(f) for f in frictions),
+        f"friction {', '.join(map(number, frictions))}",
         *(["level " + ", ".join(str(v) for v in levels)] if levels else []),
         f"{len(results['seeds'])} seeds",
         provenance["date"][:10],
     ]
-    return {
-        "facts": facts,
-        "reference": results["reference"],
-        "skipped": results["skipped"],
-        "shared_draws": results["shared_draws"],
-        "seeds": len(results["seeds"]),
-        "policies": [_policy(p, results["reference"], results["margin"]) for p in results["policies"]],
-        "fields": FIELD_LABELS,
-        "devices": results["devices"],
-        "suite": suite,
-        "resamples": results["resamples"],
-        "margin": results["margin"],
-        "draws": results["draws"],
-        "provenance": provenance,
-    }
+    policies = [_policy(p, results["reference"], results["margin"]) for p in results["policies"]]
+    more = {"facts": facts, "seeds": len(results["seeds"]), "policies": policies, "fields": FIELD_LABELS}
+    return dict(results) | more
 
 
 def _policy(block: Mapping[str, Any], reference: str, margin: float) -> dict[str, Any]:
@@ -106,10 +94,8 @@ def _policy(block: Mapping[str, Any], reference: str, margin: float) -> dict[str
     scale = interval_charts.common_scale([g["gap"] for g in gaps] + [block["floor"]["overall"]["gap"]], signed=False)
     for row in gaps:
         row["strip"] = interval_charts.strip(row["gap"], scale, block["floor"]["overall"]["gap"])
-    return {
+    return dict(block) | {
         "title": PurePath(block["policy"].replace("\\", "/")).name,
-        "contract_hash": block["contract_hash"],
-        "file_sha256": block["file_sha256"],
         "gaps": gaps,
         "gap_scale": interval_charts.strip_scale(scale),
         "floor": block["floor"]["overall"]["gap"],
@@ -117,11 +103,9 @@ def _policy(block: Mapping[str, Any], reference: str, margin: float) -> dict[str
             {"label": label, "text": verdict(pair["overall"], margin)} for label, pair in block["pairs"].items()
         ],
         "pairs": {label: _pair(pair) for label, pair in block["pairs"].items()},
-        "models": block["models"],
         "open_loop": _open_loop(block["open_loop"], reference),
         "attribution": _attribution(block["attribution"]),
         "unhealthy": {k: v for k, v in block["health"].items() if v["diverged"] or v["overflowed"]},
-        "health": block["health"],
     }
 
 
@@ -195,18 +179,11 @@ def _open_loop(block: Mapping[str, Any], reference: str) -> dict[str, Any]:
     labels = [label for label in differences if label != block["floor"]] + [block["floor"]]
     tests = []
     for test, title in TESTS.items():
+        rows = [{"label": label, **differences[label][test]} for label in labels]
         panels = [
-            curves(
-                {
-                    label: (differences[label][test]["time"], differences[label][test]["curves"][name])
-                    for label in labels
-                },
-                title=words,
-                unit=unit,
-            )
+            curves({row["label"]: (row["time"], row["curves"][name]) for row in rows}, title=words, unit=unit)
             for name, (words, unit) in CURVES.items()
         ]
-        rows = [{"label": label, **differences[label][test]} for label in labels]
         tests.append({"name": test, "title": title, "panels": panels, "rows": rows})
     supports = {label: differences[label]["stand"]["support"][1] for label in labels[:-1]}
     base = differences[labels[0]]["stand"]["support"][0] if labels else None

@@ -11,6 +11,12 @@ from ...files.choices import PLACE, PLAYED, Choice, PolicyNames, RobotName, Suit
 
 MARGIN = 0.02
 """Difference of quality that does not matter: it moves the score of a levelled terrain by 0.004, less than its repeatability."""
+_REFERENCE = "Engine that the others are compared with. Default: the first."
+_DEVICE = "cpu or cuda, for the engines that can use a GPU. Default: a GPU."
+_LEVELS = "Level (1-10) of the terrains that have levels; repeatable. Default: 3."
+_FRICTIONS = "Friction coefficient; repeatable. Default: the nominal one; on a GPU the suite's."
+_MARGIN = "Difference of quality that does not matter: below it engines are equivalent."
+_FACTORS = "Factor that the attribution switches; repeatable. Default: all (docs/guides/consistency.md)."
 
 
 class ConsistencyError(ValueError):
@@ -24,40 +30,17 @@ class StudyRequest:
     policies: PolicyNames
     backends: tuple[str, ...] = ("mujoco", "mujoco-warp", "newton")
     """Engines, each as ``parse_variant`` reads it."""
-    reference: Annotated[
-        str | None, Choice("Engine that the others are compared with. Default: the first.", PLACE, values="backends")
-    ] = None
-    device: Annotated[str | None, Choice("cpu or cuda, for the engines that can use a GPU. Default: a GPU.", PLACE)] = (
-        None
-    )
+    reference: Annotated[str | None, Choice(_REFERENCE, PLACE, "backends")] = None
+    device: Annotated[str | None, Choice(_DEVICE, PLACE)] = None
     suite: SuiteName = "robogauge-1.1"
     robot: RobotName = None
     terrains: TerrainNames = ()
-    levels: Annotated[
-        tuple[int, ...],
-        Choice("Level (1-10) of the terrains that have levels; repeatable. Default: 3.", PLAYED, flags=("--level",)),
-    ] = ()
-    frictions: Annotated[
-        tuple[float, ...],
-        Choice(
-            "Friction coefficient; repeatable. Default: the nominal one; on a GPU the suite's.",
-            PLAYED,
-            flags=("--friction",),
-        ),
-    ] = ()
+    levels: Annotated[tuple[int, ...], Choice(_LEVELS, PLAYED)] = ()
+    frictions: Annotated[tuple[float, ...], Choice(_FRICTIONS, PLAYED)] = ()
     seeds: Annotated[int | None, Choice("Number of seeds, at least 2. Default: 3; on a GPU 10.", PLAYED)] = None
-    margin: Annotated[
-        float, Ge(0.0), Choice("Difference of quality that does not matter: below it engines are equivalent.", PLAYED)
-    ] = MARGIN
+    margin: Annotated[float, Ge(0.0), Choice(_MARGIN, PLAYED)] = MARGIN
     attribution: Annotated[bool, Choice("Switch one factor at a time and see what it does.", PLAYED)] = True
-    factors: Annotated[
-        tuple[str, ...],
-        Choice(
-            "Factor that the attribution switches; repeatable. Default: all (docs/guides/consistency.md).",
-            PLAYED,
-            flags=("--factor",),
-        ),
-    ] = ()
+    factors: Annotated[tuple[str, ...], Choice(_FACTORS, PLAYED)] = ()
     threads: ThreadCount = None
     trust: Trust = False
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -215,7 +216,7 @@ def study(
         "compared": [v.label for v in prepared.others],
         "devices": {v.label: v.device for v in prepared.engines},
         "skipped": prepared.skipped,
-        "cells": [{"terrain": c.terrain, "level": c.level, "friction": c.friction} for c in prepared.cells],
+        "cells": [asdict(cell) for cell in prepared.cells],
         "seeds": list(prepared.seeds),
         "shared_draws": prepared.design.shared_draws,
         "resamples": prepared.suite.scoring.bootstrap,
@@ -241,7 +242,6 @@ class _Policy:
         self._records: dict[str, Records] = {}
         self._unable: dict[str, str] = {}
         self._part, self._parts = 0, len(prepared.engines)
-        self._digest = policy.digest
 
     def run(self) -> dict[str, Any]:
         """All layers; the closed loop comes first, since it finds out which engines can play these terrains."""
@@ -287,8 +287,6 @@ class _Policy:
             "health": {label: health(records.values()).to_data() for label, records in self._records.items()},
         }
 
-    # ---- closed loop ----------------------------------------------------------------------------------------------
-
     def _play(self, variant: Variant) -> Records:
         """Records of all episodes in a variant; nothing is played twice."""
         prepared = self._prepared
@@ -296,10 +294,7 @@ class _Policy:
             return self._records[variant.label]
         self._part += 1
         episodes = prepared.design.episodes()
-
-        def on_progress(done: int) -> None:
-            self._watch(StudyStatus(self._name, variant.label, self._part, self._parts, done, len(episodes)))
-
+        status = partial(StudyStatus, self._name, variant.label, self._part, self._parts, episodes=len(episodes))
         with RunFolder(self._folder / variant.folder, self._identity(variant), resume=self._resume) as store:
             play_variant(
                 variant,
@@ -310,7 +305,7 @@ class _Policy:
                 records=store.records,
                 keep=store.put,
                 threads=cpu_threads(prepared.request.threads),
-                watch=on_progress,
+                watch=lambda done: self._watch(status(done=done)),
             )
         self._records[variant.label] = store.records
         return store.records
@@ -318,15 +313,13 @@ class _Policy:
     def _identity(self, variant: Variant) -> dict[str, Any]:
         """What decides about the records of a variant."""
         prepared = self._prepared
-        shared = common_identity(prepared.suite, self._digest, prepared.robot, variant.device, prepared.seeds)
+        shared = common_identity(prepared.suite, self._policy.digest, prepared.robot, variant.device, prepared.seeds)
         return shared | {
             "pipeline": "consistency",
             "variant": variant.label,
             "robot": prepared.request.robot or prepared.robot.name,
             "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in prepared.cells],
         }
-
-    # ---- attribution ----------------------------------------------------------------------------------------------
 
     def _switches(self) -> list[tuple[Factor, Variant]]:
         """Which factor is switched in which engine: the reference's, and buffer sizes in the engines that have them."""
@@ -340,28 +333,19 @@ class _Policy:
         """Switch a factor, play, and say what came of it."""
         prepared = self._prepared
         switched = factor.switch(variant)
-        entry: dict[str, Any] = {
-            "factor": factor.name,
-            "title": factor.title,
-            "engine": variant.label,
-            "variant": switched.label,
-            "not_run": None,
-        }
-        for label in (variant.label, switched.label):
-            if label in self._unable:
-                return entry | {"not_run": self._unable[label]}
+        entry: dict[str, Any] = {"factor": factor.name, "title": factor.title, "engine": variant.label}
+        unable = self._unable.get(variant.label) or self._unable.get(switched.label)
+        entry |= {"variant": switched.label, "not_run": unable}
+        if unable:
+            return entry
         try:
             records = self._play(switched)
         except BackendError as error:
             return entry | {"not_run": str(error)}
-        near = [v.label for v in prepared.engines if v.label != variant.label]
-        if variant.label != prepared.reference.label:
-            near = [prepared.reference.label]
-        others = {label: self._records[label] for label in near}
+        near = prepared.others if variant.label == prepared.reference.label else [prepared.reference]
+        others = {v.label: self._records[v.label] for v in near}
         name = f"{self._name}/{switched.label}"
         return entry | effect_of_switch(prepared.design, self._records[variant.label], records, others, name=name)
-
-    # ---- models and open loop ---------------------------------------------------------------------------------------
 
     def _open_loop(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """The first two layers."""
@@ -376,10 +360,9 @@ class _Policy:
         runs: dict[str, Trajectory] = {}
         descriptions: dict[str, Mapping[str, list[float]] | None] = {}
         floor = rounded(prepared.reference)
-        for variant in [*prepared.engines, floor]:
-            runs[variant.label], descriptions[variant.label] = replay(
-                variant, targets, contract=self._policy.contract, **settings
-            )
+        contract = self._policy.contract
+        for each in [*prepared.engines, floor]:
+            runs[each.label], descriptions[each.label] = replay(each, targets, contract=contract, **settings)
         del descriptions[floor.label]
         weight = GRAVITY * total_mass(prepared.robot)
         base = prepared.reference.label

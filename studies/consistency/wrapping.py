@@ -7,8 +7,9 @@ state and targets off by a hair, to see what chaos alone makes of an episode.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import torch
@@ -19,12 +20,16 @@ from ...backends.base import (
     Capability,
     PhysicsBackend,
     PhysicsState,
-    Randomization,
     ResetState,
     Scene,
     Support,
 )
 from ...gauge.play.noise import uniform_hash
+
+
+def _handed_on(name: str) -> Callable[..., Any]:
+    """Return a method that calls the method of this name of the backend behind."""
+    return lambda self, *arguments, **options: getattr(self.inner, name)(*arguments, **options)
 
 
 class WrappedBackend(PhysicsBackend):
@@ -44,43 +49,15 @@ class WrappedBackend(PhysicsBackend):
         self.scene = scene or inner.scene
         self.device, self.dtype = inner.device, inner.dtype
 
-    @property
-    def state(self) -> PhysicsState:
-        """See ``PhysicsBackend.state``."""
-        return self.inner.state
-
-    @property
-    def sample(self) -> PhysicsState:
-        """See ``PhysicsBackend.sample``."""
-        return self.inner.sample
-
-    def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
-        """See ``PhysicsBackend.reset``."""
-        self.inner.reset(start, worlds)
-
-    def step(self, joint_targets: torch.Tensor | None, **arguments: Any) -> None:
-        """See ``PhysicsBackend.step``."""
-        self.inner.step(joint_targets, **arguments)
-
-    def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
-        """See ``PhysicsBackend.randomize``."""
-        self.inner.randomize(randomization, worlds)
-
-    def push(self, worlds: torch.Tensor | None = None, **velocities: Any) -> None:
-        """See ``PhysicsBackend.push``."""
-        self.inner.push(worlds, **velocities)
-
-    def apply_force(self, force_w: torch.Tensor) -> None:
-        """See ``PhysicsBackend.apply_force``."""
-        self.inner.apply_force(force_w)
-
-    def describe(self) -> Mapping[str, list[float]] | None:
-        """See ``PhysicsBackend.describe``."""
-        return self.inner.describe()
-
-    def close(self) -> None:
-        """See ``PhysicsBackend.close``."""
-        self.inner.close()
+    state: Any = property(attrgetter("inner.state"))
+    sample: Any = property(attrgetter("inner.sample"))
+    reset = _handed_on("reset")
+    step = _handed_on("step")
+    randomize = _handed_on("randomize")
+    push = _handed_on("push")
+    apply_force = _handed_on("apply_force")
+    describe = _handed_on("describe")
+    close = _handed_on("close")
 
 
 class PerturbedBackend(WrappedBackend):
@@ -114,7 +91,7 @@ class PerturbedBackend(WrappedBackend):
         self._key[torch.tensor(list(worlds), device=self.device)] = torch.tensor(keys, device=self.device)
 
     def _factors(self) -> torch.Tensor:
-        """One plus what is off in this step, for joints and base height, (K, J + 1)."""
+        """Return one plus the relative error of this step, for joints and base height, (K, J + 1)."""
         unit = 2.0 * uniform_hash(self._key[:, None], self._step[:, None], self._index) - 1.0
         return 1.0 + self._magnitude * unit.to(self.dtype)
 
@@ -147,11 +124,7 @@ class RetimedBackend(WrappedBackend):
     """
 
     def __init__(self, inner: PhysicsBackend, scene: Scene) -> None:
-        """Stand before ``inner``, whose control period must be that of ``scene``.
-
-        Raises:
-            BackendError: the control periods differ.
-        """
+        """Stand before ``inner``, whose control period must be that of ``scene``. Raises BackendError: the control periods differ."""
         mine, theirs = scene.physics, inner.scene.physics
         if abs(mine.control_period - theirs.control_period) > 1e-9:
             raise BackendError(

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -96,7 +97,7 @@ def collect(policy: Policy, robot: Robot, asked: LatentRequest, suite: Suite, te
         closing(make_backend(asked.backend, scene, device="cpu", threads=cpu_threads(asked.threads))) as physics,
         torch.inference_mode(),
     ):
-        episodes = _episodes(asked, terrains, places)
+        episodes = [_episode(asked, terrains[t], list(COMMANDS)[c], r) for t, c, r in places]
         walk = Walk(policy, physics, suite.noise, episodes, steps=stands + steps, session=session)
         physics.randomize(Randomization(friction=walk.tensor([asked.friction] * len(places))))
         physics.reset(physics.standing())
@@ -144,25 +145,16 @@ def start(terrain: Terrain, episode: Episode, feet: NDArray[np.float64]) -> Pose
 
 
 def _table(parts: Sequence[torch.Tensor]) -> NDArray[np.float64]:
-    """Rows of all moments, one after another."""
-    found: NDArray[np.float64] = torch.cat(tuple(parts)).double().numpy()
-    return found
+    """Return the rows of all moments, one after another."""
+    return torch.cat(tuple(parts)).double().numpy()
 
 
-def _episodes(
-    asked: LatentRequest, terrains: Sequence[Terrain], places: Sequence[tuple[int, int, int]]
-) -> list[Episode]:
-    """One for each robot, which gives it noise and latency of its own."""
-    commands = list(COMMANDS)
-    return [
-        Episode(
-            terrain=terrains[t].name,
-            level=terrains[t].level,
-            friction=asked.friction,
-            payload=0.0,
-            seed=asked.seed + r,
-            stage=f"latent {commands[c]}",
-            goals=(),
-        )
-        for t, c, r in places
-    ]
+def _episode(asked: LatentRequest, terrain: Terrain, command: str, robot: int) -> Episode:
+    """Return a robot's own episode, which gives it noise and latency of its own."""
+    place: dict[str, Any] = {
+        "terrain": terrain.name,
+        "level": terrain.level,
+        "friction": asked.friction,
+        "payload": 0.0,
+    }
+    return Episode(**place, seed=asked.seed + robot, stage=f"latent {command}", goals=())

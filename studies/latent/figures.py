@@ -25,13 +25,8 @@ SPACES = {
     "input_mean": "network's input, means of 1 s",
 }
 """In what classes are told apart, in the order in which tables list it."""
-LABELS = {
-    "slope_fd": "slope up",
-    "slope_bd": "slope down",
-    "stairs_fd": "stairs up",
-    "stairs_bd": "stairs down",
-    "obstacle": "obstacles",
-}
+LABELS = {"slope_fd": "slope up", "slope_bd": "slope down", "stairs_fd": "stairs up", "stairs_bd": "stairs down"}
+LABELS |= {"obstacle": "obstacles"}
 """Terrains as a robot meets them that walks forward from where quality episodes start."""
 _COLOURS = ("#0072b2", "#e69f00", "#d55e00", "#cc79a7", "#009e73", "#56b4e9", "#5c4033", "#9a9a00")
 """Okabe and Ito's, without yellow and black; readers who see colours differently can tell them apart."""
@@ -57,7 +52,7 @@ def draw(name: str, results: Mapping[str, Any], points: Points) -> dict[str, Any
         entries = {e["label"]: e for e in results["policies"]}
         classes = [label(n) for n in results[name]]
         panels = [_scatter(name, entries[who], notes, places[name]) for who, notes, places in points if name in places]
-        legend = [{"text": text, "colour": _COLOURS[i % len(_COLOURS)]} for i, text in enumerate(classes)]
+        legend = [{"text": text, "colour": _colour(i)} for i, text in enumerate(classes)]
     for panel in panels:
         # the panel's template has escaped what is in it
         panel["drawn"] = markupsafe.Markup(_template("latent_panel.svg.j2").render(name=name, p=panel))
@@ -95,6 +90,10 @@ def render_page(results: Mapping[str, Any], drawings: Mapping[str, Mapping[str, 
 _fixed = partial(fixed, digits=2)
 
 
+def _colour(index: int) -> str:
+    return _COLOURS[index % len(_COLOURS)]
+
+
 def _template(name: str) -> jinja2.Template:
     return page_template(__file__, name, label=label, fixed=_fixed)
 
@@ -110,10 +109,10 @@ def _scatter(name: str, entry: Mapping[str, Any], notes: Notes, places: NDArray[
     scale = 0.94 * _SIDE / max(float((high - low).max()), 1e-9)
     middle = (low + high) / 2
     spots = (places[rows] - middle) * (scale, -scale) + _SIDE / 2
+    mine = [spots[classes[rows] == c] for c in range(int(classes.max()) + 1)]
+    paths = ["".join(f"M{x:.0f} {y:.0f}h0" for x, y in some) for some in mine]
     found = entry[name].get("latent")
-    words = (
-        "" if found is None else f"silhouette {found['silhouette']:.2f}, probe {found['probe']:.2f}".replace("-", "−")
-    )
+    words = f"silhouette {found['silhouette']:.2f}, probe {found['probe']:.2f}".replace("-", "−") if found else ""
     return {
         "title": entry["label"],
         "words": words,
@@ -121,13 +120,7 @@ def _scatter(name: str, entry: Mapping[str, Any], notes: Notes, places: NDArray[
         "height": _SIDE,
         "box": (-22.0, -2.0, _SIDE + 24.0, _SIDE + 26.0),
         "axes": [f"PC {i + 1} ({100 * share:.0f} %)" for i, share in enumerate(entry[name]["explained"])],
-        "paths": [
-            {
-                "colour": _COLOURS[c % len(_COLOURS)],
-                "path": "".join(f"M{x:.0f} {y:.0f}h0" for x, y in spots[classes[rows] == c]),
-            }
-            for c in range(int(classes.max()) + 1)
-        ],
+        "paths": [{"colour": _colour(c), "path": path} for c, path in enumerate(paths)],
     }
 
 
@@ -137,12 +130,13 @@ def _weights_panel(entry: Mapping[str, Any]) -> dict[str, Any]:
     rows = [(label(name), means) for pair in ("terrains", "commands") for name, means in experts[pair].items()]
     most = max(max(means) for _, means in rows)
     count = len(rows[0][1])
+    width, height = _NAMES + _CELL * count, _ROW * (len(rows) + 1)
     return {
         "title": entry["label"],
         "words": f"{experts['at_once']:.1f} of {count} at once, {experts['in_all']:.1f} in all",
-        "width": _NAMES + _CELL * count,
-        "height": _ROW * (len(rows) + 1),
-        "box": (0.0, 0.0, _NAMES + _CELL * count, _ROW * (len(rows) + 1) + 4.0),
+        "width": width,
+        "height": height,
+        "box": (0.0, 0.0, width, height + 4.0),
         "columns": [{"x": _NAMES + _CELL * (k + 0.5), "text": str(k + 1)} for k in range(count)],
         "rows": [
             {

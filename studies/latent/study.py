@@ -15,7 +15,7 @@ from ...backends.base import BackendError
 from ...backends.registry import find_backend
 from ...files.choices import cpu_threads
 from ...files.provenance import provenance
-from ...files.writing import csv_text, json_text, make_folder, write_atomically
+from ...files.writing import csv_text, json_text, write_files
 from ...gauge.pipelines import check_friction
 from ...gauge.suite import Suite, SuiteError, load_suite
 from ...policy.base import PolicyError
@@ -25,7 +25,7 @@ from ...terrains.base import Terrain
 from ...terrains.registry import gauge_terrain_names, make_terrain
 from ..policies import Loaded, Watch, describe, load_policies
 from .collecting import COMMANDS, Notes, collect
-from .figures import FIGURES, draw, render_figure, render_page
+from .figures import FIGURES, Points, draw, render_figure, render_page
 from .request import LatentRequest
 from .separation import Separation, principal_components, separation
 
@@ -87,13 +87,10 @@ def study_latents(
             command=command, threads=cpu_threads(request.threads), seconds=round(time.perf_counter() - began, 2)
         ),
     }
-    make_folder(folder, LatentError)
     drawings = {name: drawing for name in FIGURES if (drawing := draw(name, results, points))}
-    for name, drawing in drawings.items():
-        write_atomically(folder / f"latent-{name}.svg", render_figure(drawing), LatentError)
-    write_atomically(folder / "points.csv", as_csv(results, points), LatentError)
-    write_atomically(folder / "latent.html", render_page(results, drawings), LatentError)
-    write_atomically(folder / "latent.json", json_text(results), LatentError)
+    texts = {f"latent-{name}.svg": render_figure(drawing) for name, drawing in drawings.items()}
+    texts |= {"points.csv": as_csv(results, points), "latent.html": render_page(results, drawings)}
+    write_files(folder, texts | {"latent.json": json_text(results)}, LatentError)
     return results
 
 
@@ -119,24 +116,17 @@ def look(
         LatentError: on some terrain, or with some command, every robot fell before anything could be noted; or all but one did
             everywhere.
     """
-    chosen = {
-        "terrains": notes.command == list(COMMANDS).index("forward"),
-        "commands": np.ones(len(notes.time), dtype=bool),
-    }
+    forward = notes.command == list(COMMANDS).index("forward")
+    chosen = {"terrains": forward, "commands": np.ones(len(notes.time), dtype=bool)}
     classes = {"terrains": notes.terrain, "commands": notes.command}
     names = {"terrains": terrains, "commands": list(COMMANDS)}
     spaces = {"latent": notes.latent, "experts": notes.weights, "input": notes.history}
     blocks = _blocks(notes, STRIDES)
-    entry: dict[str, Any] = {
-        **describe(label, loaded),
-        "walkers": notes.walkers,
-        "falls": notes.falls,
-        "samples": len(notes.time),
-    }
+    counts = {"walkers": notes.walkers, "falls": notes.falls, "samples": len(notes.time)}
+    entry: dict[str, Any] = describe(label, loaded) | counts
     places: dict[str, NDArray[np.float64]] = {}
     for pair, rows in chosen.items():
-        found: dict[str, Any] = {}
-        entry[pair] = found
+        found: dict[str, Any] = entry.setdefault(pair, {})
         if len(names[pair]) < 2:
             continue
         seen = np.bincount(classes[pair][rows], minlength=len(names[pair]))
@@ -161,7 +151,7 @@ def look(
                 found[f"{space}_mean"] = _plain(separation(values[whole].mean(axis=1), kinds, robots), names[pair])
         if notes.latent is not None:
             spread, shares = principal_components(notes.latent[rows])
-            found["explained"] = [float(s) for s in shares]
+            found["explained"] = shares.tolist()
             places[pair] = np.full((len(rows), 2), np.nan)
             places[pair][rows] = spread
     entry["experts"] = None if notes.weights is None else _experts(notes, names, chosen, classes)
@@ -174,8 +164,7 @@ def _blocks(notes: Notes, count: int) -> NDArray[np.int64]:
     keys = np.stack((notes.terrain, notes.command, notes.robot))[:, order]
     begins = np.flatnonzero(np.append(True, (np.diff(keys) != 0).any(axis=0)))
     parts = np.split(order, begins[1:])
-    found = [part[: len(part) // count * count].reshape(-1, count) for part in parts]
-    return np.concatenate(found)
+    return np.concatenate([part[: len(part) // count * count].reshape(-1, count) for part in parts])
 
 
 def _plain(found: Separation, names: Sequence[str]) -> dict[str, Any]:
@@ -203,35 +192,26 @@ def _experts(
         found: NDArray[np.float64] = -(parts * np.log(np.maximum(parts, 1e-12))).sum(axis=-1)
         return found
 
-    means = {
-        pair: {
-            name: [float(w) for w in weights[rows & (classes[pair] == i)].mean(axis=0)]
-            for i, name in enumerate(names[pair])
-        }
-        for pair, rows in chosen.items()
-    }
-    return {
-        **means,
-        "at_once": float(np.exp(entropy(shares).mean())),
-        "in_all": float(np.exp(entropy(shares.mean(axis=0)))),
-    }
+    found: dict[str, Any] = {}
+    for pair, rows in chosen.items():
+        masks = {name: rows & (classes[pair] == i) for i, name in enumerate(names[pair])}
+        found[pair] = {name: weights[mask].mean(axis=0).tolist() for name, mask in masks.items()}
+    at_once, in_all = entropy(shares).mean(), entropy(shares.mean(axis=0))
+    return found | {"at_once": float(np.exp(at_once)), "in_all": float(np.exp(in_all))}
 
 
-def as_csv(results: Mapping[str, Any], points: Sequence[tuple[str, Notes, Mapping[str, NDArray[np.float64]]]]) -> str:
+def as_csv(results: Mapping[str, Any], points: Points) -> str:
     """One row for each robot and moment: where it was, its places in both figures, its latent and the experts' weights."""
     latents = max((n.latent.shape[1] for _, n, _ in points if n.latent is not None), default=0)
     experts = max((n.weights.shape[1] for _, n, _ in points if n.weights is not None), default=0)
     axes = [f"{pair}_pc{i}" for pair in PAIRS for i in (1, 2)]
-    numbered = [f"latent_{i}" for i in range(latents)], [f"expert_{i}" for i in range(experts)]
-    rows: list[Sequence[object]] = [
-        ("policy", "terrain", "command", "robot", "time", *axes, *numbered[0], *numbered[1])
-    ]
+    numbered = [f"latent_{i}" for i in range(latents)] + [f"expert_{i}" for i in range(experts)]
+    rows: list[Sequence[object]] = [("policy", "terrain", "command", "robot", "time", *axes, *numbered)]
     for label, notes, places in points:
         columns = [*(places.get(pair) for pair in PAIRS), notes.latent, notes.weights]
-        widths = [2, 2, latents, experts]
         for row in range(len(notes.time)):
             values: list[str] = []
-            for column, width in zip(columns, widths, strict=True):
+            for column, width in zip(columns, (2, 2, latents, experts), strict=True):
                 own = [] if column is None else ["" if np.isnan(v) else f"{v:.4f}" for v in column[row]]
                 values += own + [""] * (width - len(own))
             terrain, told = results["terrains"][notes.terrain[row]], results["commands"][notes.command[row]]

@@ -185,11 +185,7 @@ class Scenario:
         return hashlib.sha256(json.dumps(rules, sort_keys=True).encode()).hexdigest()
 
     def terrain(self) -> Terrain:
-        """The ground.
-
-        Raises:
-            TerrainError: no such terrain or level, or a course that leads below the floor.
-        """
+        """The ground. Raises TerrainError: no such terrain or level, or a course that leads below the floor."""
         ground = self.ground
         if ground.terrain is not None:
             return make_terrain(ground.terrain, ground.level)

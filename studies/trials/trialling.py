@@ -14,7 +14,7 @@ from ...backends.base import BackendError
 from ...backends.registry import choose_device, find_backend
 from ...files.choices import cpu_threads
 from ...files.provenance import provenance
-from ...files.writing import csv_text, json_text, make_folder, write_atomically
+from ...files.writing import csv_text, json_text, write_files
 from ...gauge.chance.intervals import wilson_interval
 from ...gauge.suite import SuiteError
 from ...policy.base import PolicyError
@@ -50,31 +50,24 @@ def run_trials(
         try:
             scenario = load_scenario(name)
             if scenario.name in scenarios:
-                raise ScenarioError(
-                    f"'{name}' is called '{scenario.name}' as another one of these scenarios; rename it"
-                )
+                called = f"'{name}' is called '{scenario.name}' as another one of these scenarios"
+                raise ScenarioError(f"{called}; rename it")
             scenarios[scenario.name] = scenario
         except ScenarioError as error:
             refused.append({"what": name, "reason": str(error)})
+    where: dict[str, Any] = {"backend": request.backend, "device": device, "threads": cpu_threads(request.threads)}
     entries = [_about(scenario) for scenario in scenarios.values()]
     turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]
     for number, (scenario, entry, label) in enumerate(turns, 1):
         watch(number, len(turns), f"{label} in {scenario.name}")
         seeds = range(request.seed, request.seed + (request.repeats or scenario.repeats))
+        policy, robot = policies[label].policy, policies[label].robot
         try:
-            trials = run_scenario(
-                policies[label].policy,
-                policies[label].robot,
-                scenario,
-                seeds,
-                backend=request.backend,
-                device=device,
-                threads=cpu_threads(request.threads),
-            )
+            trials = run_scenario(policy, robot, scenario, seeds, **where)
         except (BackendError, ContractError, PolicyError, RobotError, SuiteError) as error:
             refused.append({"what": f"{label} in {scenario.name}", "reason": str(error)})
         else:
-            entry["results"].append(summary(label, policies[label].policy.contract, scenario, trials))
+            entry["results"].append(summary(label, policy.contract, scenario, trials))
     if not any(entry["results"] for entry in entries):
         raise ScenarioError("; ".join(r["reason"] for r in refused) or "there is nothing to try; name a scenario")
     results = {
@@ -90,10 +83,8 @@ def run_trials(
             seconds=round(time.perf_counter() - began, 2),
         ),
     }
-    make_folder(folder, ScenarioError)
-    write_atomically(folder / "trials.csv", as_csv(results), ScenarioError)
-    write_atomically(folder / "trial.html", render_page(results), ScenarioError)
-    write_atomically(folder / "trials.json", json_text(results), ScenarioError)
+    texts = {"trials.csv": as_csv(results), "trial.html": render_page(results), "trials.json": json_text(results)}
+    write_files(folder, texts, ScenarioError)
     return results
 
 
@@ -135,11 +126,8 @@ def summary(label: str, contract: PolicyContract, scenario: Scenario, trials: Se
     successes, count = outcomes.count("success"), len(trials)
     asked = [max(abs(p.velocity[i]) for p in scenario.commands) for i in range(3)]
     limits = contract.command_limits
-    above = [
-        f"{a:g} {unit}"
-        for a, limit, unit in zip(asked, limits, ("m/s forward", "m/s sideways", "rad/s"), strict=True)
-        if a > limit
-    ]
+    units = ("m/s forward", "m/s sideways", "rad/s")
+    above = [f"{a:g} {unit}" for a, limit, unit in zip(asked, limits, units, strict=True) if a > limit]
     note = (
         f"told up to {', '.join(above)}; made for up to {limits[0]:g} m/s forward, {limits[1]:g} m/s sideways and "
         f"{limits[2]:g} rad/s"
@@ -170,9 +158,7 @@ def as_csv(results: Mapping[str, Any]) -> str:
     for entry in results["scenarios"]:
         for result in entry["results"]:
             for row in result["rows"]:
-                pulls = "; ".join(
-                    f"{p['newtons']:.1f} N at {p['begin']:.2f} s for {p['seconds']:.2f} s" for p in row["pulls"]
-                )
+                pulls = ("{newtons:.1f} N at {begin:.2f} s for {seconds:.2f} s".format_map(p) for p in row["pulls"])
                 values = ["" if row[n] is None else row[n] for n in names]
-                rows.append((entry["name"], result["policy"], *values, pulls))
+                rows.append((entry["name"], result["policy"], *values, "; ".join(pulls)))
     return csv_text(rows)

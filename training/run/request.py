@@ -21,9 +21,7 @@ QUICK_SUITE = "quick"
 class TrainRequest:
     """A training. None stands for the resumed run's choice, or else for the task's."""
 
-    task: Annotated[
-        str, Choice("What to learn, see 'gaitgauge list tasks'.", argument=True, metavar="TASK", values="tasks")
-    ]
+    task: Annotated[str, Choice("What to learn, see 'gaitgauge list tasks'.", None, "tasks", "TASK")]
     overrides: Annotated[
         tuple[str, ...],
         Choice(
@@ -60,10 +58,7 @@ class TrainRequest:
     ] = None
     trust: Annotated[
         bool,
-        Choice(
-            "Import functions that the settings of a resumed checkpoint name; --init-from runs nothing either way.",
-            flags=("--trust",),
-        ),
+        Choice("Import functions that the settings of a resumed checkpoint name; --init-from runs nothing either way."),
     ] = False
     init_from: Annotated[
         str | None,

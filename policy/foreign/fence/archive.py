@@ -20,11 +20,7 @@ _ERRORS = (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, KeyErr
 
 
 def read_limited(path: Path) -> bytes:
-    """Return the content of a policy file or checkpoint.
-
-    Raises:
-        PolicyError: it cannot be read, is empty or larger than ``LARGEST_FILE``.
-    """
+    """Return a policy file's content; raise ``PolicyError`` where it is unreadable, empty or larger than ``LARGEST_FILE``."""
     try:
         with path.open("rb") as file:
             large = os.fstat(file.fileno()).st_size > LARGEST_FILE
@@ -39,11 +35,7 @@ def read_limited(path: Path) -> bytes:
 
 
 def archive_names(data: bytes, *, source: str) -> frozenset[str]:
-    """Return the names of an archive's records, without the folder that holds them all.
-
-    Raises:
-        PolicyError: not an archive.
-    """
+    """Return an archive's records' names without the folder that holds them all; raise ``PolicyError`` where it is no archive."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             return frozenset(name.partition("/")[2] for name in archive.namelist())
@@ -67,9 +59,7 @@ def read_archive(data: bytes, *, source: str) -> dict[str, bytes]:
 
 
 def _records(archive: zipfile.ZipFile, source: str) -> dict[str, bytes]:
-    entries = [
-        entry for entry in archive.infolist() if not entry.filename.endswith("/")
-    ]  # is_dir() fails without a name
+    entries = [e for e in archive.infolist() if not e.filename.endswith("/")]  # is_dir() fails without a name
     if len(entries) > MOST_RECORDS:
         raise PolicyError(f"'{source}' has {len(entries):,} entries; at most {MOST_RECORDS:,} are read")
     size = sum(entry.file_size for entry in entries)

@@ -60,11 +60,7 @@ class Program(Protocol):
     """A foreign program where it runs."""
 
     def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Do what a request's ``do`` says.
-
-        Raises:
-            PolicyError: the program fails.
-        """
+        """Do what a request's ``do`` says; raise ``PolicyError`` where the program fails."""
 
     def session(self, rows: int, *, rowwise: bool) -> PolicySession:
         """Start work on so many episodes, together or each alone."""
@@ -122,11 +118,7 @@ class Child:
         self._exchange(data)
 
     def ask(self, do: str, **details: Any) -> dict[str, Any]:
-        """Send a request and wait for its answer.
-
-        Raises:
-            PolicyError: the program fails, takes too long or too much memory.
-        """
+        """Return the answer to a request; raise ``PolicyError`` where the program fails, takes too long or too much memory."""
         reply = self._exchange(json.dumps({"do": do, **details}).encode())
         try:
             answer = json.loads(reply)
@@ -256,11 +248,7 @@ class Child:
 
 
 def _content(reply: bytes) -> bytes:
-    """Return the content of an answer.
-
-    Raises:
-        PolicyError: that the program failed.
-    """
+    """Return the content of an answer; raise ``PolicyError`` with the answer's words where the program failed."""
     if reply[:1] != _FINE:
         raise PolicyError(reply[1:].decode("utf-8", errors="replace"))
     return reply[1:]

@@ -93,10 +93,7 @@ def _graphs_of(attributes: Iterable[onnx.AttributeProto], source: str, depth: in
 
 
 def _load_weights(model: onnx.ModelProto, source: str, folder: Path | None) -> None:
-    """Take the weights that lie beside the file into it.
-
-    Only the main graph's may: other tensors are small, and no exporter puts them elsewhere.
-    """
+    """Take the weights beside the file into it, the main graph's alone: other tensors are small and never stored elsewhere."""
     outside = [tensor for tensor in model.graph.initializer if tensor.data_location == onnx.TensorProto.EXTERNAL]
     elsewhere = [t for t in _tensors(model, source) if t.data_location == onnx.TensorProto.EXTERNAL]
     if elsewhere:
@@ -145,11 +142,7 @@ def _tensors(model: onnx.ModelProto, source: str) -> Iterator[onnx.TensorProto]:
 
 
 def _beside(location: str, folder: Path, source: str) -> Path:
-    """Return the file of this name in a folder, which must really lie there.
-
-    Raises:
-        PolicyError: it does not, or there is none.
-    """
+    """Return the file of this name, which must really lie in the folder; raise ``PolicyError`` where it does not."""
     try:
         path = (folder / location).resolve()
         if not location or not path.is_relative_to(folder.resolve()):

@@ -7,6 +7,11 @@ other machines, reaches into memory without checking (``set_``, ``resize_``, ``a
 
 from __future__ import annotations
 
+
+def _names(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
 _ELEMENTWISE = """
 abs absolute acos acosh add addcdiv addcmul angle arccos arccosh arcsin arcsinh arctan arctan2 arctanh asin asinh atan atan2
 atanh bitwise_and bitwise_left_shift bitwise_not bitwise_or bitwise_right_shift bitwise_xor ceil celu clamp clamp_max clamp_min
@@ -64,16 +69,14 @@ TORCH_OPERATORS = frozenset(
 )
 """Operators of torch's own set, ``aten``."""
 
-_PRIM = """
+PRIM_OPERATORS = _names("""
 BroadcastSizes CallFunction CallMethod ChunkSizes Closure Constant ConstantChunk CreateObject DictConstruct Enter EnumName
 EnumValue Exit GetAttr If ListConstruct ListUnpack Loop ModuleContainerIndex NumToTensor Param Print RaiseException
 ReductionSizes Return SetAttr StringIndex TimePoint TupleConstruct TupleIndex TupleSlice TupleUnpack Uninitialized abs
 annotate data device dtype grad index is_cpu is_cuda is_meta is_mkldnn is_mps is_nested is_quantized is_sparse is_sparse_csr
 is_vulkan is_xla is_xpu isinstance itemsize layout max min name nbytes rangelist requires_grad shape tolist type
 unchecked_cast unchecked_unwrap_optional
-"""
-
-PRIM_OPERATORS = frozenset(_PRIM.split())
+""")
 """Operators of TorchScript itself: control flow, attributes, numbers."""
 
 _QUANTIZED = """
@@ -83,16 +86,14 @@ linear_dynamic linear_dynamic_fp16 linear_prepack linear_prepack_fp16 linear_rel
 OPERATORS = {"aten": TORCH_OPERATORS, "prim": PRIM_OPERATORS, "quantized": frozenset(_QUANTIZED.split())}
 """Operators of TorchScript by their set; the last are those of linear layers with weights of eight bits."""
 
-_PYTHON_NAMES = """
+PYTHON_NAMES = _names("""
 AssertionError BaseException Exception IndexError KeyError NotImplementedError RuntimeError TypeError ValueError abs all
 annotate any bool chr complex dict divmod enumerate float format getattr hasattr hash hex int isinstance len list max min oct
 ord pow print range reversed round sorted str sum tuple unchecked_cast uninitialized zip
-"""
-
-PYTHON_NAMES = frozenset(_PYTHON_NAMES.split())
+""")
 """Functions that TorchScript code calls by a bare name."""
 
-_ONNX = """
+ONNX_OPERATORS = _names("""
 Abs Acos Acosh Add And ArgMax ArgMin Asin Asinh Atan Atanh Attention AveragePool BatchNormalization Bernoulli BitShift
 BitwiseAnd BitwiseNot BitwiseOr BitwiseXor BlackmanWindow Cast CastLike Ceil Celu CenterCropPad Clip Compress Concat
 ConcatFromSequence Constant ConstantOfShape Conv ConvInteger ConvTranspose Cos Cosh CumSum DepthToSpace DequantizeLinear Det
@@ -107,15 +108,11 @@ ReduceSumSquare Relu Reshape Resize ReverseSequence RotaryEmbedding Round Scan S
 SequenceAt SequenceConstruct SequenceEmpty SequenceErase SequenceInsert SequenceLength Shape Shrink Sigmoid Sign Sin Sinh Size
 Slice Softmax Softplus Softsign SpaceToDepth Split SplitToSequence Sqrt Squeeze Sub Sum Swish Tan Tanh ThresholdedRelu Tile
 TopK Transpose Trilu Unique Unsqueeze Upsample Where Xor
-"""
-
-ONNX_OPERATORS = frozenset(_ONNX.split())
+""")
 """Operators of ONNX's own set."""
 
-_ONNX_CONTRIBUTED = """
+ONNX_CONTRIBUTED = _names("""
 BiasGelu DynamicQuantizeMatMul FastGelu FusedConv FusedGemm FusedMatMul Gelu LayerNormalization MatMulIntegerToFloat QuickGelu
 SimplifiedLayerNormalization SkipLayerNormalization SkipSimplifiedLayerNormalization TransposeMatMul
-"""
-
-ONNX_CONTRIBUTED = frozenset(_ONNX_CONTRIBUTED.split())
+""")
 """Operators that onnxruntime's own optimizer writes, domain ``com.microsoft``."""

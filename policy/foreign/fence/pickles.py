@@ -201,32 +201,28 @@ class _Machine:
 
 
 _STEPS: dict[str, Any] = {
-    "PROTO": lambda m, a: None,
-    "FRAME": lambda m, a: None,
+    **dict.fromkeys(("PROTO", "FRAME"), lambda m, a: None),
     "MARK": lambda m, a: m.push(_MARK),
     "POP": lambda m, a: m._stack.pop(),
     "NONE": lambda m, a: m.push(None),
     "NEWTRUE": lambda m, a: m.push(True),
     "NEWFALSE": lambda m, a: m.push(False),
     "EMPTY_TUPLE": lambda m, a: m.push(()),
-    "EMPTY_LIST": lambda m, a: m.push([]),
     "EMPTY_DICT": lambda m, a: m.push({}),
-    "EMPTY_SET": lambda m, a: m.push([]),
-    "ADDITEMS": lambda m, a: m.extend(m.above_mark()),
+    **dict.fromkeys(("EMPTY_LIST", "EMPTY_SET"), lambda m, a: m.push([])),
+    **dict.fromkeys(("APPENDS", "ADDITEMS"), lambda m, a: m.extend(m.above_mark())),
     "TUPLE": lambda m, a: m.push(tuple(m.above_mark())),
     "TUPLE1": lambda m, a: m.top_tuple(1),
     "TUPLE2": lambda m, a: m.top_tuple(2),
     "TUPLE3": lambda m, a: m.top_tuple(3),
     "GLOBAL": lambda m, a: m.name(a),
     "STACK_GLOBAL": _Machine.stack_name,
-    "REDUCE": _Machine.call,
-    "NEWOBJ": _Machine.call,
+    **dict.fromkeys(("REDUCE", "NEWOBJ"), _Machine.call),
     "BUILD": _Machine.build,
     "BINPERSID": _Machine.persistent,
     "SETITEM": _Machine.set_item,
     "SETITEMS": lambda m, a: m.set_items(m.above_mark()),
     "APPEND": lambda m, a: m.extend([m._stack.pop()]),
-    "APPENDS": lambda m, a: m.extend(m.above_mark()),
     "MEMOIZE": lambda m, a: m.keep(None),
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), _Machine.keep),
     **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), _Machine.recall),
@@ -241,11 +237,7 @@ def _whole(value: Any) -> bool:
 
 
 def _stored_tensor(call: Call, source: str) -> tuple[Storage, tuple[int, ...]]:
-    """Return storage and shape of the tensor that a call to torch's ``_rebuild_tensor_v2`` describes.
-
-    Raises:
-        PolicyError: its numbers are no numbers, or it reaches beyond its storage.
-    """
+    """Return a described tensor's storage and shape; raise ``PolicyError`` where they are malformed or do not fit each other."""
     if len(call.arguments) < 4:
         raise PickleError(f"'{source}' holds a malformed tensor")
     storage, offset, shape, stride = call.arguments[:4]

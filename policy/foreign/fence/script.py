@@ -84,16 +84,12 @@ def check_script(data: bytes, *, source: str) -> ScriptFile:
 
 
 def _parsed(content: bytes, name: str, source: str) -> ast.Module:
+    text = content.decode("latin-1")  # whatever is no ASCII is strange
+    if _STRANGE.search(text):
+        raise PolicyError(f"'{source}' holds code with characters that torch does not write, in '{name}'")
     try:
-        text = content.decode("ascii")
-        if _STRANGE.search(text):
-            raise PolicyError(f"'{source}' holds code with characters that torch does not write, in '{name}'")
         return ast.parse(text)
-    except UnicodeDecodeError as error:
-        raise PolicyError(f"'{source}' holds code with characters that torch does not write, in '{name}'") from error
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        if isinstance(error, PolicyError):
-            raise
         raise PolicyError(f"'{source}' holds code that cannot be read, in '{name}'") from error
 
 
