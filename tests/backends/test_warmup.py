@@ -1,6 +1,7 @@
 """Kernels compiled for a GPU that is not here."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -149,6 +150,15 @@ def test_training_finds_all_but_one_of_its_kernels(tmp_path):
     assert [name for name in found[1] - found[0] if "_nxn_broadphase_" not in name] == []
 
 
+@pytest.fixture
+def forked(monkeypatch):
+    """A program of its own is a copy of this one, which has imported everything already."""
+    from gaitgauge.backends.warp import warmup
+
+    monkeypatch.setattr(warmup.multiprocessing, "get_context", lambda _, get=multiprocessing.get_context: get("fork"))
+
+
+@pytest.mark.usefixtures("forked")
 def test_an_engine_is_played_until_a_process_compiles_nothing(monkeypatch):
     from gaitgauge.backends.warp import warmup
 
@@ -166,6 +176,7 @@ def _quits(*_):
     os._exit(9)
 
 
+@pytest.mark.usefixtures("forked")
 def test_a_program_that_was_killed_while_it_compiled_is_a_sentence(monkeypatch):
     from gaitgauge.backends.warp import warmup
 
@@ -175,6 +186,7 @@ def test_a_program_that_was_killed_while_it_compiled_is_a_sentence(monkeypatch):
         warmup.exercise_until_compiled("mujoco-warp", [], "cpu")
 
 
+@pytest.mark.usefixtures("forked")
 def test_what_an_engine_refuses_in_a_program_of_its_own_is_said():
     from gaitgauge.backends.warp import warmup
 
@@ -197,6 +209,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks a process up in /proc")
 def test_a_program_whose_warmup_was_ended_does_not_stay(tmp_path):
     """It ends with its play, and waits for nobody."""

@@ -1,6 +1,7 @@
 """Packages import downwards, and no circle of modules exists; imports under TYPE_CHECKING and inside functions count."""
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -13,6 +14,7 @@ FILES = {f.relative_to(ROOT).with_suffix("").parts: f for package in ORDER for f
 MODULES = {".".join(parts[:-1] if parts[-1] == "__init__" else parts): file for parts, file in FILES.items()}
 
 
+@cache
 def imports(module: str) -> set[str]:
     """Modules of the package that a module imports."""
     found, here = set(), (*module.split("."), "")[: None if MODULES[module].name == "__init__.py" else -1]

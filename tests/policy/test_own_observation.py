@@ -1,8 +1,6 @@
 """An observation from outside: the file of the guide, as a plug-in that is installed, and as module:name in a training."""
 
-import os
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +8,7 @@ from pathlib import Path
 import gaitgauge
 import pytest
 import torch
+from gaitgauge.cli.main import app
 from gaitgauge.gauge.play.noise import make_stream
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy import observation_table
@@ -24,6 +23,7 @@ from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment.configuration import ObservationConfiguration
 from gaitgauge.training.environment.own_terms import policy_observations
 from test_observation import EPISODES, make_inputs, make_state
+from typer.testing import CliRunner
 
 GUIDE = Path(gaitgauge.__path__[0]) / "docs" / "guides" / "your-observation.md"
 ROBOT = load_robot("go2")
@@ -109,17 +109,13 @@ def test_files_of_others_without_a_name_for_it_are_not_written(installed):
 
 
 @pytest.mark.parametrize("setting", ["foot_load", "foot_load:FOOT_LOAD"])
-def test_a_training_uses_it_and_its_policy_plays(installed, setting):
-    command = ("train", "go2-flat", "--backend", "fake", "--device", "cpu", "--num-envs", "8", "--no-score")
-    done = subprocess.run(
-        [sys.executable, "-m", "gaitgauge.cli.main", *command, *SMALL, f"environment.observations.policy={setting}"],
-        cwd=installed,
-        env={**os.environ, "PYTHONPATH": ":".join([str(installed), *filter(None, sys.path)])},
-        capture_output=True,
-        text=True,
-        timeout=300,
+def test_a_training_uses_it_and_its_policy_plays(installed, setting, monkeypatch):
+    monkeypatch.chdir(installed)
+    command = ["train", "go2-flat", "--backend", "fake", "--device", "cpu", "--num-envs", "8", "--no-score"]
+    done = CliRunner().invoke(
+        app, [*command, "--log-root", "logs", *SMALL, f"environment.observations.policy={setting}"]
     )
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.output
     policy = load_policy(next(installed.rglob("model_2.pt")), ROBOT)
     assert [t.name for t in policy.contract.observation][-1] == "foot_load"
     assert policy.contract.observation[-1].scale == (0.01,)
