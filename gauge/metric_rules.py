@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ..files.parsing import Positive, Share, Text
+from ..files.parsing import NotNegative, Positive, Share, Text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +39,10 @@ class Metrics:
     """Diagonal stance span that normalizes the ZMP distance [m]; None: that of the robot's default pose."""
     contact_share: Share = 0.05
     """Share of the weight that the ground must carry for the contact metrics to be defined."""
-    flight: Literal["left-out", "filled"] = "left-out"
-    """Value of a contact metric in the quality of a sample without contact: nothing (``left-out``), or the metric's mean
-    over the sub-command's other samples (``filled``; zero where there are none)."""
+    foot_force: NotNegative = 0.0
+    """Normal force up to which a foot does not count in the friction margin, and limit of friction up to which its margin is
+    zero [N]."""
+    flight: Literal["left-out", "filled", "perfect"] = "left-out"
+    """Value of a contact metric in the quality of a sample without contact: nothing (``left-out``), the metric's mean over
+    the sub-command's other samples (``filled``; zero where there are none), or 1, which also is the metric's own value
+    (``perfect``, the reference)."""

@@ -118,7 +118,9 @@ def zmp_margin(moment: torch.Tensor, force: torch.Tensor, span: float) -> torch.
     return torch.clamp(1.0 - torch.hypot(moment[:, 0], moment[:, 1]) / (force[:, 2].abs() * span + 1e-12), min=0.0)
 
 
-def friction_margin(normal: torch.Tensor, tangential: torch.Tensor, friction: torch.Tensor) -> torch.Tensor:
+def friction_margin(
+    normal: torch.Tensor, tangential: torch.Tensor, friction: torch.Tensor, least: float = 0.0
+) -> torch.Tensor:
     """Return the normal-force-weighted slack to the friction cone over the feet's contacts (appendix, Coulomb Friction Margin).
 
     With weights f_n/Σf_n the weighted mean of 1 - f_t/(μ f_n) is 1 - Σf_t / (μ Σf_n).
@@ -127,12 +129,14 @@ def friction_margin(normal: torch.Tensor, tangential: torch.Tensor, friction: to
         normal: sum of the normal forces of each foot's contacts, along each contact's own normal [N], (N, F).
         tangential: sum of the magnitudes of their tangential forces [N], (N, F).
         friction: friction coefficient, (N,).
+        least: normal force up to which a foot does not count, and limit μ f_n up to which its slack is zero [N].
 
     Returns:
         (N,); meaningless without contact.
     """
-    slack = 1.0 - tangential / (friction[:, None] * normal + 1e-12)
-    return (normal * torch.clamp(slack, min=0.0)).sum(1) / (normal.sum(1) + 1e-12)
+    limit, counted = friction[:, None] * normal, normal * (normal > least)
+    slack = torch.clamp(1.0 - tangential / (limit + 1e-12), min=0.0) * (limit > least)
+    return (counted * slack).sum(1) / (counted.sum(1) + 1e-12)
 
 
 def quality(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
@@ -238,9 +242,12 @@ class Instants:
     constants: MetricConstants
 
     def with_contact(self, force: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """Return values, (N,), with NaN where ``force`` [N], (N,), is too small a share of the weight (``contact_share``)."""
-        carried = force > self.constants.rules.contact_share * self.constants.weight
-        return torch.where(carried, values, torch.full_like(values, math.nan))
+        """Return values, (N,); where ``force`` [N], (N,), is too small a share of the weight (``contact_share``), NaN or, in a
+        suite with ``flight = "perfect"``, 1.
+        """
+        rules = self.constants.rules
+        carried = force > rules.contact_share * self.constants.weight
+        return torch.where(carried, values, torch.full_like(values, 1.0 if rules.flight == "perfect" else math.nan))
 
 
 # ---- the table ------------------------------------------------------------------------------------------------------------
@@ -286,8 +293,9 @@ def _zmp_margin(at: Instants) -> torch.Tensor:
 
 
 def _friction_margin(at: Instants) -> torch.Tensor:
-    normal = at.state.foot_normal_force
-    return at.with_contact(normal.sum(1), friction_margin(normal, at.state.foot_tangential_force, at.friction))
+    normal, least = at.state.foot_normal_force, at.constants.rules.foot_force
+    margin = friction_margin(normal, at.state.foot_tangential_force, at.friction, least)
+    return at.with_contact((normal * (normal > least)).sum(1), margin)
 
 
 METRICS: Mapping[str, Metric] = {

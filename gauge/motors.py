@@ -8,7 +8,7 @@ from dataclasses import replace
 from ..policy.contract import PolicyContract, check_robot
 from ..robots import Robot, RobotError
 from ..robots.base import JointParameters
-from .suite import Suite
+from .suite import Family, Suite
 
 
 def suite_parameters(suite: Suite, robot: Robot) -> JointParameters:
@@ -31,7 +31,10 @@ def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> Jo
     """
     own = suite_parameters(suite, robot)
     if suite.gains == "suite":
-        return own
+        family, joints = family_of(suite, contract), robot.num_joints
+        return (
+            replace(own, stiffness=(family.stiffness,) * joints, damping=(family.damping,) * joints) if family else own
+        )
     stiffness, damping = list(own.stiffness), list(own.damping)
     for policy_joint, robot_joint in enumerate(check_robot(contract, robot)):
         stiffness[robot_joint] = contract.stiffness[policy_joint]
@@ -39,13 +42,26 @@ def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> Jo
     return replace(own, stiffness=tuple(stiffness), damping=tuple(damping))
 
 
+_COMMAND_TERMS = ("command", "pose_command")
+
+
+def family_of(suite: Suite, contract: PolicyContract) -> Family | None:
+    """Return the family of a suite that a policy belongs to, by robot and scale of the command; None where it has none."""
+    scales = [term.scale * (3 // len(term.scale)) for term in contract.observation if term.name in _COMMAND_TERMS]
+    return next((f for f in suite.families if f.robot == contract.robot and f.command_scale in scales), None)
+
+
 def gains_note(suite: Suite, robot: Robot, contract: PolicyContract) -> str | None:
     """One sentence on gains that are not the ones that a policy was made for, or not the suite's usual ones; None where all agree."""
     usual = suite_parameters(suite, robot)
     made_for = joint_parameters(replace(suite, gains="contract"), robot, contract)
+    own, others = _gains(made_for), _gains(usual)
+    if suite.gains == "suite" and (family := family_of(suite, contract)):
+        played = _gains(joint_parameters(suite, robot, contract))
+        other = "" if played == own else f"; this one was made for {own}"
+        return f"played with {played}, as {suite.name} plays the family {family.name}{other}"
     if (made_for.stiffness, made_for.damping) == (usual.stiffness, usual.damping):
         return None
-    own, others = _gains(made_for), _gains(usual)
     if suite.gains == "contract":
         return f"played with {own}, as the policy's contract says; {robot.name} usually has {others}"
     return f"played with {others}, as {suite.name} plays every policy; this one was made for {own}"

@@ -25,6 +25,7 @@ from ..files.parsing import (
     read_text,
     shown,
 )
+from ..robots.base import Damping, Stiffness
 from ..terrains.registry import terrain_names
 from .commands import Phase
 from .metric_rules import Metrics
@@ -194,6 +195,20 @@ class Push:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Family:
+    """Policies of one training code, known by the scale of their command, and the gains that they are played with."""
+
+    name: Name
+    robot: Name
+    command_scale: tuple[NotNegative, NotNegative, NotNegative]
+    """Factors on the forward, lateral and yaw command in the policy's observation."""
+    stiffness: Stiffness
+    """kp of every joint [N·m/rad]."""
+    damping: Damping
+    """kd of every joint [N·m·s/rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Suite:
     """Everything that a score depends on."""
 
@@ -214,6 +229,8 @@ class Suite:
     scoring: Scoring
     gains: Literal["suite", "contract"] = "suite"
     """Motor gains kp and kd of every policy: those of ``parameters``, or those of the policy's own contract."""
+    families: Annotated[tuple[Family, ...], Field(max_length=100)] = ()
+    """Policies with other gains than ``gains = "suite"`` gives; the first family that fits a contract counts."""
     push: Push | None = None
     """None: nothing pushes."""
 
@@ -244,10 +261,12 @@ _ADDED: Mapping[str, Any] = {
     "physics.torque_speed_limit": False,
     "noise.projected_gravity": 0.0,
     "noise.base_linear_velocity": 0.0,
+    "metrics.foot_force": 0.0,
     "metrics.flight": "left-out",
     "scoring.level": "bisection",
     "scoring.bracket_seeds": 2,
     "gains": "suite",
+    "families": (),
     "push": None,
 }
 """Rules that came after suites had been published, and the values that say what held before."""

@@ -98,6 +98,28 @@ def _projected_gravity(state: PhysicsState, command: torch.Tensor, last_action: 
     return projected_gravity(state.base_quaternion_w)
 
 
+def _pose_command(state: PhysicsState, command: torch.Tensor, last_action: torch.Tensor) -> torch.Tensor:
+    """Return the pose that a command leads to within 1 s: place [m] in the horizontal frame of the heading, and turn [rad], (N, 3).
+
+    The base's velocities count by their horizontal parts, the turning by its part about the vertical. RoboGauge 1.1.8,
+    task family go2_lab_pose.
+    """
+    import torch
+
+    from ..robots.rotation import in_heading, projected_gravity, rotate_inverse
+
+    quaternion = state.base_quaternion_w
+    inverse = torch.cat((quaternion[:, :1], -quaternion[:, 1:]), dim=1)
+    velocity_b = torch.cat((command[:, :2], torch.zeros_like(command[:, :1])), dim=1)
+    forward, left = in_heading(quaternion, rotate_inverse(inverse, velocity_b)).unbind(1)
+    turn = -command[:, 2] * projected_gravity(quaternion)[:, 2]
+    small = turn.abs() <= 1e-3
+    safe = torch.where(small, torch.ones_like(turn), turn)
+    along = torch.where(small, 1.0 - turn**2 / 6.0, torch.sin(safe) / safe)
+    across = torch.where(small, turn / 2.0 - turn**3 / 24.0, (1.0 - torch.cos(safe)) / safe)
+    return torch.stack((along * forward - across * left, across * forward + along * left, turn), dim=1)
+
+
 _VECTOR, _AXIAL_VECTOR, _PLANAR_COMMAND = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, -1.0, -1.0)
 _OWN = (
     Observation(
@@ -143,6 +165,14 @@ _OWN = (
         foreign_names=("velocity_commands", "command"),
     ),
     Observation(
+        name="pose_command",
+        build=_pose_command,
+        width=3,
+        unit="m and rad",
+        mirror=_PLANAR_COMMAND,
+        foreign_names=("pose_command",),
+    ),
+    Observation(
         name="joint_position",
         build=lambda state, command, last_action: state.joint_position,
         width=None,
@@ -175,7 +205,9 @@ _OWN = (
 )
 OBSERVATIONS: dict[str, Observation] = {each.name: each for each in _OWN}
 """All observations that this process knows by name: the project's own first, then plug-ins in the order they were loaded."""
-STANDARD = tuple(each.name for each in _OWN if not each.privileged)
+STANDARD = (
+    "base_angular_velocity_b", "projected_gravity_b", "command", "joint_position", "joint_velocity", "last_action",
+)  # fmt: skip
 """Observations of the standard contract, in its order."""
 _OWN_NAMES = frozenset(OBSERVATIONS)
 

@@ -141,7 +141,7 @@ def test_where_a_policy_comes_from_is_told_in_words(stress):
 
 def test_directions_commands_and_references_are_shown(stress):
     page = Page(render(stress))
-    for words in ("turning left", "there and back: forward and right", "0.6739", "arXiv 2602.00678"):
+    for words in ("turning left", "there and back: forward and right", "0.6739", "go2_moe_cts_137k_0.6739"):
         assert words in page.text
     assert "others, on the same suite" not in Page(render(sample("base", **PIPELINES["base"]))).text
 
