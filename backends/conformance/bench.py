@@ -89,14 +89,14 @@ class Worlds:
         arguments = {"base_position": (0.0, 0.0, 1.0), "base_quaternion": (1.0, 0.0, 0.0, 0.0), **arguments}
         rows = {k: np.broadcast_to(v, (self.count, np.shape(v)[-1])) for k, v in arguments.items() if v is not None}
         tensors = {name: self._tensor(value) for name, value in rows.items()}
-        start = ResetState(terrain_index=self._whole(terrain_index), **tensors)
-        self.backend.reset(start, self._mask(worlds))
+        start = ResetState(terrain_index=self._tensor(terrain_index, torch.int64), **tensors)
+        self.backend.reset(start, self._tensor(worlds, torch.bool))
 
     def step(self, targets: Any = None, *, worlds: Any = None, substeps: int | None = None, **when: ArrayLike) -> None:
         """Step as ``PhysicsBackend.step`` does; ``when``: ``delay`` and ``sample_at``."""
-        asked = None if targets is None else self._tensor(targets)
-        numbers = {name: self._whole(value) for name, value in when.items()}
-        self.backend.step(asked, worlds=self._mask(worlds), substeps=substeps, **numbers)
+        numbers = {name: self._tensor(value, torch.int64) for name, value in when.items()}
+        mask = self._tensor(worlds, torch.bool)
+        self.backend.step(self._tensor(targets), worlds=mask, substeps=substeps, **numbers)
 
     def run(self, seconds: float) -> None:
         """Step whole control periods with unchanged targets."""
@@ -106,24 +106,22 @@ class Worlds:
     def randomize(self, worlds: ArrayLike | None = None, **values: ArrayLike) -> None:
         """Randomize as ``PhysicsBackend.randomize`` does; every value has a row for each world of the mask."""
         randomization = Randomization(**{name: self._tensor(value) for name, value in values.items()})
-        self.backend.randomize(randomization, self._mask(worlds))
+        self.backend.randomize(randomization, self._tensor(worlds, torch.bool))
 
     def push(self, worlds: ArrayLike | None = None, **velocities: ArrayLike) -> None:
         """Push as ``PhysicsBackend.push`` does."""
-        self.backend.push(self._mask(worlds), **{name: self._tensor(value) for name, value in velocities.items()})
+        tensors = {name: self._tensor(value) for name, value in velocities.items()}
+        self.backend.push(self._tensor(worlds, torch.bool), **tensors)
 
     def apply_force(self, force_w: ArrayLike) -> None:
         """Apply a force as ``PhysicsBackend.apply_force`` does."""
         self.backend.apply_force(self._tensor(force_w))
 
-    def _tensor(self, value: ArrayLike) -> torch.Tensor:
-        return torch.tensor(np.asarray(value), dtype=self.backend.dtype, device=self.backend.device)
-
-    def _whole(self, value: ArrayLike | None) -> torch.Tensor | None:
-        return None if value is None else torch.tensor(np.asarray(value), dtype=torch.int64, device=self.backend.device)
-
-    def _mask(self, value: ArrayLike | None) -> torch.Tensor | None:
-        return None if value is None else torch.tensor(np.asarray(value), dtype=torch.bool, device=self.backend.device)
+    def _tensor(self, value: ArrayLike | None, dtype: torch.dtype | None = None) -> Any:
+        """Return a tensor on the engine's device, by default in its floating-point type; None for None."""
+        if value is None:
+            return None
+        return torch.tensor(np.asarray(value), dtype=dtype or self.backend.dtype, device=self.backend.device)
 
 
 def _snapshot(state: PhysicsState) -> SimpleNamespace:

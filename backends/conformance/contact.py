@@ -33,18 +33,18 @@ def stand_still(
     Args:
         worlds: worlds with ``Bench.stiff()`` joints.
         seconds: time to come to rest [s].
-        ground: height of the ground below each robot [m], (N,).
-        xy: place of each robot [m], (N, 2).
+        ground: height of the ground at ``xy`` [m], (N,).
+        xy: place below each robot, along the robot's own vertical [m], (N, 2).
         turn: turn of the whole, level robot, quaternions (N, 4); None for another heading in each world.
         mask: worlds to reset, (N,) bool; None for all.
     """
     stance = level_stance(Reference(bench.robot, worlds.backend.scene.parameters))
     if turn is None:
         turn = [axis_angle((0.0, 0.0, 1.0), angle) for angle in np.linspace(0.0, 2.5, worlds.count)]
-    height = np.broadcast_to(ground, (worlds.count,)) + stance.height
+    below = np.c_[np.broadcast_to(xy, (worlds.count, 2)), np.broadcast_to(ground, (worlds.count,))]
     worlds.reset(
         mask,
-        base_position=np.c_[np.broadcast_to(xy, (worlds.count, 2)), height],
+        base_position=below + [rotated(each, (0.0, 0.0, stance.height)) for each in np.asarray(turn)],
         base_quaternion=np.array([composed(each, stance.quaternion) for each in np.asarray(turn)]),
         held_target=worlds.default_pose,
         **reset,
@@ -65,10 +65,9 @@ def centers_of_mass(
 ) -> np.ndarray:
     """Return the reference's centre of mass in each world's pose, (N, 3) [m]; ``changes`` as in ``Reference.change``."""
     found = []
-    for row in range(worlds.count):
+    for row, change in enumerate(changes or [{}] * worlds.count):
         reference = Reference(bench.robot, worlds.backend.scene.parameters)
-        if changes is not None:
-            reference.change(**changes[row])
+        reference.change(**change)
         reference.place(state.base_position_w[row], state.base_quaternion_w[row], state.joint_position[row])
         found.append(reference.center_of_mass)
     return np.array(found)
@@ -255,12 +254,7 @@ def torsion(bench: Bench) -> str:
             worlds.reset(**reset, held_target=worlds.default_pose)
             worlds.run(seconds)
             found[condim] = yaw_rate(worlds.read())
-        expected[condim] = np.zeros(WORLDS)
-        for row, start in enumerate(starts):
-            reference = Reference(bench.robot, parameters, timestep=physics.timestep, ground=physics)
-            reference.place(**start)
-            reference.step(bench.robot.default_joint_position, substeps=round(seconds / physics.timestep))
-            expected[condim][row] = rotated(reference.base_quaternion, reference.base_angular_velocity)[2]
+        expected[condim] = np.array([spun_down(bench, physics, start, seconds)[0] for start in starts])
     slowed = np.abs(expected[3] - expected[4])
     what = f"yaw rate after {seconds} s on a foot of dimension {{}} [rad/s]"
     error = max(
@@ -273,17 +267,10 @@ def torsion(bench: Bench) -> str:
 @check("contact/foot_change", "foot_contact", "foot_condim_6", "plane")
 def foot_change(bench: Bench) -> str:
     """Spinning on one foot, each world slows down and sinks in by its own torsional friction and softness, as the reference does."""
-    parameters, seconds, height = bench.stiff(), 0.1, []
+    parameters, seconds, physics = bench.stiff(), 0.1, bench.physics(foot_condim=4)
     changes = [{"foot_torsion": 0.25 * row, "foot_softness": 1.0 + 0.5 * row} for row in range(WORLDS)]
     start = spun(Reference(bench.robot, parameters), foot=0, rate=3.0)
-    rate, physics = [], bench.physics(foot_condim=4)
-    for change in changes:
-        reference = Reference(bench.robot, parameters, timestep=physics.timestep, ground=physics)
-        reference.change(**change)
-        reference.place(**start)
-        reference.step(bench.robot.default_joint_position, substeps=round(seconds / physics.timestep))
-        rate.append(rotated(reference.base_quaternion, reference.base_angular_velocity)[2])
-        height.append(reference.base_position[2])
+    rate, height = np.array([spun_down(bench, physics, start, seconds, **change) for change in changes]).T
     with bench.worlds(parameters, foot_condim=4) as worlds:
         worlds.randomize(**{name: np.array([change[name] for change in changes]) for name in changes[0]})
         worlds.reset(**{name: [value] * WORLDS for name, value in start.items()}, held_target=worlds.default_pose)
@@ -309,6 +296,17 @@ def spun(reference: Reference, *, foot: int, rate: float) -> dict[str, np.ndarra
         "base_linear_velocity": np.cross(spin, arm),
         "base_angular_velocity": rotated(turn * [1.0, -1.0, -1.0, -1.0], spin),
     }
+
+
+def spun_down(
+    bench: Bench, physics: PhysicsOptions, start: dict[str, np.ndarray], seconds: float, **change: float
+) -> tuple[float, float]:
+    """Return yaw rate [rad/s] and base height [m] of the reference, changed as ``Reference.change`` does, after a start of ``spun``."""
+    reference = Reference(bench.robot, bench.stiff(), timestep=physics.timestep, ground=physics)
+    reference.change(**change)
+    reference.place(**start)
+    reference.step(bench.robot.default_joint_position, substeps=round(seconds / physics.timestep))
+    return rotated(reference.base_quaternion, reference.base_angular_velocity)[2], reference.base_position[2]
 
 
 def yaw_rate(state: SimpleNamespace) -> np.ndarray:

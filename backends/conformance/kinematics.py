@@ -44,15 +44,9 @@ def state_fields(bench: Bench) -> str:
         worlds.reset()
         backend, robot = worlds.backend, bench.robot
         n, j, f, b = worlds.count, robot.num_joints, len(robot.foot_names), len(robot.collision_bodies)
-        shapes: dict[str, tuple[int, ...]] = {
-            "base_quaternion_w": (n, 4),
-            "foot_position_w": (n, f, 3),
-            "foot_velocity_w": (n, f, 3),
-            "foot_contact_force_w": (n, f, 3),
-            "foot_normal_force": (n, f),
-            "foot_tangential_force": (n, f),
-            "body_contact_force_w": (n, b, 3),
-        }
+        shapes: dict[str, tuple[int, ...]] = {"base_quaternion_w": (n, 4), "body_contact_force_w": (n, b, 3)}
+        shapes |= dict.fromkeys(("foot_position_w", "foot_velocity_w", "foot_contact_force_w"), (n, f, 3))
+        shapes |= dict.fromkeys(("foot_normal_force", "foot_tangential_force"), (n, f))
         types = {"tilt_substep": torch.int64, "penetration_substep": torch.int64}
         types |= {"diverged": torch.bool, "overflowed": torch.bool}
         expect(backend.dtype in (torch.float32, torch.float64), f"dtype is {backend.dtype}, not a floating-point type")
@@ -65,9 +59,7 @@ def state_fields(bench: Bench) -> str:
             whole = name == "contact_count" and not value.dtype.is_floating_point
             expect(whole or value.dtype == kind, f"state.{name} is {value.dtype}, must be {kind}")
             expect(value.device.type == backend.device.type, f"state.{name} is on {value.device}, not {backend.device}")
-        worlds.reset(
-            base_position=(0.0, 0.0, 0.0)
-        )  # feet and trunk in the floor, so that the reset has forces to clear
+        worlds.reset(base_position=(0.0, 0.0, 0.0))  # in the floor, so that the next reset has forces to clear
         worlds.step(worlds.default_pose + 0.1, substeps=1)
         worlds.reset()
         state = worlds.read()
@@ -175,8 +167,7 @@ def free_fall(bench: Bench) -> str:
         yawed = np.array([axis_angle((0.0, 0.3, 1.0), a) for a in np.linspace(0.0, 3.0, worlds.count)])
         worlds.reset(base_position=start, base_quaternion=yawed, base_linear_velocity=thrown)
         h, count = worlds.backend.scene.physics.timestep, 100
-        for _ in range(count // 10):
-            worlds.step()
+        worlds.run(h * count)
         state, t = worlds.read(), h * count
         velocity = thrown - [0.0, 0.0, GRAVITY * t]
         expect_close("velocity after 0.2 s of free fall [m/s]", state.base_linear_velocity_w, velocity, 2e-3)
@@ -230,10 +221,9 @@ def follow_reference(
     """
     physics = worlds.backend.scene.physics
     quaternions, positions, joints = [], [], []
-    for row in range(worlds.count):
+    for row, change in enumerate(changes or [{}] * worlds.count):
         reference = Reference(bench.robot, worlds.backend.scene.parameters, timestep=physics.timestep)
-        if changes is not None:
-            reference.change(**changes[row])
+        reference.change(**change)
         if force_w is not None:
             reference.force_w = force_w[row]
         reference.place(**{name: value[row] for name, value in asked.items()})

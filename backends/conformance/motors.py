@@ -166,14 +166,11 @@ def limp_and_held(bench: Bench) -> str:
         worlds.step(substeps=1)
         expected = law(bench, target, asked["joint_position"], asked["joint_velocity"])
         expect_close("joint_torque with a held target [N·m]", worlds.read().joint_torque, expected, 2e-3)
-        before = worlds.read()
-        worlds.step(worlds.default_pose, substeps=1)
-        expected = law(bench, worlds.default_pose, before.joint_position, before.joint_velocity)
-        expect_close("joint_torque of a new target [N·m]", worlds.read().joint_torque, expected, 2e-3)
-        before = worlds.read()
-        worlds.step(substeps=1)
-        expected = law(bench, worlds.default_pose, before.joint_position, before.joint_velocity)
-        expect_close("joint_torque after step(None) [N·m]", worlds.read().joint_torque, expected, 2e-3)
+        for given, what in ((worlds.default_pose, "of a new target"), (None, "after step(None)")):
+            before = worlds.read()
+            worlds.step(given, substeps=1)
+            expected = law(bench, worlds.default_pose, before.joint_position, before.joint_velocity)
+            expect_close(f"joint_torque {what} [N·m]", worlds.read().joint_torque, expected, 2e-3)
         worlds.reset(**asked)
         worlds.step()
         expect_close("joint_torque after a reset without held target [N·m]", worlds.read().joint_torque, 0.0, 1e-5)
@@ -191,8 +188,7 @@ def step_response(bench: Bench) -> str:
             target[row, row % 3 :: 3] += 0.3 if row < 3 else -0.2  # hips, thighs, calves, hips
         worlds.reset(**asked)
         worlds.step(target)
-        for _ in range(9):
-            worlds.step()
+        worlds.run(0.18)
         bounds: dict[str, Any] = {"angle": 0.01, "position": 0.003}
         error = follow_reference(bench, worlds, asked, worlds.read(), seconds=0.2, target=target, **bounds)
     return f"0.2 s after a step of 0.3 rad: {error}"

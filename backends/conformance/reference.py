@@ -178,6 +178,12 @@ class Reference:
         """Return the centre of mass of the whole robot, world frame [m], (3,)."""
         return self.data.subtree_com[self.base].copy()
 
+    @property
+    def center_of_mass_velocity(self) -> Array:
+        """Return the velocity of the centre of mass of the whole robot, world frame [m/s], (3,)."""
+        mujoco.mj_subtreeVel(self.model, self.data)
+        return self.data.subtree_linvel[self.base].copy()
+
 
 def _add_ground(spec: mujoco.MjSpec, robot: Robot, physics: PhysicsOptions) -> None:
     """Add a plane and a solver that iterates until it has converged."""
@@ -232,8 +238,7 @@ def composed(*quaternions: ArrayLike) -> Array:
     """Return the product of quaternions wxyz; the leftmost turn is the outermost."""
     product = np.array([1.0, 0.0, 0.0, 0.0])
     for quaternion in quaternions:
-        factor = product.copy()
-        mujoco.mju_mulQuat(product, factor, np.asarray(quaternion, dtype=np.float64))
+        mujoco.mju_mulQuat(product, product.copy(), np.asarray(quaternion, dtype=np.float64))
     return product
 
 

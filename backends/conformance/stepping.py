@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base import PhysicsState, Support
-from .bench import Bench, Worlds, expect, expect_close
+from .bench import WORLDS, Bench, Worlds, expect, expect_close
 from .check import check
 from .reference import Reference, level_stance
 
@@ -20,11 +20,13 @@ MOTION_FIELDS = (
 )  # fmt: skip
 
 
-def stand(bench: Bench, worlds: Worlds, *, clearance: float = 0.02, held: bool = True) -> None:
-    """Reset all worlds just above level ground, each with another heading and sideways speed."""
-    stance = level_stance(Reference(bench.robot, bench.soft()), clearance=clearance)
-    speed = np.zeros((worlds.count, 3))
-    speed[:, 0] = np.linspace(0.0, 0.6, worlds.count)
+SPEEDS = np.linspace(0.0, 0.6, WORLDS)[:, None] * [1.0, 0.0, 0.0]
+"""Velocity of each world's robot in ``stand`` [m/s], (N, 3)."""
+
+
+def stand(bench: Bench, worlds: Worlds, *, speed: np.ndarray = SPEEDS, held: bool = True) -> None:
+    """Reset all worlds just above level ground, each with another speed."""
+    stance = level_stance(Reference(bench.robot, bench.soft()), clearance=0.02)
     worlds.reset(
         base_position=(0.0, 0.0, stance.height),
         base_quaternion=stance.quaternion,
@@ -201,17 +203,11 @@ def independence(bench: Bench) -> str:
         stand(bench, worlds)
         for period in range(4):
             worlds.step(wave(worlds, period))
-        together, count = worlds.read(), worlds.count
+        together = worlds.read()
         targets = [wave(worlds, period) for period in range(4)]
     with bench.worlds(terrain_index=(0,)) as alone:
         row = 2
-        stance = level_stance(Reference(bench.robot, bench.soft()), clearance=0.02)
-        alone.reset(
-            base_position=(0.0, 0.0, stance.height),
-            base_quaternion=stance.quaternion,
-            base_linear_velocity=(np.linspace(0.0, 0.6, count)[row], 0.0, 0.0),
-            held_target=alone.default_pose,
-        )
+        stand(bench, alone, speed=SPEEDS[row : row + 1])
         for target in targets:
             alone.step(target[row : row + 1])
         state, tolerance = alone.read(), alone.precision(1e-7, 2e-3)

@@ -8,7 +8,7 @@ from enum import Enum
 from time import perf_counter
 
 from ...robots import Robot, load_robot
-from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsBackend, Scene, Support, unsupported
+from ..base import CAPABILITY_NAMES, BackendError, PhysicsBackend, Scene, Support, unsupported
 from ..registry import engine_class, make_backend
 from . import contact, disturbance, friction, ground, health, kinematics, legs, model, motors, refusal, stepping
 from .bench import Bench
@@ -49,7 +49,9 @@ def run_check(check: Check, bench: Bench) -> CheckResult:
     missing = unsupported(check.needs, bench.capabilities)
     if missing:
         outcome = Outcome.NOT_SUPPORTED
-        detail = ", ".join(_described(name, bench.capabilities[name]) for name in missing)
+        notes = {name: bench.capabilities[name].note for name in missing}
+        none = Support.NONE.value
+        detail = ", ".join(f"{name}: {none}" + (f" ({note})" if note else "") for name, note in notes.items())
     else:
         try:
             outcome, detail = Outcome.PASSED, check.run(bench)
@@ -114,8 +116,3 @@ def run_conformance(
             report(result)
         results.append(result)
     return results
-
-
-def _described(name: str, capability: Capability) -> str:
-    note = f" ({capability.note})" if capability.note else ""
-    return f"{name}: {Support.NONE.value}{note}"
