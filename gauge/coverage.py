@@ -13,6 +13,8 @@ from .suite import Suite
 _AXES = {"terrains": "terrain", "frictions": "friction", "payloads": "payload", "seeds": "seed"}
 """Axes of a suite's matrix, and one entry of each in words."""
 
+UNPROVED = "unproved: results of schema 2 lack what mean, mean@25, falls and self-contact follow from; evaluate the policy again"
+
 
 def coverage(
     suite: Suite, environments: Sequence[Environment], seeds: Sequence[int], *, pipeline: str = "stress"
@@ -85,8 +87,8 @@ def score_label(result: Result) -> str:
 
 
 def notes(result: Result) -> list[str]:
-    """Return sentences that a reader of the score must know: on privileged observations, and on gains that are not the usual ones."""
-    found = []
+    """Return sentences that a reader of the score must know: on figures without proof, privileged observations and unusual gains."""
+    found = [] if result.proved else [UNPROVED]
     if result.policy.kind_of_observations == "privileged":
         terms = ", ".join(t for t in result.policy.observations or () if t in PRIVILEGED_TERMS)
         found.append(f"privileged observations: no sensor of a robot measures {terms}")

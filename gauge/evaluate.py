@@ -31,6 +31,7 @@ from ..robots import Robot, load_robot
 from ..robots.loading import robot_digest
 from ..terrains.registry import make_terrain, terrain_names
 from .coverage import coverage
+from .described import assumptions, command_shares, played_feet, training_physics
 from .episodes import QUALITY
 from .fit import check_fit
 from .goals import TARGET, check_terrain, count_sub_commands
@@ -237,7 +238,7 @@ def evaluate(
         outcomes = [environment_result(environment, store.records, rules) for environment in prepared.environments]
         counted = [record for outcome in outcomes for record in (*outcome.trials, *outcome.records)]
         scores = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
-        contract = prepared.policy.contract
+        contract, engine = prepared.policy.contract, find_backend(request.backend, prepared.device)
         digests = {"policy": prepared.policy.digest, "robot": robot_digest(prepared.robot)}
         digests |= {"suite": suite.digest, "source": source_digest()}
         motors, note = joint_parameters(suite, prepared.robot, contract), gains_note(suite, prepared.robot, contract)
@@ -250,14 +251,18 @@ def evaluate(
                 observations=tuple(term.name for term in contract.observation),
                 kind_of_observations=kind_of_observations(contract),
                 provenance=without_copy(contract.provenance),
+                assumptions=assumptions(contract),
             ),
             coverage=coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline),
             pipeline=request.pipeline,
             backend=request.backend,
             robot=prepared.robot.name,
             motors=Motors(stiffness=motors.stiffness, damping=motors.damping, note=note),
+            training=training_physics(contract),
+            commands=command_shares(contract),
+            feet=played_feet(suite, prepared.robot, engine),
             health=health([record for outcome in outcomes for record in outcome.records]),
-            solver=dict(find_backend(request.backend, prepared.device).solver_settings(suite.physics)),
+            solver=dict(engine.solver_settings(suite.physics)),
             provenance=Provenance(
                 **provenance(
                     command=command, device=prepared.device, threads=request.threads or count, digests=digests

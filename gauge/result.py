@@ -11,7 +11,7 @@ from copy import copy
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar, get_type_hints
 
 from pydantic import Field, GetCoreSchemaHandler, JsonValue, WrapValidator
 from pydantic_core import CoreSchema, core_schema
@@ -19,13 +19,15 @@ from pydantic_core import CoreSchema, core_schema
 from ..files.parsing import Name, NotNegative, Seed, Share, Text, one_line, read_results, shown, take
 from .suite import Friction, Payload
 
-SCHEMA: Final = 2
+SCHEMA: Final = 3
+"""The schema that is written. Schema 2, which is read too, lacks what some of its figures follow from (``Result.proved``)."""
 CONFIDENCE = 0.95
 FLAT = "flat"
 COMPLETE: Final = "complete"
 PART: Final = "part"
 CUSTOM: Final = "custom"
 UNKNOWN: Final = "unknown"
+BY_HAND = "it was changed by hand, so ask its maker for the results.json of the run"
 MOST_ROWS = 10_000
 """Environments of one result."""
 MOST_REPLICATES = 20_000_000
@@ -42,8 +44,8 @@ _AsWritten = WrapValidator(_as_written)
 _Words = Annotated[str, Field(max_length=4096)]
 Value = Annotated[float, Field(ge=-1e9, le=1e9), _AsWritten]
 """Of a metric, weighted by the level or not."""
-Score = Annotated[float, Field(ge=0.0, le=1001.0), _AsWritten]
-"""A level weighs at most 1, and there are at most 1000."""
+Fraction = Annotated[float, Field(ge=0.0, le=1.0), _AsWritten]
+"""Of a metric, quality or score, weighted by the level or not: the best is 1."""
 Level = Annotated[float, Field(ge=0, le=1000), _AsWritten]
 Interval = tuple[Value, Value]
 """Ends of a 95 % interval."""
@@ -56,6 +58,8 @@ Kind = TypeVar("Kind", bound="Table")
 class Table:
     """A table of the file."""
 
+    may_lack: ClassVar[frozenset[str]] = frozenset()
+    """Entries that a file of the present schema may leave out."""
     lacking: frozenset[str] = field(default=frozenset(), repr=False, compare=False)
     """Entries that the file did not state, as older files do not; they have their defaults and are not written."""
 
@@ -108,12 +112,15 @@ class ChanceRules(Table):
     """The search for a level, as the suite has it; absent from results that are older than the choice."""
     bracket_seeds: Annotated[int, Field(ge=1, le=1000)] = 2
     """Seeds that look for the crossing of a curve."""
+    decimals: Annotated[int, Field(ge=0, le=15)] | None = None
+    """Decimals to which the suite rounds runs and means; None: not at all, or unknown in schema 2."""
     note: _Words | None = None
     """Reason why there is no interval."""
 
     def unlike(self, other: ChanceRules, *apart: str) -> str | None:
-        """Return the name of the first rule that differs, but for those named."""
-        names = [f.name for f in fields(self) if f.name not in ("lacking", "confidence", "note", *apart)]
+        """Return the name of the first rule that differs, but for those named and those that a file of schema 2 lacks."""
+        unknown = {"lacking", "confidence", "note", *apart, *({"decimals"} & (self.lacking | other.lacking))}
+        names = [f.name for f in fields(self) if f.name not in unknown]
         return next((name for name in names if getattr(self, name) != getattr(other, name)), None)
 
 
@@ -121,9 +128,9 @@ class ChanceRules(Table):
 class Statistics(Table):
     """Means of a quality or metric: over all samples, and over the lowest 25 % and 50 % of them."""
 
-    mean: Value
-    mean25: Value
-    mean50: Value
+    mean: Fraction
+    mean25: Fraction
+    mean50: Fraction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,16 +144,16 @@ class MetricScore(Statistics):
 class TerrainScore(Table):
     """One terrain: the mean over its environments."""
 
-    score: Score | None = None
+    score: Fraction | None = None
     """None where levels alone were searched."""
     interval: Interval | None = None
     level: Level | None = None
     """None on flat ground."""
     level_interval: Interval | None = None
     """None where the level was given."""
-    mean: Value | None = None
-    mean25: Value | None = None
-    mean50: Value | None = None
+    mean: Fraction | None = None
+    mean25: Fraction | None = None
+    mean50: Fraction | None = None
 
     def left_out(self) -> Iterable[str]:
         """Leave out scores where there are levels alone."""
@@ -154,28 +161,56 @@ class TerrainScore(Table):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RunHealth(Table):
+    """The counts of one run."""
+
+    samples: _Counted
+    falls: _Counted
+    diverged: _Counted
+    overflowed: _Counted
+    restarted: _Counted
+    self_contact: Fraction | None
+    """Share of the samples in which parts of the robot touch each other; None where it is not known."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Run(Table):
-    """Mean@50 of one seed in one environment."""
+    """One seed in one environment: the statistics of each metric and of ``quality``."""
 
     columns: Mapping[str, float]
-    """By metric, and ``quality``."""
+    """Mean@50 by column."""
     commands: Mapping[str, float] = field(default_factory=dict)
-    """Quality by sub-command."""
+    """Mean@50 of the quality by sub-command."""
+    mean: Mapping[str, float] = field(default_factory=dict)
+    """Mean by column; empty in schema 2, as are the fields below."""
+    mean25: Mapping[str, float] = field(default_factory=dict)
+    """Mean@25 by column."""
+    health: RunHealth | None = None
 
     def to_data(self) -> dict[str, Any]:
-        """Return columns and sub-commands as one table."""
-        return {**self.columns, "commands": dict(self.commands)}
+        """Return mean@50 by column, and the other fields under their names beside it."""
+        own = {"commands": dict(self.commands)}
+        if self.health is not None:
+            own |= {"mean": dict(self.mean), "mean25": dict(self.mean25), "health": self.health.to_data()}
+        return {**self.columns, **own}
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Read a run from its table: columns and ``commands`` side by side."""
+        """Read a run from its table: columns and the other fields side by side."""
+        kinds = dict.fromkeys(("commands", "mean", "mean25"), Mapping[Text, Fraction]) | {"health": RunHealth}
+        own = {n: core_schema.typed_dict_field(handler.generate_schema(k), required=False) for n, k in kinds.items()}
 
         def made(table: dict[str, Any]) -> Run:
-            own = {name: value for name, value in table.items() if name != "commands"}
-            return cls(columns=own, commands=table.get("commands", {}))
+            return cls(
+                columns={k: v for k, v in table.items() if k not in own}, **{k: table[k] for k in own & table.keys()}
+            )
 
-        table = handler.generate_schema(Mapping[Text, Value | Mapping[Text, Value]])
-        return core_schema.no_info_after_validator_function(made, table)
+        return core_schema.no_info_after_validator_function(
+            made,
+            core_schema.typed_dict_schema(
+                own, extra_behavior="allow", extras_schema=handler.generate_schema(Fraction), config={"strict": True}
+            ),
+        )
 
 
 Runs = Mapping[Seed, Run]
@@ -193,13 +228,13 @@ class EnvironmentRow(Table):
     """None on flat ground; 0 where no level is passed."""
     quality: Statistics | None = None
     """At the level, not weighted by it."""
-    score: Score | None = None
+    score: Fraction | None = None
     interval: Interval | None = None
     search: Mapping[Seed, bool] | None = None
     """The levels of the search and their outcome; None where the level was given."""
     trials: Mapping[Seed, Mapping[Seed, bool]] = field(default_factory=dict)
     """Success by level and search seed."""
-    curve: Mapping[Seed, Value] = field(default_factory=dict)
+    curve: Mapping[Seed, Fraction] = field(default_factory=dict)
     """Fitted share of successes by level, where the suite expects levels."""
     runs: Runs = field(default_factory=dict)
     """By quality seed; empty where no quality was measured."""
@@ -212,7 +247,7 @@ class EnvironmentRow(Table):
     diverged: _Counted | None = None
     overflowed: _Counted | None = None
     restarted: _Counted | None = None
-    self_contact: Value | None = None
+    self_contact: Fraction | None = None
     """Share of the samples in which parts of the robot touch each other; None where it is not known."""
 
     @property
@@ -251,6 +286,8 @@ class PolicyName(Table):
     kind_of_observations: Literal["measurable", "privileged"] | None = None
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
     """The origin of the policy, as its file has it."""
+    assumptions: Annotated[tuple[_Words, ...], Field(max_length=100)] = ()
+    """Sentences on what the file does not say of the policy and was assumed; empty where its description is complete."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,6 +340,51 @@ class Motors(Table):
 
 
 @dataclass(frozen=True, kw_only=True)
+class EngineName(Table):
+    """Physics in which a policy learned, or by which it was chosen."""
+
+    engine: Text
+    """Name of the backend."""
+    version: Text | None = None
+    """Of the engine's package; None where it is not known."""
+    settings: Mapping[Text, Value | bool | Text | None] = field(default_factory=dict)
+    """Solver, time step and feet, or the suite that chose, by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingPhysics(Table):
+    """Physics that the policy was trained and tuned with, as the provenance in its file says."""
+
+    trained: Annotated[tuple[EngineName, ...], Field(max_length=100)] = ()
+    """Engines in which it learned, in their order."""
+    tuned: Annotated[tuple[EngineName, ...], Field(max_length=100)] = ()
+    """Engines that scored it while it learned, so that its checkpoint or settings may be chosen by them."""
+    note: _Words | None = None
+    """A sentence where its file does not say."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandShares(Table):
+    """Commands of the suite against the largest ones that the policy was made for."""
+
+    limits: tuple[Value, Value, Value] | None = None
+    """Largest forward, lateral [m/s] and yaw [rad/s] command of the policy's contract."""
+    beyond: Mapping[Literal["forward", "lateral", "yaw"], Fraction] = field(default_factory=dict)
+    """For each axis the share of the commands that ask for something on it and ask for more than its limit; empty where the
+    suite does not count them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feet(Table):
+    """Contact of the feet with the ground."""
+
+    dimension: Annotated[tuple[Literal[1, 3, 4, 6], ...], Field(max_length=4)] = ()
+    """Dimensions that were played, rising: 3 slides alone, 4 adds torsional friction, 6 rolling friction too; empty where unknown."""
+    torsion: Value | None = None
+    """Largest coefficient of torsional friction of a foot [m]; 0 where no contact has one, None where unknown."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Health(Table):
     """Quality episodes: how many there were, fell, diverged and dropped contacts."""
 
@@ -310,7 +392,7 @@ class Health(Table):
     falls: _Counted = 0
     diverged: _Counted = 0
     overflowed: _Counted = 0
-    self_contact: Value | None = None
+    self_contact: Fraction | None = None
     """Share of the samples in which parts of the robot touch each other; None where it is not known."""
 
 
@@ -326,6 +408,7 @@ class ClusterName(Table):
 class Provenance(Table):
     """Programs, machine, command and digests of what was read."""
 
+    may_lack: ClassVar[frozenset[str]] = frozenset({"host", "command"})
     versions: Mapping[str, Text] = field(default_factory=dict)
     commit: str | None = None
     plugins: Mapping[str, str] = field(default_factory=dict)
@@ -360,13 +443,13 @@ class Provenance(Table):
 class Scores(Table):
     """The scores of an evaluation, and the rows that they follow from."""
 
-    schema: Literal[2] = SCHEMA
+    schema: Literal[2, 3] = SCHEMA
     suite: SuiteName
     chance: ChanceRules
-    score: Score | None
+    score: Fraction | None
     """Mean over terrains; None where levels alone were searched."""
     score_interval: Interval | None = None
-    groups: Mapping[Text, Value] = field(default_factory=dict)
+    groups: Mapping[Text, Fraction] = field(default_factory=dict)
     """Mean of the metrics of each group of the suite."""
     group_metrics: Mapping[Text, tuple[Text, ...]] = field(default_factory=dict)
     level: Level | None = None
@@ -392,6 +475,9 @@ class Result(Scores):
     backend: Text
     robot: Name
     motors: Motors = Motors()
+    training: TrainingPhysics = TrainingPhysics()
+    commands: CommandShares = CommandShares()
+    feet: Feet = Feet()
     health: Health = Health()
     solver: Mapping[Text, Value | bool | Text | None] = field(default_factory=dict)
     """Settings of the engine's solver."""
@@ -410,9 +496,9 @@ class Result(Scores):
         """
         if not isinstance(data, Mapping):
             raise error(f"{source} is {shown(data)}; it must be a table")
-        if (schema := data.get("schema")) != SCHEMA:
+        if (schema := data.get("schema")) not in (2, SCHEMA):
             raise error(
-                f"{source}: it has schema {shown(schema)}, this version reads {SCHEMA}; evaluate the policy again"
+                f"{source}: it has schema {shown(schema)}, this version reads 2 and {SCHEMA}; evaluate the policy again"
             )
         figures = take(_figures(), data, source, error)
         absent = {name for name in _OPTIONAL if data.get(name) is None}
@@ -429,7 +515,16 @@ class Result(Scores):
         if found.score_interval is not None and found.score_interval[0] > found.score_interval[1]:
             raise error(f"{source}: score_interval is {shown(list(found.score_interval))}; its ends must rise")
         found.check_replicates(source, error)
+        found._check_lacking(source, error)
         return found
+
+    def _check_lacking(self, source: str, error: type[Exception]) -> None:
+        """Check that a file of the present schema states all that it has; raise ``error`` on the first entry that it lacks."""
+        tables: list[tuple[str, Table]] = [("it", self), *((name, getattr(self, name)) for name in _TABLES)]
+        tables += [(f"environments[{at}]", row) for at, row in enumerate(self.environments)]
+        for name, table in tables if self.schema == SCHEMA else ():
+            if missing := table.lacking.difference(table.left_out(), table.may_lack):
+                raise error(f"{source}: {name} lacks '{min(missing)}', which schema {SCHEMA} has; {BY_HAND}")
 
     def check_replicates(self, source: str, error: type[Exception]) -> None:
         """Check that the level searches can be drawn again; raise ``error`` where all replicates together are too many."""
@@ -443,6 +538,11 @@ class Result(Scores):
     def complete(self) -> bool:
         """True where the whole suite was played, and nothing else."""
         return self.coverage.complete
+
+    @property
+    def proved(self) -> bool:
+        """True where every figure follows from runs and trials that the file holds; schema 2 holds mean@50 of its runs alone."""
+        return self.schema == SCHEMA
 
     @property
     def robot_digest(self) -> str | None:
@@ -469,9 +569,12 @@ _TABLES: Mapping[str, type[Table]] = {
     "chance": ChanceRules,
     "coverage": Coverage,
     "motors": Motors,
+    "training": TrainingPhysics,
+    "commands": CommandShares,
+    "feet": Feet,
     "health": Health,
 }
-_OPTIONAL = ("coverage", "motors", "health")
+_OPTIONAL = ("coverage", "motors", "training", "commands", "feet", "health")
 """Tables that older files lack."""
 
 
@@ -520,7 +623,7 @@ def _read(kind: type[Kind], data: object, source: str, error: type[Exception]) -
 
 
 def _lacking(kind: type[Table], data: Any) -> frozenset[str]:
-    return frozenset(f.name for f in fields(kind)) - data.keys()
+    return frozenset(f.name for f in fields(kind)) - data.keys() - {"lacking"}
 
 
 @cache

@@ -10,11 +10,10 @@ import numpy as np
 from ..files.parsing import edited, one_line, shown
 from .chance.intervals import Evidence
 from .episodes import QUALITY
-from .result import ChanceRules, EnvironmentRow, Result, Statistics
+from .result import BY_HAND, ChanceRules, EnvironmentRow, Result, Statistics
 from .results import environment_weights
 from .scoring import STATISTICS, level_score
 
-BY_HAND = "it was changed by hand, so ask its maker for the results.json of the run"
 _ROUNDING = 2e-6
 """Of figures that are written with six decimals."""
 _INTERVAL_ROUNDING = 1e-4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from .result import (
     Interval,
     MetricScore,
     Run,
+    RunHealth,
     Scores,
     Statistics,
     SuiteName,
@@ -49,6 +50,7 @@ def chance_rules(suite: Suite, seeds: Sequence[int]) -> ChanceRules:
         resamples=scoring.bootstrap,
         level=scoring.level,
         bracket_seeds=scoring.bracket_seeds,
+        decimals=scoring.decimals,
     )
 
 
@@ -170,7 +172,7 @@ def _environment(
     for record in environment.records:
         of_seed.setdefault(record.episode.seed, []).append((weights[record.episode.level], record))
     plain: dict[str, Array] = {}
-    measured: dict[int, dict[str, float]] = {seed: {} for seed in of_seed}
+    measured: dict[int, dict[str, Array]] = {seed: {} for seed in of_seed}
     for index, column in enumerate(columns):
         runs = [
             rounded(np.sum([weight * run_statistics(r, index) for weight, r in found], axis=0), scoring)
@@ -182,22 +184,16 @@ def _environment(
         weighted = [rounded(np.asarray(level_score(v, level, scoring, flat=flat)), scoring) for v in runs]
         statistics[name] = rounded(np.mean(weighted, axis=0), scoring)
         for run, values in zip(measured.values(), runs, strict=True):
-            run[column] = _number(values[2])
+            run[column] = values
     return replace(
         row,
         quality=Statistics(**_named(plain[columns[-1]])),
         score=_number(statistics["score"][2]),
-        runs={
-            seed: Run(columns=measured[seed], commands=_commands(suite, found, len(columns) - 1))
-            for seed, found in of_seed.items()
-        },
+        runs={seed: _run(suite, found, measured[seed]) for seed, found in of_seed.items()},
         runs_by_level={at: _runs_at(suite, environment, at, columns) for at in weights} if len(weights) > 1 else {},
         metrics={c: Statistics(**_named(plain[c])) for c in columns[:-1]},
-        falls=sum(r.falls for r in environment.records),
-        diverged=sum(bool(r.diverged) for r in environment.records),
-        overflowed=sum(bool(r.overflowed) for r in environment.records),
-        restarted=sum(bool(r.restarted) for r in environment.records),
         self_contact=self_contact(environment.records),
+        **_counts(environment.records),
     ), statistics
 
 
@@ -209,13 +205,33 @@ def _named(values: Array) -> dict[str, Any]:
 def _runs_at(suite: Suite, environment: EnvironmentResult, level: int, columns: Sequence[str]) -> dict[int, Run]:
     """Return the runs at one of the two levels beside an expected one, as ``runs`` has them in between."""
     return {
-        record.episode.seed: Run(
-            columns={column: _number(run_statistics(record, index)[2]) for index, column in enumerate(columns)},
-            commands=_commands(suite, [(1.0, record)], len(columns) - 1),
+        record.episode.seed: _run(
+            suite, [(1.0, record)], {column: run_statistics(record, index) for index, column in enumerate(columns)}
         )
         for record in environment.records
         if record.episode.level == level
     }
+
+
+def _run(suite: Suite, found: Sequence[tuple[float, Record]], statistics: Mapping[str, Array]) -> Run:
+    """Return a run from its records, at one or two levels with their weights, and from the statistics of its columns."""
+    mean, mean25, mean50 = ({c: _number(v[at]) for c, v in statistics.items()} for at in range(3))
+    records = [record for _, record in found]
+    return Run(
+        columns=mean50,
+        commands=_commands(suite, found, len(statistics) - 1),
+        mean=mean,
+        mean25=mean25,
+        health=RunHealth(
+            samples=sum(len(r.samples) for r in records), self_contact=self_contact(records), **_counts(records)
+        ),
+    )
+
+
+def _counts(records: Collection[Record]) -> dict[str, Any]:
+    """Return how often robots fell, and how many episodes diverged, overflowed and were restarted."""
+    flags = {name: sum(bool(getattr(r, name)) for r in records) for name in ("diverged", "overflowed", "restarted")}
+    return {"falls": sum(r.falls for r in records), **flags}
 
 
 def _commands(suite: Suite, found: Sequence[tuple[float, Record]], column: int) -> dict[str, float]:
@@ -291,10 +307,5 @@ def self_contact(records: Collection[Record]) -> float | None:
 
 def health(records: Collection[Record]) -> Health:
     """Return how many quality episodes there are, fell, diverged or dropped contacts, and how often parts of the robot touched."""
-    return Health(
-        episodes=len(records),
-        falls=sum(r.falls for r in records),
-        diverged=sum(r.diverged for r in records),
-        overflowed=sum(r.overflowed for r in records),
-        self_contact=self_contact(records),
-    )
+    counts = {name: count for name, count in _counts(records).items() if name != "restarted"}
+    return Health(episodes=len(records), self_contact=self_contact(records), **counts)

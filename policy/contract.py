@@ -27,6 +27,10 @@ PER_JOINT = ("default_joint_position", "action_scale", "stiffness", "damping", "
 PRIVILEGED_TERMS = tuple(each.name for each in OBSERVATIONS.values() if each.privileged)
 """The project's own observation terms that no sensor of a robot measures."""
 
+PHYSICS, ASSUMPTIONS, ASSUMED = "physics", "assumptions", "assumed"
+"""Entries of a contract's provenance: ``trained`` and ``tuned``, lists of engines with version and settings; a list of sentences on what
+the file does not say and an importer assumed; the same as one text."""
+
 
 class ContractError(ValueError):
     """A contract is malformed, or does not fit the robot, suite or policy at hand."""

@@ -204,6 +204,15 @@ def sources(result: Result) -> dict[str, str]:
         "pipeline": result.pipeline,
         "robot": result.robot,
         "engine": _engine(result),
+        "feet": _feet(result),
+        "trained in": _in_words([each.to_data() for each in result.training.trained]) or result.training.note or "–",
+        "tuned with": _in_words([each.to_data() for each in result.training.tuned]) or "–",
+        "command limits of the policy": _in_words(result.commands.limits),
+        "commands beyond them": _in_words(
+            {axis: f"{100 * share:.3g} %" for axis, share in result.commands.beyond.items()}
+        )
+        or "not counted",
+        "assumed of the policy": _in_words(result.policy.assumptions) or "–",
         "machine": f"{provenance.host}: {provenance.machine}",
         "date": provenance.date,
         "time": f"{_duration(provenance.seconds)} on {provenance.device}, CPU threads: {provenance.threads}",
@@ -224,6 +233,20 @@ def _in_words(value: Any) -> str:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return ", ".join(map(_in_words, value))
     return "–" if value is None else str(value)
+
+
+def _feet(result: Result) -> str:
+    """Return the contact of the feet in words."""
+    words = {
+        1: "no friction",
+        3: "sliding friction",
+        4: "sliding and torsional friction",
+        6: "sliding, torsional and rolling friction",
+    }
+    if not result.feet.dimension:
+        return "–"
+    found = " or ".join(words[dimension] for dimension in result.feet.dimension)
+    return f"{found}, torsion {1000 * result.feet.torsion:g} mm" if result.feet.torsion else found
 
 
 def _engine(result: Result) -> str:

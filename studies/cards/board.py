@@ -110,6 +110,7 @@ def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]
         "observations": "not stated" if terms is None else "privileged" if privileged else "measurable",
         "terms": list(terms or ()),
         "coverage": card.coverage.words,
+        "proved": card.proved,
         "ranked": card.complete and card.score is not None and not privileged,
         "rank": None,
         "command": f"gaitgauge verify {shlex.quote(str(folder / name))}{'' if found else ' --policy FILE'}",

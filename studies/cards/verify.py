@@ -15,8 +15,8 @@ from ...gauge.chance.intervals import Evidence
 from ...gauge.coverage import coverage
 from ...gauge.evaluate import Prepared, Request, Status, evaluate, prepare
 from ...gauge.pipelines import Environment
-from ...gauge.result import UNKNOWN, EnvironmentRow, Result, Table, unlike
-from ...gauge.result_figures import BY_HAND, check_interval
+from ...gauge.result import BY_HAND, UNKNOWN, EnvironmentRow, Result, Table, unlike
+from ...gauge.result_figures import check_interval
 from ...gauge.results import chance_rules, environment_weights
 from ...gauge.suite import Suite, load_suite
 from ...policy.finding import shipped_policies

@@ -92,6 +92,7 @@ def test_only_a_complete_run_carries_the_suites_name_and_a_bare_score():
 def test_results_from_before_are_not_taken_for_complete():
     data = sample("base", **PIPELINES["base"]).to_data()
     del data["coverage"]
+    data["schema"] = 2
     old = read(data)
     assert old.coverage.kind == "unknown" and not old.complete
     assert "unknown" in suite_label(old)

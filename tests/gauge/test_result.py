@@ -53,16 +53,20 @@ def test_a_card_keeps_all_that_an_evaluation_wrote():
 def test_whole_numbers_stay_whole_and_null_and_absent_stay_apart():
     data = sample("base", **PIPELINES["base"]).to_data()
     data["environments"][0] |= {"friction": 1, "self_contact": None}
+    data["schema"] = 2
     del data["health"]["self_contact"]
     written = read(data).to_data()
     assert json.dumps(written["environments"][0]["friction"]) == "1"
     assert written["environments"][0]["self_contact"] is None and "self_contact" not in written["health"]
 
 
-@pytest.mark.parametrize("table", ["coverage", "motors", "health"])
+@pytest.mark.parametrize("table", ["coverage", "motors", "health", "training", "feet", "commands"])
 def test_files_of_before_lack_tables(table):
     data = sample("base", **PIPELINES["base"]).to_data()
     del data[table]
+    with pytest.raises(StoreError, match=f"it lacks '{table}', which schema 3 has"):
+        read(data)
+    data["schema"] = 2
     found = read(data)
     assert table in found.lacking and found.to_data() == data
     assert not getattr(found, table).entries()
@@ -70,7 +74,7 @@ def test_files_of_before_lack_tables(table):
 
 def test_another_schema_is_refused():
     data = sample("base", **PIPELINES["base"]).to_data()
-    with pytest.raises(StoreError, match="it has schema 1, this version reads 2; evaluate the policy again"):
+    with pytest.raises(StoreError, match="it has schema 1, this version reads 2 and 3; evaluate the policy again"):
         read(data | {"schema": 1})
 
 

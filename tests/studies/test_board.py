@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from gaitgauge.cli.main import app
+from gaitgauge.gauge.coverage import UNPROVED, notes
 from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.studies.cards.board import board_data, render_board, write_board
@@ -48,6 +49,14 @@ def test_complete_cards_are_ranked_by_score_and_others_only_listed():
     assert [(e["rank"], e["card"]) for e in table["ranked"]] == [(1, "high.json"), (2, "low.json"), (2, "same.json")]
     assert [(e["rank"], e["coverage"]) for e in table["others"]] == [(None, "part: 1 of 7 terrains")]
     assert table["ranked"][0]["command"] == "gaitgauge verify high.json --policy FILE"
+
+
+def test_a_card_of_schema_2_is_marked_as_unproved():
+    older = sample().to_data() | {"schema": 2}
+    tables = board({"new.json": sample().to_data(), "old.json": older})
+    assert {e["card"]: e["proved"] for e in tables[0]["ranked"]} == {"new.json": True, "old.json": False}
+    assert Page(render_board(tables)).text.count("unproved") == 1
+    assert notes(read(older)) == [UNPROVED] and notes(sample()) == []
 
 
 def test_policies_whose_files_are_called_alike_are_told_apart():
@@ -151,7 +160,7 @@ def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(whole):
     part = {"environments": rows, "score": float(weights @ [row["score"] for row in rows])}
     part |= {"level": float(np.mean([row["level"] for row in rows if row["terrain"] != "flat"]))}
     with pytest.raises(CardError, match=r"card\.json' calls itself complete, but holds 8 of 9 frictions"):
-        whole(**part, terrains={}, metrics={}, groups={}, health=None)
+        whole(**part, schema=2, terrains={}, metrics={}, groups={}, health=None)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,15 @@
 """What a resumed run takes over where it is not quite the run that wrote the checkpoint."""
 
+from dataclasses import replace
+
 import pytest
 import torch
+from gaitgauge.gauge.described import training_physics
+from gaitgauge.policy.loading import load_policy
 from gaitgauge.training.environment.configuration import ScheduleConfiguration
 from gaitgauge.training.processes import Processes
 from gaitgauge.training.run.checkpoint import copy_checkpoint, rank_file
-from gaitgauge.training.run.resuming import resume_run
+from gaitgauge.training.run.resuming import begin_with, resume_run
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything
 from small_environment import STAIRS, make
@@ -195,3 +199,38 @@ def test_a_part_that_was_not_written_with_the_checkpoint_is_not_taken(tmp_path, 
     rank_file(path, 1).write_bytes(old)
     second, said = resume_both(path)
     assert second.fresh and "has no part of process 1" in said
+
+
+def engine(name):
+    return {"engine": name, "version": "1", "settings": {"timestep": 0.005}}
+
+
+def learned_in(runner, *names, tuned=()):
+    """Let a run say in which engines it trains and which score it."""
+    physics = {"trained": [*map(engine, names)], "tuned": [*map(engine, tuned)]}
+    runner.contract = replace(runner.contract, provenance={**runner.contract.provenance, "physics": physics})
+    return runner
+
+
+def test_a_policy_remembers_the_physics_of_all_its_trainings(tmp_path):
+    for folder in ("one", "two", "three", "four"):
+        (tmp_path / folder).mkdir()
+    learned_in(build(tmp_path / "one"), "warp", tuned=["mujoco"]).learn(1)
+    second = learned_in(build(tmp_path / "two"), "newton")
+    begin_with(second, tmp_path / "one" / "model_1.pt")
+    second.learn(1)
+    resumed = learned_in(build(tmp_path / "three"), "newton", tuned=["mujoco"])
+    resume_run(resumed, tmp_path / "two" / "model_1.pt")
+    resumed.learn(1)
+    physics = training_physics(load_policy(tmp_path / "three" / "model_2.pt").contract)
+    assert [e.engine for e in physics.trained] == ["warp", "newton"] and physics.note is None
+    assert [e.engine for e in physics.tuned] == ["mujoco"]
+
+
+def test_a_policy_that_began_with_one_of_unknown_physics_says_so(tmp_path):
+    (tmp_path / "one").mkdir()
+    build(tmp_path / "one").learn(1)
+    second = learned_in(build(), "newton")
+    begin_with(second, tmp_path / "one" / "model_1.pt")
+    physics = training_physics(second.contract)
+    assert [e.engine for e in physics.trained] == ["newton"] and "began with does not say" in physics.note

@@ -10,11 +10,14 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from ...files.provenance import provenance
+from ...backends.registry import find_backend
+from ...files.provenance import provenance, versions
 from ...files.writing import LOCK, lock_folder
+from ...policy.contract import PHYSICS
 from ...policy.finding import shipped_policies
 from ..algorithms.symmetry import build_mirror
 from ..configuration import ConfigurationError
@@ -134,13 +137,16 @@ def _runner(
     if run is not None and task.training.run.video_interval > 0:
         level_ground = all(tile.name == FLAT_TILE.name for tile in task.environment.terrain.tiles)
         filmer = Filmer(run, terrain="flat" if level_ground else "stairs_fd")
+    contract = replace(
+        env.contract, provenance={**env.contract.provenance, PHYSICS: _physics(plan, scored=scorer is not None)}
+    )
     mirror = None
     if task.training.algorithm.symmetry != "none":
         mirror = build_mirror(task.environment.observations, contract=env.contract, robot=env.robot)
     return TrainingRunner(
         env,
         task.training,
-        contract=env.contract,
+        contract=contract,
         task=task.name,
         log_dir=Path(processes.firsts(str(run))),
         device=plan.device,
@@ -152,6 +158,18 @@ def _runner(
         progress=progress,
         message=message,
     )
+
+
+def _physics(plan: TrainPlan, *, scored: bool) -> dict[str, Any]:
+    """Return the physics of a run for the provenance of its policies: the engine that trains them, and the one that scores them."""
+    environment, known = plan.task.environment, versions()
+    physics, engine = environment.physics, find_backend(plan.backend, plan.device)
+    settings = {name: getattr(physics, name) for name in ("timestep", "substeps", "foot_condim", "self_collision")}
+    low, high = environment.randomization.foot_torsion
+    settings |= {**engine.solver_settings(physics), "foot_torsion": f"{low:g} to {high:g} times the model's"}
+    learned = {"engine": plan.backend, "version": known.get(plan.backend.partition(":")[0]), "settings": settings}
+    judge = {"engine": "mujoco", "version": known["mujoco"], "settings": {"suite": str(plan.request.score_suite)}}
+    return {"trained": [learned], "tuned": [judge] if scored else []}
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ...files.parsing import edited, one_line, shown
-from ...policy.contract import PolicyContract, difference
+from ...policy.contract import PHYSICS, PolicyContract, difference
 from ...policy.finding import latest_checkpoint
 from ...policy.native import StoredNetwork
 from ...policy.networks.estimators import VELOCITY
@@ -117,6 +117,7 @@ def resume_run(run: RunState, path: Path) -> None:
     _check_fits(run, path, entries, numbers)
     with edited(f"Cannot resume from '{path}': its training state", CheckpointError, RuntimeError):
         whole = _take_over(run, path, entries, numbers)
+        _remember_physics(run, PolicyContract.from_json(entries["contract"]))
     if numbers.world_size == run.processes.count and (
         lacking := run.processes.largest(0 if whole else run.processes.rank)
     ):
@@ -202,6 +203,25 @@ def _begin(run: RunState, path: Path, entries: Mapping[str, Any]) -> None:
     except (RuntimeError, KeyError, ValueError) as error:
         raise _misfit("start", path, error) from error
     run.average.load_state_dict(None)
+    _remember_physics(run, theirs)
+
+
+def _remember_physics(run: RunState, theirs: PolicyContract) -> None:
+    """Note the physics of the policy that a run begins or goes on with before the run's own, in the provenance of its policies."""
+    own, earlier = (contract.provenance.get(PHYSICS) for contract in (run.contract, theirs))
+    if not isinstance(own, Mapping):
+        return
+    before = earlier if isinstance(earlier, Mapping) else {"note": _UNKNOWN_PHYSICS}
+    both = {name: [*before.get(name, ()), *own.get(name, ())] for name in ("trained", "tuned")}
+    merged: dict[str, Any] = {
+        name: [e for at, e in enumerate(all_) if e not in all_[:at]] for name, all_ in both.items()
+    }
+    if note := before.get("note"):
+        merged["note"] = note
+    run.contract = replace(run.contract, provenance={**run.contract.provenance, PHYSICS: merged})
+
+
+_UNKNOWN_PHYSICS = "the file of the policy that its training began with does not say in which physics that was trained"
 
 
 def _misfit(verb: str, path: Path, error: Exception) -> CheckpointError:
