@@ -3,6 +3,7 @@ synthetic ones whose truth is known. And how often a policy is told apart from i
 
     python benchmarks/interval_coverage.py                                    # judge docs/data/repeated_evaluations.json
     python benchmarks/interval_coverage.py --synthetic 1000                   # and 1000 synthetic evaluations of each kind
+    python benchmarks/interval_coverage.py --shapes 1000                      # 1000 of gaitgauge-1 for each shape of the pass curve
     python benchmarks/interval_coverage.py --record 30 --folder /tmp/repeated # play the evaluations again, and write the data
 
 Recorded are evaluations of a policy that was ``pretrained`` once (the data hold its digest), by the rules of ``robogauge-1.1``,
@@ -18,13 +19,14 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gaitgauge.files.writing import write_atomically
 from gaitgauge.gauge.chance.intervals import Chance, Evidence
+from gaitgauge.gauge.chance.level_area import follow_area
 from gaitgauge.gauge.chance.level_chance import bisect
-from gaitgauge.gauge.chance.level_curve import expected_levels, follow
+from gaitgauge.gauge.chance.level_curve import follow
 from gaitgauge.gauge.episodes import QUALITY
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.result import (
@@ -54,8 +56,10 @@ RULES = ChanceRules(
     resamples=1000,
 )
 """Those of ``robogauge-1.1``."""
-EXPECTED = replace(RULES, shared_noise=False, level="curve", search_seeds=(0, 1, 2, 3, 4, 5))
+AREA = replace(RULES, shared_noise=False, level="area", search_seeds=tuple(range(6)))
 """Those of ``gaitgauge-1``."""
+CURVE = replace(AREA, level="curve")
+"""Those of ``gaitgauge-1`` 1.0.0 and of ``demo``."""
 _LEVELS = np.arange(1, 11)
 SUITE = """
 extends = "robogauge-1.1"
@@ -155,6 +159,40 @@ def make_policy(generator: np.random.Generator, terrains: Sequence[str], frictio
     )
 
 
+def _lapsing(share: float) -> Callable[[NDArray[np.float64], np.random.Generator], NDArray[np.float64]]:
+    return lambda chance, _: (1.0 - share) * chance
+
+
+def _bumped(chance: NDArray[np.float64], generator: np.random.Generator) -> NDArray[np.float64]:
+    """Half the chance at one level below the crossing."""
+    easy = np.maximum((chance > 0.5).sum(1) - 1, 1)
+    bump = generator.integers(0, easy)
+    return np.where(np.arange(chance.shape[1]) == bump[:, None], 0.5 * chance, chance)
+
+
+def _stepped(chance: NDArray[np.float64], _: np.random.Generator) -> NDArray[np.float64]:
+    """Certain success, then one half, then none: the half begins midway."""
+    crossing = (chance > 0.5).sum(1, keepdims=True)
+    at = np.arange(chance.shape[1])
+    return np.where(at < (crossing + 1) // 2, 1.0, np.where(at <= crossing, 0.5, 0.0))
+
+
+SHAPES: Mapping[str, Callable[[NDArray[np.float64], np.random.Generator], NDArray[np.float64]]] = {
+    "logistic": lambda chance, _: chance,
+    "lapses of 10 %": _lapsing(0.1),
+    "lapses of 20 %": _lapsing(0.2),
+    "bump": _bumped,
+    "steps": _stepped,
+}
+"""Shapes of the pass curve, each made from a logistic one, (environments, levels)."""
+
+
+def shaped(policy: Known, shape: str, generator: np.random.Generator) -> Known:
+    """Return the policy with pass curves of another shape; flat ground stays as it is."""
+    flat = np.array([t == "flat" for t, _ in policy.environments])[:, None]
+    return replace(policy, success=np.where(flat, 1.0, SHAPES[shape](policy.success, generator)))
+
+
 def synthetic(policy: Known, rules: ChanceRules, generator: np.random.Generator) -> Result:
     """Return one evaluation of a policy whose chances are known."""
     common = rules.shared_noise
@@ -168,7 +206,7 @@ def synthetic(policy: Known, rules: ChanceRules, generator: np.random.Generator)
         if not row.flat:
             draws = np.sqrt(1.0 - luck) * generator.standard_normal((10, len(rules.search_seeds))) + lucky
             reached = draws < _quantile(policy.success[at])[:, None]
-            if rules.level == "curve":
+            if rules.level != "bisection":
                 level, trials = _expected(reached, rules)
             else:
                 level, trials = int(bisect(reached.sum(1) >= needed)), dict(_trials(reached, rules, needed))
@@ -214,14 +252,19 @@ def _trials(reached: NDArray[np.bool_], rules: ChanceRules, needed: int) -> Iter
 
 def _expected(reached: NDArray[np.bool_], rules: ChanceRules) -> tuple[float, dict[int, dict[int, bool]]]:
     """The expected level, and the trials that its design plays."""
-    seeds = rules.search_seeds
-    found = follow(lambda level: [bool(o) for o in reached[level - 1]], 10, len(seeds), rules.bracket_seeds)
-    assert found.level is not None
-    trials = {
-        level: {s: bool(o) for s, o in zip(seeds[:count], reached[level - 1], strict=False)}
-        for level, count in found.seeds.items()
-    }
-    return found.level, trials
+    seeds, rows = rules.search_seeds, reached.tolist()
+
+    def outcomes(level: int) -> list[bool]:
+        return rows[level - 1]
+
+    if rules.level == "area":
+        area = follow_area(outcomes, rules.levels, len(seeds))
+        counts, found = area.seeds, area.level
+    else:
+        curve = follow(outcomes, rules.levels, len(seeds), rules.bracket_seeds)
+        counts, found = curve.seeds, curve.level
+    assert found is not None
+    return found, {level: dict(zip(seeds[:count], rows[level - 1], strict=False)) for level, count in counts.items()}
 
 
 def _quantile(chance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -232,12 +275,18 @@ def _quantile(chance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def expected_score(policy: Known, rules: ChanceRules) -> float:
-    """The mean score over all seeds: exact, or of many draws where levels are expected ones. A seed's luck must be zero."""
+    """The true score: of the area under the pass curve, or the mean of bisections over all seeds. A seed's luck must be zero."""
     from scipy.stats import binom
 
-    if rules.level == "curve":
-        return _mean_of_draws(policy, rules)
-
+    if rules.level != "bisection":
+        levels = policy.success.sum(1)
+        quality = [np.interp(max(x, 1.0), _LEVELS, q) for x, q in zip(levels, policy.quality, strict=True)]
+        of_quality = rules.quality_weight * np.minimum(levels, 1.0) * quality
+        scores = rules.level_weight * np.maximum(levels - 1.0, 0.0) + of_quality
+        flat = [t == "flat" for t, _ in policy.environments]
+        return float(
+            environment_weights([t for t, _ in policy.environments]) @ np.where(flat, policy.quality[:, 0], scores)
+        )
     seeds = len(rules.search_seeds)
     passed = binom.sf(round(rules.pass_rate * seeds) - 1, seeds, policy.success)
     scores = []
@@ -258,22 +307,6 @@ def expected_score(policy: Known, rules: ChanceRules) -> float:
     return float(environment_weights([t for t, _ in policy.environments]) @ scores)
 
 
-def _mean_of_draws(policy: Known, rules: ChanceRules, draws: int = 2000) -> float:
-    generator, scores = np.random.default_rng(9), []
-    for at, (terrain, _) in enumerate(policy.environments):
-        if terrain == "flat":
-            scores.append(policy.quality[at, 0])
-            continue
-        chance = policy.success[at][:, None]
-        levels = expected_levels(
-            generator.uniform(size=(draws, 10, len(rules.search_seeds))) < chance, rules.bracket_seeds
-        )
-        quality = np.minimum(levels, 1.0) * np.interp(levels, _LEVELS, policy.quality[at])
-        found = rules.level_weight * np.maximum(levels - 1.0, 0.0) + rules.quality_weight * quality
-        scores.append(found.mean())
-    return float(environment_weights([t for t, _ in policy.environments]) @ scores)
-
-
 NINE = tuple(0.1 * n for n in range(2, 11))
 ALL = ("flat", "a", "b", "c", "d", "e", "f")
 KINDS = {
@@ -284,8 +317,8 @@ KINDS = {
     "all terrains, one friction": (ALL, (0.6,), RULES),
     "all terrains, nine frictions": (ALL, NINE, RULES),
     "the same, noise not shared": (ALL, NINE, replace(RULES, shared_noise=False)),
-    "expected levels, one friction": (ALL, (0.6,), EXPECTED),
-    "expected levels, nine frictions": (ALL, NINE, EXPECTED),
+    "areas, one friction": (ALL, (0.6,), AREA),
+    "areas, thirteen environments a terrain": (ALL, tuple(0.05 * n for n in range(8, 21)), AREA),
 }
 """Synthetic evaluations: terrains, frictions, and rules."""
 
@@ -312,6 +345,59 @@ def false_alarms(kind: str, count: int, seed: int = 1) -> tuple[float, float]:
         policy = make_policy(generator, terrains, frictions)
         alarms += alarm([synthetic(policy, rules, generator), synthetic(policy, other, generator)])
     return float(alarms[0] / count), float(alarms[1] / count)
+
+
+class Judged(NamedTuple):
+    """Figures of the synthetic evaluations of one shape."""
+
+    bias: float
+    """Mean of score minus truth."""
+    sigma: float
+    """Root of the mean square of score minus truth, the bias left out."""
+    trials: float
+    """Level trials of an environment that has levels."""
+    covered: float
+    """Share of the 95 % intervals that hold the truth."""
+    alarms: float
+    """Share of the pairs of evaluations of one policy that a comparison tells apart by the score."""
+    before: float
+    """Level trials of the design of ``gaitgauge-1`` 1.0.0."""
+
+
+def judge_shape(shape: str, count: int, seed: int = 2, environments: int = 13) -> Judged:
+    """Judge pairs of whole evaluations of ``count`` policies by the rules of ``gaitgauge-1``, each pair of another policy.
+
+    Args:
+        shape: one of ``SHAPES``.
+        count: policies.
+        seed: of the generator.
+        environments: of each terrain.
+    """
+    generator = np.random.default_rng(seed)
+    other = replace(AREA, seeds=(10, 11, 12), search_seeds=tuple(10 + s for s in AREA.search_seeds))
+    off, held, alarms, trials, before = [], [], [], [], []
+    for _ in range(count):
+        policy = make_policy(generator, ALL, [0.05 * (8 + n) for n in range(environments)])
+        policy = shaped(policy, shape, generator)
+        truth = expected_score(policy, AREA)
+        pair = [synthetic(policy, rules, generator) for rules in (AREA, other)]
+        for found in pair:
+            low, high = found.score_interval or (0.0, 0.0)
+            off.append((found.score or 0.0) - truth)
+            held.append(low <= truth <= high)
+            trials += [sum(map(len, row.trials.values())) for row in found.environments if not row.flat]
+        alarms.append(alarm(pair)[0])
+        chance = policy.success[generator.integers(environments, len(policy.success)), :, None]
+        _, played = _expected(generator.uniform(size=(10, len(CURVE.search_seeds))) < chance, CURVE)
+        before.append(sum(map(len, played.values())))
+    return Judged(
+        bias=float(np.mean(off)),
+        sigma=float(np.std(off)),
+        trials=float(np.mean(trials)),
+        covered=float(np.mean(held)),
+        alarms=float(np.mean(alarms)),
+        before=float(np.mean(before)),
+    )
 
 
 def alarm(pair: Sequence[Result]) -> NDArray[np.float64]:
@@ -382,7 +468,20 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--synthetic", type=int, default=0, metavar="COUNT")
+    parser.add_argument(
+        "--shapes", type=int, default=0, metavar="COUNT", help="judge shapes of the pass curve, and nothing else"
+    )
     arguments = parser.parse_args()
+    if arguments.shapes:
+        print(f"pairs of whole evaluations of {arguments.shapes} policies, 91 environments each\n")
+        print(f"{'pass curve':16}{'bias':>9}{'σ':>9}{'covered':>9}{'alarms':>9}{'trials':>9}{'1.0.0':>9}")
+        for shape in SHAPES:
+            f = judge_shape(shape, arguments.shapes)
+            print(
+                f"{shape:16}{f.bias:+9.4f}{f.sigma:9.4f}{f.covered:9.3f}{f.alarms:9.3f}{f.trials:9.1f}{f.before:9.1f}",
+                flush=True,
+            )
+        return
     if arguments.record:
         if arguments.folder is None:
             parser.error("--record needs a --folder to play in")

@@ -7,7 +7,7 @@ scheduling of episodes and the folding of results all ask this function; there i
 Two rules hold, and tests check them. What counts depends on the outcomes of the counted episodes alone: records of others,
 played ahead of time, change when something is known and never what. And what is required once stays counted.
 
-A suite says how a level is found: by bisection over level tests, or as the area under a curve (``level_curve``).
+A suite says how a level is found: by bisection over level tests, or as an expected level (``level_curve``, ``level_area``).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
+from .chance.level_area import follow_area
 from .chance.level_curve import CurveSearch, bracketing_levels, fitted_curve, follow, nearness
 from .episodes import Episode, Record
 from .goals import TARGET
@@ -57,8 +58,8 @@ class Plan:
 
 def plan(environment: Environment, records: Records, rules: PlanRules) -> Plan:
     """Plan an environment: its level unless it is given, then its quality. ``records`` may hold those of other environments, too."""
-    if environment.level is None and rules.suite.scoring.level == "curve":
-        return _plan_curve(environment, records, rules)
+    if environment.level is None and rules.suite.scoring.level != "bisection":
+        return _plan_expected(environment, records, rules)
     counted: list[Episode] = []
     passed: dict[int, bool] = {}
     low, high = 0, rules.suite.scoring.levels
@@ -211,7 +212,7 @@ def _episode(environment: Environment, level: int, seed: int, stage: str, suite:
 # ---- an expected level ------------------------------------------------------------------------------------------------
 
 
-def _plan_curve(environment: Environment, records: Records, rules: PlanRules) -> Plan:
+def _plan_expected(environment: Environment, records: Records, rules: PlanRules) -> Plan:
     """The level as the area under a curve, then the quality episodes beside it."""
     suite = rules.suite
     seeds, levels = suite.matrix.search_seeds, suite.scoring.levels
@@ -223,17 +224,25 @@ def _plan_curve(environment: Environment, records: Records, rules: PlanRules) ->
         found = [records.get(trial(level, seed)) for seed in seeds]
         return [None if r is None else bool(r.success) for r in found]
 
-    found = follow(outcomes, levels, len(seeds), suite.scoring.bracket_seeds)
-    counted = [trial(level, seed) for level, count in found.seeds.items() for seed in seeds[:count]]
-    if found.level is None:
-        possible = {trial(level, seed): p for level, p in _likely_levels(found, levels).items() for seed in seeds}
+    if suite.scoring.level == "area":
+        area = follow_area(outcomes, levels, len(seeds))
+        known, counts, near = area.level, area.seeds, area.near
+        begins = max(counts.values()) == 1  # every trial that may count does so once each level has its first outcome
+        likely = {at: _share(*near, levels, 4) * nearness(at, *near) for at in range(1, levels + 1) if begins}
+    else:
+        found = follow(outcomes, levels, len(seeds), suite.scoring.bracket_seeds)
+        known, counts, near = found.level, found.seeds, (found.lowest, found.highest)
+        likely = _likely_levels(found, levels)
+    counted = [trial(level, seed) for level, count in counts.items() for seed in seeds[:count]]
+    if known is None:
+        possible = {trial(level, seed): p for level, p in likely.items() for seed in seeds}
         for level in range(1, levels + 1):
-            chance = _share(found, levels, 2) * nearness(level, found.lowest, found.highest)
+            chance = _share(*near, levels, 2) * nearness(level, *near)
             possible |= dict.fromkeys(_quality(environment, level, rules), chance)
         return _plan(None, {}, counted, possible, records)
-    fit = fitted_curve({level: [bool(o) for o in outcomes(level)[:count]] for level, count in found.seeds.items()})
-    passed = {level: fit[level] >= 0.5 for level in found.seeds}
-    return _plan(found.level, passed, [*counted, *_quality(environment, found.level, rules)], {}, records)
+    fit = fitted_curve({level: [bool(o) for o in outcomes(level)[:count]] for level, count in counts.items()})
+    passed = {level: fit[level] >= 0.5 for level in counts}
+    return _plan(known, passed, [*counted, *_quality(environment, known, rules)], {}, records)
 
 
 def _likely_levels(found: CurveSearch, levels: int) -> dict[int, float]:
@@ -241,13 +250,13 @@ def _likely_levels(found: CurveSearch, levels: int) -> dict[int, float]:
     below = range(1, found.lowest) if found.goes_down else range(0)
     above = range(found.highest + 1, levels + 1) if found.goes_up else range(0)
     within = range(max(found.lowest, 1), min(found.highest, levels) + 1)
-    share = _share(found, levels, 4)
+    share = _share(found.lowest, found.highest, levels, 4)
     return {level: share * nearness(level, found.lowest, found.highest) for level in (*within, *below, *above)}
 
 
-def _share(found: CurveSearch, levels: int, wanted: int) -> float:
+def _share(lowest: int, highest: int, levels: int, wanted: int) -> float:
     """Part of the levels in question that ``wanted`` of them are, at most 0.8: the more are in question, the less is known of each."""
-    return min(wanted / (min(found.highest, levels) - max(found.lowest, 1) + 1), 0.8)
+    return min(wanted / (min(highest, levels) - max(lowest, 1) + 1), 0.8)
 
 
 # ---- the end ----------------------------------------------------------------------------------------------------------

@@ -108,7 +108,7 @@ class ChanceRules(Table):
     """True where the environments of a seed share its random numbers."""
     resamples: Annotated[int, Field(ge=1, le=100_000)]
     """Replicates of the level searches."""
-    level: Literal["bisection", "curve"] = "bisection"
+    level: Literal["bisection", "curve", "area"] = "bisection"
     """The search for a level, as the suite has it; absent from results that are older than the choice."""
     bracket_seeds: Annotated[int, Field(ge=1, le=1000)] = 2
     """Seeds that look for the crossing of a curve."""

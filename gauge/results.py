@@ -162,7 +162,7 @@ def _environment(
         for trial in sorted(environment.trials, key=lambda t: t.episode):
             trials[trial.episode.level][trial.episode.seed] = bool(trial.success)
         row = replace(row, search=dict(sorted(environment.search.items())), trials=trials)
-        if scoring.level == "curve":
+        if scoring.level != "bisection":
             fit = fitted_curve({at: list(found.values()) for at, found in trials.items()})
             row = replace(row, curve={at: _number(share) for at, share in fit.items()})
     if not environment.records:

@@ -173,9 +173,10 @@ class Scoring:
     """Metrics averaged in each group, on their level-weighted mean@50."""
     bootstrap: Annotated[int, Field(ge=1, le=100_000)]
     """Number of bootstrap resamples for the confidence intervals."""
-    level: Literal["bisection", "curve"] = "bisection"
-    """``bisection``: the highest level that a bisection of level tests finds passed, a whole number; ``curve``: the expected level,
-    the area under the share of successes by level (``gauge/chance/level_curve.py``)."""
+    level: Literal["bisection", "curve", "area"] = "bisection"
+    """``bisection``: the highest level that a bisection of level tests finds passed, a whole number; ``curve``: the expected level
+    where easy levels are never failed (``gauge/chance/level_curve.py``); ``area``: the area under the pass curve of any shape
+    (``gauge/chance/level_area.py``)."""
     bracket_seeds: Annotated[int, Field(ge=1, le=1000)] = 2
     """Search seeds with which a curve's crossing is looked for, before all of them are played around it."""
 
@@ -393,13 +394,17 @@ def _check(suite: Suite, source: str) -> None:
         f"levels, quality_weight {scoring.quality_weight:g}); it must be 1 at most": best <= 1.0 + 1e-9,
         f"goals has a goal twice: {', '.join(goals)}": len(set(goals)) == len(goals),
         f"scoring.bracket_seeds is {scoring.bracket_seeds}; at most the {len(matrix.search_seeds)} of matrix.search_seeds "
-        "are possible": scoring.level == "bisection" or scoring.bracket_seeds <= len(matrix.search_seeds),
+        "are possible": scoring.level != "curve" or scoring.bracket_seeds <= len(matrix.search_seeds),
     }
     for name in ("projected_gravity", "base_linear_velocity"):
         half = getattr(suite.noise, name)
         rules[
             f"noise.{name} is {half:g}, which the stream 'reference' does not draw; let it be 0, or the stream 'counter'"
         ] = half == 0.0 or suite.noise.stream == "counter"
+    rules[
+        f"scoring.level is 'area', and episodes need noise of their own; noise.stream is '{suite.noise.stream}', let it be "
+        "'counter', or let scoring.level be 'bisection'"
+    ] = scoring.level != "area" or suite.noise.stream == "counter"
     rules |= _goal_rules(suite)
     if (push := suite.push) is not None:
         rules[f"push.after ({push.after[0]:g} to {push.after[1]:g} s) must rise"] = push.after[0] <= push.after[1]

@@ -20,6 +20,7 @@ from scipy import special
 
 from ..episodes import QUALITY
 from ..result import CONFIDENCE, ChanceRules, EnvironmentRow
+from .level_area import redraw_areas
 from .level_chance import bisected_levels, redraw_levels, shared_luck, success_curves
 from .level_curve import expected_levels
 
@@ -141,6 +142,11 @@ class Evidence:
         if not searched:
             return
         searches, rules = [self.rows[at].trials for at in searched], self._rules
+        if rules.level == "area":
+            noise = generator.standard_normal((len(searched), rules.resamples))
+            outcomes = [{level: [*found.values()] for level, found in trials.items() if found} for trials in searches]
+            self.redrawn[searched] = redraw_areas(self._reached[searched], outcomes, noise)
+            return
         curves = success_curves(searches, [self.rows[at].terrain for at in searched], rules.levels)
         self.redrawn[searched] = redraw_levels(
             curves,

@@ -79,7 +79,7 @@ def report_data(result: Result) -> dict[str, Any]:
     rows, terrains, evaluated = result.environments, result.terrains, result.score is not None
     searched = any(r.search is not None for r in rows)
     both = (("friction", "over friction"), ("payload", "over payload"))
-    expected = result.chance.level == "curve"
+    expected = result.chance.level != "bisection"
     counts = [_plural(len(terrains), "terrain"), _plural(len(rows), "environment")]
     counts += [_plural(result.health.episodes, "quality episode")] if result.health.episodes else []
     groups = {name: (value, result.groups_interval.get(name)) for name, value in result.groups.items()}

@@ -33,9 +33,9 @@ def test_synthetic_intervals_hold_the_truth(kind):
     assert 0.9 <= bench.coverage(kind, 120) <= 0.995
 
 
-def test_intervals_of_expected_levels_hold_the_truth():
+def test_intervals_of_areas_hold_the_truth():
     """As many as 30 trials can tell; the slow test has twenty times as many."""
-    assert bench.coverage("expected levels, one friction", 30) >= 0.83
+    assert bench.coverage("areas, one friction", 30) >= 0.83
 
 
 @pytest.mark.slow
@@ -53,8 +53,8 @@ def test_a_policy_is_hardly_ever_told_apart_from_itself(recorded):
 
 
 @pytest.mark.slow
-def test_expected_levels_tell_a_policy_from_itself_as_seldom():
-    by_score, by_detail = bench.false_alarms("expected levels, one friction", 60)
+def test_areas_tell_a_policy_from_itself_as_seldom():
+    by_score, by_detail = bench.false_alarms("areas, one friction", 60)
     assert by_score <= 0.1 and by_detail <= 0.1
 
 
@@ -67,3 +67,21 @@ def test_a_policy_that_is_better_is_told_apart():
     score = found.differences[0]
     assert score.real and score.difference == pytest.approx(0.09, abs=0.05)
     assert found.sentences[0].startswith("'new' is better than 'old'")
+
+
+def test_lapses_neither_shift_the_score_nor_leave_the_interval():
+    """One failure in five trials at easy levels: as much as 24 evaluations can tell; the slow test has all shapes."""
+    found = bench.judge_shape("lapses of 20 %", 12, environments=4)
+    assert abs(found.bias) < 0.008
+    assert found.covered >= 0.8
+    assert found.trials < 1.2 * found.before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", bench.SHAPES)
+def test_scores_are_unbiased_for_pass_curves_of_every_shape(shape):
+    found = bench.judge_shape(shape, 200)
+    assert abs(found.bias) < 0.002
+    assert 0.92 <= found.covered <= 0.98
+    assert found.alarms <= 0.07
+    assert found.trials <= 1.2 * found.before

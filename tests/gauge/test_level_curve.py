@@ -13,7 +13,7 @@ from gaitgauge.gauge.suite import load_suite
 from scipy.optimize import isotonic_regression
 from test_plan import play
 
-OWN = load_suite("gaitgauge-1")
+OWN = load_suite("demo")
 SEEDS = len(OWN.matrix.search_seeds)
 WAVE = Environment(terrain="wave", friction=0.6, payload=0.0, level=None)
 RULES = PlanRules(suite=OWN, seeds=(0, 1, 2))

@@ -90,6 +90,7 @@ def test_a_suite_of_ones_own_changes_what_it_names_and_nothing_else(suite_file):
     assert suite == replace(
         OWN,
         name="mine",
+        version="1.0.0",
         matrix=replace(OWN.matrix, frictions=(0.5, 1.0), nominal_friction=0.5),
         events=replace(OWN.events, fall="close-goal"),
     )
@@ -132,7 +133,14 @@ def test_a_suite_may_limit_torque_by_speed(suite_file):
             "[noise]\nstream = 'reference'",
             "noise.projected_gravity is 0.05, which the stream 'reference' does not draw",
         ),
-        ("[scoring]\nbracket_seeds = 7", "scoring.bracket_seeds is 7; at most the 6 of matrix.search_seeds"),
+        (
+            "[noise]\nstream = 'reference'\nprojected_gravity = 0.0\nbase_linear_velocity = 0.0",
+            "scoring.level is 'area', and episodes need noise of their own",
+        ),
+        (
+            "[scoring]\nlevel = 'curve'\nbracket_seeds = 7",
+            "scoring.bracket_seeds is 7; at most the 6 of matrix.search_seeds",
+        ),
         ("[push]\nforce = [100.0, 80.0]", "push.force .100 to 80 N. must rise"),
         ("[push]\nafter = [3.5, 1.5]", "push.after .3.5 to 1.5 s. must rise"),
         ("[push]\ngoal = 'target_pos_velocity'", "push.goal .target_pos_velocity. is none of goals with sub-commands"),
