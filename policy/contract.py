@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
+from itertools import accumulate, product
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -20,10 +21,12 @@ from ..robots.base import Angle, Damping, Robot, Speed, Stiffness
 from .observation_table import OBSERVATIONS, STANDARD, ObservationError, observation
 
 SCHEMA_VERSION: Literal[1] = 1
-HistoryOrder = Literal["frame-major", "term-major", "frame-major-newest-first"]
+HistoryOrder = Literal["frame-major", "term-major", "frame-major-newest-first", "term-major-newest-first"]
 
-PER_JOINT = ("default_joint_position", "action_scale", "stiffness", "damping", "target_range")
+PER_JOINT = ("default_joint_position", "action_scale", "action_offset", "stiffness", "damping", "target_range")
 """Fields of a contract with a value for each joint."""
+PER_ENTRY = ("scale", "clip", "reference")
+"""Fields of a term with one value, or a value for each of its entries."""
 PRIVILEGED_TERMS = tuple(each.name for each in OBSERVATIONS.values() if each.privileged)
 """The project's own observation terms that no sensor of a robot measures."""
 
@@ -38,6 +41,12 @@ class ContractError(ValueError):
 
 _MOST = 1000
 """Joints."""
+_LATER = frozenset(
+    {"action_offset", "layout", "memory", "encoder"} | {"reference", "values", "period", "offsets", "waves", "at_rest"}
+)
+"""Fields that hashes of older contracts lack."""
+RESTING = 0.1
+"""Length of a command, speeds [m/s] and [rad/s] alike, below which a gait clock is at rest."""
 _ActionScale = Annotated[float, Field(strict=True, ge=-100.0, le=100.0)]
 _Factor = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
 _Clip = Annotated[float, Field(strict=True, gt=0.0, le=1e9)]
@@ -47,14 +56,27 @@ _Period = Annotated[float, Field(strict=True, ge=0.0005, le=1.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationTerm:
-    """One block of the observation vector; ``joint_position`` is relative to the default pose, ``last_action`` the raw output."""
+    """One block of the observation vector: ``scale`` times what is observed less ``reference``, then clipped."""
 
     name: Text
-    """Name of an observation of ``observation_table``."""
+    """Name of an observation of ``observation_table``. ``last_action`` is the network's output, within ``action_clip``."""
     scale: Annotated[tuple[_Factor, ...], Field(min_length=1, max_length=_MOST)]
     """Factor per entry; one entry stands for all."""
     clip: _Clip | Annotated[tuple[_Clip, ...], Field(min_length=1, max_length=_MOST)] | None = None
     """Largest magnitude after scaling, for all entries or per entry; None for no clipping."""
+    reference: Annotated[tuple[_Target, ...], Field(min_length=1, max_length=_MOST)] | None = None
+    """Subtracted before scaling, in the observation's unit, for all entries or per entry; None: the default pose for
+    ``joint_position``, nothing for all others."""
+    values: Annotated[tuple[_Target, ...], Field(max_length=_MOST)] = ()
+    """The entries of ``constant``; of ``command``, those that follow the three speeds and stay as they are."""
+    period: Annotated[float, Field(strict=True, gt=0.0, le=100.0)] | None = None
+    """Of ``gait_phase``: time of one gait cycle [s]. The phase is 0 at each reset."""
+    offsets: Annotated[tuple[Annotated[float, Field(strict=True, ge=-1.0, le=1.0)], ...], Field(min_length=1)] = (0.0,)
+    """Of ``gait_phase``: shares of a cycle by which each clock is ahead, one clock per entry."""
+    waves: Annotated[tuple[Literal["sin", "cos"], ...], Field(min_length=1, max_length=2)] = ("sin", "cos")
+    """Of ``gait_phase``: functions of the phase; the first one of all clocks, then the second one."""
+    at_rest: Literal["runs", "holds", "zeros"] = "runs"
+    """Of ``gait_phase``, while the command is below ``RESTING``: the clock runs, holds still, or its entries are zero."""
 
     def __post_init__(self) -> None:
         check_fields(self, "contract", ContractError)
@@ -62,6 +84,25 @@ class ObservationTerm:
             observation(self.name)
         except ObservationError as error:
             raise ContractError(f"contract: {error}") from error
+        if self.values and self.name not in ("constant", "command"):
+            raise ContractError(f"contract: observation.{self.name} has values; only constant and command do")
+        if self.name == "constant" and not self.values:
+            raise ContractError("contract: observation.constant has no values; give a list of numbers")
+        if (self.period is None) == (self.name == "gait_phase"):
+            wrong = (
+                "has no period; give the time of a gait cycle [s]"
+                if self.period is None
+                else "has a period; only gait_phase does"
+            )
+            raise ContractError(f"contract: observation.{self.name} {wrong}")
+
+    def width(self, joints: int) -> int:
+        """Return the number of entries for a robot of so many joints."""
+        if self.name == "gait_phase":
+            return len(self.offsets) * len(self.waves)
+        if self.name == "constant":
+            return len(self.values)
+        return (observation(self.name).width or joints) + len(self.values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +112,8 @@ class History:
     length: Annotated[int, Field(strict=True, ge=1, le=1000)] = 1
     """Number of frames, the current one included."""
     order: HistoryOrder = "frame-major"
-    """``frame-major``: whole frames, oldest first; ``frame-major-newest-first``: the same reversed; ``term-major``: all
-    frames of the first term, oldest first, then the next term.
+    """``frame-major``: whole frames, oldest first; ``term-major``: all frames of the first term, oldest first, then the
+    next term; with ``-newest-first`` the frames are reversed.
     """
     start: Literal["zeros", "repeat"] = "zeros"
     """Content of the frames before the first one: ``zeros``, as in the published training, or ``repeat`` for copies of
@@ -83,8 +124,41 @@ class History:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part of what a network is given, where that is more than one history of the whole observation."""
+
+    terms: tuple[Text, ...] = ()
+    """Observation terms in this part, in this order; empty for all."""
+    length: Annotated[int, Field(strict=True, ge=1, le=1000)] | None = None
+    """Number of frames, the current one included; None for that of ``history``."""
+    order: HistoryOrder | None = None
+    """Order of the frames; None for that of ``history``."""
+    input: Annotated[str, Field(max_length=1000)] = ""
+    """Input of the network: the name of an ONNX input or of an argument of ``forward``; empty for the only one. Parts of one
+    input are joined."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "contract", ContractError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoder:
+    """A second network file, which runs first; what it gives is joined with the input of the main one."""
+
+    file: Text
+    """File beside the policy's."""
+    input: Annotated[str, Field(max_length=1000)] = ""
+    """Input of ``layout`` that goes to the encoder; empty: both are given the whole observation."""
+    latent: Literal["first", "last"] = "last"
+    """Place of the encoder's output in the main network's input."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "contract", ContractError)
+
+
+@dataclass(frozen=True, kw_only=True)
 class PolicyContract:
-    """Joint order, poses, scales and timing of a policy. The target of joint j is ``default + action_scale * action``.
+    """Joint order, poses, scales and timing of a policy. The target of joint j is ``offset + action_scale * action``.
 
     Raises:
         ContractError: a field has the wrong type, length or value; the message names it.
@@ -98,8 +172,10 @@ class PolicyContract:
     """[rad], in the policy's joint order."""
     action_scale: Annotated[tuple[_ActionScale, ...], Field(min_length=1, max_length=_MOST)]
     """[rad] per unit of network output, per joint; negative where the network's joint turns the other way."""
+    action_offset: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=_MOST)] | None = None
+    """Joint target at an action of zero [rad], None for the default pose."""
     action_clip: _Clip | None = None
-    """Largest magnitude of the raw action, None for no clipping."""
+    """Largest magnitude of the network's output, for targets and ``last_action`` alike; None for no clipping."""
     target_range: tuple[tuple[_Target, _Target], ...] | None = None
     """Lowest and highest joint target per joint [rad], None for no limit."""
     stiffness: Annotated[tuple[Stiffness, ...], Field(min_length=1, max_length=_MOST)]
@@ -110,6 +186,11 @@ class PolicyContract:
     """[s]."""
     observation: Annotated[tuple[ObservationTerm, ...], Field(min_length=1)]
     history: History = History()
+    layout: tuple[Part, ...] = ()
+    """Parts of the network's input, where terms have histories of their own or the network several inputs; empty: the history."""
+    memory: tuple[tuple[Text, Text], ...] = ()
+    """Input and output of an ONNX file for each recurrent state, zeros at a reset; empty: found by their names."""
+    encoder: Encoder | None = None
     command_limits: tuple[Speed, Speed, Speed]
     """Largest forward, lateral [m/s] and yaw [rad/s] command the policy was made for."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
@@ -134,12 +215,22 @@ class PolicyContract:
         if len(set(terms)) != len(terms):
             raise ContractError(f"contract: observation has a term twice: {', '.join(terms)}")
         for term, width in zip(self.observation, self.term_widths, strict=True):
-            clip = term.clip if isinstance(term.clip, tuple) else (0.0,)
-            for name, values in (("scale", term.scale), ("clip", clip)):
-                if len(values) not in (1, width):
+            for name in PER_ENTRY:
+                values = getattr(term, name)
+                if isinstance(values, tuple) and len(values) not in (1, width):
                     raise ContractError(
                         f"contract: observation.{term.name}.{name} has {len(values)} entries; 1 or {width} are needed"
                     )
+        for part in self.layout:
+            if strange := [name for name in part.terms if name not in terms]:
+                raise ContractError(
+                    f"contract: layout has the term {shown(strange[0])}; the observation has {', '.join(terms)}"
+                )
+        if self.encoder and self.encoder.input and self.encoder.input not in self.input_widths:
+            known = ", ".join(n for n in self.input_widths if n) or "none"
+            raise ContractError(
+                f"contract: encoder.input is {shown(self.encoder.input)}; the inputs that layout names are: {known}"
+            )
 
     @cached_property
     def num_joints(self) -> int:
@@ -149,7 +240,7 @@ class PolicyContract:
     @cached_property
     def term_widths(self) -> tuple[int, ...]:
         """Return the width of each observation term."""
-        return tuple(observation(term.name).width or self.num_joints for term in self.observation)
+        return tuple(term.width(self.num_joints) for term in self.observation)
 
     @cached_property
     def frame_width(self) -> int:
@@ -157,13 +248,45 @@ class PolicyContract:
         return sum(self.term_widths)
 
     @cached_property
+    def frames(self) -> int:
+        """Return the number of frames that have to be kept, the current one included."""
+        return max((part.length or self.history.length for part in self.layout), default=self.history.length)
+
+    @cached_property
+    def inputs(self) -> Mapping[str, tuple[int, ...]]:
+        """Return each input's entries as places in the kept frames (H, F), oldest first, by the input's name, ``""`` for the only one."""
+        begins = dict(zip((t.name for t in self.observation), accumulate((0, *self.term_widths)), strict=False))
+        widths = dict(zip(begins, self.term_widths, strict=True))
+        found: dict[str, tuple[int, ...]] = {}
+        for part in self.layout or (Part(),):
+            length, order = part.length or self.history.length, part.order or self.history.order
+            frames = list(range(self.frames - length, self.frames))
+            if order.endswith("newest-first"):
+                frames.reverse()
+            terms = part.terms or tuple(begins)
+            blocks = product(frames, terms) if order.startswith("frame") else ((f, t) for t in terms for f in frames)
+            places = (self.frame_width * f + begins[t] + i for f, t in blocks for i in range(widths[t]))
+            found[part.input] = found.get(part.input, ()) + tuple(places)
+        return found
+
+    @cached_property
+    def input_widths(self) -> Mapping[str, int]:
+        """Return the width of each input, in order."""
+        return {name: len(places) for name, places in self.inputs.items()}
+
+    @cached_property
     def observation_width(self) -> int:
-        """Return the width of the network's input."""
-        return self.frame_width * self.history.length
+        """Return the width of the network's input, all inputs together."""
+        return sum(self.input_widths.values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data, ready for JSON."""
-        return asdict(self)
+        """Return plain data, ready for JSON; what came after the first contracts stands there only where it is used."""
+        data = asdict(self)
+        for made, found in ((self, data), *zip(self.observation, data["observation"], strict=True)):
+            for entry in fields(made):
+                if entry.name in _LATER and getattr(made, entry.name) == entry.default:
+                    del found[entry.name]
+        return data
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PolicyContract:
@@ -224,7 +347,9 @@ def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyCon
         return tuple(values[i] for i in index) if isinstance(values, tuple) and len(values) == len(index) else values
 
     terms = tuple(
-        term if observation(term.name).width else replace(term, scale=moved(term.scale), clip=moved(term.clip))
+        term
+        if observation(term.name).width
+        else replace(term, **{name: moved(getattr(term, name)) for name in PER_ENTRY})
         for term in contract.observation
     )
     values = {name: moved(getattr(contract, name)) for name in PER_JOINT}
@@ -253,8 +378,7 @@ def _flat(contract: PolicyContract) -> dict[str, str]:
         if name == "observation":
             rows["observation"] = ", ".join(t["name"] for t in value)
             for term in value:
-                rows[f"observation.{term['name']}.scale"] = repr(term["scale"])
-                rows[f"observation.{term['name']}.clip"] = repr(term["clip"])
+                rows.update({f"observation.{term['name']}.{k}": repr(v) for k, v in term.items() if k != "name"})
         elif name == "history":
             rows.update({f"history.{key}": repr(entry) for key, entry in value.items()})
         elif name != "provenance":

@@ -8,7 +8,7 @@ import torch
 
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
-from .contract import ContractError, ObservationTerm, PolicyContract, check_robot
+from .contract import RESTING, ContractError, ObservationTerm, PolicyContract, check_robot
 from .observation_table import OBSERVATIONS, Observation, observation
 
 
@@ -45,6 +45,7 @@ class ObservationBuilder:
         inverse = tuple(index.index(j) for j in identity)
         self._policy_joint = None if index == identity else self._tensor(inverse, torch.int64)
         self._default = self._tensor(contract.default_joint_position)
+        self._offset = self._tensor(contract.action_offset or contract.default_joint_position)
         self._action_scale = self._tensor(contract.action_scale)
         self._target_range = None if contract.target_range is None else self._tensor(contract.target_range).T
         self._scale = torch.cat(
@@ -52,20 +53,34 @@ class ObservationBuilder:
         )
         limits = [self._tensor(_clip(t)).expand(w) for t, w in zip(contract.observation, widths, strict=True)]
         self._limit = None if all(t.clip is None for t in contract.observation) else torch.cat(limits)
-        self._term_major = term_major_order(contract, contract.history.length).argsort().to(self.device)
-        self._frames = torch.zeros(num_episodes, contract.history.length, contract.frame_width, device=self.device)
+        self._references = [self._reference(term) for term in contract.observation]
+        self._values = [self._tensor(t.values).expand(num_episodes, -1) for t in contract.observation]
+        self._clock_offsets = [self._tensor(t.offsets) for t in contract.observation]
+        self._clocks = torch.zeros(num_episodes, len(contract.observation), device=self.device)
+        places = tuple(place for places in contract.inputs.values() for place in places)
+        as_kept = places == tuple(range(contract.frames * contract.frame_width))
+        self._places = None if as_kept else self._tensor(places, torch.int64)
+        self._frames = torch.zeros(num_episodes, contract.frames, contract.frame_width, device=self.device)
         self._fresh = torch.ones(num_episodes, dtype=torch.bool, device=self.device)
 
     def _tensor(self, values: object, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.tensor(values, dtype=dtype, device=self.device)
 
+    def _reference(self, term: ObservationTerm) -> torch.Tensor | None:
+        """Return what is subtracted from a term, joints in the policy's order."""
+        if term.reference is not None:
+            return self._tensor(term.reference) if any(term.reference) else None
+        return self._default if observation(term.name).about_default_pose else None
+
     def reset(self, episodes: torch.Tensor | None = None) -> None:
-        """Forget the past frames of the masked episodes, (N,) bool, None for all."""
+        """Forget the past frames of the masked episodes, (N,) bool, None for all; their gait clocks begin anew."""
         if episodes is None:
             self._frames.zero_()
+            self._clocks.zero_()
             self._fresh.fill_(True)
         else:
             self._frames.masked_fill_(episodes[:, None, None], 0.0)
+            self._clocks.masked_fill_(episodes[:, None], 0.0)
             self._fresh.logical_or_(episodes)
 
     def build(
@@ -96,14 +111,20 @@ class ObservationBuilder:
         noise = noise or {}
         if not noise.keys() <= self._noisy:
             _refuse_noise(noise.keys() - self._noisy)
-        blocks = [self._value(each, state, command, last_action, noise.get(each.name)) for each in self._observations]
+        if self.contract.action_clip is not None:
+            last_action = torch.clamp(last_action, -self.contract.action_clip, self.contract.action_clip)
+        blocks = [
+            self._value(i, each, state, command, last_action, noise.get(each.name))
+            for i, each in enumerate(self._observations)
+        ]
         frame = torch.cat(blocks, dim=-1).to(torch.float32) * self._scale
         if self._limit is not None:
             frame = torch.clamp(frame, -self._limit, self._limit)
-        return frame if self.contract.history.length == 1 else self._with_history(frame)
+        return self._with_history(frame) if self.contract.frames > 1 else self._in_order(frame)
 
     def _value(
         self,
+        number: int,
         made: Observation,
         state: PhysicsState,
         command: torch.Tensor,
@@ -111,12 +132,34 @@ class ObservationBuilder:
         noise: torch.Tensor | None,
     ) -> torch.Tensor:
         """Return one term in physical units, joints in the policy's order."""
+        if made.name == "gait_phase":
+            return self._phase(number, command)
+        if made.name == "constant":
+            return self._values[number]
         value = made.build(state, command, last_action)
+        if made.name == "command" and self.contract.observation[number].values:
+            value = torch.cat((value, self._values[number].to(value.dtype)), dim=1)
         if noise is not None:
             value = value + noise
         if made.width is None and not made.policy_order and self._robot_joint is not None:
             value = value[:, self._robot_joint]
-        return value - self._default if made.about_default_pose else value
+        reference = self._references[number]
+        return value if reference is None else value - reference
+
+    def _phase(self, number: int, command: torch.Tensor) -> torch.Tensor:
+        """Return the waves of a gait's clocks, (N, W), and let the clocks go on by one control period."""
+        term = self.contract.observation[number]
+        assert term.period is not None  # of the term's own check
+        clock, resting = self._clocks[:, number], command.norm(dim=1) < RESTING
+        cycles = (clock * (self.contract.control_period / term.period))[:, None] + self._clock_offsets[number]
+        angle = 2.0 * torch.pi * torch.remainder(cycles, 1.0)
+        found = torch.cat([torch.sin(angle) if wave == "sin" else torch.cos(angle) for wave in term.waves], dim=1)
+        clock.add_((~resting).to(clock.dtype) if term.at_rest == "holds" else 1.0)
+        return found.masked_fill(resting[:, None], 0.0) if term.at_rest == "zeros" else found
+
+    def _in_order(self, frames: torch.Tensor) -> torch.Tensor:
+        """Return the network's inputs of frames (N, H·F), oldest first."""
+        return frames if self._places is None else frames.index_select(1, self._places)
 
     def _with_history(self, frame: torch.Tensor) -> torch.Tensor:
         frames = torch.cat((self._frames[:, 1:], frame[:, None]), dim=1)
@@ -124,18 +167,13 @@ class ObservationBuilder:
             frames = torch.where(self._fresh[:, None, None], frame[:, None].expand_as(frames), frames)
         self._frames.copy_(frames)
         self._fresh.fill_(False)
-        order = self.contract.history.order
-        if order == "term-major":
-            return frames.flatten(1).index_select(1, self._term_major)
-        if order == "frame-major-newest-first":
-            frames = frames.flip(1)
-        return frames.reshape(self.num_episodes, -1)
+        return self._in_order(frames.flatten(1))
 
     def targets(self, action: torch.Tensor) -> torch.Tensor:
         """Return joint targets [rad], in the robot's order, of raw actions in the policy's order, both (N, J). NaN stays NaN."""
         if self.contract.action_clip is not None:
             action = torch.clamp(action, -self.contract.action_clip, self.contract.action_clip)
-        target = self._default + self._action_scale * action
+        target = self._offset + self._action_scale * action
         if self._target_range is not None:
             target = torch.clamp(target, self._target_range[0], self._target_range[1])
         return target if self._policy_joint is None else target[:, self._policy_joint]

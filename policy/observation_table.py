@@ -202,6 +202,15 @@ _OWN = (
         foreign_names=("last_action", "actions"),
         policy_order=True,
     ),
+    # The next two have no function of the state: the builder makes them of what the contract's term says.
+    Observation(
+        name="gait_phase",
+        build=lambda state, command, last_action: command[:, :2],
+        width=2,
+        unit="",
+        foreign_names=("gait_phase", "phase"),
+    ),
+    Observation(name="constant", build=lambda state, command, last_action: command[:, :1], width=1, unit=""),
 )
 OBSERVATIONS: dict[str, Observation] = {each.name: each for each in _OWN}
 """All observations that this process knows by name: the project's own first, then plug-ins in the order they were loaded."""
