@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -109,16 +111,48 @@ def act_alike(alone: PolicySession, together: PolicySession, width: int) -> bool
     return True
 
 
-def check_observation(observation: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Interface:
+    """The inputs and the output of a foreign program."""
+
+    inputs: Mapping[str, int]
+    """Width of each input by name, in the order in which an observation holds them; ``""`` for the only one."""
+    num_joints: int
+    """Width of the output, 0 while it is not known."""
+    memory: tuple[tuple[str, str], ...] = ()
+    """Input and output of each recurrent state of an ONNX file; empty: found by their names."""
+
+    @property
+    def observation_width(self) -> int:
+        """Return the width of all inputs together."""
+        return sum(self.inputs.values())
+
+    @classmethod
+    def of(cls, contract: PolicyContract) -> Interface:
+        """Return the interface of a policy with this contract and one network."""
+        return cls(inputs=contract.input_widths, num_joints=contract.num_joints, memory=contract.memory)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data, ready for JSON."""
+        return {"inputs": list(self.inputs.items()), "num_joints": self.num_joints, "memory": self.memory}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Interface:
+        """Read what ``to_dict`` wrote."""
+        memory = tuple((str(a), str(b)) for a, b in data["memory"])
+        return cls(inputs=dict(data["inputs"]), num_joints=int(data["num_joints"]), memory=memory)
+
+
+def check_observation(observation: torch.Tensor, rows: int, contract: PolicyContract | Interface, source: str) -> None:
     """Raise ``PolicyError``, with the policy's name ``source``, for observations that are not ``rows`` of the contract's width."""
     expected = (rows, contract.observation_width)
     if observation.shape != expected:
         raise PolicyError(f"'{source}' takes observations of shape {expected}, not {tuple(observation.shape)}")
 
 
-def checked_action(action: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> torch.Tensor:
+def checked_action(action: torch.Tensor, rows: int, contract: PolicyContract | Interface, source: str) -> torch.Tensor:
     """Return an output as a fresh float32 tensor (rows, J), one row also without its axis; raise ``PolicyError`` for another shape."""
-    expected = (rows, contract.num_joints)
+    expected = (rows, contract.num_joints or action.shape[-1] if action.dim() else 0)
     if rows == 1 and tuple(action.shape) == expected[1:]:
         action = action.unsqueeze(0)
     if tuple(action.shape) != expected:

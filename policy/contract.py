@@ -282,7 +282,11 @@ class PolicyContract:
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, ready for JSON; what came after the first contracts stands there only where it is used."""
         data = asdict(self)
-        for made, found in ((self, data), *zip(self.observation, data["observation"], strict=True)):
+        pairs: list[tuple[Any, dict[str, Any]]] = [
+            (self, data),
+            *zip(self.observation, data["observation"], strict=True),
+        ]
+        for made, found in pairs:
             for entry in fields(made):
                 if entry.name in _LATER and getattr(made, entry.name) == entry.default:
                     del found[entry.name]
@@ -357,10 +361,13 @@ def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyCon
 
 
 def other_width(contract: PolicyContract, width: int) -> str:
-    """Return a contract's observation width as part of a sentence on a network with another width, and the history that would fit."""
+    """Return a contract's observation width as part of a sentence on a network with another width, and what would fit."""
     frames, rest = divmod(width, contract.frame_width)
     fits = f"; {frames} frames are {width}: history = {{ length = {frames} }}" if frames and not rest else ""
-    return f"but its contract's observation has {contract.observation_width}{fits}"
+    return (
+        f"but its contract's observation has {contract.observation_width} "
+        f"({', '.join(f'{t.name} {w}' for t, w in zip(contract.observation, contract.term_widths, strict=True))}){fits}"
+    )
 
 
 def difference(a: PolicyContract, b: PolicyContract) -> str:

@@ -24,7 +24,7 @@ from ...robots import Robot
 from ..base import PROBE_EPISODES, Policy, PolicyError
 from ..contract import HistoryOrder, ObservationTerm, PolicyContract, difference
 from ..foreign.adapters import deploy_contract
-from ..foreign.torchscript_session import CONTRACT_FILE
+from ..foreign.fence.script import CONTRACT_FILE
 from ..loading import load_policy
 from ..native import NativePolicy
 from ..networks.architectures import MlpNetwork

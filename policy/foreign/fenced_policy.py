@@ -8,8 +8,8 @@ from collections.abc import Collection
 
 import torch
 
-from ..base import PolicySession, check_observation
-from ..contract import PolicyContract
+from ..base import Interface, PolicyError, PolicySession, check_observation
+from ..contract import PolicyContract, other_width
 from ..native import FilePolicy, ForeignFile
 from .fence.child import Child
 
@@ -37,7 +37,9 @@ class FencedPolicy(FilePolicy):
         """
         self.stored, self.contract, self.path = stored, contract, path
         self._child = child
-        answer = child.ask("prepare", contract=contract.to_json(), attributes=sorted(attributes))
+        answer = child.ask("prepare", interface=Interface.of(contract).to_dict(), attributes=sorted(attributes))
+        if width := answer.get("width"):
+            raise PolicyError(f"'{path}' takes {width} values, {other_width(contract, width)}")
         self.row_by_row = answer.get("batched") is not True
         if self.row_by_row:
             _warn_of_speed(path)

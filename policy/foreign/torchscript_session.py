@@ -13,13 +13,14 @@ import io
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
 from ..base import (
     PROBE_EPISODES,
+    Interface,
     PolicyError,
     PolicySession,
     RowwiseSession,
@@ -27,10 +28,12 @@ from ..base import (
     check_observation,
     checked_action,
 )
-from ..contract import PolicyContract
 from ..native import LOAD_ERRORS, said_lines
 from .fence.operators import OPERATORS
-from .fence.script import CONTRACT_FILE, RESET_METHODS
+from .fence.script import RESET_METHODS
+
+MOST_WIDTHS_TRIED = 20
+"""Widths of matrices in a module that are tried as its input's."""
 
 
 @contextmanager
@@ -52,6 +55,26 @@ class Memory:
     name: str
     axis: int
     """Batch axis."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wiring:
+    """Hold how an observation becomes the arguments of ``forward``."""
+
+    widths: tuple[int, ...]
+    """Width of each input in the observation."""
+    order: tuple[int, ...]
+    """The input that each argument is."""
+    dtype: torch.dtype
+    """Type of the module's weights."""
+
+    def arguments(self, observation: torch.Tensor) -> Sequence[torch.Tensor]:
+        """Return the arguments for observations (N, W)."""
+        observation = observation.to(self.dtype)
+        if len(self.order) == 1:
+            return (observation,)
+        parts = observation.split(self.widths, dim=1)
+        return [parts[place] for place in self.order]
 
 
 def load_module(data: bytes, *, source: str) -> Any:
@@ -101,12 +124,24 @@ def _check_operators(module: Any, *, source: str) -> None:
 
 
 def input_width(module: Any, candidates: Sequence[int], *, source: str) -> int:
-    """Return the first of the candidate widths that the module accepts as (1, width); raise ``PolicyError`` where it accepts none."""
+    """Return the first width that the module accepts as (1, width): of the candidates, then of the matrices in it.
+
+    Raises:
+        PolicyError: it accepts none, or takes several inputs.
+    """
     reason = "it has no forward()"
-    for width in candidates:
+    names = argument_names(module)
+    if len(names) > 1:
+        raise PolicyError(
+            f"'{source}' takes {len(names)} inputs ({', '.join(names)}); give a contract.toml that says what each holds: layout = ["
+            + ", ".join(f'{{ input = "{name}", length = FRAMES }}' for name in names)
+            + "]"
+        )
+    inside = sorted({p.shape[1] for p in module.parameters() if p.dim() == 2} - set(candidates), reverse=True)
+    for width in (*candidates, *inside[:MOST_WIDTHS_TRIED]):
         try:
             with _plain_execution():
-                first_tensor(copy.deepcopy(module)(torch.zeros(1, width)))
+                first_tensor(copy.deepcopy(module)(torch.zeros(1, width, dtype=_dtype(module))))
         except PolicyError as error:
             raise PolicyError(f"'{source}' {error}") from error
         except LOAD_ERRORS as error:
@@ -116,8 +151,22 @@ def input_width(module: Any, candidates: Sequence[int], *, source: str) -> int:
     widths = ", ".join(str(w) for w in candidates[:3])
     raise PolicyError(
         f"'{source}' takes none of the standard observation widths ({widths} …): {reason}; "
-        f"put a {CONTRACT_FILE} beside it that describes its observation"
+        "give a contract.toml that describes its observation (gaitgauge contract new)"
     )
+
+
+def argument_names(module: Any) -> list[str]:
+    """Return the names of the arguments that ``forward`` must be given."""
+    if not module._c._has_method("forward"):
+        return []
+    arguments = module._c._get_method("forward").schema.arguments[1:]
+    return [argument.name for argument in arguments if not argument.has_default_value()]
+
+
+def _dtype(module: Any) -> torch.dtype:
+    """Return the floating-point type of a module's weights, float32 where it has none."""
+    types = (tensor.dtype for tensor in (*module.parameters(), *module.buffers()) if tensor.is_floating_point())
+    return next(types, torch.float32)
 
 
 def first_tensor(output: Any) -> torch.Tensor:
@@ -146,38 +195,67 @@ class ScriptProgram:
         """Load the module from ``data`` after ``fence.script.check_script``; raise ``PolicyError`` where it cannot be loaded."""
         self.source = source
         self._module = load_module(data, source=source)
-        self.contract: PolicyContract
+        self.contract: Interface
         self.memories: tuple[Memory, ...] | None = None
 
     def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Answer ``width`` with the first of ``candidates`` that the module takes, ``prepare`` with whether it runs in batches."""
+        """Answer ``width`` with the width that the module takes, and ``prepare`` with whether it runs in batches, or with the width
+        that it takes in place of the interface's.
+        """
         if request["do"] == "width":
             return {"width": input_width(self._module, request["candidates"], source=self.source)}
-        self.prepare(PolicyContract.from_json(request["contract"]), request["attributes"])
-        return {"batched": self.memories is not None}
+        interface = Interface.from_dict(request["interface"])
+        try:
+            self.prepare(interface, request["attributes"])
+        except PolicyError:
+            if len(interface.inputs) > 1 or (width := self._other_width(interface.observation_width)) is None:
+                raise
+            return {"width": width}
+        return {"batched": self.memories is not None, "num_joints": self.contract.num_joints}
 
-    def prepare(self, contract: PolicyContract, attributes: Collection[str]) -> None:
+    def prepare(self, contract: Interface, attributes: Collection[str]) -> None:
         """Find out how to run the module in batches.
 
         Args:
+            contract: its inputs, and its output where that is known; inputs that have names are put in the order of its
+                arguments.
             attributes: names of all attributes that the archive's classes declare; torch itself lists only parameters and
                 buffers.
 
         Raises:
             PolicyError: the module fails on zeros, or its input or output has the wrong width.
         """
-        self.contract, self._attributes = contract, frozenset(attributes)
-        check = CopiesSession(self._module, 1, contract, self.source)
-        check.act(torch.zeros(1, contract.observation_width))
+        self._attributes = frozenset(attributes)
+        names = argument_names(self._module)
+        wanted = [name for name in contract.inputs if name]
+        if len(names) != len(contract.inputs) or (wanted and set(wanted) != set(names)):
+            raise PolicyError(
+                f"'{self.source}' takes {len(names)} inputs ({', '.join(names)}); its contract's layout has "
+                f"{len(contract.inputs)} ({', '.join(wanted) or 'without a name'})"
+            )
+        order = [list(contract.inputs).index(name) for name in names] if wanted else [0]
+        widths = list(contract.inputs.values())
+        self._wiring = Wiring(widths=tuple(widths), order=tuple(order), dtype=_dtype(self._module))
+        check = CopiesSession(self._module, 1, contract, self.source, self._wiring)
+        action = check.act(torch.zeros(1, contract.observation_width))
+        self.contract = replace(contract, num_joints=action.shape[1])
         self.memories = self._find_memories()
+
+    def _other_width(self, width: int) -> int | None:
+        """Return the width that the module takes in place of this one, None where it takes none or this one."""
+        try:
+            found = input_width(self._module, (width,), source=self.source)
+        except PolicyError:
+            return None
+        return None if found == width else found
 
     def session(self, rows: int, *, rowwise: bool = False) -> PolicySession:
         """Start work on so many episodes with a copy of the module, all at once or each alone."""
         if rowwise:
             return RowwiseSession(self.session, rows)
         if self.memories is None:
-            return CopiesSession(self._module, rows, self.contract, self.source)
-        return BatchSession(self._module, rows, self.contract, self.source, self.memories)
+            return CopiesSession(self._module, rows, self.contract, self.source, self._wiring)
+        return BatchSession(self._module, rows, self.contract, self.source, self._wiring, self.memories)
 
     def _find_memories(self) -> tuple[Memory, ...] | None:
         """Return the module's memories, such that a batch proves equal to single runs; None if there is no such way."""
@@ -201,7 +279,8 @@ class ScriptProgram:
         generator = torch.Generator().manual_seed(0)
         with _plain_execution():
             for _ in range(2):
-                module(torch.randn(1, self.contract.observation_width, generator=generator))
+                observation = torch.randn(1, self.contract.observation_width, generator=generator)
+                module(*self._wiring.arguments(observation))
         changed = []
         for key, value in self._snapshot(module).items():
             old = before[key]
@@ -228,8 +307,8 @@ class ScriptProgram:
 
     def _proved(self, memories: tuple[Memory, ...]) -> bool:
         """Return whether a batch acts as single copies do."""
-        batch = BatchSession(self._module, PROBE_EPISODES, self.contract, self.source, memories)
-        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, self.source)
+        batch = BatchSession(self._module, PROBE_EPISODES, self.contract, self.source, self._wiring, memories)
+        copies = CopiesSession(self._module, PROBE_EPISODES, self.contract, self.source, self._wiring)
         return act_alike(copies, batch, self.contract.observation_width)
 
 
@@ -237,10 +316,16 @@ class BatchSession(PolicySession):
     """One module for all episodes; its memories have a row per episode."""
 
     def __init__(
-        self, module: Any, num_episodes: int, contract: PolicyContract, source: str, memories: Sequence[Memory]
+        self,
+        module: Any,
+        num_episodes: int,
+        contract: Interface,
+        source: str,
+        wiring: Wiring,
+        memories: Sequence[Memory],
     ) -> None:
         self._module = copy.deepcopy(module)
-        self._num_episodes, self._contract, self._source = num_episodes, contract, source
+        self._num_episodes, self._contract, self._source, self._wiring = num_episodes, contract, source, wiring
         parts = dict(self._module.named_modules())
         self._memories: list[tuple[Any, Memory, torch.Tensor]] = []
         for memory in memories:
@@ -263,16 +348,16 @@ class BatchSession(PolicySession):
 
     def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
         """See ``PolicySession``."""
-        return _run(self._module, observation, self._num_episodes, self._contract, self._source)
+        return _run(self._module, observation, self._num_episodes, self._contract, self._source, self._wiring)
 
 
 class CopiesSession(PolicySession):
     """One copy of the module for each episode, run one after another."""
 
-    def __init__(self, module: Any, num_episodes: int, contract: PolicyContract, source: str) -> None:
+    def __init__(self, module: Any, num_episodes: int, contract: Interface, source: str, wiring: Wiring) -> None:
         """Copy the module, which must be freshly reset."""
         self._fresh = copy.deepcopy(module)
-        self._contract, self._source = contract, source
+        self._contract, self._source, self._wiring = contract, source, wiring
         self._modules = [copy.deepcopy(self._fresh) for _ in range(num_episodes)]
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
@@ -285,14 +370,16 @@ class CopiesSession(PolicySession):
         """See ``PolicySession``."""
         check_observation(observation, len(self._modules), self._contract, self._source)
         pairs = zip(self._modules, observation.split(1), strict=True)
-        return torch.cat([_run(module, row, 1, self._contract, self._source) for module, row in pairs])
+        return torch.cat([_run(module, row, 1, self._contract, self._source, self._wiring) for module, row in pairs])
 
 
-def _run(module: Any, observation: torch.Tensor, rows: int, contract: PolicyContract, source: str) -> torch.Tensor:
+def _run(
+    module: Any, observation: torch.Tensor, rows: int, contract: Interface, source: str, wiring: Wiring
+) -> torch.Tensor:
     check_observation(observation, rows, contract, source)
     try:
         with _plain_execution():
-            action = first_tensor(module(observation))
+            action = first_tensor(module(*wiring.arguments(observation)))
     except PolicyError as error:
         raise PolicyError(f"'{source}' {error}") from error
     except LOAD_ERRORS as error:

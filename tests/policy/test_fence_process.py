@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from foreign_programs import Plain, refused, script
-from gaitgauge.policy.base import PolicyError
+from gaitgauge.policy.base import Interface, PolicyError
 from gaitgauge.policy.foreign.fence import child as fence_child
 from gaitgauge.policy.foreign.fenced_policy import FencedPolicy, FencedSession
 from gaitgauge.policy.foreign.torchscript_session import BatchSession, ScriptProgram
@@ -285,7 +285,7 @@ class Changing(Plain):
 def test_a_program_acts_to_the_last_bit_as_in_its_owner(contract, module, inference):
     data = script(module())
     child, here = fence_child.Child(ScriptProgram, data, source="policy"), ScriptProgram(data, "policy")
-    details = {"contract": contract.to_json(), "attributes": ["last", "seen"]}
+    details = {"interface": Interface.of(contract).to_dict(), "attributes": ["last", "seen"]}
     assert child.ask("prepare", **details) == here.answer({"do": "prepare", **details})
     assert isinstance(here.session(5), BatchSession)
     fenced, alone = FencedSession(child, 5, contract, "policy", device=torch.device("cpu")), here.session(5)

@@ -8,7 +8,7 @@ import onnx
 import pytest
 import torch
 import yaml
-from gaitgauge.policy.base import PolicyError, RowwiseSession
+from gaitgauge.policy.base import Interface, PolicyError, RowwiseSession
 from gaitgauge.policy.contract import History, PolicyContract
 from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
 from gaitgauge.policy.foreign.onnx_session import GraphProgram, OnnxSession
@@ -84,7 +84,7 @@ def linear(
 def unfenced(path: Path, contract: PolicyContract) -> GraphProgram:
     """Return the program of a file in this process."""
     program = GraphProgram(path.read_bytes(), "policy.onnx")
-    program.prepare(contract)
+    program.prepare(Interface.of(contract))
     return program
 
 

@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from gaitgauge.policy.base import PolicyError
+from gaitgauge.policy.base import Interface, PolicyError
 from gaitgauge.policy.batch_invariance import steady_session
 from gaitgauge.policy.contract import History
 from gaitgauge.policy.foreign.fence.script import check_script
 from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
-from gaitgauge.policy.foreign.torchscript_session import BatchSession, CopiesSession, ScriptProgram
+from gaitgauge.policy.foreign.torchscript_session import BatchSession, CopiesSession, ScriptProgram, Wiring
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from torch import nn
@@ -169,7 +169,7 @@ def unfenced(path, contract) -> ScriptProgram:
     """Return the program of a file in this process."""
     script = check_script(path.read_bytes(), source="policy")
     program = ScriptProgram(script.data, "policy")
-    program.prepare(contract, script.attributes)
+    program.prepare(Interface.of(contract), script.attributes)
     return program
 
 
@@ -397,7 +397,9 @@ def test_copies_are_made_of_the_fresh_module(tmp_path, contract, cts_network):
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.jit.save(torch.jit.script(WithHistory(cts_network)), buffer)
         module = torch.jit.load(io.BytesIO(buffer.getvalue()))
-    session = CopiesSession(module, 1, contract, "policy")
+    session = CopiesSession(
+        module, 1, Interface.of(contract), "policy", Wiring(widths=(45,), order=(0,), dtype=torch.float32)
+    )
     observation = torch.ones(1, 45)
     first = session.act(observation)
     module(observation)
